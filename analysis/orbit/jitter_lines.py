@@ -22,6 +22,8 @@ _FAR = 5.0
 _MEDIAN = 1.4826
 _ROUNDS = 40
 _ARRIVED = 1e-10
+_ASTRAY = 1.0
+"""Resolution elements: a fit that goes farther from the highest power has not found what makes it."""
 _CELL = 1.0
 """Resolution elements to each side of a line that is fitted in which none else is sought."""
 
@@ -161,10 +163,13 @@ def search(given: Observations, lowest: float, highest: float, false_alarm: floa
         probability = float(now.chance(now.power[best]))
         if probability > false_alarm:
             break
-        frequency.append(float(now.frequency[best]))
-        chance.append(probability)
-        lines = _fitted(kept, np.array(frequency), np.array(chance))
-        frequency = lines.frequency.tolist()
+        more, chances = [*frequency, float(now.frequency[best])], [*chance, probability]
+        try:
+            fitted = _fitted(kept, np.array(more), np.array(chances))
+        except JitterError:
+            # what is left is no oscillation beside the others, such as one whose amplitude changes
+            break
+        lines, frequency, chance = fitted, fitted.frequency.tolist(), chances
         again = _good(given, lines)
         if not np.array_equal(again, used):
             used = again
@@ -246,6 +251,8 @@ def _fitted(given: Observations, frequency: Array, chance: Array) -> Lines:
         f = f + move
         if np.max(np.abs(move)) * given.span < _ARRIVED:
             break
+    if np.max(np.abs(f - frequency)) * given.span > _ASTRAY:
+        raise JitterError("an oscillation that was found is none of one frequency")
     factor = float(left @ left) / max(given.freedom - count * width, 1)
     spread = (vt.T / s**2) @ vt / size[:, None] / size
     return replace(

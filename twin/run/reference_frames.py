@@ -144,8 +144,9 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "rates": "of the bias in body axes, per second of UTC",
         },
         "jitter": {
-            "amplitude, phase": f"rotations about the body's own axes; {_BODY}; sin(2 pi f t + p), t from the epoch",
-            "artefacts/course": "the same, less what is slow; seconds from the epoch in UTC of the pass",
+            "amplitude, phase": "about the body's own axes: roll X forward, pitch Y = Z x X, yaw Z toward the scene; "
+            "sin(2 pi f t + p), t from the epoch",
+            "artefacts/attitude": "the same, less what is slow; seconds from the epoch in UTC of the pass",
         },
         "monitor": {
             "times_s, reference_time_s, monitored_times_s": "seconds from the epoch in UTC of the orbit in config.yaml",

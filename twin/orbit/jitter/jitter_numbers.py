@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from analysis.units import ARCSEC
+from scenes.specs.orbit.jitter_search import OrbitJitterSpec
 from twin.orbit.jitter.jitter_run import JitterRun, PassJitter
 from twin.run.quantity import Quantity, Record
 from twin.sensors.charge_transfer import Collection, Motion
@@ -35,8 +36,9 @@ class FoundLine:
         """
         if self.one.truth is None:
             return None
-        stated, frequency = self.one.truth, self.one.found.lines.frequency[self.number]
-        lines = len(self.run.setup.test.attitude.jitter.lines)
+        test, stated = self.run.setup.test, self.one.truth
+        assert isinstance(test, OrbitJitterSpec)
+        frequency, lines = self.one.found.lines.frequency[self.number], len(test.attitude.jitter.lines)
         if not lines:
             return None
         k = int(np.argmin(np.abs(stated.frequency[:lines] - frequency)))
@@ -160,7 +162,7 @@ LINE: Record[FoundLine] = Record(
     Quantity(
         "chance",
         lambda one: one.one.found.lines.chance[one.number],
-        "largest probability of one like it by noise alone",
+        "largest probability that noise alone shows one like it, anywhere",
     ),
     Quantity(
         "true_frequency_hz",

@@ -8,7 +8,8 @@ from analysis.units import ARCSEC
 from twin.orbit.jitter.jitter_numbers import blind_multiples, found_lines, transfers
 from twin.orbit.jitter.jitter_plots import figure_svg
 from twin.orbit.jitter.jitter_run import JitterRun, PassJitter
-from twin.run.artefact import Cell, SvgFigure, Table, decimals_for, fixed, significant
+from twin.run.artefact import Cell, CsvFile, SvgFigure, Table, decimals_for, fixed, significant
+from twin.run.data_files import csv_table
 from twin.run.report import Report, Section, answer
 
 _COURSE = 0.02
@@ -58,7 +59,7 @@ def _verdict(run: JitterRun) -> tuple[str, tuple[str, ...]]:
     )
     more = f"{len(every)} oscillations were found" if len(every) > 1 else "One oscillation was found"
     return answer(
-        f"{more}, the largest at {fixed(f, decimals_for(sigma))} ± {significant(sigma, 1)} Hz: {sizes}",
+        f"{more}, the largest at {fixed(f, decimals_for(sigma))} ± {fixed(sigma, decimals_for(sigma))} Hz: {sizes}",
         f"the false-alarm rate is {rate:g} over all frequencies that were looked at",
         "see Blind frequencies for those that the lines cannot see",
     )
@@ -135,13 +136,13 @@ def _spectrum(run: JitterRun, one: PassJitter, suffix: str, head: str) -> Sectio
     heads = ["frequency [Hz]"]
     for axis in run.axes:
         heads += [f"{axis} [arcsec]", f"{axis} left", f"σ {axis}", f"{axis} detectable", f"{axis} response"]
-    full = Table(f"spectrum-table{suffix}", "Spectrum", "", (*heads, "blind"), rows)
+    listed = csv_table([(*heads, "blind"), *rows]).decode()
+    full = CsvFile(f"frequencies{suffix}", "Amplitudes by frequency, all numbers", "", listed)
     spectrum = SvgFigure(
         f"spectrum{suffix}",
         "Amplitudes by frequency",
         "Fitted at every frequency; an oscillation above the dashed line would be found.",
         figure_svg("spectrum", run, one),
-        full=full,
     )
     disparity = SvgFigure(
         f"disparity{suffix}",
@@ -151,7 +152,7 @@ def _spectrum(run: JitterRun, one: PassJitter, suffix: str, head: str) -> Sectio
     )
     shown = transfers(run, one)
     if not shown:
-        return Section(f"Spectrum{head}", text, (disparity, spectrum))
+        return Section(f"Spectrum{head}", text, (disparity, spectrum, full))
     directions = list(next(iter(shown.values())))
     table = Table(
         f"transfer{suffix}",
@@ -162,7 +163,7 @@ def _spectrum(run: JitterRun, one: PassJitter, suffix: str, head: str) -> Sectio
         [(name, *values.values()) for name, values in shown.items()],
         digits=4,
     )
-    return Section(f"Spectrum{head}", text, (disparity, spectrum, table))
+    return Section(f"Spectrum{head}", text, (disparity, spectrum, table, full))
 
 
 def _blind(one: PassJitter, suffix: str, head: str) -> Section:
@@ -200,15 +201,15 @@ def _course(run: JitterRun, one: PassJitter, suffix: str, head: str) -> Section:
         for k, axis in enumerate(run.axes):
             heads += [f"{axis}{word} [arcsec]", f"σ {axis}{word}"]
             columns += [value[:, k] / ARCSEC, np.sqrt(np.maximum(spread[:, k, k], 0.0)) / ARCSEC]
-    full = Table(f"course-table{suffix}", "Course", "", heads, np.stack(columns, axis=-1).tolist())
+    rows = csv_table([heads, *np.stack(columns, axis=-1).tolist()]).decode()
+    full = CsvFile(f"attitude{suffix}", "Attitude over time, all numbers", "", rows)
     figure = SvgFigure(
         f"course{suffix}",
         "Attitude over time",
         "Less what is slow. Its mean and what is blind are not in it.",
         figure_svg("course", run, one),
-        full=full,
     )
-    return Section(f"Course{head}", (), (figure,))
+    return Section(f"Course{head}", (), (figure, full))
 
 
 def _warnings(run: JitterRun) -> tuple[str, ...]:

@@ -96,7 +96,10 @@ def read_pass(
     """
     files = spec.files
     platform = _platform(spec, conventions)
-    lines, known, pixels = (read_table(files[key], COLUMNS[key]) for key in ("lines", "ground", "image_points"))
+    # who needs no control is content with tie points
+    least = 0 if "tie_points" in files and not needed else 1
+    lines = read_table(files["lines"], COLUMNS["lines"])
+    known, pixels = (read_table(files[key], COLUMNS[key], least) for key in ("ground", "image_points"))
     times, origins = _line_times_of(lines, conventions, camera, platform)
     ground = ground_of(known)
     number = {name: k for k, name in enumerate(ground.ids.tolist())}

@@ -1,0 +1,189 @@
+"""Oscillations in disparities: found with frequency and amplitude, blind where a whole number of periods lies between
+two sights, and none where there is none.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.orbit.jitter_lines import search, splined
+from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
+
+GAPS = (0.1216, 0.1024)
+"""Seconds between the sights of ZY-3's blue and green, and of its green and red band."""
+RATE = 1e-3
+LIMIT = 1e-3
+"""Chance with which a test of a rate fails though all is right."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Disparities of one axis in pixels."""
+
+    lines: tuple[tuple[float, float, float], ...] = ()
+    gaps: tuple[float, ...] = GAPS[:1]
+    count: int = 300
+    length: float = 10.0
+    noise: float = 0.1
+    wrong: float = 0.0
+
+    def turn(self, t):
+        return sum((a * np.sin(2.0 * np.pi * f * t + p) for f, a, p in self.lines), np.zeros_like(t))
+
+    def observed(self, seed: int) -> Observations:
+        random = np.random.default_rng(seed)
+        pair = np.repeat(np.arange(len(self.gaps)), self.count)
+        first = random.uniform(0.0, self.length, len(pair))
+        second = first + np.array(self.gaps)[pair]
+        moved = self.turn(second) - self.turn(first) + 0.5 * pair + 0.03 * first + 0.004 * first**2
+        moved = moved + self.noise * random.standard_normal(len(pair))
+        bad = random.uniform(size=len(pair)) < self.wrong
+        moved[bad] += random.uniform(-20.0, 20.0, len(pair))[bad]
+        return Observations.of_disparities(first, second, moved, self.noise, pair)
+
+
+def test_lines_are_recovered_within_their_sigmas() -> None:
+    """0.65 Hz of 0.5 to 1.5 px as ZY-3 shows it, and a smaller line: over 60 passes the errors over sigma are those of
+    a standard normal number, by their chi-square.
+    """
+    off: list[list[float]] = []
+    for seed in range(60):
+        truth = ((0.65, 0.5 + seed / 59.0, 0.1 * seed), (3.4, 0.12, 1.0))
+        found = search(Pass(truth).observed(seed), 0.1, 6.0, RATE).lines
+        order = np.argsort(found.frequency)
+        assert len(order) == 2, seed
+        for k, (frequency, amplitude, _) in zip(order, truth, strict=True):
+            off.append(
+                [
+                    (found.frequency[k] - frequency) / found.frequency_sigma[k],
+                    (found.amplitude[k, 0] - amplitude) / found.amplitude_sigma[k, 0],
+                ]
+            )
+    chi = np.sum(np.square(off))
+    low, high = stats.chi2.ppf([LIMIT / 2.0, 1.0 - LIMIT / 2.0], 240)
+    assert low < chi < high
+
+
+def test_the_phase_counts_from_the_epoch_and_the_course_has_a_covariance_that_holds() -> None:
+    at, square = np.linspace(0.5, 9.5, 40), []
+    for seed in range(40):
+        one = Pass(((0.65, 1.0, 2.0), (4.0, 0.3, 5.0)))
+        lines = search(one.observed(seed), 0.1, 6.0, RATE).lines
+        value, spread = lines.course(at)
+        square.append((value[20, 0] - one.turn(at)[20]) ** 2 / spread[20, 0, 0])
+        assert np.isclose(lines.phase[np.argmin(lines.frequency), 0], 2.0, atol=0.15)
+    low, high = stats.chi2.ppf([LIMIT / 2.0, 1.0 - LIMIT / 2.0], 40)
+    assert low < np.sum(square) < high
+
+
+@pytest.mark.parametrize(("gap", "blind"), [(GAPS[0], 8.224), (GAPS[1], 9.766)])
+def test_a_pair_is_blind_where_a_period_lies_between_its_sights(gap: float, blind: float) -> None:
+    """A jitter of ten times the noise stays unseen at 1/dt, is named as unseeable, and is found a hertz beside it."""
+    found = search(Pass(((blind, 1.0, 0.3),), (gap,)).observed(1), 0.5, 12.0, RATE)
+    assert not len(found.lines.frequency)
+    inside = [(a, b) for a, b in found.before.intervals() if a < blind < b]
+    assert len(inside) == 1
+    assert np.mean(inside[0]) == pytest.approx(1.0 / gap, abs=0.02)
+    # |sin(pi f dt)| < 0.1: a thirtieth of the frequency to each side
+    assert inside[0][1] - inside[0][0] == pytest.approx(2.0 * np.arcsin(0.1) / np.pi / gap, rel=0.1)
+    beside = search(Pass(((blind - 1.0, 1.0, 0.3),), (gap,)).observed(1), 0.5, 12.0, RATE).lines
+    assert beside.frequency[0] == pytest.approx(blind - 1.0, abs=0.01)
+
+
+def test_two_gaps_together_see_what_each_is_blind_for() -> None:
+    for frequency in (8.224, 9.766):
+        found = search(Pass(((frequency, 0.5, 0.3),), GAPS).observed(2), 0.5, 12.0, RATE)
+        assert found.lines.frequency[0] == pytest.approx(frequency, abs=0.01)
+        assert found.lines.amplitude[0, 0] == pytest.approx(0.5, abs=5.0 * found.lines.amplitude_sigma[0, 0])
+        assert not [span for span in found.before.intervals() if span[0] > 1.0]
+
+
+def test_the_response_is_that_of_a_difference() -> None:
+    found = periodogram(Pass(count=800).observed(3), 2.0, 12.0)
+    np.testing.assert_allclose(
+        found.response[:, 0], 2.0 * np.abs(np.sin(np.pi * found.frequency * GAPS[0])), rtol=0, atol=0.06
+    )
+
+
+@pytest.mark.parametrize("gaps", [GAPS[:1], pytest.param(GAPS, marks=pytest.mark.second)], ids=["one", "two"])
+def test_the_false_alarm_rate_is_a_bound_and_close(gaps: tuple[float, ...]) -> None:
+    """400 passes of noise: the highest power of all frequencies exceeds each level at most as often as is said, and not
+    much more rarely.
+    """
+    chances = []
+    for seed in range(400):
+        found = periodogram(Pass(gaps=gaps, count=120).observed(seed), 0.5, 12.0)
+        chances.append(float(found.chance(found.power[found.best])))
+    for rate in (0.01, 0.05, 0.2):
+        alarms = int(np.sum(np.array(chances) < rate))
+        assert alarms <= stats.binom.ppf(1.0 - LIMIT, 400, rate), rate
+        assert alarms >= stats.binom.ppf(LIMIT, 400, 0.5 * rate), rate
+
+
+def test_wrong_matches_hide_nothing_and_add_nothing() -> None:
+    one = Pass(((0.65, 1.0, 0.5),), wrong=0.1)
+    found = search(one.observed(4), 0.1, 6.0, RATE)
+    assert found.lines.frequency == pytest.approx([0.65], abs=4.0 * found.lines.frequency_sigma[0])
+    assert found.lines.amplitude[0, 0] == pytest.approx(1.0, abs=4.0 * found.lines.amplitude_sigma[0, 0])
+    assert 0.85 < np.mean(found.used) < 0.95
+    assert found.factor == pytest.approx(1.0, abs=0.35)
+    assert not len(search(Pass(wrong=0.1).observed(5), 0.1, 6.0, RATE).lines.frequency)
+
+
+def test_the_variance_of_the_noise_need_not_be_known() -> None:
+    """Covariances that are ten times too small give no line, and sigmas of lines follow the noise that there is."""
+    quiet = Pass(((2.0, 0.4, 0.0),)).observed(6)
+    loud = Observations.of(10.0 * quiet.value, quiet.group, quiet.time, 10.0 * quiet.weight, quiet.nuisance)
+    a, b = (search(one, 0.1, 6.0, RATE) for one in (quiet, loud))
+    np.testing.assert_allclose(a.lines.amplitude_sigma, b.lines.amplitude_sigma, rtol=1e-6)
+    assert b.factor == pytest.approx(100.0 * a.factor)
+    none = Pass().observed(7)
+    assert not len(
+        search(
+            Observations.of(10.0 * none.value, none.group, none.time, none.weight, none.nuisance), 0.1, 6.0, RATE
+        ).lines.frequency
+    )
+
+
+def test_a_spline_follows_what_is_no_line() -> None:
+    """A band of noise from 1 to 3 Hz, over 30 passes, in the middle of the strip: errors within the covariance."""
+    at, square, plain = np.linspace(3.0, 7.0, 9), [], []
+    for seed in range(30):
+        random = np.random.default_rng(100 + seed)
+        frequency = 1.0 + 2.0 * (np.arange(40) + random.uniform(size=40)) / 40
+        lines = tuple(
+            (float(f), float(a), float(p))
+            for f, a, p in zip(frequency, 0.1 * random.rayleigh(size=40), random.uniform(0.0, 6.28, 40), strict=True)
+        )
+        one = Pass(lines, count=600)
+        value, spread = splined(one.observed(seed), 0.1, 1.0).at(at)
+        # what is slow is known to a trend only: it is taken off all that is compared
+        slow = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, len(at)), 2)
+        away = np.eye(len(at)) - slow @ np.linalg.pinv(slow)
+        plain.append(np.std(away @ one.turn(at)))
+        square.append(np.std(away @ (value[:, 0] - one.turn(at))))
+        assert np.all(spread[:, 0, 0] > 0.0)
+    assert np.sqrt(np.mean(np.square(square))) < 0.35 * np.sqrt(np.mean(np.square(plain)))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda v: {"first": v[:5], "second": v[:5] + 0.1, "disparity": v[:5]}, "too few"),
+        (lambda v: {"first": v, "second": v + 0.1, "disparity": np.where(v > 5.0, np.nan, 0.0)}, "not finite"),
+    ],
+)
+def test_what_says_nothing_is_told(change, told: str) -> None:
+    with pytest.raises(JitterError, match=told):
+        Observations.of_disparities(**change(np.linspace(0.0, 10.0, 200)), sigma=0.1)
+
+
+def test_frequencies_that_cannot_be_looked_at_are_told() -> None:
+    given = Pass().observed(1)
+    with pytest.raises(JitterError, match="no frequencies"):
+        periodogram(given, 3.0, 3.001)
+    with pytest.raises(JitterError, match="moves nothing"):
+        both = np.concatenate([given.weight, 0.0 * given.weight], axis=2)
+        periodogram(Observations.of(given.value, given.group, given.time, both, given.nuisance), 1.0, 2.0)

@@ -1,0 +1,193 @@
+"""Jitter of a pass, found in what the lines of a camera saw: simulated, exported, read back."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import twin.orbit.__main__ as command
+from analysis.orbit.jitter_lines import Found, search
+from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.measured.orbit_data_setup import resolve_any_jitter
+from scenes.specs.orbit.jitter_search import OrbitJitterSpec
+from scenes.specs.orbit.setup import JitterSetup
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from tests.twin.commands import invoke
+from twin.orbit.flight.light_effects import LightEffects
+from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.platform_table import TabulatedTrajectory
+from twin.orbit.jitter import sights
+from twin.orbit.jitter.jitter_numbers import JITTER, blind_multiples
+from twin.orbit.jitter.jitter_run import fly_strip, run_jitter
+from twin.orbit.jitter.sights import SightsError, sights_of
+from twin.orbit.jitter.steady_platform import SteadyPlatform
+from twin.run.procedure import BenchError
+
+ARCSEC = np.pi / 648000.0
+run = partial(invoke, command.app)
+READINGS = 0.25
+"""Seconds between readings of the attitude: 4 Hz."""
+RATE = 0.01
+
+
+def setup(**change) -> JitterSetup:
+    data = dict(read_yaml(SCENES / ORBIT / "jitter.yaml").data)
+    data["orbit"] = {**data["orbit"], "before": "10 s", "after": "10 s"}
+    data["points"] = {"count": 160, "duration": "10 s", "noise": 0.1, "height": "300 m", "relief": "100 m"}
+    data |= change
+    test = OrbitJitterSpec.model_validate(data)
+    camera = resolve_any_jitter(SCENES / ORBIT / "jitter.yaml").camera
+    return JitterSetup.model_construct(test=test, camera=camera)
+
+
+def attitude(*lines: dict) -> dict:
+    return {"steering": "yaw", "jitter": {"lines": list(lines)}}
+
+
+OSCILLATION = {"frequency": "0.65 Hz", "amplitude": "2.4 1 0 arcsec", "phase": "40 10 0 deg"}
+
+
+def searched(one: JitterSetup, seed: int) -> Found:
+    spec = one.test
+    measured, _ = fly_strip(one, seed)
+    seen = sights_of(measured, line_cameras(one.camera), spec.lines, spec.search, LightEffects.of(spec.effects))
+    return search(seen.observations, spec.search.lowest, spec.search.highest, spec.search.false_alarm)
+
+
+def test_an_oscillation_of_the_body_is_found_about_its_axes() -> None:
+    """1 px of roll and 0.4 px of pitch at 0.65 Hz through geometry, light, attitude readings and matching noise."""
+    found = run_jitter(setup(attitude=attitude(OSCILLATION), search={"highest": "12 Hz", "height": "250 m"}), None, 3)
+    one = found.passes["jitter"]
+    lines = one.found.lines
+    assert one.sights.lines == ("blue", "green", "red", "nir")
+    assert len(lines.frequency) == 1
+    assert lines.frequency[0] == pytest.approx(0.65, abs=4.0 * lines.frequency_sigma[0])
+    away = (lines.amplitude[0] / ARCSEC - [2.4, 1.0]) / (lines.amplitude_sigma[0] / ARCSEC)
+    assert np.all(np.abs(away) < 4.0)
+    np.testing.assert_allclose(np.degrees(lines.phase[0]), [40.0, 10.0], rtol=0, atol=8.0)
+    assert one.found.factor == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / one.found.after.freedom))
+    gaps = {pair: gap[1] for pair, gap in one.sights.gaps.items()}
+    assert gaps["blue", "green"] == pytest.approx(0.1216, abs=2e-4)
+    assert gaps["green", "red"] == pytest.approx(0.1024, abs=2e-4)
+    first = {(m.first, m.second): m.frequency for m in blind_multiples(one) if m.order == 1}
+    assert first["blue", "green"] == pytest.approx(8.22, abs=0.02)
+    assert first["green", "red"] == pytest.approx(9.77, abs=0.02)
+    numbers = JITTER(found)["passes"]["jitter"]
+    assert numbers["oscillations"][0]["true_amplitude_arcsec"] == pytest.approx({"roll": 2.4, "pitch": 1.0})
+
+
+@pytest.mark.parametrize(("pair", "blind"), [(("blue", "green"), 8.223), (("green", "red"), 9.765)])
+def test_two_bands_are_blind_at_the_inverse_of_their_gap(pair: tuple[str, str], blind: float) -> None:
+    """An oscillation of 1 px there is not found by the two, but by all four."""
+    line = {"frequency": f"{blind} Hz", "amplitude": "2.4 0 0 arcsec", "phase": "0 deg"}
+    ask = {"lowest": "5 Hz", "highest": "12 Hz", "height": "300 m"}
+    two = searched(setup(attitude=attitude(line), lines=pair, search=ask), 4)
+    assert not len(two.lines.frequency)
+    assert any(a < blind < b for a, b in two.before.intervals())
+    four = searched(setup(attitude=attitude(line), search=ask), 4)
+    assert four.lines.frequency[0] == pytest.approx(blind, abs=0.01)
+
+
+def quiet() -> JitterSetup:
+    """Without jitter, with readings of the attitude that are as noisy as half a pixel."""
+    tracker = {"interval": f"{READINGS} s", "noise": "1 1 1 arcsec"}
+    return setup(
+        attitude={"steering": "yaw"},
+        lines=("blue", "nir"),
+        errors={"star_tracker": tracker, "gps": {"noise": "0.3 0.3 0.3 m"}},
+        points={"count": 120, "duration": "6 s", "noise": 0.05, "height": "300 m", "relief": "100 m"},
+        search={"highest": "9 Hz", "height": "300 m", "false_alarm": RATE},
+    )
+
+
+def test_readings_of_the_attitude_leave_no_period(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without jitter none is found; against readings joined by a spline it would be, below half of their rate."""
+    assert not [seed for seed in range(4) if len(searched(quiet(), seed).lines.frequency)]
+
+    class Joined(SteadyPlatform):
+        @classmethod
+        def of(cls, path: TabulatedTrajectory, first: float, last: float) -> TabulatedTrajectory:
+            return path
+
+    monkeypatch.setattr(sights, "SteadyPlatform", Joined)
+    false = [searched(quiet(), seed).lines.frequency for seed in range(4)]
+    assert all(len(one) for one in false)
+    assert np.max(np.concatenate(false)) < 1.0 / READINGS
+
+
+@pytest.mark.slow
+def test_a_hundred_passes_without_jitter_in_figures() -> None:
+    """False alarms within the stated rate, at the binomial limit of 1e-3, and none with the period of the readings."""
+    found = [searched(quiet(), seed) for seed in range(100)]
+    chances = np.array([float(one.before.chance(one.before.power[one.before.best])) for one in found])
+    alarms = [one.lines.frequency for one in found if len(one.lines.frequency)]
+    print(f"{len(alarms)} of 100 alarms at {RATE:g}, {int(np.sum(chances < 0.1))} at 0.1; {alarms}")  # noqa: T201
+    assert len(alarms) <= stats.binom.ppf(1.0 - 1e-3, 100, RATE)
+    for rate in (0.05, 0.1, 0.3):
+        assert np.sum(chances < rate) <= stats.binom.ppf(1.0 - 1e-3, 100, rate)
+    for frequency in [f for one in alarms for f in one]:
+        assert abs(frequency * READINGS - round(frequency * READINGS)) > 0.02
+
+
+def test_what_is_exported_gives_the_same_oscillations(tmp_path: Path) -> None:
+    path = tmp_path / "pass.yaml"
+    ask = {"highest": "6 Hz", "height": "300 m", "spline": {"interval": "0.2 s", "sigma": "3 arcsec"}}
+    one = setup(attitude=attitude(OSCILLATION), search=ask)
+    path.write_text(dump_yaml({**one.test.plain(), "camera": "ms4"}))
+    out, data = tmp_path / "run", tmp_path / "data"
+    result = run("jitter", path, "--out", out, "--export", data, "--json")
+    assert result.exit_code == 0, result.output
+    first = json.loads(result.stdout)["passes"]["jitter"]
+    again = run("jitter", data / "jitter.yaml", "--out", tmp_path / "again", "--json")
+    assert again.exit_code == 0, again.output
+    second = json.loads(again.stdout)["passes"]["jitter"]
+    assert "true_frequency_hz" not in second["oscillations"][0]
+    there, back = (one["oscillations"][0]["frequency_hz"] for one in (first, second))
+    assert back == pytest.approx(there, rel=1e-7)
+    course = (tmp_path / "again/artefacts/attitude.csv").read_text().splitlines()
+    assert course[0].startswith("time [s],roll [arcsec],σ roll")
+    assert "roll spline [arcsec]" in course[0]
+    values = np.array([line.split(",") for line in course[1:]], float)
+    turn = 2.4 * np.sin(2.0 * np.pi * 0.65 * values[:, 0] + np.radians(40.0))
+    assert np.std(values[:, 1] - turn) < 0.1
+    # a spline has no shape to go by: it follows with its sigma
+    inner = np.abs(values[:, 0]) < 4.0
+    assert np.std((values[:, 5] - turn)[inner]) < 0.5
+    assert (tmp_path / "again/artefacts/frequencies.csv").is_file()
+
+
+def test_steady_readings_are_those_of_a_pass_without_noise() -> None:
+    """Polynomials through exact readings: the orbit to a millimetre, the attitude to a thousandth of an arcsecond."""
+    one = setup(attitude={"steering": "yaw"}, errors={})
+    path = TabulatedTrajectory(fly_strip(one, 1)[0].platform)
+    steady = SteadyPlatform.of(path, -4.0, 4.0)
+    t = np.linspace(-4.0, 4.0, 33)
+    np.testing.assert_allclose(steady.position(t), path.position(t), rtol=0, atol=1e-3)
+    turn = np.einsum("nji,njk->nik", path.body_to_itrs(t), steady.body_to_itrs(t))
+    np.testing.assert_allclose(turn, np.broadcast_to(np.eye(3), turn.shape), rtol=0, atol=1e-3 * ARCSEC)
+
+
+def test_what_cannot_be_searched_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    data = dict(read_yaml(SCENES / ORBIT / "jitter.yaml").data)
+    for change, told in (
+        ({"lines": ["blue", "grren"]}, "did you mean 'green'"),
+        ({"lines": ["blue"]}, "two lines or more"),
+        ({"search": {"highest": "0.05 Hz"}}, "no frequencies to look at"),
+        ({"search": {"highest": "9 Hz", "axes": ["roll", "roll"]}}, "no axis, or one twice"),
+        ({"time": "25 s"}, "outside the orbit data"),
+    ):
+        path.write_text(dump_yaml({**data, **change}))
+        with pytest.raises(InputError) as error:
+            resolve_any_jitter(path)
+        assert told in str(error.value), change
+    with pytest.raises(BenchError, match="are seen by all of"):
+        run_jitter(setup(time="9.6 s", points={"count": 100, "duration": "0.7 s"}), None, 1)
+    one = setup()
+    measured, _ = fly_strip(one, 1)
+    with pytest.raises(SightsError, match="0 points"):
+        sights_of(measured, {"blue": line_cameras(one.camera)["blue"]}, None, one.test.search, LightEffects())
