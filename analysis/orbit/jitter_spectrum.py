@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
-from optics.numerics.physical_error import PhysicalError
+from analysis.measurement_error import MeasurementError
 
 Array = NDArray[np.float64]
 OVERSAMPLING = 6
@@ -49,7 +49,7 @@ _LEAST_ROWS = 30
 _STEPS = 30
 
 
-class JitterError(PhysicalError, ValueError):
+class JitterError(MeasurementError, ValueError):
     """Observations that say nothing of jitter."""
 
 

@@ -38,6 +38,8 @@ READ_BY = {
     "orbit_monitor": "`python -m twin.orbit monitor FILE`",
     "orbit_check": "`python -m twin.orbit check FILE`",
     "orbit_match": "`python -m twin.orbit match FILE`",
+    "orbit_jitter": "`python -m twin.orbit jitter FILE`",
+    "measured_jitter": "`python -m twin.orbit jitter FILE`",
     "tolerance": "`python -m twin.tolerance FILE`",
     "asbuilt": "`python -m twin.asbuilt FILE`, `python -m twin.asbuilt check FILE`",
     "telemetry": "`python -m twin.operate ingest RECORD FILE`",

@@ -326,6 +326,7 @@ FOLDERS = {
     "twin.orbit monitor": "twin/orbit/monitoring",
     "twin.orbit check": "twin/orbit/conventions",
     "twin.orbit match": "twin/orbit/matching",
+    "twin.orbit jitter": "twin/orbit/jitter",
     "twin.study --gradient": "twin/study/gradient",
     "twin.study": "twin/study/report",
 }

@@ -48,7 +48,9 @@ FOLDERS = {
     "orbit/measured/data": "orbit_data",
     "orbit/measured/check": "orbit_check",
     "orbit/measured/match": "orbit_match",
+    "orbit/measured/jitter": "measured_jitter",
     "orbit/calibrate": "orbit_calibration",
+    "orbit/jitter": "orbit_jitter",
     "orbit/monitor": "orbit_monitor",
     "orbit/simulate": "orbit_simulate",
 }
