@@ -111,10 +111,10 @@ class Found:
 
     Attributes:
         lines: that were found.
-        before: periodogram of the observations.
+        before: periodogram of the observations, with the variances of their kinds as they were found.
         after: the same beside all lines that were found.
         used: (R,) observations that were not left out as wrong.
-        factor: variance of the noise over that of the covariances.
+        factor: variance of the noise over that of the covariances, of the first kind of observations.
         threshold: power of ``after`` that noise alone exceeds with the stated probability.
     """
 
@@ -145,16 +145,14 @@ def search(given: Observations, lowest: float, highest: float, false_alarm: floa
         JitterError: observations that say nothing of jitter.
     """
     used = _good(given, None)
-    first: Periodogram | None = None
     frequency: list[float] = []
     chance: list[float] = []
     lines: Lines | None = None
     while True:
         kept = given.taken(used)
-        beside = kept if lines is None else kept.beside(_columns(kept, lines))
-        now = periodogram(beside, lowest, highest)
-        if first is None:
-            first = now
+        factors = _beside(kept, lines).factors()
+        kept = kept.evened(factors)
+        now = periodogram(_beside(kept, lines), lowest, highest)
         step = _CELL / kept.span
         open_ = ~now.blind & np.all(np.abs(now.frequency[:, None] - np.array(frequency)) > step, axis=1)
         if not np.any(open_) or len(frequency) >= MOST_LINES:
@@ -166,25 +164,28 @@ def search(given: Observations, lowest: float, highest: float, false_alarm: floa
         more, chances = [*frequency, float(now.frequency[best])], [*chance, probability]
         try:
             fitted = _fitted(kept, np.array(more), np.array(chances))
+            again = _good(given, fitted)
+            kept = given.taken(again).evened(factors)
+            fitted = _fitted(kept, fitted.frequency, np.array(chances))
+            # a strong line was noise to the factors before
+            kept = given.taken(again)
+            kept = kept.evened(_beside(kept, fitted).factors())
+            fitted = _fitted(kept, fitted.frequency, np.array(chances))
         except JitterError:
             # what is left is no oscillation beside the others, such as one whose amplitude changes
             break
-        lines, frequency, chance = fitted, fitted.frequency.tolist(), chances
-        again = _good(given, lines)
-        if not np.array_equal(again, used):
-            used = again
-            lines = _fitted(given.taken(used), np.array(frequency), np.array(chance))
-            frequency = lines.frequency.tolist()
-            if len(frequency) == 1:
-                # wrong matches were taken for good ones before
-                first = periodogram(given.taken(used), lowest, highest)
-    factor = now.total / now.freedom
+        lines, used, frequency, chance = fitted, again, fitted.frequency.tolist(), chances
+    before = now if lines is None else periodogram(kept, lowest, highest)
     if lines is None:
         axes = given.axes
-        lines = Lines(
-            np.zeros(0), np.zeros((0, axes)), np.zeros((0, axes)), np.zeros((0, 0)), np.zeros(0), given.middle
-        )
-    return Found(lines, first, now, used, factor, now.threshold(false_alarm))
+        none = np.zeros((0, axes))
+        lines = Lines(np.zeros(0), none, none, np.zeros((0, 0)), np.zeros(0), given.middle)
+    return Found(lines, before, now, used, float(factors[0]), now.threshold(false_alarm))
+
+
+def _beside(given: Observations, lines: Lines | None) -> Observations:
+    """Observations with all that is fitted of lines as unknowns beside the others."""
+    return given if lines is None else given.beside(_columns(given, lines))
 
 
 def _columns(given: Observations, lines: Lines) -> Array:

@@ -63,6 +63,8 @@ class Observations:
         time: (G, J) moments that those of a group compare, seconds.
         weight: (R, J, A) by radian about each axis at each moment; zero where there are fewer moments.
         nuisance: (R, P) columns of what else is unknown, of any rank.
+        kind: (R,) whole numbers from 0 on: observations whose variances may be wrong by factors of their own, such as
+            those that know of the places' heights beforehand.
     """
 
     value: Array
@@ -70,26 +72,42 @@ class Observations:
     time: Array
     weight: Array
     nuisance: Array
+    kind: NDArray[np.intp]
 
     @classmethod
     def of(
-        cls, value: ArrayLike, group: ArrayLike, time: ArrayLike, weight: ArrayLike, nuisance: ArrayLike
+        cls,
+        value: ArrayLike,
+        group: ArrayLike,
+        time: ArrayLike,
+        weight: ArrayLike,
+        nuisance: ArrayLike,
+        kind: ArrayLike | None = None,
     ) -> Observations:
         """Checked.
+
+        Args:
+            value: (R,).
+            group: (R,).
+            time: (G, J), seconds.
+            weight: (R, J, A), by radian.
+            nuisance: (R, P).
+            kind: (R,); None for all alike.
 
         Raises:
             JitterError: shapes that do not match, values that are not finite, too few observations.
         """
         v, t, w, n = (np.array(a, np.float64) for a in (value, time, weight, nuisance))
         g = np.array(group, np.intp)
+        sort = np.zeros(len(v), np.intp) if kind is None else np.array(kind, np.intp)
         shapes = v.shape, g.shape, t.shape, w.shape, n.shape
-        if v.ndim != 1 or w.ndim != 3 or t.ndim != 2 or not (len(v) == len(g) == len(w) == len(n)):
+        if v.ndim != 1 or w.ndim != 3 or t.ndim != 2 or not (len(v) == len(g) == len(w) == len(n) == len(sort)):
             raise JitterError(f"observations of shapes {shapes} do not match")
         if w.shape[1] != t.shape[1] or np.any(np.diff(g) < 0) or np.any(g < 0) or np.any(g >= len(t)):
             raise JitterError(f"observations of shapes {shapes} do not match, or their groups are mixed")
         if not all(np.all(np.isfinite(a)) for a in (v, t, w, n)):
             raise JitterError("an observation is not finite")
-        found = cls(v, g, t, w, n)
+        found = cls(v, g, t, w, n, sort)
         if found.freedom < _LEAST_ROWS:
             unknown = len(v) - found.freedom
             raise JitterError(f"{len(v)} observations with {unknown} unknowns are too few for a spectrum")
@@ -176,7 +194,24 @@ class Observations:
         """Some of them, by mask."""
         where = np.asarray(keep)
         some, group = np.unique(self.group[where], return_inverse=True)
-        return Observations(self.value[where], group, self.time[some], self.weight[where], self.nuisance[where])
+        value, weight, nuisance = self.value[where], self.weight[where], self.nuisance[where]
+        return Observations(value, group, self.time[some], weight, nuisance, self.kind[where])
+
+    def factors(self) -> Array:
+        """Variance of each kind's noise by what the nuisance leaves, over that it was whitened by; 1 where there are
+        too few to tell.
+        """
+        square, freedom = self.rest(self.value) ** 2, 1.0 - np.sum(self.known**2, axis=1)
+        count = int(self.kind.max(initial=0)) + 1
+        of_kind = np.bincount(self.kind, freedom, count)
+        enough = of_kind >= _LEAST_ROWS
+        return np.where(enough, np.bincount(self.kind, square, count) / np.where(enough, of_kind, 1.0), 1.0)
+
+    def evened(self, factors: ArrayLike) -> Observations:
+        """The same with variances multiplied by a factor (kinds,) of each kind."""
+        size = 1.0 / np.sqrt(np.maximum(np.asarray(factors, np.float64), _NEVER))[self.kind]
+        weight, nuisance = self.weight * size[:, None, None], self.nuisance * size[:, None]
+        return replace(self, value=self.value * size, weight=weight, nuisance=nuisance)
 
     def beside(self, columns: Array) -> Observations:
         """The same with further columns (R, P) of what is unknown."""

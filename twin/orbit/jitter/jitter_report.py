@@ -124,7 +124,7 @@ def _spectrum(run: JitterRun, one: PassJitter, suffix: str, head: str) -> Sectio
         cells: list[Cell] = [float(f[k])]
         for a in range(len(run.axes)):
             least = found.detectable[k, a]
-            sigma = before.sigma[k, a] * np.sqrt(found.factor)
+            sigma = before.sigma[k, a]
             cells += [
                 float(before.amplitude[k, a] / ARCSEC),
                 float(found.after.amplitude[k, a] / ARCSEC),

@@ -266,14 +266,13 @@ def _whitened(
         residual[name] = off
     values: list[np.ndarray] = []
     times: list[np.ndarray] = []
-    weights, columns, groups = [], [], []
+    weights, columns, groups, kinds = [], [], [], []
     for used, rows in _alike(seen, prior.tie):
         m, n = len(used), len(rows)
         root = np.linalg.inv(np.linalg.cholesky(spread[rows][:, used][:, :, :, used].reshape(n, 2 * m, 2 * m)))
         seen_by = root @ by[rows][:, used].reshape(n, 2 * m, 3)
         before, off = prior.of(rows, place[rows])
-        # rows that no place on the ground explains, white as all of them are
-        free = np.linalg.svd(np.concatenate([seen_by, before], axis=1))[0][:, :, 3:].swapaxes(1, 2)
+        free, own = _free(seen_by, before)
         measured = np.concatenate([(root @ value[rows][:, used].reshape(n, 2 * m, 1))[..., 0], off], axis=1)
         values.append((free @ measured[..., None]).ravel())
         root = free[:, :, : 2 * m] @ root
@@ -286,12 +285,33 @@ def _whitened(
             column[:, :, k] = part[..., None] * basis[rows][:, None, None, :]
         weights.append(weight.reshape(-1, count, axes))
         columns.append(column.reshape(n * left, -1))
+        kinds.append(np.tile(own, n))
         groups.append(np.repeat(np.arange(n), left) + sum(len(part) for part in times))
         times.append(time[rows])
     if not values:
         raise SightsError("no point is seen by two lines where camera and platform expect it, to 200 pixels")
-    given = Observations.of(*(np.concatenate(part) for part in (values, groups, times, weights, columns)))
+    given = Observations.of(*(np.concatenate(part) for part in (values, groups, times, weights, columns, kinds)))
     return given, residual
+
+
+def _free(seen: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Combinations of observations that no place on the ground explains, white as all of them are.
+
+    Args:
+        seen: (n, 2 m, 3) derivatives of what lines see by the place.
+        before: (n, k, 3) of what is known of it before.
+
+    Returns:
+        Rows (n, 2 m + k - 3, 2 m + k): first those of the lines alone, then those that use what is known before; and
+        which of them do, 0 or 1.
+    """
+    n, many, known = len(seen), seen.shape[1], before.shape[1]
+    alone = np.linalg.svd(seen)[0][:, :, 3:]
+    alone = np.concatenate([alone, np.zeros((n, known, many - 3))], axis=1)
+    place = np.concatenate([seen, before], axis=1)
+    others = np.linalg.svd(np.concatenate([place, alone], axis=2))[0][:, :, many:]
+    free = np.concatenate([alone, others], axis=2).swapaxes(1, 2)
+    return free, np.repeat([0, 1], [many - 3, known])
 
 
 def _alike(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
