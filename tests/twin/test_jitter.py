@@ -26,7 +26,9 @@ STEP = 0.7e-3
 
 
 def stated(text: dict, seed: int = 1) -> Jitter:
-    found = Jitter.of(AttitudeSpec.model_validate({"jitter": text}).jitter, np.random.SeedSequence(seed))
+    spec = AttitudeSpec.model_validate({"jitter": text}).jitter
+    assert spec is not None
+    found = Jitter.of(spec, np.random.SeedSequence(seed))
     assert found is not None
     return found
 

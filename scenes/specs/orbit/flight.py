@@ -186,13 +186,13 @@ class AttitudeSpec(Spec):
         steering: X lies along the inertial velocity (none), or along the track on the turning Earth (yaw), so that the
             image at nadir does not drift along the line.
         offset: rotation vector of the body against the orbital frame, radians (roll, pitch, yaw).
-        jitter: small fast turns about the body's own axes.
+        jitter: small fast turns about the body's own axes; None for none.
     """
 
     nadir: Literal["geodetic", "geocentric"] = "geodetic"
     steering: Literal["none", "yaw"] = "none"
     offset: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="60 deg"))] = _ZERO
-    jitter: JitterSpec = JitterSpec()
+    jitter: JitterSpec | None = None
 
 
 class GpsErrorsSpec(Spec):

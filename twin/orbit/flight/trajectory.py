@@ -259,7 +259,7 @@ class Trajectory:
             seed: of what is random in its jitter, in a stream of its own of this seed.
             number: of the pass, where several share a seed.
         """
-        jitter = Jitter.of(spec.jitter, stream(seed, JITTER_STREAM, *number)) if spec.jitter.stated else None
+        jitter = None if spec.jitter is None else Jitter.of(spec.jitter, stream(seed, JITTER_STREAM, *number))
         return cls(orbit, Attitude.from_spec(spec), jitter=jitter)
 
     @property

@@ -38,6 +38,7 @@ class FoundLine:
             return None
         test, stated = self.run.setup.test, self.one.truth
         assert isinstance(test, OrbitJitterSpec)
+        assert test.attitude.jitter is not None
         frequency, lines = self.one.found.lines.frequency[self.number], len(test.attitude.jitter.lines)
         if not lines:
             return None
