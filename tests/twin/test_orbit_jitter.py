@@ -13,7 +13,7 @@ from analysis.orbit.jitter_lines import Found, search
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data_setup import resolve_any_jitter
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec
-from scenes.specs.orbit.setup import JitterSetup
+from scenes.specs.orbit.setup import JitterSetup, load_three_line_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.twin.commands import invoke
@@ -191,3 +191,19 @@ def test_what_cannot_be_searched_is_told(tmp_path: Path) -> None:
     measured, _ = fly_strip(one, 1)
     with pytest.raises(SightsError, match="0 points"):
         sights_of(measured, {"blue": line_cameras(one.camera)["blue"]}, None, one.test.search, LightEffects())
+
+
+@pytest.mark.second
+def test_lines_at_large_angles_tell_of_roll_whatever_the_heights() -> None:
+    """The three lines of th1 see a place 33 s after one another and at 25 degrees: along the track they tell heights,
+    and across it the roll of all three moments.
+    """
+    line = {"frequency": "0.65 Hz", "amplitude": "1 0 0 arcsec", "phase": "40 0 0 deg"}
+    data = dict(setup(attitude=attitude(line)).test.plain())
+    data["orbit"] = {**data["orbit"], "before": "60 s", "after": "60 s"}
+    data |= {"lines": ["forward", "nadir", "backward"], "line_time": "0.7 ms", "time": "-33 s"}
+    data["search"] = {"highest": "2 Hz", "axes": ["roll"], "height": "350 m"}
+    test = OrbitJitterSpec.model_validate(data)
+    lines = searched(JitterSetup.model_construct(test=test, camera=load_three_line_camera("th1")), 1).lines
+    assert lines.frequency[0] == pytest.approx(0.65, abs=4.0 * lines.frequency_sigma[0])
+    assert lines.amplitude[0, 0] / ARCSEC == pytest.approx(1.0, abs=4.0 * lines.amplitude_sigma[0, 0] / ARCSEC)
