@@ -81,7 +81,7 @@ def simplified(block: Block) -> Block:
     def whole(terms: tuple[Term, ...]) -> tuple[Term, ...]:
         sigma = np.sqrt(np.sum([np.square(t.law.spread(half)) for t in terms], axis=0)) if terms else np.zeros(3)
         a, b, c = np.maximum(sigma, 1e-12).tolist()
-        return (Term(Law("constant", "constant", (a, b, c))),)
+        return (Term(Law("", "constant", (a, b, c))),)
 
     return replace(block, attitude=whole(block.attitude), station=whole(block.station), angles=())
 
@@ -143,9 +143,9 @@ def _sizes(block: Block, names: tuple[str, ...]) -> Array:
     sizes: dict[str, float] = {}
     for one in block.passes:
         for axis, size in zip(("roll", "pitch", "yaw"), turn, strict=True):
-            sizes[f"{one.name} constant {axis}"] = size
+            sizes[f"{one.name} {axis}"] = size
         for axis, size in zip(("along", "across", "down"), shift, strict=True):
-            sizes[f"{one.name} constant offset {axis}"] = size
+            sizes[f"{one.name} offset {axis}"] = size
         for camera, known in block.known.items():
             own = np.sqrt(np.diag(known.covariance)).reshape(-1, 4).max(axis=0)
             for axis, size in zip(("d_alpha", "d_beta", "d_gamma", "d_f"), own.tolist(), strict=True):

@@ -229,7 +229,7 @@ class FixedPoints:
         point: (n,).
         given: (n, 3) ITRS, metres.
         white: (n, 3, 3) whitens their misclosures.
-        datum: (0,) or (3,) unknowns of the common shift along ITRS axes, metres.
+        datum: (0,) or (3,) unknowns of what all given coordinates are too large by, along ITRS axes, metres.
         group: variance group.
     """
 
@@ -250,8 +250,8 @@ class FixedPoints:
         """See `Packets`."""
         white = self.white[which]
         shift = x[self.datum] if len(self.datum) else np.zeros(3)
-        miss = np.einsum("nij,nj->ni", white, ground - self.given[which] - shift)
-        return miss, -white[:, :, : len(self.datum)], white
+        miss = np.einsum("nij,nj->ni", white, ground - self.given[which] + shift)
+        return miss, white[:, :, : len(self.datum)], white
 
 
 @dataclass(frozen=True, eq=False)
