@@ -119,7 +119,8 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
         for k, term in enumerate(terms):
             for scope, members in _scopes(block, term, times).items():
                 moments = np.concatenate([times[name] for name in members])
-                support = Support.of(term.law, moments)
+                middle = next(p.middle for p in block.passes if p.name == members[0]) if term.scope == "pass" else None
+                support = Support.of(term.law, moments, middle)
                 made = Process(f"{scope} {term.law.group}".strip(), support, size, kind)
                 scopes[kind, k, scope] = made
                 every.append(made)

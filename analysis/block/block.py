@@ -31,10 +31,17 @@ class Term:
 
 @dataclass(frozen=True)
 class Pass:
-    """A pass of the satellite, and the star tracker that gave its attitude."""
+    """A pass of the satellite.
+
+    Attributes:
+        name: of the pass.
+        tracker: star tracker that gave its attitude.
+        middle: when rates and walks of its own are zero, seconds; None for the middle of its observations.
+    """
 
     name: str
     tracker: str = "tracker"
+    middle: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,8 +97,13 @@ class Support:
     precision: sparse.csr_matrix
 
     @classmethod
-    def of(cls, law: Law, times: Array) -> Support:
-        """The unknowns that these times (n,), seconds, meet.
+    def of(cls, law: Law, times: Array, middle: float | None = None) -> Support:
+        """The unknowns that observations meet.
+
+        Args:
+            law: of the process.
+            times: of the observations, (n,), seconds.
+            middle: where a rate and a walk are zero, seconds; None for the middle of the times.
 
         Raises:
             BlockError: numbers of the law that cannot be used, or no times.
@@ -106,7 +111,7 @@ class Support:
         law.check()
         if not len(times):
             raise BlockError(f"block: {law.group}: no observation meets it")
-        middle = 0.5 * float(times.min() + times.max())
+        middle = 0.5 * float(times.min() + times.max()) if middle is None else middle
         if law.kind in ("constant", "rate", "orbital"):
             count = 2 if law.kind == "orbital" else 1
             return cls(law, np.arange(count), middle, sparse.csr_matrix(sparse.eye(count)))
@@ -120,11 +125,13 @@ class Support:
             parts = [spline_precision(len(run)) for run in runs]
             return cls(law, numbers, middle, sparse.csr_matrix(sparse.block_diag(parts)))
         first = np.asarray(np.floor(times / law.interval), np.intp)
-        numbers = np.unique(np.concatenate([first, first + 1]))
+        zero = int(np.round(middle / law.interval))
+        ends = [zero] if law.kind == "walk" else []
+        numbers = np.unique(np.concatenate([first, first + 1, np.array(ends, np.intp)]))
         step = np.diff(numbers) * law.interval
         if law.kind == "walk":
             precision = _chain(np.ones(len(step)), step)
-            pin = int(np.argmin(np.abs(numbers * law.interval - middle)))
+            pin = int(np.searchsorted(numbers, zero))
             shape = (len(numbers), len(numbers))
             extra = sparse.csr_matrix(([_PINNED / law.interval], ([pin], [pin])), shape=shape)
             return cls(law, numbers, middle, sparse.csr_matrix(precision + extra))

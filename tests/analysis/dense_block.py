@@ -35,7 +35,7 @@ def _basis(law, times, moments):
     line = make_interp_spline(h * number, np.eye(len(number)), k=1)(times)
     if law.kind == "slow":
         return line, np.exp(-h * np.abs(number[:, None] - number) / law.time)
-    pin = knots[np.argmin(np.abs(knots * h - middle))]
+    pin = np.round(middle / h)
     away = h * (number - pin)
     same = np.sign(away)[:, None] * np.sign(away) > 0
     keep = number != pin

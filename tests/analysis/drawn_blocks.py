@@ -120,9 +120,7 @@ def drawn_process(law: Law, times: np.ndarray, random: np.random.Generator):
     if law.kind == "walk":
         values = np.cumsum(steps, axis=0) * np.sqrt(law.interval)
         # the knot next to the middle is zero
-        own = np.unique(np.concatenate([np.floor(times / law.interval), np.floor(times / law.interval) + 1]))
-        pin = own[np.argmin(np.abs(own * law.interval - middle))]
-        values = values - values[np.flatnonzero(number == pin)[0]]
+        values = values - values[np.flatnonzero(number == np.round(middle / law.interval))[0]]
     else:
         kept = np.exp(-law.interval / law.time)
         values[0] = steps[0]
