@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from analysis.block.block import Block
 from analysis.block.plausible_block import check_places, pruned
 from analysis.block.point_reduction import Reduced
 from analysis.block.processes import BlockError
-from analysis.orbit.residual_tests import Robust, bounded, extrapolated, robust_weights, standardised_packets
+from analysis.orbit.residual_tests import bounded, extrapolated, robust_weights, standardised_packets
 
 __all__ = ["BlockAdjustment", "GroupTest", "adjust_block"]
 
@@ -36,7 +37,7 @@ _MOST = 20_000
 _COLUMNS = 256
 _ROUNDS = 40
 _HUBER_ROUNDS = 4
-_FREE_ROUNDS = 12
+_FREE_ROUNDS = 8
 _SETTLED = 1e-3
 _LEAST_REDUNDANCY = 10.0
 """A variance from fewer redundant observations is uncertain by 45% or more: the group keeps its factor."""
@@ -223,7 +224,7 @@ class _At:
 def adjust_block(
     block: Block,
     *,
-    robust: Robust | None = None,
+    robust: Literal["huber", "reject"] | None = None,
     variance_components: bool | Collection[str] = False,
     datum: bool = False,
     iterations: int = 20,
@@ -232,8 +233,8 @@ def adjust_block(
 
     Args:
         block: what is observed, and what is known of it.
-        robust: "huber" takes weight from packets with large residuals, "igg" leaves the worst out, and with them points
-            of which too little is left.
+        robust: "huber" takes weight from packets with large residuals; "reject" leaves out those that stand out from
+            the others so weighed, one good packet in 10 000, and with them points of which too little is left.
         variance_components: estimate a factor on the variances of every group, or of those named.
         datum: look for a shift that all control points have in common.
         iterations: most Gauss-Newton steps of one round.
@@ -251,7 +252,9 @@ def adjust_block(
     estimated = set(groups) if variance_components is True else set(variance_components or ())
     factors: list[Mapping[str, float]] = []
     for turn in range(_ROUNDS):
-        at, reduced, factor = _solved(assembly, at, iterations)
+        screening = robust is not None and turn < _HUBER_ROUNDS
+        # weights that will change are not worth more than a step or two
+        at, reduced, factor = _solved(assembly, at, iterations, 1e-2 if screening else _CONVERGED)
         covariance = factor.inverse()
         standard, taken = _checked(assembly, at, covariance, reduced)
         tests = _tests(assembly, at, covariance, reduced, taken)
@@ -259,12 +262,13 @@ def adjust_block(
             return _result(assembly, at, covariance, standard, tests, reduced)
         new_weight, new_factor = at.weight, dict(at.factor)
         if robust is not None:
-            kind = "huber" if turn < _HUBER_ROUNDS else robust
+            kind: Literal["huber", "accept"] = "accept"
+            if robust == "huber" or turn < _HUBER_ROUNDS:
+                kind = "huber"
             new_weight = tuple(robust_weights(one, kind) for one in standard)
-            if kind == "igg" and turn >= _FREE_ROUNDS:
+            if kind == "accept" and turn >= _FREE_ROUNDS:
                 new_weight = tuple(np.minimum(a, b) for a, b in zip(new_weight, at.weight, strict=True))
             new_weight = _without_lost(assembly, new_weight)
-        screening = robust is not None and turn < _HUBER_ROUNDS
         if estimated and not screening:
             for name in estimated & set(tests):
                 one = tests[name]
@@ -283,8 +287,8 @@ def adjust_block(
     raise BlockError(f"block: weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}")
 
 
-def _solved(assembly: Assembly, at: _At, iterations: int) -> tuple[_At, Reduced, _Factor]:
-    """Gauss-Newton with the weights as they stand."""
+def _solved(assembly: Assembly, at: _At, iterations: int, tolerance: float) -> tuple[_At, Reduced, _Factor]:
+    """Gauss-Newton with the weights as they stand, until a step is below so many sigmas."""
     reduction = assembly.reduction
     last = np.inf
     for _ in range(iterations):
@@ -298,7 +302,7 @@ def _solved(assembly: Assembly, at: _At, iterations: int) -> tuple[_At, Reduced,
         apart = float(np.sqrt(np.max(np.einsum("ni,nij,nj->n", moved, _inverses(reduced.spread), moved), initial=0.0)))
         at = replace(at, x=at.x + step, ground=at.ground + moved, steps=at.steps + 1)
         size = max(size, apart)
-        if size < _CONVERGED or (size < 1e3 * _CONVERGED and size > 0.5 * last):
+        if size < tolerance or (size < 1e3 * tolerance and size > 0.5 * last):
             return at, reduction.reduced(at.x, at.ground, at.weight, at.factor), factor
         if not np.isfinite(size):
             break

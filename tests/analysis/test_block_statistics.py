@@ -108,7 +108,7 @@ def test_one_tenth_of_gross_errors_is_found_by_name():
     moved = 30 * PITCH * random.choice([-1.0, 1.0], (12, 2))
     wrong = without_errors_in_images(drawn, "P0/fore", rows, moved)
     assert adjust_block(wrong.block).p_value < 1e-9
-    found = adjust_block(wrong.block, robust="igg")
+    found = adjust_block(wrong.block, robust="reject")
     told = {point for point, of in found.rejected() if of == "P0/fore"}
     bad = {str(drawn.block.points.ids[k]) for k in rows}
     assert bad <= told

@@ -325,7 +325,7 @@ def _scenes(
         one = data[name]
         random = np.random.default_rng(stream(seed, _IMAGES, k))
         here = np.flatnonzero(np.isfinite(line))
-        unit = np.array([1.0 / one.pixels_per_line(camera), 1.0])
+        unit = np.array([1.0 / _pixels_per_line(one, camera, line[here], pixel[here], spec.area.height), 1.0])
         noise = spec.points.image * unit * random.standard_normal((len(here), 2))
         spoilt = np.random.default_rng(stream(seed, _GROSS, k))
         wrong = (spoilt.random(len(here)) < spec.points.gross) & (role[here] == "tie")
@@ -337,10 +337,28 @@ def _scenes(
         spread = np.diag((spec.points.image * unit) ** 2)
         rays = one.rays({camera: ImagePoints.of(here, place[:, 0], place[:, 1], spread)})[camera]
         assert rays.time is not None
-        moved = Rays(rays.point, rays.image, rays.station, rays.attitude, rays.time + begin[name], rays.spread)
+        own = np.tile((spec.points.image * one.pitch[camera]) ** 2 * np.eye(2), (len(here), 1, 1))
+        moved = Rays(rays.point, rays.image, rays.station, rays.attitude, rays.time + begin[name], own)
         scenes.append(known.Scene(scene, name, camera, moved))
         gross[scene] = here[wrong]
     return tuple(scenes), gross
+
+
+def _pixels_per_line(one: PassData, camera: str, line: np.ndarray, pixel: np.ndarray, height: float) -> float:
+    """What one image line is in x of the focal plane where the points lie, pixels: by the ground that the next sees."""
+    if not len(line):
+        return 1.0
+    sensor, model = one.sensors[camera], one.models[camera]
+    here = np.array([np.clip(np.mean(line), 0.0, sensor.lines - 2.0)])
+    at = np.array([np.mean(pixel)])
+    place = []
+    for step in (0.0, 1.0):
+        ground = sensor.ground(here + step, at, height)
+        seconds = sensor.time(here)
+        arm = np.einsum("nji,nj->ni", sensor.trajectory.body_to_itrs(seconds), ground - sensor.trajectory.position(seconds))
+        a, _, c = ((arm - model.position) @ model.to_body).T
+        place.append(-model.interior[0] * a / c)
+    return abs(float(place[1][0] - place[0][0])) / one.pitch[camera]
 
 
 @dataclass(frozen=True, eq=False)
