@@ -147,7 +147,15 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
     priors += _angles(block, scopes)
     axes = {one.name: _axes(block, one.name) for one in block.passes if one.name in times}
     bare = Assembly(
-        block, Reduction((), priors, size, len(block.points.ids)), by_pass, tuple(every), changes, units, shift, axes, {}
+        block,
+        Reduction((), priors, size, len(block.points.ids)),
+        by_pass,
+        tuple(every),
+        changes,
+        units,
+        shift,
+        axes,
+        {},
     )
     sets, images = _sets(bare, common)
     return Assembly(
@@ -203,9 +211,7 @@ def _unit(count: int) -> sparse.csr_matrix:
     return sparse.csr_matrix(sparse.eye(count))
 
 
-def _cameras(
-    block: Block, priors: list[PriorGroup], size: int
-) -> tuple[dict[str, Indices], dict[str, Array], int]:
+def _cameras(block: Block, priors: list[PriorGroup], size: int) -> tuple[dict[str, Indices], dict[str, Array], int]:
     """Unknowns of the cameras' changes in all passes in which they took an image."""
     order = [one.name for one in block.passes]
     changes: dict[str, Indices] = {}
@@ -239,9 +245,7 @@ def _cameras(
 def _angles(block: Block, scopes: Mapping[tuple[str, int, str], Process]) -> list[PriorGroup]:
     """Angles between star trackers as knowledge of the difference of their constants."""
     found = []
-    constants = [
-        k for k, term in enumerate(block.attitude) if term.scope == "tracker" and term.law.kind == "constant"
-    ]
+    constants = [k for k, term in enumerate(block.attitude) if term.scope == "tracker" and term.law.kind == "constant"]
     for angle in block.angles:
         if not constants:
             raise BlockError("block: an angle between star trackers needs a constant error of each of them")

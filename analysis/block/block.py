@@ -12,7 +12,18 @@ from numpy.typing import NDArray
 from analysis.block.processes import BlockError, Law
 from analysis.orbit.three_line_model import LineModel, Rays
 
-__all__ = ["SENSORS", "Block", "CameraKnowledge", "Footprints", "Pass", "Points", "Scene", "Term", "Terrain", "TrackerAngle"]
+__all__ = [
+    "SENSORS",
+    "Block",
+    "CameraKnowledge",
+    "Footprints",
+    "Pass",
+    "Points",
+    "Scene",
+    "Term",
+    "Terrain",
+    "TrackerAngle",
+]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -113,6 +124,12 @@ class Footprints:
     distance: Array
     sigma: tuple[float, float]
 
+    def taken(self, keep: NDArray[np.bool_]) -> Footprints:
+        """Some of them, by mask (n,)."""
+        rows = (self.time, self.station, self.attitude, self.aim, self.distance)
+        time, station, attitude, aim, distance = (row[keep] for row in rows)
+        return Footprints(self.of, self.point[keep], time, station, attitude, aim, distance, self.sigma)
+
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
@@ -131,6 +148,10 @@ class Terrain:
     normal: Array
     sigma: Array
     common: float
+
+    def taken(self, keep: NDArray[np.bool_]) -> Terrain:
+        """The model at some of the points, by mask (n,)."""
+        return Terrain(self.point[keep], self.place[keep], self.normal[keep], self.sigma[keep], self.common)
 
 
 @dataclass(frozen=True)
@@ -204,8 +225,7 @@ class Block:
             terrain = self.terrain
             if terrain is not None:
                 use = kept[terrain.point]
-                parts = (terrain.point, terrain.place, terrain.normal, terrain.sigma)
-                terrain = Terrain(*(v[use] for v in parts), terrain.common) if np.any(use) else None
+                terrain = terrain.taken(use) if np.any(use) else None
             return replace(self, scenes=scenes, terrain=terrain)
         if sensor == "monitor":
             return replace(self, monitored=None)

@@ -24,7 +24,7 @@ from analysis.block.point_reduction import Reduced
 from analysis.block.processes import BlockError
 from analysis.orbit.residual_tests import bounded, extrapolated, robust_weights, standardised_packets
 
-__all__ = ["BlockAdjustment", "GroupTest", "adjust_block"]
+__all__ = ["BlockAdjustment", "GroupTest", "adjust_block", "kept_block"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -171,6 +171,27 @@ class BlockAdjustment:
         )
 
 
+def kept_block(found: BlockAdjustment) -> Block:
+    """The block without the packets that robust weights gave up. Rejected control points become tie points."""
+    block, sets = found.assembly.block, found.assembly.reduction.sets
+    keep = {one.name: weight > _SETTLED for one, weight in zip(sets, found.weight, strict=True)}
+    scenes = tuple(
+        replace(s, rays=s.rays.taken(keep[s.name])) if s.name in keep and not s.name.endswith(" laser") else s
+        for s in block.scenes
+    )
+    footprints = tuple(f.taken(keep[f"{f.of} laser"]) for f in block.footprints)
+    points = block.points
+    role = points.role.copy()
+    for one, weight in zip(sets, found.weight, strict=True):
+        if one.group == "control":
+            role[one.point[weight <= _SETTLED]] = "tie"
+    terrain = block.terrain
+    if terrain is not None:
+        terrain = terrain.taken(keep["terrain"])
+    footprints = tuple(f for f in footprints if len(f.point))
+    return replace(block, scenes=scenes, footprints=footprints, points=replace(points, role=role), terrain=terrain)
+
+
 class _Factor:
     """A factor of a positive definite matrix, whose unknowns are brought to one size first."""
 
@@ -276,7 +297,9 @@ def adjust_block(
                     new_factor[name] = bounded(at.factor[name] * one.square / one.redundancy)
             factors.append(new_factor)
         change = max(
-            max((float(np.abs(a - b).max(initial=0.0)) for a, b in zip(new_weight, at.weight, strict=True)), default=0.0),
+            max(
+                (float(np.abs(a - b).max(initial=0.0)) for a, b in zip(new_weight, at.weight, strict=True)), default=0.0
+            ),
             max(abs(new_factor[g] / at.factor[g] - 1.0) for g in new_factor),
         )
         if change < _SETTLED and not screening:
@@ -375,7 +398,8 @@ def _tests(
     for one, weight in zip(reduction.sets, at.weight, strict=True):
         counts[one.group] = counts.get(one.group, 0) + one.rows * int(np.sum(weight > _SETTLED))
     found = {
-        name: GroupTest(counts[name], counts[name] - taken[name], reduced.square[name], at.factor[name]) for name in taken
+        name: GroupTest(counts[name], counts[name] - taken[name], reduced.square[name], at.factor[name])
+        for name in taken
     }
     used: dict[str, float] = {}
     for prior in reduction.priors:

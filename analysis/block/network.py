@@ -192,5 +192,3 @@ def _level(place: Array) -> Array:
     east = np.cross([0.0, 0.0, 1.0], up)
     east = east / np.linalg.norm(east)
     return np.stack([east, np.cross(up, east), up])
-
-

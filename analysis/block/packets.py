@@ -207,7 +207,10 @@ class Pointings:
         first = first / np.linalg.norm(first, axis=1, keepdims=True)
         across = np.stack([first, np.cross(aim, first)], axis=1)
         miss = np.concatenate(
-            [(far - self.distance[which])[:, None] / self.sigma[0], np.einsum("nij,nj->ni", across, unit) / self.sigma[1]],
+            [
+                (far - self.distance[which])[:, None] / self.sigma[0],
+                np.einsum("nij,nj->ni", across, unit) / self.sigma[1],
+            ],
             axis=1,
         )
         flat = np.eye(3) - unit[:, :, None] * unit[:, None, :]

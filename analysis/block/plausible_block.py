@@ -37,10 +37,8 @@ def pruned(block: Block) -> Block:
         raise BlockError("block: no point is seen by two scenes, and none is control")
     scenes = tuple(replace(s, rays=s.rays.taken(good[s.rays.point])) for s in block.scenes)
     terrain = block.terrain
-    if terrain is not None and not np.all(good[terrain.point]):
-        use = good[terrain.point]
-        parts = (v[use] for v in (terrain.point, terrain.place, terrain.normal, terrain.sigma))
-        terrain = replace(terrain, **dict(zip(("point", "place", "normal", "sigma"), parts, strict=True)))
+    if terrain is not None:
+        terrain = terrain.taken(good[terrain.point])
     return replace(block, scenes=scenes, terrain=terrain)
 
 

@@ -196,7 +196,11 @@ class Reduction:
                 miss, by_x, by_point = packets.linearised(which, x, ground[packets.point[which]])
                 if weighted:
                     root = np.sqrt(weight[k][which] / factor.get(packets.group, 1.0))
-                    miss, by_x, by_point = root[:, None] * miss, root[:, None, None] * by_x, root[:, None, None] * by_point
+                    miss, by_x, by_point = (
+                        root[:, None] * miss,
+                        root[:, None, None] * by_x,
+                        root[:, None, None] * by_point,
+                    )
                 parts[k] = (miss, by_x, by_point)
             for one in piece:
                 n, width = len(one.points), len(one.columns)

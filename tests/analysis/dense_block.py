@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.analysis.drawn_blocks import BEYOND, EAST, LOOKS, NORTH, UP, project
 
 FRAME = np.stack([EAST, NORTH, UP])
+ZERO = np.zeros(3)
 
 
 def _basis(law, times, moments):
@@ -169,7 +170,8 @@ class DenseBlock:
             change = x[self.change[scene.of, scene.camera]]
             at = ground[self.place[rays.point]]
 
-            def seen(dt=0, ds=0, dc=0, dp=np.zeros(3), rays=rays, axes=axes, turn=turn, shift=shift, change=change, at=at, look=LOOKS[scene.camera]):  # fmt: skip
+            def seen(dt=0, ds=0, dc=0, dp=ZERO, kept=(rays, axes, turn, shift, change, at, LOOKS[scene.camera])):
+                rays, axes, turn, shift, change, at, look = kept
                 body = rays.attitude @ Rotation.from_rotvec(turn + dt).as_matrix()
                 arm = np.einsum("nji,nj->ni", body, at + dp @ FRAME - rays.station - (shift + ds) @ axes.T)
                 return project(look, change + dc, arm) - rays.image
@@ -192,7 +194,7 @@ class DenseBlock:
             turn, shift = turn_matrix @ x, shift_matrix @ x
             at = ground[self.place[one.point]]
 
-            def hit(dt=0, ds=0, dp=np.zeros(3), one=one, axes=axes, turn=turn, shift=shift, at=at):
+            def hit(dt=0, ds=0, dp=ZERO, one=one, axes=axes, turn=turn, shift=shift, at=at):
                 body = one.attitude @ Rotation.from_rotvec(turn + dt).as_matrix()
                 arm = np.einsum("nji,nj->ni", body, at + dp @ FRAME - one.station - (shift + ds) @ axes.T)
                 far = np.linalg.norm(arm, axis=1)
@@ -239,5 +241,3 @@ class DenseBlock:
                 right += row * off / angle.sigma[axis]
                 square += off**2
         return normal, right, square
-
-

@@ -134,7 +134,9 @@ def project(look: float, change: np.ndarray, arm_body: np.ndarray) -> np.ndarray
     mount = Rotation.from_euler("Y", look).as_matrix()
     d_alpha, d_beta, d_gamma, d_f = change
     own = (
-        Rotation.from_rotvec([d_beta, 0, 0]) * Rotation.from_rotvec([0, d_alpha, 0]) * Rotation.from_rotvec([0, 0, d_gamma])
+        Rotation.from_rotvec([d_beta, 0, 0])
+        * Rotation.from_rotvec([0, d_alpha, 0])
+        * Rotation.from_rotvec([0, 0, d_gamma])
     ).as_matrix()
     seen = arm_body @ (mount @ own)
     return -(FOCAL + d_f) * seen[:, :2] / seen[:, 2:]
@@ -146,9 +148,7 @@ def draw(plan: Plan, random: np.random.Generator, true: Plan | None = None) -> D
     count = plan.control + plan.ties + plan.check
     laser_count = plan.footprints * plan.passes
     total = count + laser_count
-    level = np.column_stack(
-        [random.uniform(-plan.half, plan.half, (total, 2)), random.uniform(-300.0, 300.0, total)]
-    )
+    level = np.column_stack([random.uniform(-plan.half, plan.half, (total, 2)), random.uniform(-300.0, 300.0, total)])
     ground = CENTRE + level @ np.stack([EAST, NORTH, UP])
     role = np.array(
         ["control"] * plan.control + ["tie"] * plan.ties + ["check"] * plan.check + ["tie"] * laser_count, object
@@ -208,7 +208,9 @@ def draw(plan: Plan, random: np.random.Generator, true: Plan | None = None) -> D
         noise = np.kron(np.eye(size), np.diag(plan.monitor**2))
         gain = law @ np.linalg.inv(law + noise)
         for c in plan.cameras:
-            read = np.array([change[f"{p.name}/{c}"] for p in passes]) + plan.monitor * random.standard_normal((size, 4))
+            read = np.array([change[f"{p.name}/{c}"] for p in passes]) + plan.monitor * random.standard_normal(
+                (size, 4)
+            )
             monitored[c] = CameraKnowledge((gain @ read.ravel()).reshape(size, 4), law - gain @ law)
 
     def at(name: str, when: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -243,7 +245,9 @@ def draw(plan: Plan, random: np.random.Generator, true: Plan | None = None) -> D
     start = ground + random.standard_normal((total, 3)) * 20.0
     flat, high = plan.control_sigma
     spread = frame.T @ np.diag([flat**2, flat**2, high**2]) @ frame
-    start[: plan.control] = ground[: plan.control] + random.standard_normal((plan.control, 3)) @ np.linalg.cholesky(spread).T
+    start[: plan.control] = (
+        ground[: plan.control] + random.standard_normal((plan.control, 3)) @ np.linalg.cholesky(spread).T
+    )
     terrain = None
     if plan.terrain is not None:
         here = np.arange(plan.control, count)

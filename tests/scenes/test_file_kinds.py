@@ -42,6 +42,7 @@ FOLDERS = {
     "library/disturbances": "disturbances",
     "library/instruments": "instrument",
     "library/payloads": "three_line_camera",
+    "orbit/adjust": "orbit_adjust",
     "orbit/angle": "orbit_angle",
     "orbit/measured/angle": "measured_angle",
     "orbit/measured/calibrate": "measured_calibration",

@@ -6,7 +6,6 @@ given, and what the adjustment is told of them in any case.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -14,13 +13,12 @@ from pydantic import Field, model_validator
 from scenes.specs.orbit.angle import Relief, TerrainHeight
 from scenes.specs.orbit.calibration import CameraDriftSpec, FieldLength, LineTime, MonitorReadingSpec
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, Interval, Latitude, Longitude, UtcTime
+from scenes.specs.orbit.sensors import SENSORS
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
 from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, TitledSpec, Whole, not_empty
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 
-SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
-"""What an adjustment can be asked to do without."""
 Sensor = Literal["ties", "control", "monitor", "laser", "terrain", "tracker_angles"]
 LawKind = Literal["constant", "rate", "white", "walk", "slow", "orbital"]
 Period = Annotated[float, Quantity(MOMENT, above_zero=True, largest="100000 h")]
@@ -34,8 +32,8 @@ class LawSpec(Spec):
 
     Attributes:
         law: constant; rate, of even growth from the middle of what shares it; white, readings independent of one
-            another that a cubic spline joins; walk, a random walk that is zero in the middle; slow, a stationary process
-            that forgets itself over `time`; orbital, cosine and sine of the period `time`.
+            another that a cubic spline joins; walk, a random walk that is zero in the middle; slow, a stationary
+            process that forgets itself over `time`; orbital, cosine and sine of the period `time`.
         shared_by: what has one draw of it: each pass, all passes of a star tracker, or the block.
         interval: between independent readings of `white`; between the values of `walk` and `slow` that are solved for,
             seconds.
@@ -168,7 +166,10 @@ class BlockPointsSpec(Spec):
     tie: PointCount = 300
     check: Annotated[Whole, Field(ge=2, le=100_000)] = 100
     image: Annotated[Number, Field(gt=0, le=10)] = 0.3
-    control_sigma: Annotated[tuple[float, float], Vector(Quantity(LENGTH, above_zero=True, largest="1 km"), 2)] = (0.2, 0.3)
+    control_sigma: Annotated[tuple[float, float], Vector(Quantity(LENGTH, above_zero=True, largest="1 km"), 2)] = (
+        0.2,
+        0.3,
+    )
     gross: Annotated[Number, Field(ge=0, le=0.4)] = 0.0
     gross_size: Annotated[Number, Field(gt=0, le=1000)] = 30.0
 
@@ -286,7 +287,9 @@ class OrbitAdjustSpec(TitledSpec):
         lasting = [one for one in self.errors.attitude.values() if (one.law, one.shared_by) == ("constant", "tracker")]
         if self.angles and not lasting:
             problem = "an angle between star trackers that have no constant error"
-            raise Problem(problem, None, "a law `constant` of `shared_by: tracker` in errors.attitude", within=("angles",))
+            raise Problem(
+                problem, None, "a law `constant` of `shared_by: tracker` in errors.attitude", within=("angles",)
+            )
         return self._has_known_groups()
 
     def _has_known_groups(self) -> OrbitAdjustSpec:
@@ -297,6 +300,14 @@ class OrbitAdjustSpec(TitledSpec):
         return self
 
     @property
-    def laws(self) -> Mapping[str, LawSpec]:
-        """Name -> stated law."""
-        return {**self.errors.attitude, **self.errors.orbit}
+    def sensors(self) -> tuple[str, ...]:
+        """Those of `SENSORS` that the block has."""
+        has = {
+            "ties": self.points.tie > 0,
+            "control": self.points.control > 0,
+            "monitor": self.monitor is not None,
+            "laser": self.laser is not None,
+            "terrain": self.terrain is not None,
+            "tracker_angles": bool(self.angles),
+        }
+        return tuple(name for name in SENSORS if has[name])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from scenes.specs import load
@@ -36,4 +37,30 @@ def resolve_adjust(path: str | Path) -> AdjustSetup:
     for k, name in enumerate(setup.test.lines):
         if name not in setup.camera.lines:
             raise setup.test.error(unknown("no such line", name, setup.camera.lines), ("lines", k))
+    _require_sensors(setup.test)
     return setup
+
+
+def without_sensors(setup: AdjustSetup, names: Sequence[str]) -> AdjustSetup:
+    """The block adjusted without further sensors.
+
+    Args:
+        setup: the block.
+        names: of sensors.
+
+    Raises:
+        InputError: the block has no such sensor.
+    """
+    if not names:
+        return setup
+    every = tuple(dict.fromkeys((*setup.test.without, *names)))
+    test = setup.test.model_copy(update={"without": every})
+    _require_sensors(test)
+    return setup.model_copy(update={"test": test})
+
+
+def _require_sensors(test: OrbitAdjustSpec) -> None:
+    """InputError for a sensor that is to be left out and is not there."""
+    for name in test.without:
+        if name not in test.sensors:
+            raise test.error(unknown("the block has no such sensor", name, test.sensors), ("without",))

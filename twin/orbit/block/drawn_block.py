@@ -306,7 +306,9 @@ def _points(
     if len(good) < wanted:
         problem = f"only {len(good)} of {count} places of the area are seen by two scenes"
         raise BenchError(problem, ("area",), "an area inside the strips of two scenes or more, and a longer `span`")
-    role = np.repeat(np.array(["control", "tie", "check"], object), [spec.points.control, spec.points.tie, spec.points.check])
+    role = np.repeat(
+        np.array(["control", "tie", "check"], object), [spec.points.control, spec.points.tie, spec.points.check]
+    )
     return ground[good], role, {k: (line[good], pixel[good]) for k, (line, pixel) in seen.items()}
 
 
@@ -355,7 +357,9 @@ def _pixels_per_line(one: PassData, camera: str, line: np.ndarray, pixel: np.nda
     for step in (0.0, 1.0):
         ground = sensor.ground(here + step, at, height)
         seconds = sensor.time(here)
-        arm = np.einsum("nji,nj->ni", sensor.trajectory.body_to_itrs(seconds), ground - sensor.trajectory.position(seconds))
+        arm = np.einsum(
+            "nji,nj->ni", sensor.trajectory.body_to_itrs(seconds), ground - sensor.trajectory.position(seconds)
+        )
         a, _, c = ((arm - model.position) @ model.to_body).T
         place.append(-model.interior[0] * a / c)
     return abs(float(place[1][0] - place[0][0])) / one.pitch[camera]
@@ -459,5 +463,3 @@ def _angles(
         a, b, c = (first - second + np.array(one.sigma) * random.standard_normal(3)).tolist()
         found.append(known.TrackerAngle(one.between, (a, b, c), one.sigma))
     return tuple(found)
-
-

@@ -1,0 +1,194 @@
+"""Adjust a block, and adjust it again without each of its sensors: ``python -m twin.orbit adjust``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import chi2
+
+from analysis.block.accuracy import Accuracy, level_axes, predicted, realised
+from analysis.block.block import Block
+from analysis.block.block_adjustment import BlockAdjustment, adjust_block, kept_block
+from analysis.block.law_tests import LawTest, law_tests
+from analysis.block.network import DatumTest, Network, Open, datum_test, network_of, open_combinations
+from analysis.block.processes import BlockError
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.threads import one_blas_thread
+from scenes.specs.orbit.adjust_setup import AdjustSetup
+from twin.orbit.block.drawn_block import DrawnBlock, draw_block
+from twin.run.procedure import Advance, BenchError, silent
+
+if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+
+ALL = "all"
+NOTHING = "ties alone"
+"""Of the table of sensors: image points of unknown ground alone, beside what is stated of readings and cameras."""
+
+
+@dataclass(frozen=True, eq=False)
+class Worth:
+    """The block with some of its sensors.
+
+    Attributes:
+        left_out: sensors that were not used.
+        predicted: errors at check points by their covariances. found: by their true places.
+        agreement: mean square of the errors over their sigmas, of the three coordinates: 1 where sigmas are right.
+    """
+
+    left_out: tuple[str, ...]
+    predicted: Accuracy
+    found: Accuracy
+    agreement: float
+
+
+@dataclass(frozen=True, eq=False)
+class CameraChange:
+    """A camera in one scene: found, sigma, expected sigma without the block, truth, (4,) each, radians and metres."""
+
+    found: np.ndarray
+    sigma: np.ndarray
+    before: np.ndarray
+    truth: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class BlockRun:
+    """Everything that was computed.
+
+    Attributes:
+        setup: what the file says.
+        seed: of all that was drawn.
+        drawn: the block and its truth.
+        adjustment: with all sensors that the file does not leave out.
+        worth: case -> check points: all sensors, without each, and ties alone.
+        network: how scenes hang together.
+        open: what observations leave to the priors.
+        laws: tests of the laws in time.
+        datum: of the control points against the rest; None without control points.
+        cameras: scene -> its camera.
+        check: (k,) check points, (k, 3) errors east, north and up, metres, and (k, 3) their sigmas.
+    """
+
+    setup: AdjustSetup
+    seed: int
+    drawn: DrawnBlock
+    adjustment: BlockAdjustment
+    worth: Mapping[str, Worth]
+    network: Network
+    open: tuple[Open, ...]
+    laws: tuple[LawTest, ...]
+    datum: DatumTest | None
+    cameras: Mapping[str, CameraChange]
+    check: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """Sensors of the adjustment."""
+        return self.adjustment.assembly.block.sensors
+
+    @property
+    def datum_chance(self) -> float:
+        """Chance of such a shift of the control points where there is none; 1 without control points."""
+        return 1.0 if self.datum is None else float(chi2.sf(self.datum.chi_square, 3))
+
+
+@one_blas_thread()  # of small matrices: threads would only wait for each other
+def run_adjustment(setup: AdjustSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> BlockRun:
+    """Draw a block and adjust it. Nothing is traced: the backend is not used.
+
+    Raises:
+        BenchError: no such orbit, or a block that cannot be adjusted.
+    """
+    spec = setup.test
+    advance("block", 0, 2)
+    drawn = draw_block(setup, np.random.SeedSequence(seed))
+    block = drawn.block
+    for sensor in spec.without:
+        block = block.without(sensor)
+    advance("block", 1, 2)
+    try:
+        network = network_of(block)
+        found = adjust_block(
+            block, robust="reject" if spec.robust else None, variance_components=_components(spec.components)
+        )
+        advance("block", 2, 2)
+        kept = kept_block(found)
+        worth = _worth(kept, found, drawn, advance)
+        datum = None
+        if np.any(kept.points.role == "control"):
+            datum = datum_test(adjust_block(kept, datum=True))
+    except BlockError as error:
+        raise BenchError(str(error), ("points",), "more points, or scenes that see the same ground") from error
+    where, error_there, spread = _check(found, drawn)
+    level = level_axes(drawn.ground[where])
+    sigma = np.sqrt(np.einsum("nij,njk,nik->ni", level, spread, level))
+    errors = np.einsum("nij,nj->ni", level, error_there)
+    return BlockRun(
+        setup,
+        seed,
+        drawn,
+        found,
+        worth,
+        network,
+        open_combinations(found),
+        law_tests(found),
+        datum,
+        _cameras(found, drawn),
+        (where, errors, sigma),
+    )
+
+
+def _components(names: tuple[str, ...]) -> bool | tuple[str, ...]:
+    return names or False
+
+
+def _check(found: BlockAdjustment, drawn: DrawnBlock) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Check points that are known, their errors (k, 3), ITRS, metres, and covariances (k, 3, 3)."""
+    block = found.assembly.block
+    where = np.flatnonzero((block.points.role == "check") & np.isfinite(found.ground).all(axis=1))
+    if len(where) < 2:
+        raise BlockError("block: fewer than two check points are left")
+    return where, found.ground[where] - drawn.ground[where], found.point_covariance(where)
+
+
+def _worth(kept: Block, found: BlockAdjustment, drawn: DrawnBlock, advance: Advance) -> FrozenMap[str, Worth]:
+    """Check points by all sensors, without each, and by none but ties."""
+    sensors = [name for name in kept.sensors if name != "ties"]
+    cases: dict[str, tuple[str, ...]] = {ALL: ()}
+    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors}
+    if len(sensors) > 1:
+        cases[NOTHING] = tuple(sensors)
+    rows = {}
+    for k, (case, left_out) in enumerate(cases.items()):
+        advance("sensors", k, len(cases))
+        block = kept
+        for name in left_out:
+            block = block.without(name)
+        one = found
+        if left_out:
+            one = adjust_block(block, variance_components=False)
+        where, error, spread = _check(one, drawn)
+        square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(spread), error)
+        places = drawn.ground[where]
+        rows[case] = Worth(left_out, predicted(places, spread), realised(places, error), float(np.mean(square)) / 3.0)
+    advance("sensors", len(cases), len(cases))
+    return FrozenMap(rows)
+
+
+def _cameras(found: BlockAdjustment, drawn: DrawnBlock) -> FrozenMap[str, CameraChange]:
+    block = found.assembly.block
+    order = [one.name for one in block.passes]
+    rows = {}
+    for scene in block.scenes:
+        if scene.name not in found.assembly.changes:
+            continue
+        value, spread = found.change(scene.name)
+        known = block.known[scene.camera].covariance
+        own = 4 * order.index(scene.of) + np.arange(4)
+        before = np.sqrt(np.diag(known)[own])
+        rows[scene.name] = CameraChange(value, np.sqrt(np.diag(spread)), before, drawn.change[scene.name])
+    return FrozenMap(rows)
