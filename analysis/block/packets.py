@@ -79,7 +79,13 @@ class Corrections:
         return turn, shift
 
     def slopes(self, which: Indices, by_turn: Array, by_station: Array) -> Array:
-        """(k, d, 3 a + 3 s) derivatives by the unknowns from those (k, d, 3) by the turn and by the station, ITRS."""
+        """(k, d, 3 a + 3 s) derivatives of d rows by the unknowns.
+
+        Args:
+            which: observations, (k,).
+            by_turn: derivatives by the rotation vector, (k, d, 3), 1/rad.
+            by_station: by the station, ITRS, (k, d, 3), 1/m.
+        """
         parts = []
         for by, (_, factor) in ((by_turn, self.turn), (by_station @ self.axes, self.shift)):
             some = factor[which]
@@ -89,6 +95,12 @@ class Corrections:
     def applied(self, which: Indices, x: Array, station: Array, attitude: Array) -> tuple[Array, Array, Array]:
         """Corrected station (k, 3) and attitude (k, 3, 3), and the Jacobian (k, 3, 3) of the turn: a change of the
         rotation vector as a small turn about the corrected body's axes.
+
+        Args:
+            which: observations, (k,).
+            x: all unknowns, (P,).
+            station: readings, ITRS, (k, 3), metres.
+            attitude: readings, body to ITRS, (k, 3, 3).
         """
         turn, shift = self.at(which, x)
         matrix, jacobian = _rotation(turn)
@@ -149,7 +161,13 @@ class LineImage:
         return np.concatenate([self.corrections.columns, own], axis=1)
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """See `Packets`."""
+        """See `Packets`.
+
+        Args:
+            which: packets, (k,).
+            x: all unknowns, (P,).
+            ground: points of these packets, (k, 3), ITRS, metres.
+        """
         rays, camera = self.rays, self.camera.drifted(self.unit * x[self.change])
         station, attitude, jacobian = self.corrections.applied(which, x, rays.station[which], rays.attitude[which])
         here = Rays(rays.point[which], rays.image[which], station, attitude)
@@ -197,7 +215,13 @@ class Pointings:
         return self.corrections.columns
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """See `Packets`: range, then the beam's two components."""
+        """See `Packets`: range, then the beam's two components.
+
+        Args:
+            which: packets, (k,).
+            x: all unknowns, (P,).
+            ground: points of these packets, (k, 3), ITRS, metres.
+        """
         station, attitude, jacobian = self.corrections.applied(which, x, self.station[which], self.attitude[which])
         arm = np.einsum("nji,nj->ni", attitude, ground - station)
         far = np.linalg.norm(arm, axis=1)
@@ -250,7 +274,13 @@ class FixedPoints:
         return np.broadcast_to(self.datum, (len(self.point), len(self.datum)))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """See `Packets`."""
+        """See `Packets`.
+
+        Args:
+            which: packets, (k,).
+            x: all unknowns, (P,).
+            ground: points of these packets, (k, 3), ITRS, metres.
+        """
         white = self.white[which]
         shift = x[self.datum] if len(self.datum) else np.zeros(3)
         miss = np.einsum("nij,nj->ni", white, ground - self.given[which] + shift)
@@ -287,7 +317,13 @@ class Heights:
         return np.broadcast_to(self.common, (len(self.point), 1))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """See `Packets`."""
+        """See `Packets`.
+
+        Args:
+            which: packets, (k,).
+            x: all unknowns, (P,).
+            ground: points of these packets, (k, 3), ITRS, metres.
+        """
         normal, sigma = self.normal[which], self.sigma[which]
         above = np.sum(normal * (ground - self.place[which]), axis=1) - self.unit * float(x[self.common[0]])
         by_x = np.broadcast_to(-self.unit / sigma[:, None, None], (len(which), 1, 1))

@@ -218,7 +218,14 @@ class Reduction:
                 yield rows
 
     def reduced(self, x: Array, ground: Array, weight: Sequence[Array], factor: Mapping[str, float]) -> Reduced:
-        """Equations at a state; arguments as of `rows`."""
+        """Equations at a state.
+
+        Args:
+            x: unknowns, (P,).
+            ground: points, (m, 3), ITRS, metres.
+            weight: set -> robust weights of its packets.
+            factor: group -> variance factor.
+        """
         data = _Collected(self.size)
         right = np.zeros(self.size)
         spread, start = np.zeros((self.count, 3, 3)), np.zeros((self.count, 3))
@@ -231,10 +238,12 @@ class Reduction:
             pull = np.einsum("nij,nj->ni", turned, m)
             cross = turned @ a
             root = np.linalg.cholesky(inverse)
-            flat, half = a.reshape(-1, a.shape[2]), (np.swapaxes(root, 1, 2) @ cross).reshape(-1, a.shape[2])
+            n, depth, width = a.shape
+            flat = a.reshape(n * depth, width)
+            half = (np.swapaxes(root, 1, 2) @ cross).reshape(3 * n, width)
             step = np.einsum("nij,nj->ni", inverse, pull)
             data.add(rows.bundle.columns, flat.T @ flat - half.T @ half)
-            np.add.at(right, rows.bundle.columns, flat.T @ m.ravel() - cross.reshape(-1, a.shape[2]).T @ step.ravel())
+            np.add.at(right, rows.bundle.columns, flat.T @ m.ravel() - cross.reshape(3 * n, width).T @ step.ravel())
             spread[rows.bundle.points], start[rows.bundle.points] = inverse, -step
             d = 0
             for k, _ in rows.bundle.members:
@@ -271,7 +280,16 @@ class Reduction:
     def point_steps(
         self, x: Array, ground: Array, weight: Sequence[Array], factor: Mapping[str, float], at: Reduced, step: Array
     ) -> Array:
-        """(m, 3) change of the points that goes with a change (P,) of the unknowns."""
+        """(m, 3) change of the points that goes with a change of the unknowns.
+
+        Args:
+            x: unknowns, (P,).
+            ground: points, (m, 3), ITRS, metres.
+            weight: set -> robust weights of its packets.
+            factor: group -> variance factor.
+            at: equations of this state.
+            step: change of the unknowns, (P,).
+        """
         found = at.start.copy()
         for rows in self.rows(x, ground, weight, factor):
             moved = rows.by_x @ step[rows.bundle.columns]

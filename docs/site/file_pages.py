@@ -32,6 +32,7 @@ READ_BY = {
     "measured_focus": "`python -m twin.lab focus FILE`",
     "measured_distortion": "`python -m twin.lab distortion FILE`",
     "measured_turntable": "`python -m twin.lab turntable FILE`",
+    "orbit_adjust": "`python -m twin.orbit adjust FILE`",
     "orbit_angle": "`python -m twin.orbit angle FILE`",
     "orbit_calibration": "`python -m twin.orbit calibrate FILE`",
     "orbit_simulate": "`python -m twin.orbit simulate FILE`",

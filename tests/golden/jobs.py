@@ -160,6 +160,7 @@ ALL = (
     _job("lab_focus_measured", "twin.lab focus scenes/lab/measured/focus.yaml --out {out}"),
     _job("lab_turntable_measured", "twin.lab turntable scenes/lab/measured/turntable.yaml --out {out} --json"),
     _job("orbit_simulate", f"twin.orbit simulate {RUN % 'simulate'}"),
+    _job("orbit_adjust", f"twin.orbit adjust {RUN % 'adjust'} --without tracker_angles"),
     _job("orbit_angle", f"twin.orbit angle {RUN % 'angle'} --json"),
     _job("orbit_angle_traced", f"twin.orbit angle {RUN % 'angle_gf7'}"),
     _job("orbit_angle_off_axis", f"twin.orbit angle {RUN % 'angle_off_axis'}"),

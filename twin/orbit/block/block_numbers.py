@@ -113,7 +113,5 @@ BLOCK: Record[BlockRun] = Record(
         "open", lambda run: list(run.open), "what the observations leave to what is known beforehand", record=OPEN
     ),
     Quantity("cameras", lambda run: run.cameras, "scene -> its camera", record=CHANGE),
-    Quantity(
-        "rejected", lambda run: [list(one) for one in run.adjustment.rejected()], "point and scene, as gross errors"
-    ),
+    Quantity("rejected", lambda run: [list(one) for one in run.rejected], "point and scene, as gross errors"),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from twin.orbit.block.block_numbers import CHANGE, GROUP
-from twin.orbit.block.block_run import ALL, BlockRun
+from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report, Section, answer
 
@@ -153,10 +153,10 @@ def _points(run: BlockRun) -> Section:
 
 def _warnings(run: BlockRun) -> tuple[str, ...]:
     found = list(_network(run))
-    rejected = run.adjustment.rejected()
-    if rejected:
-        found.append(f"left out as gross errors: {_listed([f'{point} in {scene}' for point, scene in rejected])}")
-    if run.datum is not None and run.datum_chance < _ALARM:
+    if run.rejected:
+        names = [f"{point} in {scene}" for point, scene in run.rejected]
+        found.append(f"left out as gross errors: {_listed(names)}")
+    if run.datum is not None and run.datum_chance < DATUM_ALARM:
         d = run.datum
         found.append(
             f"the control points lie {d.east:+.2f} m east, {d.north:+.2f} m north and {d.up:+.2f} m up of where all"

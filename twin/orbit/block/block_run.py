@@ -24,6 +24,9 @@ from twin.run.procedure import Advance, BenchError, silent
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
 
+Rejected = tuple[tuple[str, str], ...]
+DATUM_ALARM = 1e-3
+"""Chance below which a common shift of the control points is told."""
 ALL = "all"
 NOTHING = "ties alone"
 """Of the table of sensors: image points of unknown ground alone, beside what is stated of readings and cameras."""
@@ -71,6 +74,7 @@ class BlockRun:
         datum: of the control points against the rest; None without control points.
         cameras: scene -> its camera.
         check: (k,) check points, (k, 3) errors east, north and up, metres, and (k, 3) their sigmas.
+        rejected: point and set of observations of every gross error that was left out.
     """
 
     setup: AdjustSetup
@@ -84,6 +88,7 @@ class BlockRun:
     datum: DatumTest | None
     cameras: Mapping[str, CameraChange]
     check: tuple[np.ndarray, np.ndarray, np.ndarray]
+    rejected: Rejected
 
     @property
     def used(self) -> tuple[str, ...]:
@@ -112,15 +117,13 @@ def run_adjustment(setup: AdjustSetup, backend: Backend | None, seed: int, advan
     advance("block", 1, 2)
     try:
         network = network_of(block)
+        datum, block, rejected = _datum(block, spec.robust)
+        robust = spec.robust and rejected is None
         found = adjust_block(
-            block, robust="reject" if spec.robust else None, variance_components=_components(spec.components)
+            block, robust="reject" if robust else None, variance_components=_components(spec.components)
         )
         advance("block", 2, 2)
-        kept = kept_block(found)
-        worth = _worth(kept, found, drawn, advance)
-        datum = None
-        if np.any(kept.points.role == "control"):
-            datum = datum_test(adjust_block(kept, datum=True))
+        worth = _worth(kept_block(found), found, drawn, advance)
     except BlockError as error:
         raise BenchError(str(error), ("points",), "more points, or scenes that see the same ground") from error
     where, error_there, spread = _check(found, drawn)
@@ -139,7 +142,24 @@ def run_adjustment(setup: AdjustSetup, backend: Backend | None, seed: int, advan
         datum,
         _cameras(found, drawn),
         (where, errors, sigma),
+        rejected or found.rejected(),
     )
+
+
+def _datum(block: Block, robust: bool) -> tuple[DatumTest | None, Block, Rejected | None]:
+    """A common shift of the control points, the block to be adjusted, and what was left out of it already.
+
+    It is looked for first: control points of another datum would else all be taken for gross errors. Where there is
+    one, gross errors are those that stand out beside it, and the control points stay as they are given.
+    """
+    if not np.any(block.points.role == "control"):
+        return None, block, None
+    shifted = adjust_block(block, robust="reject" if robust else None, datum=True)
+    test = datum_test(shifted)
+    assert test is not None
+    if robust and chi2.sf(test.chi_square, 3) < DATUM_ALARM:
+        return test, kept_block(shifted), shifted.rejected()
+    return test, block, None
 
 
 def _components(names: tuple[str, ...]) -> bool | tuple[str, ...]:

@@ -1,0 +1,156 @@
+"""``twin.orbit adjust``: what the command says of blocks that are right, and of blocks that are not."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.orbit.three_line_model import misclosure
+from scenes.specs.load import SCENES
+from scenes.specs.orbit.adjust_setup import resolve_adjust, without_sensors
+from scenes.yaml.errors import InputError
+from tests.twin.commands import invoke
+from twin.orbit.__main__ import app
+from twin.orbit.block.block_report import block_report
+from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
+from twin.orbit.block.drawn_block import change_covariance, draw_block
+from twin.run.procedure import BenchError
+
+FILE = SCENES / "orbit" / "adjust.yaml"
+
+
+def setup(tmp_path=None, *changes):
+    """The shipped block with fewer points, and texts of its file replaced."""
+    text = FILE.read_text("utf-8").replace("tie: 120, check: 60", "tie: 40, check: 30")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    if tmp_path is None:
+        return resolve_adjust(FILE)
+    file = tmp_path / "adjust.yaml"
+    file.write_text(text, "utf-8")
+    return resolve_adjust(file)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return run_adjustment(setup(tmp_path_factory.mktemp("block")), None, 3)
+
+
+def test_errors_of_check_points_are_those_predicted_and_every_sensor_helps(run):
+    assert 0.3 < run.worth[ALL].agreement < 2.0
+    full = run.worth[ALL].predicted
+    for name, one in run.worth.items():
+        # less is known without a sensor; rounding of the quantiles
+        assert one.predicted.ce90 > full.ce90 * (1 - 1e-6), name
+        assert one.predicted.le90 > full.le90 * (1 - 1e-6), name
+    assert run.worth["without control"].predicted.ce90 > 2 * full.ce90
+    assert run.worth[NOTHING].predicted.le90 > 3 * full.le90
+    assert run.adjustment.p_value > 1e-4
+    assert block_report(run).warnings == ()
+
+
+def test_cameras_are_found_within_their_sigmas(run):
+    ratio = np.array([(c.found - c.truth) / c.sigma for c in run.cameras.values()])
+    # 16 normals: beyond 4 by chance in 1 of 1000 blocks
+    assert np.max(np.abs(ratio)) < 4.0
+    assert all(np.all(c.sigma < c.before) for c in run.cameras.values())
+
+
+def test_rays_meet_where_the_true_platform_saw_the_points():
+    """A block without errors: all misclosures vanish for true corrections."""
+    drawn = draw_block(setup(), np.random.SeedSequence(4))
+    for scene in drawn.block.scenes:
+        rays, platform = scene.rays, drawn.platforms[scene.of]
+        camera = drawn.block.cameras[scene.camera].drifted(drawn.change[scene.name])
+        seconds = rays.time - platform.begin
+        here = replace(rays, station=platform.position(seconds), attitude=platform.body_to_itrs(seconds))
+        zero = np.zeros(3)
+        miss = misclosure(camera, here, drawn.ground[rays.point], zero, zero)
+        sigma = np.sqrt(np.diagonal(rays.spread, axis1=1, axis2=2))
+        # image points have their own errors of one sigma, 0.2 px; nothing else is left
+        assert np.sqrt(np.mean((miss / sigma) ** 2)) == pytest.approx(1.0, abs=0.12)
+
+
+def test_readings_of_another_law_are_told(tmp_path):
+    said = FILE.read_text("utf-8")
+    laws = said[said.index("errors:\n") : said.index("angles:")]
+    true = laws.replace("errors:", "truth:").replace(
+        "{law: white, sigma: [0.5 arcsec, 0.5 arcsec, 1 arcsec], interval: 1 s}",
+        "{law: walk, sigma: [1 arcsec, 1 arcsec, 1 arcsec], interval: 1 s}",
+    )
+    wrong = run_adjustment(setup(tmp_path, ("\nangles:", "\n" + true + "angles:")), None, 3)
+    told = " ".join(block_report(wrong).warnings)
+    assert "readings: errors that should be independent in a white process are alike" in told
+
+
+def test_gross_errors_are_left_out_by_name(tmp_path):
+    found = run_adjustment(setup(tmp_path, ("image: 0.2", "image: 0.2, gross: 0.1, gross_size: 20")), None, 3)
+    ids = found.drawn.block.points.ids
+    bad = {(str(ids[p]), scene) for scene, points in found.drawn.gross.items() for p in points}
+    told = set(found.rejected)
+    assert len(bad) > 8
+    # an error along the ray of the other scenes is absorbed by the point's height
+    assert len(bad - told) <= 0.2 * len(bad)
+    assert 0.3 < found.worth[ALL].agreement < 2.0
+    assert any(w.startswith("left out as gross errors: ") for w in block_report(found).warnings)
+
+
+def test_a_wrong_datum_is_told(tmp_path):
+    found = run_adjustment(setup(tmp_path, ("seed: 1", "seed: 1\ndatum: [80 m, 0 m, -20 m]")), None, 3)
+    assert found.datum.east == pytest.approx(80.0, abs=4 * found.datum.sigma[0])
+    assert found.datum.up == pytest.approx(-20.0, abs=4 * found.datum.sigma[2])
+    assert any("another datum" in w for w in block_report(found).warnings)
+
+
+def test_command_writes_its_numbers_and_takes_sensors_away(tmp_path):
+    setup(tmp_path)
+    out = tmp_path / "run"
+    words = ["adjust", tmp_path / "adjust.yaml", "--without", "control", "--out", out, "--json"]
+    result = invoke(app, *words)
+    assert result.exit_code == 0
+    numbers = json.loads((out / "block.json").read_text("utf-8"))
+    assert numbers["check_points"] == json.loads(result.stdout)["check_points"]
+    assert "control" not in numbers["sensors"]
+    assert "without: [control]" in (out / "config.yaml").read_text("utf-8")
+    assert numbers["verdict"].startswith("Nine ground points in ten lie within ")
+
+
+def test_sensors_that_are_not_there_are_refused():
+    with pytest.raises(InputError, match="no such sensor; did you mean 'control'"):
+        without_sensors(resolve_adjust(FILE), ["controls"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("lines: [forward, backward]", "lines: [forward, nadir]", "it is not said how nadir may have changed"),
+        ("between: [A, B]", "between: [A, C]", "no such star tracker in the passes"),
+        ("interval: 1 s}", "interval: 1 s, time: 3 s}", "a white law has no `time:`"),
+        ("seed: 1", "seed: 1\ncomponents: [noise]", "no such group of variances"),
+        ("orbit: {law: constant", "gyro: {law: constant", "one name for two laws"),
+    ],
+)
+def test_files_that_contradict_themselves_are_refused(tmp_path, old, new, told):
+    with pytest.raises(InputError, match=told):
+        setup(tmp_path, (old, new))
+
+
+def test_scenes_that_share_no_ground_are_an_error_with_a_key(tmp_path):
+    alone = setup(tmp_path, ("lines: [forward, backward]", "lines: [forward]"), ("longitude: 117.4 deg, ", "longitude: 120 deg, "),
+                  ("  backward:\n    lasting: {angles: [2 arcsec, 2 arcsec, 4 arcsec], principal_distance: 10 um}\n"
+                   "    each_pass: {angles: [1 arcsec, 1 arcsec, 2 arcsec], principal_distance: 5 um}\n", ""))  # fmt: skip
+    with pytest.raises(BenchError, match="only 0 of .* places of the area are seen by two scenes"):
+        run_adjustment(alone, None, 1)
+
+
+def test_covariance_of_changes_holds_all_three_laws():
+    spec = setup().test.changes["forward"]
+    walk = spec.walk.model_copy(update={"angles": (1e-6, 0.0, 0.0)})
+    spread = change_covariance(spec.model_copy(update={"walk": walk}), np.array([0.0, 4.0, 9.0]))
+    lasting, each = spec.lasting.angles[0] ** 2, spec.each_pass.angles[0] ** 2
+    assert spread[0, 0] == pytest.approx(lasting + each)
+    assert spread[8, 8] == pytest.approx(lasting + each + 9e-12)
+    assert spread[4, 8] == pytest.approx(lasting + 4e-12)
+    assert spread[4, 9] == 0.0
