@@ -138,10 +138,11 @@ def test_files_that_contradict_themselves_are_refused(tmp_path, old, new, told):
 
 
 def test_scenes_that_share_no_ground_are_an_error_with_a_key(tmp_path):
-    alone = setup(tmp_path, ("lines: [forward, backward]", "lines: [forward]"), ("longitude: 117.4 deg, ", "longitude: 120 deg, "),
-                  ("  backward:\n    lasting: {angles: [2 arcsec, 2 arcsec, 4 arcsec], principal_distance: 10 um}\n"
-                   "    each_pass: {angles: [1 arcsec, 1 arcsec, 2 arcsec], principal_distance: 5 um}\n", ""))  # fmt: skip
-    with pytest.raises(BenchError, match="only 0 of .* places of the area are seen by two scenes"):
+    text = FILE.read_text("utf-8")
+    backward = text[text.index("  backward:\n") : text.index("monitor: {angles")]
+    one = (("lines: [forward, backward]", "lines: [forward]"), (backward, ""))
+    alone = setup(tmp_path, *one, ("longitude: 117.4 deg, ", "longitude: 120 deg, "))
+    with pytest.raises(BenchError, match=r"only 0 of .* places of the area are seen by two scenes"):
         run_adjustment(alone, None, 1)
 
 
