@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from analysis.block.block import Block, CameraKnowledge, Term
-from analysis.block.packets import Corrections, FixedPoints, Heights, LineImage, Packets, Pointings
+from analysis.block.packets import Corrections, FixedPoints, Heights, LineImage, Packets, Part, Pointings
 from analysis.block.point_reduction import PriorGroup, Reduction
 from analysis.block.processes import BlockError, Support
 from analysis.orbit.three_line_model import BIAS, DRIFT
@@ -89,13 +89,11 @@ class Assembly:
         """Of a pass at times (n,)."""
         parts = []
         for kind in ("attitude", "station"):
-            columns, factors = [np.zeros((len(times), 0, 3), np.intp)], [np.zeros((len(times), 0, 3))]
             for one in self.processes[kind, of]:
-                where, blend = one.support.blend(times)
-                columns.append(one.column + 3 * where[:, :, None] + np.arange(3))
-                factors.append(blend[:, :, None] * np.array(one.support.law.sigma))
-            parts.append((np.concatenate(columns, axis=1), np.concatenate(factors, axis=1)))
-        return Corrections(parts[0], parts[1], self.axes[of])
+                number, blend = one.support.blend(times)
+                sigma = np.array(one.support.law.sigma)
+                parts.append(Part(kind == "attitude", one.column, sigma, number.astype(np.int32), blend))
+        return Corrections(tuple(parts), self.axes[of], len(times))
 
 
 def assembled(block: Block, datum: bool = False) -> Assembly:

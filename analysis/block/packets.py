@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analysis.orbit.three_line_model import LineModel, Rays, misclosure, partials
 
-__all__ = ["Corrections", "FixedPoints", "Heights", "LineImage", "Packets", "Pointings"]
+__all__ = ["Corrections", "FixedPoints", "Heights", "LineImage", "Packets", "Part", "Pointings"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -55,28 +55,67 @@ class Packets(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class Part:
+    """One law's share of a correction at the times of n observations.
+
+    Attributes:
+        turns: whether it turns the body, radians; else it shifts the station along the axes of the pass, metres.
+        first: of its unknowns, three axes of each number.
+        sigma: (3,) of the axes.
+        number: (n, w) of the law's numbers that each time meets. blend: (n, w) how much of each.
+    """
+
+    turns: bool
+    first: int
+    sigma: Array
+    number: NDArray[np.int32]
+    blend: Array
+
+    def value(self, which: Indices, x: Array) -> Array:
+        """(k, 3) at observations (k,)."""
+        number, blend = self.number[which], self.blend[which]
+        own = x[self.first + 3 * number[:, :, None] + np.arange(3)]
+        return np.asarray(self.sigma * np.einsum("nw,nwa->na", blend, own))
+
+
+@dataclass(frozen=True, eq=False)
 class Corrections:
     """Corrections of attitude and station at the times of n observations, linear in the unknowns.
 
     Attributes:
-        turn: unknowns (n, a, 3) about the body's axes, and their coefficients (n, a, 3), radians.
-        shift: unknowns (n, s, 3) along the axes of the pass, and their coefficients (n, s, 3), metres.
+        parts: of the laws; those that turn come first.
         axes: (3, 3) axes of the pass (along, across, down) as columns, ITRS.
+        count: n.
     """
 
-    turn: tuple[Indices, Array]
-    shift: tuple[Indices, Array]
+    parts: tuple[Part, ...]
     axes: Array
+    count: int
 
     @property
     def columns(self) -> Indices:
-        """(n, 3 a + 3 s)."""
-        return np.concatenate([part[0].reshape(len(part[0]), -1) for part in (self.turn, self.shift)], axis=1)
+        """(n, w) unknowns of all parts."""
+        every = [np.zeros((self.count, 0), np.intp)]
+        for one in self.parts:
+            columns = one.first + 3 * one.number[:, :, None].astype(np.intp) + np.arange(3)
+            every.append(columns.reshape(self.count, -1))
+        return np.concatenate(every, axis=1)
+
+    def factors(self, turns: bool) -> tuple[Indices, Array]:
+        """Unknowns (n, w, 3) of the turns or of the shifts, and their coefficients (n, w, 3), SI."""
+        columns, factors = [np.zeros((self.count, 0, 3), np.intp)], [np.zeros((self.count, 0, 3))]
+        for one in self.parts:
+            if one.turns == turns:
+                columns.append(one.first + 3 * one.number[:, :, None].astype(np.intp) + np.arange(3))
+                factors.append(one.blend[:, :, None] * one.sigma)
+        return np.concatenate(columns, axis=1), np.concatenate(factors, axis=1)
 
     def at(self, which: Indices, x: Array) -> tuple[Array, Array]:
         """Turns (k, 3), radians, and shifts (k, 3) along the axes of the pass, metres."""
-        turn, shift = (np.sum(c[which] * x[i[which]], axis=1) for i, c in (self.turn, self.shift))
-        return turn, shift
+        found = [np.zeros((len(which), 3)), np.zeros((len(which), 3))]
+        for one in self.parts:
+            found[0 if one.turns else 1] += one.value(which, x)
+        return found[0], found[1]
 
     def slopes(self, which: Indices, by_turn: Array, by_station: Array) -> Array:
         """(k, d, 3 a + 3 s) derivatives of d rows by the unknowns.
@@ -86,10 +125,12 @@ class Corrections:
             by_turn: derivatives by the rotation vector, (k, d, 3), 1/rad.
             by_station: by the station, ITRS, (k, d, 3), 1/m.
         """
-        parts = []
-        for by, (_, factor) in ((by_turn, self.turn), (by_station @ self.axes, self.shift)):
-            some = factor[which]
-            parts.append((by[:, :, None, :] * some[:, None]).reshape(*by.shape[:2], -1))
+        count, depth = by_turn.shape[:2]
+        along = by_station @ self.axes
+        parts = [np.zeros((count, depth, 0))]
+        for one in self.parts:
+            by = (by_turn if one.turns else along) * one.sigma
+            parts.append((by[:, :, None, :] * one.blend[which][:, None, :, None]).reshape(count, depth, -1))
         return np.concatenate(parts, axis=2)
 
     def applied(self, which: Indices, x: Array, station: Array, attitude: Array) -> tuple[Array, Array, Array]:

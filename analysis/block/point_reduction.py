@@ -24,7 +24,7 @@ __all__ = ["Bundle", "PriorGroup", "Reduced", "Reduction", "Rows"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-_PIECE = 20_000
+_PIECE = 4_000
 """Points that are linearised at once."""
 _FLUSH = 4_000_000
 """Entries of the reduced matrix that are collected before they are added up."""
