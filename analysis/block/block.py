@@ -221,6 +221,8 @@ class Block:
             return replace(self, points=replace(points, role=role))
         if sensor == "ties":
             kept = points.role != "tie"
+            for one in self.footprints:  # the images see them as part of the laser
+                kept[one.point] = True
             scenes = tuple(replace(s, rays=s.rays.taken(kept[s.rays.point])) for s in self.scenes)
             terrain = self.terrain
             if terrain is not None:

@@ -155,3 +155,15 @@ def test_covariance_of_changes_holds_all_three_laws():
     assert spread[8, 8] == pytest.approx(lasting + each + 9e-12)
     assert spread[4, 8] == pytest.approx(lasting + 4e-12)
     assert spread[4, 9] == 0.0
+
+
+def test_laser_and_monitor_of_a_gf7_pass_as_gf7_reports_it():
+    """GF-7 reports 2.15 m in height without and 0.75 m with its laser, a factor of 2.9."""
+    found = run_adjustment(resolve_adjust(SCENES / "orbit" / "adjust_gf7.yaml"), None, 1)
+    sigma = {name: one.predicted.le90 / 1.645 for name, one in found.worth.items()}
+    # inputs are chosen, so that the size and not the digit is compared
+    assert 1.2 < sigma["without laser"] < 2.6
+    assert 0.4 < sigma[ALL] < 0.9
+    assert 2.0 < sigma["without laser"] / sigma[ALL] < 4.0
+    # neither monitor nor laser: angles of the cameras of 0.7 arcsec, 5 m for each arcsec
+    assert 3.5 < sigma[NOTHING] < 6.0
