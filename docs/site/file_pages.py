@@ -25,6 +25,7 @@ READ_BY = {
     "principle_experiment": "`python -m twin.validate --only 001.table2`",
     "focus_test": "`python -m twin.lab focus FILE`",
     "distortion_test": "`python -m twin.lab distortion FILE`",
+    "measured_adjust": "`python -m twin.orbit adjust FILE`",
     "measured_calibration": "`python -m twin.orbit calibrate FILE`",
     "measured_angle": "`python -m twin.orbit angle FILE`",
     "orbit_data": "tests on measurements, which name its folder: `data: DIR`",

@@ -89,6 +89,7 @@ def test_a_wrong_law_is_told_and_a_right_one_is_not(stated, true):
             assert "not that of the readings" in str(test)
 
 
+@pytest.mark.second
 @one_blas_thread()
 def test_serial_correlation_has_unit_variance_under_the_right_law():
     every = []

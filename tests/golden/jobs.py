@@ -168,6 +168,7 @@ ALL = (
     _job("orbit_calibrate_monitor", f"twin.orbit calibrate {RUN % 'calibrate_monitor'}"),
     _job("orbit_calibrate_strip", f"twin.orbit calibrate {RUN % 'calibrate_strip'}"),
     _job("orbit_calibrate_images", f"twin.orbit calibrate {RUN % 'calibrate_images'}"),
+    _job("orbit_adjust_measured", "twin.orbit adjust scenes/orbit/measured/adjust.yaml --out {out} --json"),
     _job("orbit_angle_measured", "twin.orbit angle scenes/orbit/measured/angle.yaml --out {out} --quiet"),
     _job("orbit_calibrate_measured", "twin.orbit calibrate scenes/orbit/measured/calibrate.yaml --out {out}"),
     _job("orbit_check", "twin.orbit check scenes/orbit/measured/check.yaml --out {out}"),

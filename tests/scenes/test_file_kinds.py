@@ -44,6 +44,7 @@ FOLDERS = {
     "library/payloads": "three_line_camera",
     "orbit/adjust": "orbit_adjust",
     "orbit/angle": "orbit_angle",
+    "orbit/measured/adjust": "measured_adjust",
     "orbit/measured/angle": "measured_angle",
     "orbit/measured/calibrate": "measured_calibration",
     "orbit/measured/data": "orbit_data",

@@ -8,13 +8,18 @@ import pytest
 
 from analysis.orbit.three_line_model import misclosure
 from scenes.specs.load import SCENES
-from scenes.specs.orbit.adjust_setup import resolve_adjust, without_sensors
+from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
+from scenes.specs.orbit.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from twin.orbit.__main__ import app
 from twin.orbit.block.block_report import block_report
 from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
-from twin.orbit.block.drawn_block import change_covariance, draw_block
+from twin.orbit.block.drawn_block import draw_block
+from twin.orbit.block.measured_block import measured_block
+from twin.orbit.block.pass_knowledge import change_covariance
+from twin.orbit.calibration.calibration_run import source_of
+from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.run.procedure import BenchError
 
 FILE = SCENES / "orbit" / "adjust.yaml"
@@ -73,6 +78,7 @@ def test_rays_meet_where_the_true_platform_saw_the_points():
         assert np.sqrt(np.mean((miss / sigma) ** 2)) == pytest.approx(1.0, abs=0.12)
 
 
+@pytest.mark.second
 def test_readings_of_another_law_are_told(tmp_path):
     said = FILE.read_text("utf-8")
     laws = said[said.index("errors:\n") : said.index("angles:")]
@@ -85,6 +91,7 @@ def test_readings_of_another_law_are_told(tmp_path):
     assert "readings: errors that should be independent in a white process are alike" in told
 
 
+@pytest.mark.second
 def test_gross_errors_are_left_out_by_name(tmp_path):
     found = run_adjustment(setup(tmp_path, ("image: 0.2", "image: 0.2, gross: 0.1, gross_size: 20")), None, 3)
     ids = found.drawn.block.points.ids
@@ -97,6 +104,7 @@ def test_gross_errors_are_left_out_by_name(tmp_path):
     assert any(w.startswith("left out as gross errors: ") for w in block_report(found).warnings)
 
 
+@pytest.mark.second
 def test_a_wrong_datum_is_told(tmp_path):
     found = run_adjustment(setup(tmp_path, ("seed: 1", "seed: 1\ndatum: [80 m, 0 m, -20 m]")), None, 3)
     assert found.datum.east == pytest.approx(80.0, abs=4 * found.datum.sigma[0])
@@ -157,6 +165,7 @@ def test_covariance_of_changes_holds_all_three_laws():
     assert spread[4, 9] == 0.0
 
 
+@pytest.mark.second
 def test_laser_and_monitor_of_a_gf7_pass_as_gf7_reports_it():
     """GF-7 reports 2.15 m in height without and 0.75 m with its laser, a factor of 2.9."""
     found = run_adjustment(resolve_adjust(SCENES / "orbit" / "adjust_gf7.yaml"), None, 1)
@@ -167,3 +176,61 @@ def test_laser_and_monitor_of_a_gf7_pass_as_gf7_reports_it():
     assert 2.0 < sigma["without laser"] / sigma[ALL] < 4.0
     # neither monitor nor laser: angles of the cameras of 0.7 arcsec, 5 m for each arcsec
     assert 3.5 < sigma[NOTHING] < 6.0
+
+
+MEASURED = SCENES / "orbit" / "measured" / "adjust.yaml"
+
+
+@pytest.mark.second
+def test_measured_passes_as_their_calibration_has_them():
+    """The tables of the shipped campaign: two image points of control points were moved by some pixels."""
+    found = run_adjustment(resolve_any_adjust(MEASURED), None, 0)
+    assert found.drawn is None
+    assert {("Beijing c4", "Beijing/forward"), ("Beijing k33", "Beijing/nadir")} <= set(found.rejected)
+    assert len(found.rejected) <= 6
+    assert 0.5 < found.worth[ALL].agreement < 1.6
+    assert found.adjustment.p_value > 1e-3
+    assert len(found.network.parts) == 2
+    assert found.worth["without control"].predicted.le90 > 20 * found.worth[ALL].predicted.le90
+    # the same passes calibrated by the campaign's adjustment: the principal distances agree
+    calibrated = simultaneous(source_of(resolve_measured_calibration(MEASURED.with_name("calibrate.yaml")), None))
+    for line in ("forward", "nadir", "backward"):
+        change = found.cameras[f"Beijing/{line}"]
+        laboratory = found.adjustment.assembly.block.cameras[line].interior[0]
+        apart = laboratory + change.found[3] - calibrated.value(f"{line} f")
+        assert abs(apart) < 2.0 * calibrated.sigma[f"{line} f"]
+
+
+def test_monitor_readings_of_measured_passes_hold_the_cameras(tmp_path):
+    text = MEASURED.read_text("utf-8").replace("data: .", f"data: {MEASURED.parent}")
+    reading = "{angles: [1 arcsec, 2 arcsec, 3 arcsec], principal_distance: 20 um}"
+    monitor = (
+        "monitor:\n  angles: [0.1 arcsec, 0.1 arcsec, 0.1 arcsec]\n  principal_distance: 0.1 um\n"
+        f"  readings: {{Anhui: {{nadir: {reading}}}}}\n"
+    )
+    file = tmp_path / "adjust.yaml"
+    file.write_text(text + monitor, "utf-8")
+    block, given = measured_block(resolve_any_adjust(file))
+    known = block.monitored["nadir"]
+    # what lasts is read in one pass and known in both, to the reading's sigma
+    assert known.mean[0, 3] == pytest.approx(20e-6, rel=1e-3)
+    assert np.sqrt(known.covariance[3, 3]) == pytest.approx(0.1e-6, rel=1e-3)
+    assert np.allclose(block.monitored["forward"].covariance, block.known["forward"].covariance)
+    assert np.isfinite(given[block.points.role == "check"]).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("names: own", "names: own\ntrackers: {Peking: A}", "no such pass"),
+        ("names: own", "names: own\nwithout: [monitor]", "no monitor to do without"),
+        ("  nadir: {lasting", "  middle: {lasting", "no such line"),
+    ],
+)
+def test_measured_files_that_name_what_is_not_there_are_refused(tmp_path, old, new, told):
+    text = MEASURED.read_text("utf-8").replace("data: .", f"data: {MEASURED.parent}")
+    assert old in text
+    file = tmp_path / "adjust.yaml"
+    file.write_text(text.replace(old, new), "utf-8")
+    with pytest.raises(InputError, match=told):
+        resolve_any_adjust(file)

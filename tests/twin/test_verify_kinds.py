@@ -22,6 +22,7 @@ KINDS = (
     *(
         "orbit_simulate",
         "orbit_adjust",
+        "orbit_adjust_measured",
         "orbit_angle",
         "orbit_angle_measured",
         "orbit_calibrate",

@@ -22,7 +22,7 @@ from twin.run.command import Result, add_tests, finished, run_command, run_test
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.adjust_setup import AdjustSetup
+    from scenes.specs.orbit.adjust_setup import AnyAdjust
     from twin.orbit.export.export_run import ExportSource
 
 PROGRAM = "twin.orbit"
@@ -66,10 +66,10 @@ def adjust(
     """Adjust a block of scenes; its help is that of the test."""
     procedure = PROCEDURES["orbit adjust"]
 
-    def resolve(path: Path) -> AdjustSetup:
-        from scenes.specs.orbit.adjust_setup import resolve_adjust, without_sensors
+    def resolve(path: Path) -> AnyAdjust:
+        from scenes.specs.orbit.adjust_setup import resolve_any_adjust, without_sensors
 
-        return without_sensors(resolve_adjust(path), without or ())
+        return without_sensors(resolve_any_adjust(path), without or ())
 
     options = Options(out, seed, backend, force, as_json, quiet)
     run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve), file, options)

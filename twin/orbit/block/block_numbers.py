@@ -24,7 +24,12 @@ WORTH: Record[Worth] = Record(
     "Check points by some of the block's sensors.",
     Quantity("left_out", lambda one: list(one.left_out), "sensors that were not used"),
     Quantity("predicted", lambda one: one.predicted, "by the covariances of the points", record=ACCURACY),
-    Quantity("found", lambda one: one.found, "by the points' true places", record=ACCURACY),
+    Quantity(
+        "found",
+        lambda one: one.found,
+        "by the points' true places, or given ones; none without check points",
+        record=ACCURACY,
+    ),
     Quantity("agreement", lambda one: one.agreement, "mean square of errors over sigmas; 1 where the sigmas are right"),
 )
 GROUP: Record[GroupTest] = Record(
@@ -70,8 +75,12 @@ NETWORK: Record[Network] = Record(
 )
 
 
-def _four(get: Callable[[CameraChange], np.ndarray], k: int) -> Callable[[CameraChange], Any]:
-    return lambda one: get(one)[k]
+def _four(get: Callable[[CameraChange], np.ndarray | None], k: int) -> Callable[[CameraChange], Any]:
+    def value(one: CameraChange) -> Any:
+        row = get(one)
+        return None if row is None else row[k]
+
+    return value
 
 
 CHANGE: Record[CameraChange] = Record(

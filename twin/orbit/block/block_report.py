@@ -43,10 +43,13 @@ def _verdict(run: BlockRun) -> tuple[str, tuple[str, ...]]:
             f"Plan loses most {plan}, by a factor of {losses[plan][0]:.2f}, and height {height}, by"
             f" {losses[height][1]:.2f}"
         )
+    checked = ""
+    if found is not None:
+        checked = f"; {found.count} check points have {found.ce90:.2f} m and {found.le90:.2f} m"
     control = "with" if "control" in run.used else "without"
     return answer(
         f"Nine ground points in ten lie within {said.ce90:.2f} m in plan and {said.le90:.2f} m in height, {control}"
-        f" ground control; {found.count} check points have {found.ce90:.2f} m and {found.le90:.2f} m",
+        f" ground control{checked}",
         most,
         f"residuals have {run.adjustment.chi_square:.0f} for chi-square where {run.adjustment.degrees_of_freedom} is"
         f" expected, chance {run.adjustment.p_value:.2g}",
@@ -58,7 +61,7 @@ def _facts(run: BlockRun) -> tuple[tuple[str, str], ...]:
     role = block.points.role
     counts = ", ".join(f"{int(np.sum(role == name))} {name}" for name in ("control", "tie", "check"))
     return (
-        ("Camera", f"{run.setup.camera.name}: {', '.join(spec.lines)}"),
+        ("Camera", f"{run.setup.camera.name}: {', '.join(block.cameras)}"),
         ("Scenes", f"{len(block.scenes)} of {len(block.passes)} passes"),
         ("Points", counts),
         ("Sensors", ", ".join(one.replace("_", " ") for one in run.used)),
@@ -72,8 +75,8 @@ def _summary(run: BlockRun) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name, one in run.worth.items():
         ratio = (one.predicted.ce90 / full.ce90, one.predicted.le90 / full.le90)
-        errors = (one.predicted.ce90, one.predicted.le90, one.found.ce90, one.found.le90)
-        rows.append((name, *errors, *ratio, one.agreement))
+        errors = (None, None) if one.found is None else (one.found.ce90, one.found.le90)
+        rows.append((name, one.predicted.ce90, one.predicted.le90, *errors, *ratio, one.agreement))
     return Table(
         "sensors",
         "What each sensor is worth",
@@ -108,7 +111,7 @@ def _cameras(run: BlockRun) -> Section:
     keys = [
         f"{name}{end}"
         for name in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
-        for end in ("", "_sigma", "_true")
+        for end in (("", "_sigma", "_true") if run.drawn is not None else ("", "_sigma"))
     ]
     table = CHANGE.table("cameras", "Cameras", "Changes since the calibration, in each scene.", rows, keys, "scene")
     return Section("Cameras", (), (table,))

@@ -17,13 +17,15 @@ from analysis.block.network import DatumTest, Network, Open, datum_test, network
 from analysis.block.processes import BlockError
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.orbit.adjust_setup import AdjustSetup
+from scenes.specs.orbit.adjust_setup import AnyAdjust, MeasuredAdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
+from twin.orbit.block.measured_block import measured_block
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
 
+_LEAST_CHECK = 2
 Rejected = tuple[tuple[str, str], ...]
 DATUM_ALARM = 1e-3
 """Chance below which a common shift of the control points is told."""
@@ -38,24 +40,40 @@ class Worth:
 
     Attributes:
         left_out: sensors that were not used.
-        predicted: errors at check points by their covariances. found: by their true places.
-        agreement: mean square of the errors over their sigmas, of the three coordinates: 1 where sigmas are right.
+        predicted: errors at check points by their covariances; at all tie points where there are no check points.
+        found: by their true or given places; None without check points.
+        agreement: mean square of the errors over their sigmas, of the three coordinates: 1 where sigmas are right;
+            None likewise.
     """
 
     left_out: tuple[str, ...]
     predicted: Accuracy
-    found: Accuracy
-    agreement: float
+    found: Accuracy | None
+    agreement: float | None
 
 
 @dataclass(frozen=True, eq=False)
 class CameraChange:
-    """A camera in one scene: found, sigma, expected sigma without the block, truth, (4,) each, radians and metres."""
+    """A camera in one scene: found, sigma, expected sigma without the block, truth, (4,) each, radians and metres.
+
+    truth: None where nobody knows it.
+    """
 
     found: np.ndarray
     sigma: np.ndarray
     before: np.ndarray
-    truth: np.ndarray
+    truth: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What check points and cameras are compared with: places (m, 3) and their covariances (m, 3, 3), metres; scene ->
+    true change of its camera, empty where nobody knows.
+    """
+
+    places: np.ndarray
+    covariance: np.ndarray
+    change: Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +83,7 @@ class BlockRun:
     Attributes:
         setup: what the file says.
         seed: of all that was drawn.
-        drawn: the block and its truth.
+        drawn: the block and its truth; None for a measured block.
         adjustment: with all sensors that the file does not leave out.
         worth: case -> check points: all sensors, without each, and ties alone.
         network: how scenes hang together.
@@ -77,9 +95,9 @@ class BlockRun:
         rejected: point and set of observations of every gross error that was left out.
     """
 
-    setup: AdjustSetup
+    setup: AnyAdjust
     seed: int
-    drawn: DrawnBlock
+    drawn: DrawnBlock | None
     adjustment: BlockAdjustment
     worth: Mapping[str, Worth]
     network: Network
@@ -102,16 +120,23 @@ class BlockRun:
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
-def run_adjustment(setup: AdjustSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> BlockRun:
-    """Draw a block and adjust it. Nothing is traced: the backend is not used.
+def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance: Advance = silent) -> BlockRun:
+    """Draw or read a block and adjust it. Nothing is traced: the backend is not used.
 
     Raises:
+        InputError: tables that cannot be used.
         BenchError: no such orbit, or a block that cannot be adjusted.
     """
     spec = setup.test
     advance("block", 0, 2)
-    drawn = draw_block(setup, np.random.SeedSequence(seed))
-    block = drawn.block
+    drawn = None
+    if isinstance(setup, MeasuredAdjustSetup):
+        block, places = measured_block(setup, advance)
+        known = _Known(places, block.points.covariance, {})
+    else:
+        drawn = draw_block(setup, np.random.SeedSequence(seed))
+        block = drawn.block
+        known = _Known(drawn.ground, np.zeros((len(drawn.ground), 3, 3)), drawn.change)
     for sensor in spec.without:
         block = block.without(sensor)
     advance("block", 1, 2)
@@ -123,13 +148,13 @@ def run_adjustment(setup: AdjustSetup, backend: Backend | None, seed: int, advan
             block, robust="reject" if robust else None, variance_components=_components(spec.components)
         )
         advance("block", 2, 2)
-        worth = _worth(kept_block(found), found, drawn, advance)
+        worth = _worth(kept_block(found), found, known, advance)
     except BlockError as error:
         raise BenchError(str(error), ("points",), "more points, or scenes that see the same ground") from error
-    where, error_there, spread = _check(found, drawn)
-    level = level_axes(drawn.ground[where])
+    where, wrong, spread = _check(found, known)
+    level = level_axes(found.ground[where])
     sigma = np.sqrt(np.einsum("nij,njk,nik->ni", level, spread, level))
-    errors = np.einsum("nij,nj->ni", level, error_there)
+    errors = np.einsum("nij,nj->ni", level, wrong)
     return BlockRun(
         setup,
         seed,
@@ -140,7 +165,7 @@ def run_adjustment(setup: AdjustSetup, backend: Backend | None, seed: int, advan
         open_combinations(found),
         law_tests(found),
         datum,
-        _cameras(found, drawn),
+        _cameras(found, known),
         (where, errors, sigma),
         rejected or found.rejected(),
     )
@@ -166,20 +191,19 @@ def _components(names: tuple[str, ...]) -> bool | tuple[str, ...]:
     return names or False
 
 
-def _check(found: BlockAdjustment, drawn: DrawnBlock) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Check points that are known, their errors (k, 3), ITRS, metres, and covariances (k, 3, 3)."""
+def _check(found: BlockAdjustment, known: _Known) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Check points (k,) that were adjusted, their errors (k, 3), ITRS, metres, and covariances (k, 3, 3) of these."""
     block = found.assembly.block
     where = np.flatnonzero((block.points.role == "check") & np.isfinite(found.ground).all(axis=1))
-    if len(where) < 2:
-        raise BlockError("block: fewer than two check points are left")
-    return where, found.ground[where] - drawn.ground[where], found.point_covariance(where)
+    spread = found.point_covariance(where) + known.covariance[where]
+    return where, found.ground[where] - known.places[where], spread
 
 
-def _worth(kept: Block, found: BlockAdjustment, drawn: DrawnBlock, advance: Advance) -> FrozenMap[str, Worth]:
+def _worth(kept: Block, found: BlockAdjustment, known: _Known, advance: Advance) -> FrozenMap[str, Worth]:
     """Check points by all sensors, without each, and by none but ties."""
     sensors = [name for name in kept.sensors if name != "ties"]
     cases: dict[str, tuple[str, ...]] = {ALL: ()}
-    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors}
+    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors if _leaves_points(kept, name)}
     if len(sensors) > 1:
         cases[NOTHING] = tuple(sensors)
     rows = {}
@@ -191,15 +215,31 @@ def _worth(kept: Block, found: BlockAdjustment, drawn: DrawnBlock, advance: Adva
         one = found
         if left_out:
             one = adjust_block(block, variance_components=False)
-        where, error, spread = _check(one, drawn)
-        square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(spread), error)
-        places = drawn.ground[where]
-        rows[case] = Worth(left_out, predicted(places, spread), realised(places, error), float(np.mean(square)) / 3.0)
+        rows[case] = _accuracy(left_out, one, known)
     advance("sensors", len(cases), len(cases))
     return FrozenMap(rows)
 
 
-def _cameras(found: BlockAdjustment, drawn: DrawnBlock) -> FrozenMap[str, CameraChange]:
+def _leaves_points(block: Block, sensor: str) -> bool:
+    """Whether points are left to be judged by."""
+    return sensor != "ties" or int(np.sum(block.points.role == "check")) >= _LEAST_CHECK
+
+
+def _accuracy(left_out: tuple[str, ...], one: BlockAdjustment, known: _Known) -> Worth:
+    where, error, spread = _check(one, known)
+    if len(where) < _LEAST_CHECK:
+        role = one.assembly.block.points.role
+        ties = np.flatnonzero((role == "tie") & np.isfinite(one.ground).all(axis=1))
+        if not len(ties):
+            raise BlockError("block: neither check points nor tie points are left")
+        return Worth(left_out, predicted(one.ground[ties], one.point_covariance(ties)), None, None)
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(spread), error)
+    places = one.ground[where]
+    own = one.point_covariance(where)
+    return Worth(left_out, predicted(places, own), realised(places, error), float(np.mean(square)) / 3.0)
+
+
+def _cameras(found: BlockAdjustment, known: _Known) -> FrozenMap[str, CameraChange]:
     block = found.assembly.block
     order = [one.name for one in block.passes]
     rows = {}
@@ -207,8 +247,8 @@ def _cameras(found: BlockAdjustment, drawn: DrawnBlock) -> FrozenMap[str, Camera
         if scene.name not in found.assembly.changes:
             continue
         value, spread = found.change(scene.name)
-        known = block.known[scene.camera].covariance
+        law = block.known[scene.camera].covariance
         own = 4 * order.index(scene.of) + np.arange(4)
-        before = np.sqrt(np.diag(known)[own])
-        rows[scene.name] = CameraChange(value, np.sqrt(np.diag(spread)), before, drawn.change[scene.name])
+        before = np.sqrt(np.diag(law)[own])
+        rows[scene.name] = CameraChange(value, np.sqrt(np.diag(spread)), before, known.change.get(scene.name))
     return FrozenMap(rows)

@@ -19,10 +19,10 @@ from analysis.block.processes import Law
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit.adjust import BlockPassSpec, CameraChangeSpec, LawSpec, OrbitAdjustSpec, ReadingLawsSpec
+from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.adjust_setup import AdjustSetup
-from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
 from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
+from twin.orbit.block.pass_knowledge import camera_sigmas, change_covariance, law_of, monitored_camera, pixels_per_line
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.observations import PassData
 from twin.orbit.flight.earth import Earth, east_north_up, tai_of
@@ -96,12 +96,6 @@ class DrawnBlock:
     gross: Mapping[str, np.ndarray]
 
 
-def law_of(name: str, spec: LawSpec) -> known.Term:
-    """A stated law as the analysis has it."""
-    sigma: tuple[float, float, float] = spec.sigma  # type: ignore[attr-defined]
-    return known.Term(Law(name, spec.law, sigma, spec.interval, spec.time or 0.0), spec.shared_by)
-
-
 def drawn_course(law: Law, first: float, last: float, random: np.random.Generator) -> Course:
     """One draw of a law between two times, seconds."""
     sigma, middle = np.array(law.sigma), 0.5 * (first + last)
@@ -166,18 +160,6 @@ def _summed(parts: list[Course]) -> Course:
     return lambda t: np.asarray(sum((one(t) for one in parts), np.zeros((len(t), 3))))
 
 
-def _four(spec: CameraDriftSpec | MonitorReadingSpec) -> np.ndarray:
-    return np.array([*spec.angles, spec.principal_distance])
-
-
-def change_covariance(spec: CameraChangeSpec, days: np.ndarray) -> np.ndarray:
-    """(4 T, 4 T) of a camera's changes in passes at so many days (T,) from the first."""
-    lasting, each, walk = (np.diag(_four(s) ** 2) for s in (spec.lasting, spec.each_pass, spec.walk))
-    one = np.ones((len(days), len(days)))
-    earlier = np.minimum(days[:, None], days)
-    return np.asarray(np.kron(one, lasting) + np.kron(np.eye(len(days)), each) + np.kron(earlier, walk))
-
-
 def _cameras(
     spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator
 ) -> tuple[dict[str, np.ndarray], dict[str, known.CameraKnowledge], dict[str, known.CameraKnowledge] | None]:
@@ -191,11 +173,8 @@ def _cameras(
         expected[line] = known.CameraKnowledge(np.zeros((len(days), 4)), law)
         noise = random.standard_normal(len(drawn))
         if spec.monitor is not None:
-            sigma = np.tile(_four(spec.monitor), len(days))
-            gain = law @ np.linalg.inv(law + np.diag(sigma**2))
-            mean = (gain @ (drawn + sigma * noise)).reshape(-1, 4)
-            rest = law - gain @ law
-            monitored[line] = known.CameraKnowledge(mean, 0.5 * (rest + rest.T))
+            sigma = np.tile(camera_sigmas(spec.monitor), len(days))
+            monitored[line] = monitored_camera(law, drawn + sigma * noise, sigma)
     return true, expected, monitored if spec.monitor is not None else None
 
 
@@ -327,7 +306,7 @@ def _scenes(
         one = data[name]
         random = np.random.default_rng(stream(seed, _IMAGES, k))
         here = np.flatnonzero(np.isfinite(line))
-        unit = np.array([1.0 / _pixels_per_line(one, camera, line[here], pixel[here], spec.area.height), 1.0])
+        unit = np.array([1.0 / pixels_per_line(one, camera, line[here], pixel[here], spec.area.height), 1.0])
         noise = spec.points.image * unit * random.standard_normal((len(here), 2))
         spoilt = np.random.default_rng(stream(seed, _GROSS, k))
         wrong = (spoilt.random(len(here)) < spec.points.gross) & (role[here] == "tie")
@@ -344,25 +323,6 @@ def _scenes(
         scenes.append(known.Scene(scene, name, camera, moved))
         gross[scene] = here[wrong]
     return tuple(scenes), gross
-
-
-def _pixels_per_line(one: PassData, camera: str, line: np.ndarray, pixel: np.ndarray, height: float) -> float:
-    """What one image line is in x of the focal plane where the points lie, pixels: by the ground that the next sees."""
-    if not len(line):
-        return 1.0
-    sensor, model = one.sensors[camera], one.models[camera]
-    here = np.array([np.clip(np.mean(line), 0.0, sensor.lines - 2.0)])
-    at = np.array([np.mean(pixel)])
-    place = []
-    for step in (0.0, 1.0):
-        ground = sensor.ground(here + step, at, height)
-        seconds = sensor.time(here)
-        arm = np.einsum(
-            "nji,nj->ni", sensor.trajectory.body_to_itrs(seconds), ground - sensor.trajectory.position(seconds)
-        )
-        a, _, c = ((arm - model.position) @ model.to_body).T
-        place.append(-model.interior[0] * a / c)
-    return abs(float(place[1][0] - place[0][0])) / one.pitch[camera]
 
 
 @dataclass(frozen=True, eq=False)
