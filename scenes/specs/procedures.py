@@ -214,8 +214,8 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "orbit adjust": Procedure(
         "block",
-        setup="scenes.specs.orbit.adjust_setup:AdjustSetup",
-        resolve="scenes.specs.orbit.adjust_setup:resolve_any_adjust",
+        setup="scenes.specs.measured.adjust_setup:AdjustSetup",
+        resolve="scenes.specs.measured.adjust_setup:resolve_any_adjust",
         run="twin.orbit.block.block_run:run_adjustment",
         numbers="twin.orbit.block.block_numbers:BLOCK",
         report="twin.orbit.block.block_report:block_report",

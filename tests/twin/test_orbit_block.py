@@ -8,8 +8,8 @@ import pytest
 
 from analysis.orbit.three_line_model import misclosure
 from scenes.specs.load import SCENES
+from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
 from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
-from scenes.specs.orbit.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from twin.orbit.__main__ import app

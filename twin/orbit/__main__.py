@@ -22,7 +22,7 @@ from twin.run.command import Result, add_tests, finished, run_command, run_test
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.adjust_setup import AnyAdjust
+    from scenes.specs.measured.adjust_setup import AnyAdjust
     from twin.orbit.export.export_run import ExportSource
 
 PROGRAM = "twin.orbit"
@@ -67,7 +67,7 @@ def adjust(
     procedure = PROCEDURES["orbit adjust"]
 
     def resolve(path: Path) -> AnyAdjust:
-        from scenes.specs.orbit.adjust_setup import resolve_any_adjust, without_sensors
+        from scenes.specs.measured.adjust_setup import resolve_any_adjust, without_sensors
 
         return without_sensors(resolve_any_adjust(path), without or ())
 

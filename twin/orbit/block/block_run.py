@@ -17,7 +17,7 @@ from analysis.block.network import DatumTest, Network, Open, datum_test, network
 from analysis.block.processes import BlockError
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.orbit.adjust_setup import AnyAdjust, MeasuredAdjustSetup
+from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import measured_block
 from twin.run.procedure import Advance, BenchError, silent

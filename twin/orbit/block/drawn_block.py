@@ -19,8 +19,8 @@ from analysis.block.processes import Law
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.measured.adjust_setup import AdjustSetup
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
-from scenes.specs.orbit.adjust_setup import AdjustSetup
 from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
 from twin.orbit.block.pass_knowledge import camera_sigmas, change_covariance, law_of, monitored_camera, pixels_per_line
 from twin.orbit.calibration.campaign import line_model

@@ -11,7 +11,7 @@ from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit.adjust_setup import MeasuredAdjustSetup
+from scenes.specs.measured.adjust_setup import MeasuredAdjustSetup
 from twin.orbit.block.pass_knowledge import (
     camera_sigmas,
     change_covariance,
