@@ -36,6 +36,8 @@ Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital"]
 KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital")
 _GAP = 18
 """Stretches of a spline's unknowns this far apart correlate by 1e-9 and are kept apart."""
+_MOST = 1e5
+"""Intervals from the first observation of a scope to the last; unknowns of more could not be adjusted together."""
 _PINNED = 1e8
 """Precision of a walk's zero at the middle, in squares of what it gains in an interval."""
 
@@ -115,6 +117,8 @@ class Support:
         if law.kind in ("constant", "rate", "orbital"):
             count = 2 if law.kind == "orbital" else 1
             return cls(law, np.arange(count), middle, sparse.csr_matrix(sparse.eye(count)))
+        if np.ptp(times) / law.interval > _MOST:
+            raise BlockError(f"block: {law.group}: the interval is too short for {np.ptp(times):.3g} s of observations")
         if law.kind == "white":
             first, _ = spline_blend(times, law.interval)
             used = np.unique(first[:, None] + np.arange(4))

@@ -215,6 +215,18 @@ class CameraChangeSpec(Spec):
     each_pass: CameraDriftSpec = CameraDriftSpec()
     walk: CameraDriftSpec = CameraDriftSpec()
 
+    @model_validator(mode="after")
+    def _may_change(self) -> CameraChangeSpec:
+        both = (self.lasting, self.each_pass)
+        for k, name in enumerate(("d_alpha", "d_beta", "d_gamma")):
+            if not any(one.angles[k] for one in both):
+                problem = f"{name} may not change at all, which no camera keeps"
+                raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
+        if not any(one.principal_distance for one in both):
+            problem = "the principal distance may not change at all, which no camera keeps"
+            raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
+        return self
+
 
 class OrbitAdjustSpec(TitledSpec):
     """A block of scenes, adjusted at once.

@@ -15,6 +15,7 @@ from analysis.block.block_adjustment import BlockAdjustment, adjust_block, kept_
 from analysis.block.law_tests import LawTest, law_tests
 from analysis.block.network import DatumTest, Network, Open, datum_test, network_of, open_combinations
 from analysis.block.processes import BlockError
+from analysis.measurement_error import MeasurementError
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup
@@ -149,8 +150,9 @@ def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance
         )
         advance("block", 2, 2)
         worth = _worth(kept_block(found), found, known, advance)
-    except BlockError as error:
-        raise BenchError(str(error), ("points",), "more points, or scenes that see the same ground") from error
+    except (MeasurementError, np.linalg.LinAlgError) as error:
+        key = "data" if drawn is None else "points"
+        raise BenchError(str(error), (key,), "more points, or scenes that see the same ground") from error
     where, wrong, spread = _check(found, known)
     level = level_axes(found.ground[where])
     sigma = np.sqrt(np.einsum("nij,njk,nik->ni", level, spread, level))

@@ -41,6 +41,8 @@ _BEYOND = 30
 _SPARE = 4.0
 """Places drawn for each point: those that fewer than two scenes see are left out."""
 _DAY = 86400.0
+_MOST_STEPS = 1e5
+"""Of a law with a course in time."""
 _PLACES, _IMAGES, _LASER, _TERRAIN, _CONTROL, _COURSES, _CAMERAS, _GROSS = range(8)
 """Streams of the seed."""
 
@@ -145,8 +147,10 @@ def _courses(
                 last = max(begin[m] for m in members) + spec.span
                 random = np.random.default_rng(stream(seed, number))
                 number += 1
-                if (last - first) / term.law.interval > 1e6 and term.law.kind in ("white", "walk", "slow"):
-                    problem = f"{name}: a law with a course in time cannot be shared by passes this far apart"
+                if (last - first) / term.law.interval > _MOST_STEPS and term.law.kind in ("white", "walk", "slow"):
+                    problem = (
+                        f"{name}: more than {_MOST_STEPS:.0e} values of a course; are passes too far apart to share it?"
+                    )
                     raise BenchError(problem, ("errors",), "`shared_by: pass`, or a longer interval")
                 course = drawn_course(term.law, first, last, random)
                 if term.scope == "tracker" and term.law.kind == "constant":
