@@ -383,6 +383,8 @@ NOT_RUN = {
     "python -m twin.camera camera.yaml": "a file that the lines before it make; tests/scenes/lens makes some",
     "python -m twin.compare RUN1": "run folders of the reader's own; tests/twin/test_compare.py compares some",
     "python -m twin.export": "run folders of the reader's own; tests/twin/test_run_export.py exports some",
+    "python -m twin.operate": "a record of the reader's own; tests/twin/test_operate.py and those beside it make some",
+    "python -m twin.render products/": "what the line before it makes; tests/twin/test_operate_products.py renders one",
     "python -m tests.mutation": "hours, a campaign of its own",
     "python -m tests.golden": "a test of its own runs it (tests/golden/test_golden.py)",
     "python -m tests.benchmarks": "a test of its own runs it (tests/benchmarks/test_limits.py)",

@@ -1,7 +1,7 @@
 """Circular and linear errors of ground points: from their covariances, and from errors that are known.
 
 CE90 is the radius in plan that holds nine points in ten, LE90 the height that does. Of a set of points with different
-covariances they hold for a point that is drawn from the set.
+covariances they hold for a point that is drawn from the set; `analysis.orbit.ground_errors` has those of one point.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.special import erf
 
 from analysis.orbit.calibration_parameters import vertical
 
-__all__ = ["Accuracy", "circular_error", "level_axes", "linear_error", "predicted", "realised"]
+__all__ = ["Accuracy", "circle_of_points", "interval_of_points", "level_axes", "predicted", "realised"]
 
 Array = NDArray[np.float64]
 _SHARE = 0.9
@@ -39,7 +39,7 @@ def level_axes(points: Array) -> Array:
     return np.stack([east, np.cross(up, east), up], axis=1)
 
 
-def circular_error(covariance: Array, share: float = _SHARE) -> float:
+def circle_of_points(covariance: Array, share: float = _SHARE) -> float:
     """Radius, metres, of the share of points with covariances (m, 2, 2) in plan, m^2.
 
     The share within R of a normal with variances a and b is the mean over directions of 1 - exp(-R^2 q / 2), weighed by
@@ -56,7 +56,7 @@ def circular_error(covariance: Array, share: float = _SHARE) -> float:
     return float(brentq(missing, 0.0, 10.0 * float(np.sqrt(values.max())), xtol=1e-9))
 
 
-def linear_error(variance: Array, share: float = _SHARE) -> float:
+def interval_of_points(variance: Array, share: float = _SHARE) -> float:
     """Distance, metres, that holds the share of points with variances (m,), m^2."""
     sigma = np.sqrt(np.maximum(variance, 1e-300))
 
@@ -70,7 +70,7 @@ def predicted(points: Array, covariance: Array) -> Accuracy:
     """By covariances (m, 3, 3), ITRS, of points (m, 3)."""
     axes = level_axes(points)
     level = axes @ covariance @ np.swapaxes(axes, 1, 2)
-    return Accuracy(circular_error(level[:, :2, :2]), linear_error(level[:, 2, 2]), len(points))
+    return Accuracy(circle_of_points(level[:, :2, :2]), interval_of_points(level[:, 2, 2]), len(points))
 
 
 def realised(points: Array, error: Array) -> Accuracy:

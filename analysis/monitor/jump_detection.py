@@ -44,6 +44,7 @@ __all__ = [
     "Steps",
     "candidates",
     "knots",
+    "larger",
     "likeliest",
     "sized",
     "steps",
@@ -61,6 +62,8 @@ _UNLIKELY = 1e-4
 """Likelihood over that of the likeliest time, below which the step did not come at a time."""
 _AHEAD = 100.0
 """Lengths of the series after its end for which a forecast knows that jumps go on."""
+_AGAIN, _TWO_VALUED = 1.0, 1.5
+"""Times that, for a smoother, what spots leave unknown of a told jump counts once more, and what it did counts."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
 """By how much the variance of a jump is tried to be larger than stated."""
 
@@ -73,11 +76,13 @@ class Candidate:
         body: whose they are.
         motions: their numbers among the disturbances.
         spots: (D, r) px, for independent amounts of unit variance that make the stated motions.
+        root: (r, r) the motions by these amounts.
     """
 
     body: str
     motions: tuple[int, ...]
     spots: Array
+    root: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +115,10 @@ class Jump:
         chance: of as large a ratio anywhere in the series if nothing jumps, at most.
         rivals: other bodies -> their best log ratio at the same time, best first.
         times: standard deviations of the jump over those stated, which the smoother takes it to have.
+        parts: (motions, variance) of each body that may have jumped, over that stated and times the chance that it was
+            this body; empty for the motions above alone.
+        change: (D + P) of the spots, px, and of the parameters by the jump, whichever body it was; empty where that is
+            not worked out. spread: covariance of its error; width: D.
     """
 
     body: str
@@ -125,6 +134,10 @@ class Jump:
     chance: float
     rivals: Mapping[str, float]
     times: float
+    parts: tuple[tuple[tuple[int, ...], float], ...] = ()
+    change: tuple[float, ...] = ()
+    spread: tuple[tuple[float, ...], ...] = ()
+    width: int = 0
 
     @cached_property
     def law(self) -> TimeLaw:
@@ -150,20 +163,30 @@ class Step:
     """Motions that step once, by amounts that nobody knows: at an event, or a jump that was told.
 
     Attributes:
-        motions: numbers of the disturbances.
+        parts: (motions, variance over that stated) of what steps, independent of each other.
         chances: (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a
             known moment, seconds.
-        times: standard deviations of the step over those that are stated.
+        moment: (D + P, D + P) mean square of what it does to spots and parameters; None for that of independent parts.
     """
 
-    motions: tuple[int, ...]
+    parts: tuple[tuple[tuple[int, ...], float], ...]
     chances: tuple[tuple[float, float], ...]
-    times: float = 1.0
+    moment: Array | None = None
 
     @classmethod
     def of(cls, jump: Jump) -> Step:
-        """Of a jump."""
-        return cls(jump.motions, jump.chances, jump.times)
+        """Of a jump that was told, for a smoother: its mean square as it was found, one body having made it. What the
+        readings said of it they will say once more, so that what they left unknown of what spots see counts twice; what
+        spots do not see stays as it is. Between the readings around it the state is one of two, the jump away from each
+        other, and no normal: half of its square more.
+        """
+        moment = None
+        if jump.change:
+            change = np.array(jump.change)
+            spread, spots = np.array(jump.spread), slice(jump.width)
+            seen = spread[:, spots] @ np.linalg.pinv(spread[spots, spots], hermitian=True) @ spread[spots]
+            moment = _TWO_VALUED * np.outer(change, change) + spread + _AGAIN * seen
+        return cls(jump.parts or ((jump.motions, jump.times**2),), jump.chances, moment)
 
     def come(self, time: float) -> float:
         """Chance that it has come by a time, seconds."""
@@ -215,7 +238,7 @@ def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
     for own in groups:
         values, vectors = np.linalg.eigh(stated.correlation[np.ix_(own, own)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        out.append(Candidate(stated.bodies[own[0]], own, stated.spots[:, own] @ root))
+        out.append(Candidate(stated.bodies[own[0]], own, stated.spots[:, own] @ root, root))
     return tuple(out)
 
 
@@ -283,7 +306,7 @@ def likeliest(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturba
         log_ratio=0.5 * float(squares[which, k]),
         chance=float(np.exp(min(0.0, logs[which, k] + np.log(logs.size)))),
         rivals=dict(sorted(rivals.items(), key=lambda item: -item[1])),
-        times=_larger(best.spots.T @ information[k] @ best.spots, score[k] @ best.spots),
+        times=larger(best.spots.T @ information[k] @ best.spots, score[k] @ best.spots),
     )
 
 
@@ -318,8 +341,13 @@ def knots(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float
     return tuple(sorted(out.items()))
 
 
-def _larger(information: Array, score: Array) -> float:
-    """Standard deviation over that stated that makes a jump most likely, not less than the jump itself, nor than 1."""
+def larger(information: Array, score: Array) -> float:
+    """Standard deviation over that stated that makes a jump most likely, not less than the jump itself, nor than 1.
+
+    Args:
+        information: (r, r) of its amounts.
+        score: (r,) of them.
+    """
     values, vectors = np.linalg.eigh(information)
     values, along = np.maximum(values, 0.0), vectors.T @ score
     added = _INFLATIONS[:, None] * values

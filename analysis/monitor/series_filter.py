@@ -10,9 +10,12 @@ Automat. Contr. 21, 1976, 108). With the response X of its own estimate to a ste
 are what `jump_detection.likeliest` needs, without going through a reading twice. The chance of a false alarm counts
 every look of the whole life: readings, places of the step and candidates (Boole's inequality, a bound). A jump that is
 told changes the estimate as if it had been known all along, (G - X) times its amounts, G what steps do to the states,
-as a mixture over the readings between which it can have come; so sigma is wide where that is not known.
+as a mixture over the readings between which it can have come; so sigma is wide where that is not known. All motions of
+the body that may jump are then free to have done so: what the readings did not tell yet of the others cannot be found
+later, since the places of the jump are given up.
 
-Jumps too small to be told are taken for a walk of their mean square, as in `jump_detection.with_unfound`.
+Jumps too small to be told are taken for a walk of their mean square, as in `jump_detection.with_unfound`, and what is
+known now and of the future counts those that the last readings hint at by their chances (`untold_jumps`).
 """
 
 from __future__ import annotations
@@ -33,12 +36,12 @@ from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.jump_detection import Amounts, Candidate, Jump, Step, Steps, candidates, knots, likeliest
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import HeatInputs, StateSpace
+from analysis.monitor.told_jumps import Bodies, mixed
+from analysis.monitor.untold_jumps import Hint, Jumper, blended, jumpers
 
 __all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Track", "Whitened", "of_shifts", "series_of"]
 
 Array = NDArray[np.float64]
-_UNLIKELY = 1e-4
-"""Of the weight of the likeliest time of a jump, below which it did not come at a time."""
 _NEARLY = 1e-11
 """Of the sum of its eigenvalues, by which information is made regular."""
 _SIZES = np.linspace(0.0, 8.0, 201)
@@ -225,9 +228,16 @@ class SeriesFilter:
         """(n, n) covariance of the states by each step."""
         out = []
         for one in self.steps:
-            own = list(one.motions)
-            level = self.space.level_of(own)
-            out.append(one.times**2 * level @ self.stated.correlation[np.ix_(own, own)] @ level.T)
+            if one.moment is not None:
+                does = self.space.level_doing
+                out.append(does @ one.moment @ does.T)
+                continue
+            together = np.zeros((self.space.size, self.space.size))
+            for motions, variance in one.parts:
+                own = list(motions)
+                level = self.space.level_of(own)
+                together += variance * level @ self.stated.correlation[np.ix_(own, own)] @ level.T
+            out.append(together)
         return out
 
     @cached_property
@@ -451,38 +461,60 @@ class SeriesFilter:
 
     def _jumped(self, belief: Belief, jump: Jump) -> tuple[Belief, Jump]:
         """What is known once a jump is told, and the jump with its sizes."""
-        own = list(jump.motions)
-        values, vectors = np.linalg.eigh(self.stated.correlation[np.ix_(own, own)])
-        root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        outputs, level = self._stacked.spots[:, own] @ root, self.space.level_of(own) @ root
-        looked = Amounts.of(belief.looking.score, belief.looking.information, outputs, jump.times)
-        weight = np.exp(looked.log_weight - looked.log_weight.max()) * (belief.until - belief.after)
-        weight = np.where(weight > _UNLIKELY * weight.max(), weight, 0.0)
-        weight /= weight.sum()
-        state = _compensated(
-            belief.state,
-            Amounts.of(belief.state.score, belief.state.information, outputs, jump.times),
-            weight,
-            level,
-            outputs,
-        )
-        search = None
-        if belief.search is not None:
-            search = _compensated(belief.search, looked, weight, level, outputs)
-        amounts = Amounts.of(belief.state.score, belief.state.information, outputs, jump.times)
-        mean = weight @ amounts.mean
-        away = amounts.mean - mean
-        spread = np.einsum("k,kij->ij", weight, amounts.covariance + away[:, :, None] * away[:, None, :])
-        sigma = self.stated.sigmas[own]
-        sizes, sigmas = sigma * (root @ mean), sigma * np.sqrt(np.diag(root @ spread @ root.T))
+        looking, own = ((track.score, track.information) for track in (belief.looking, belief.state))
+        gap = belief.until - belief.after
+        bodies = Bodies.of(self._may, jump, belief.until, gap, looking, own)
+        levels = [self.space.level_of(one.motions) @ one.root for one in bodies.own]
+        state, search = belief.state, belief.search
+        mean, covariance = bodies.known(state.mean, state.covariance, state.response, levels, bodies.amounts)
+        state = replace(state.alone(), mean=mean, covariance=covariance)
+        if search is not None:
+            mean, covariance = bodies.known(search.mean, search.covariance, search.response, levels, bodies.judged)
+            search = replace(search.alone(), mean=mean, covariance=covariance)
+        # sizes are those of the motions that explain it best, had they jumped alone
+        alone, weight = next(one for one in self._may if one.motions == jump.motions), bodies.weight.sum(axis=0)
+        named = Amounts.of(*own, alone.spots, jump.times)
+        size, size_spread = mixed([named], [self.stated.sigmas[list(alone.motions), None] * alone.root], weight[None])
+        does = [self.space.outputs_of(one.motions) @ one.root for one in bodies.own]
+        change, spread = mixed(bodies.amounts, does, bodies.weight)
+        empty = np.zeros(0)
         told = replace(
             jump,
-            sizes=tuple(sizes.tolist()),
-            sigmas=tuple(sigmas.tolist()),
+            sizes=tuple(size.tolist()),
+            sigmas=tuple(np.sqrt(np.diag(size_spread)).tolist()),
             chances=knots(belief.after, belief.until, weight),
+            parts=bodies.parts,
+            change=tuple(change.tolist()),
+            spread=tuple(tuple(row) for row in spread.tolist()),
+            width=self.space.width,
         )
-        empty = np.zeros(0)
         return replace(belief, state=state, search=search, after=empty, until=empty), told
+
+    @cached_property
+    def jumpers(self) -> tuple[Jumper, ...]:
+        """Bodies that jump at a stated rate."""
+        return jumpers(self.stated, self._may) if self.unfound else ()
+
+    def blended(self, belief: Belief) -> Belief:
+        """What is known where jumps that are not told count by their chances, of the state now and of forecasts; later
+        readings go on from the belief that is given.
+
+        Args:
+            belief: so far.
+        """
+        if not self.jumpers or not len(belief.until):
+            return belief
+        track, looking, hints, moved = belief.state, belief.looking, [], []
+        for one in self.jumpers:
+            expected = (belief.until - belief.after) / one.every_s
+            looked, own = ((t.score, t.information) for t in (looking, track))
+            hints.append(Hint.of(looked, own, one.spots, expected))
+            moved.append(self.space.level_of(one.motions) @ one.root - track.response @ one.spots)
+        mean, covariance = blended(track.mean, track.covariance, hints, moved)
+        none = belief.until[:0]
+        return replace(
+            belief, after=none, until=none, state=replace(track.alone(), mean=mean, covariance=covariance), search=None
+        )
 
     def changes(self, belief: Belief, times: ArrayLike) -> SeriesChanges:
         """Forecast from what is known: parameters at times that are not before the newest reading.
@@ -491,14 +523,15 @@ class SeriesFilter:
             belief: so far.
             times: (T,) seconds.
         """
-        found = [self.parameters(belief, time) for time in np.asarray(times, np.float64).tolist()]
+        now = self.blended(belief)
+        found = [self.parameters(now, time) for time in np.asarray(times, np.float64).tolist()]
         return series_of(found, self.stated.parameters.shape[0])
 
     def parameters(self, belief: Belief, time: float) -> tuple[Array, Array]:
         """Parameters (P,) and their covariance (P, P).
 
         Args:
-            belief: so far.
+            belief: so far, as `blended` gives it where jumps count that are not told.
             time: not before its own, seconds.
         """
         state = self._moved(belief.state, belief.time, time, belief.left)
@@ -517,7 +550,9 @@ class SeriesFilter:
         own = rows[width:]
         return values[width:], own @ covariance @ own.T + left[width:, width:]
 
-    def motions_of(self, mean: Array, covariance: Array, time: float, since: float) -> tuple[Array, Array]:
+    def motions_of(
+        self, mean: Array, covariance: Array, time: float, since: float, acting: bool = False
+    ) -> tuple[Array, Array]:
         """Motions (M,) and their covariance (M, M), in the standard deviations that are stated.
 
         Args:
@@ -525,26 +560,18 @@ class SeriesFilter:
             covariance: (n, n) of them.
             time: of them, seconds.
             since: from when on jumps have come that were not told, seconds.
+            acting: temperatures of bodies with sensors as they act on light: times the factor by which heat does more
+                than computed, so that what is computed of the motions is what is estimated.
         """
-        more = [(one.motions, one.times**2 * one.come(time)) for one in self.steps]
+        more = [(motions, variance * one.come(time)) for one in self.steps for motions, variance in one.parts]
         for motion in self.walking.tolist():
             every = float(self.stated.laws[motion].every_s or math.inf)
             more.append(((motion,), max(time - since, 0.0) / every))
         rows, left = self.space.motion_gain(time, more)
-        return rows @ mean, rows @ covariance @ rows.T + left
-
-
-def _compensated(track: Track, amounts: Amounts, weight: Array, level: Array, outputs: Array) -> Track:
-    """The filter as if it had known of the jump, averaged over its places; nothing is looked for beside it."""
-    moved = level - track.response @ outputs
-    each = np.einsum("knr,kr->kn", moved, amounts.mean)
-    mean = weight @ each
-    spread = np.einsum("k,knr,krs,kms->nm", weight, moved, amounts.covariance, moved, optimize=True)
-    away = (each - mean) * np.sqrt(weight)[:, None]
-    covariance = track.covariance + spread + away.T @ away
-    q = track.score.shape[1]
-    none = np.zeros((0, len(mean), q)), np.zeros((0, q)), np.zeros((0, q, q))
-    return Track(track.mean + mean, 0.5 * (covariance + covariance.T), *none)
+        if not acting:
+            return rows @ mean, rows @ covariance @ rows.T + left
+        values, rows, beside = self.space.acting(rows, mean, covariance)
+        return values, rows @ covariance @ rows.T + left + beside
 
 
 def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:

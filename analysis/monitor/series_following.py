@@ -3,6 +3,10 @@
 The smoother goes backwards over the same readings (Bryson, Frazier; de Jong, J. Am. Stat. Assoc. 84, 1989, 1085): it
 needs no inverse of a covariance, and of the filter only what is of the size of a reading. It is worked in pieces, the
 filter being run a second time in each, so that memory does not grow with states times readings.
+
+On its way it has score and information of a step before every reading, by all readings (de Jong, Penzer, J. Am. Stat.
+Assoc. 93, 1998, 796): a first way back finds what jumps the readings hint at that were not told (`untold_jumps`), and
+the second takes these for steps of their chances and sizes.
 """
 
 from __future__ import annotations
@@ -17,8 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Whitened, series_of
 from analysis.monitor.series_smoother import SeriesChanges
+from analysis.monitor.untold_jumps import added
 
-__all__ = ["Followed", "follow", "smoothed"]
+__all__ = ["Followed", "follow", "hinted", "smoothed"]
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
@@ -69,24 +74,62 @@ def follow(
     left: list[Array] = []
     ahead = 0
     for k, one in enumerate(observed):
+        if ahead < len(order) and times[order[ahead]] < one.time:
+            now = how.blended(belief)
         while ahead < len(order) and times[order[ahead]] < one.time:
-            filtered[order[ahead]] = how.parameters(belief, times[order[ahead]])
+            filtered[order[ahead]] = how.parameters(now, times[order[ahead]])
             ahead += 1
         left.append(belief.left)
         belief, found = how.update(belief, one)
         innovations.append(found)
         advance(k + 1)
+    now = how.blended(belief)
     for k in order[ahead:]:
-        filtered[k] = how.parameters(belief, times[k])
+        filtered[k] = how.parameters(now, times[k])
     jumps = tuple(one.jump for one in innovations if one.jump is not None)
     knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
-    late = smoothed(knowing, knowing.start(earliest), observed, times, left, knowing.parameters_of)
+    begin = knowing.start(earliest)
+    left = hinted(how, knowing, begin, observed, left)
+    late = smoothed(knowing, begin, observed, times, left, knowing.parameters_of)
     width = how.stated.parameters.shape[0]
     return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief)
 
 
 def _of_nothing(count: int) -> list[tuple[Array, Array]]:
     return [(np.empty(0), np.empty(0))] * count
+
+
+def hinted(
+    how: SeriesFilter, knowing: SeriesFilter, start: Belief, observed: Sequence[Observed], left: Sequence[Array]
+) -> list[Array]:
+    """N times (m,) what share of the mean square of jumps could not be told, with jumps that all readings hint at.
+
+    Args:
+        how: the filter that looked for jumps.
+        knowing: the same, which looks for none but knows of those that were told.
+        start: as for `smoothed`.
+        observed: N readings in the order of time.
+        left: as for `smoothed`.
+    """
+    if not how.jumpers or not observed:
+        return list(left)
+    levels = [how.space.level_of(one.motions) @ one.root for one in how.jumpers]
+    score = [np.empty((len(observed), level.shape[1])) for level in levels]
+    information = [np.empty((len(observed), level.shape[1], level.shape[1])) for level in levels]
+
+    def note(number: int, carried: Array, known: Array) -> None:
+        for level, own_score, own_information in zip(levels, score, information, strict=True):
+            own_score[number], own_information[number] = carried @ level, level.T @ known @ level
+
+    plain = replace(knowing, unfound=False)
+    none = np.zeros(0)
+    smoothed(plain, replace(start, left=none), observed, none, [none] * len(observed), knowing.parameters_of, note)
+    gap = np.diff([one.time for one in observed], prepend=observed[0].time)
+    place = {k: i for i, k in enumerate(how.walking.tolist())}
+    out = np.array(left)
+    for one, more in zip(how.jumpers, added(score, information, gap, how.jumpers, how.window), strict=True):
+        out[:, [place[k] for k in one.motions]] += more
+    return list(out)
 
 
 def smoothed(
@@ -96,6 +139,7 @@ def smoothed(
     wanted: ArrayLike,
     left: Sequence[Array],
     each: Callable[[Array, Array, float], T],
+    note: Callable[[int, Array, Array], None] = lambda number, score, information: None,
 ) -> list[T]:
     """What all readings say of times past: forward to where pieces begin, then backward piece by piece.
 
@@ -107,6 +151,8 @@ def smoothed(
         left: N times (m,) what share of the mean square of jumps could not be told, as the filter had it before each
             reading: the process is then the filter's, and a part of a series gives what the whole gives.
         each: (n,) mean and (n, n) covariance of the states at a wanted time, and the time -> what is made of them.
+        note: called with the number of each reading, and score (n,) and information (n, n) of a change of the states
+            just before it by the readings from it on.
     """
     times = np.asarray(wanted, np.float64)
     order = np.argsort(times, kind="stable")
@@ -136,6 +182,7 @@ def smoothed(
             change = whitened.rows.T @ half
             known = known - (change + change.T)
             carried = carried + whitened.rows.T @ (whitened.white - whitened.gain @ carried)
+            note(number, carried, known)
             for k in order[behind == number]:
                 there = how.at(before, times[k])
                 back = moved(carried[:, None], times[k], now, back=True)[:, 0]

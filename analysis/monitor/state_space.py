@@ -203,6 +203,16 @@ class StateSpace:
         out[block.at] = self._coordinates(block, motions)
         return out
 
+    @cached_property
+    def level_doing(self) -> Array:
+        """(n, D + P) states of the level that do what is asked for, in the sense of least squares."""
+        block = self._blocks[0]
+        scale = np.abs(block.outputs).max(axis=1, initial=0.0)
+        scale = np.where(scale > 0.0, scale, 1.0)
+        out = np.zeros((self.size, len(scale)))
+        out[block.at] = np.linalg.pinv(block.outputs / scale[:, None]) / scale
+        return out
+
     def _coordinates(self, block: _Block, motions: Sequence[int]) -> Array:
         """(r, m) states of a block that do what motions do."""
         scale = np.abs(block.outputs).max(axis=1, initial=0.0)
@@ -310,7 +320,17 @@ class StateSpace:
             covariance: (n, n) of them.
             time: seconds.
         """
-        rows = self._rows(time)
+        return self.acting(self._rows(time), mean, covariance)
+
+    def acting(self, rows: Array, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
+        """What rows on the states make of them where heat does more or less to light than computed: values (R,), rows
+        (R, n) and covariance of what these leave out, as `outputs`.
+
+        Args:
+            rows: (R, n), of temperatures as if heat did what was computed.
+            mean: (n,) of the states.
+            covariance: (n, n) of them.
+        """
         left = np.zeros((len(rows), len(rows)))
         if self.heat is None:
             return rows @ mean, rows, left

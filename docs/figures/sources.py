@@ -232,9 +232,13 @@ def _modules() -> dict[str, tuple[Callable[[], Mapping[str, tuple[float, int, st
     """Beginning of the names of figures that no command writes -> what measures them (value, decimals, unit), and the
     seed of its random numbers. The modules are imported here, since they need what ``setup.sh --test`` installs.
     """
-    from docs.figures import ccd_growth, libraries
+    from docs.figures import ccd_growth, libraries, simulated_years
 
-    return {"ccd": (ccd_growth.measured, ccd_growth.SEED), "libraries": (libraries.measured, libraries.SEED)}
+    return {
+        "ccd": (ccd_growth.measured, ccd_growth.SEED),
+        "libraries": (libraries.measured, libraries.SEED),
+        "operation": (simulated_years.measured, simulated_years.SEED),
+    }
 
 
 def measure(known: Mapping[str, Figure], only: str = "") -> dict[str, Figure]:

@@ -15,10 +15,10 @@ from scenes.specs.operation import read_operation
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.record_bench import A_DAY, START, given, made
-from twin.operate.database import FILE
-from twin.operate.entries import Entry
-from twin.operate.history import History
-from twin.operate.operation import Operation
+from twin.operate.estimate.operation import Operation
+from twin.operate.record.database import FILE
+from twin.operate.record.entries import Entry
+from twin.operate.record.history import History
 
 MS = 50.0
 GROWS = 1.5

@@ -13,9 +13,10 @@ from typing import Any
 
 from websockets.sync import client as client_of
 
-from twin.live.guard import COOKIE, Guard
 from twin.live.messages import Opened, packed
-from twin.live.server import LiveServer, listen
+from twin.live.server import LiveServer
+from twin.serving.guard import COOKIE, Guard
+from twin.serving.server import listen
 
 SECRET = "a-secret-of-enough-letters"
 
@@ -56,13 +57,13 @@ def serving(computer: StandIn, stay: bool = True, host: str = "127.0.0.1", port:
     thread = threading.Thread(target=server.run, args=(listening,), daemon=True)
     thread.start()
     for _ in range(200):
-        if server._uvicorn is not None and server._uvicorn.started:
+        if server.started:
             break
         time.sleep(0.02)
     try:
         yield port, server
     finally:
-        server._stop()
+        server.stop()
         thread.join(5)
         assert not thread.is_alive()
 

@@ -9,15 +9,15 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 from scenes.specs.operation import OperationSetup, read_operation
 from scenes.specs.resolved import resolve_with
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.entries import MICRO, Entry, Given, digest_of_data, micros
-from twin.operate.history import History, initialised
-from twin.operate.operation import Operation
+from twin.operate.estimate.operation import Operation
+from twin.operate.record.entries import MICRO, Entry, Given, digest_of_data, micros
+from twin.operate.record.history import History, initialised
 
 DAY = 86_400.0
 START = micros("2026-03-01T00:00:00Z")
 NOISE = 0.002
 """Px of a spot's coordinate."""
-PLAN = """instrument: monitor_pair
+PLAN = """instrument: {instrument}
 disturbances: {disturbances}
 events: {{safe_mode: [settling]}}
 mission: 8766 h
@@ -57,10 +57,10 @@ class Life:
     changes: np.ndarray
 
 
-def plan_of(folder: Path) -> OperationSetup:
+def plan_of(folder: Path, instrument: str = "monitor_pair") -> OperationSetup:
     """The plan above, as a user's file."""
     (folder / "own.yaml").write_text(DISTURBANCES)
-    (folder / "plan.yaml").write_text(PLAN.format(disturbances="own.yaml"))
+    (folder / "plan.yaml").write_text(PLAN.format(instrument=instrument, disturbances="own.yaml"))
     return read_operation(folder / "plan.yaml")
 
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from scenes.specs.resolved import ResolvedJob, resolve_with
-from twin.operate.entries import Entry, Given, digest_of_data, micros
-from twin.operate.history import History, initialised
+from twin.operate.record.entries import Entry, Given, digest_of_data, micros
+from twin.operate.record.history import History, initialised
 
 ROOT = Path(__file__).resolve().parents[2]
 START = micros("2026-01-01T00:00:00Z")

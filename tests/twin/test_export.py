@@ -298,3 +298,16 @@ def test_a_file_is_exported_without_images() -> None:
     export = run_export(small, load_backend("llvm"), (0.0, 500.0))
     assert set(export_files(export)) == {"models/nadir.json", "models/nadir_RPC.TXT"}
     assert export.lines["nadir"].window.frame is None
+
+
+@pytest.mark.second
+def test_the_run_folder_of_a_test_of_angles_is_its_file(tmp_path: Path) -> None:
+    """Camera, orbit and moment of the run; so are the models."""
+    file = tmp_path / "angle.yaml"
+    file.write_text((SCENES / ORBIT / "angle.yaml").read_text("utf-8").replace("passes: 200", "passes: 2"), "utf-8")
+    assert run("angle", file, "--out", tmp_path / "run", "--seed", 4, "--quiet").exit_code == 0
+    sources = [read_source(tmp_path / "run"), read_source(file, 4)]
+    assert sources[0].setup.camera == sources[1].setup.camera
+    assert [(one.seed, one.folder, dict(one.windows)) for one in sources] == [(4, None, {})] * 2
+    made = [export_files(run_export(one, load_backend("llvm"), (0.0, 500.0))) for one in sources]
+    assert made[0] == made[1]

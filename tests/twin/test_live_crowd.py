@@ -21,8 +21,8 @@ from websockets.frames import Frame, Opcode
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
 from tests.twin.live_crowd import SOCKET, WRONG, crowded
 from tests.twin.live_page import CHROMIUM, FLAGS
-from twin.live import guard
-from twin.live.guard import COOKIE, MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS, Guard, names_of_this_machine
+from twin.serving import guard
+from twin.serving.guard import COOKIE, MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS, Guard, names_of_this_machine
 
 PROMPT = 0.2
 """Seconds in which a user's page is answered."""

@@ -19,11 +19,13 @@ pytest.importorskip("websockets.sync.client", reason="the extra `live` is not in
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
+from twin.live.__main__ import TOKEN
 from twin.live.clients import BAD_MESSAGES, BURST, MOST_CLIENTS, Client, Desk, Goodbye
 from twin.live.computer import CannotStart, ComputerLost
-from twin.live.guard import TOKEN, BadToken, Guard, new_token
 from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
-from twin.live.server import PARTS, LiveServer, listen
+from twin.live.server import PARTS, LiveServer
+from twin.serving.guard import BadToken, Guard, new_token
+from twin.serving.server import listen
 
 
 @pytest.fixture(scope="module")
@@ -146,14 +148,14 @@ def test_every_part_of_the_page_is_there_and_loads_nothing_from_elsewhere(runnin
 
 def test_a_token_of_the_environment(monkeypatch):
     monkeypatch.delenv(TOKEN, raising=False)
-    assert new_token() != new_token()
-    assert len(new_token()) >= 32
+    assert new_token(TOKEN) != new_token(TOKEN)
+    assert len(new_token(TOKEN)) >= 32
     monkeypatch.setenv(TOKEN, SECRET)
-    assert new_token() == SECRET
+    assert new_token(TOKEN) == SECRET
     for bad in ("short", "x" * 21, "x" * 30 + ";", "x" * 30 + " ", "ü" * 30):
         monkeypatch.setenv(TOKEN, bad)
         with pytest.raises(BadToken):
-            new_token()
+            new_token(TOKEN)
 
 
 # --- what it takes ----------------------------------------------------------------------------------------------------

@@ -26,12 +26,12 @@ from tests.twin.operation_records import (
 from tests.twin.record_bench import operating
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
-from twin.operate.alarms import AGAIN, alarms_of, raise_alarms
-from twin.operate.entries import MICRO, Alarm, Entry, utc_text
+from twin.operate.estimate.alarms import AGAIN, alarms_of, raise_alarms
+from twin.operate.estimate.operation import Break, Following, FoundJump, Operation, SensorState
+from twin.operate.estimate.plans import keep_plan, kept_plan
 from twin.operate.followed import known_of
-from twin.operate.history import History
-from twin.operate.operation import Break, Following, FoundJump, Operation, SensorState
-from twin.operate.plans import keep_plan, kept_plan
+from twin.operate.record.entries import MICRO, Alarm, Entry, utc_text
+from twin.operate.record.history import History
 
 DAY = 86_400 * MICRO
 EVERY, DAYS = 4, 120

@@ -25,10 +25,10 @@ from tests.twin.record_bench import (
 )
 from tests.twin.test_durability import mounted
 from twin.operate.__main__ import app
-from twin.operate.database import FILE, RecordFailed
-from twin.operate.entries import Alarm
-from twin.operate.history import History
-from twin.operate.record_tables import tables
+from twin.operate.record.database import FILE, RecordFailed
+from twin.operate.record.entries import Alarm
+from twin.operate.record.history import History
+from twin.operate.record.record_tables import tables
 from twin.run.data_files import TABLE_FORMATS
 
 FILES, ROWS = 12, 400
@@ -177,7 +177,7 @@ def test_the_command_tells_of_a_database_that_fails(tmp_path: Path, monkeypatch:
     made(tmp_path / "record").close()
     base = sqlite3.connect(tmp_path / "record" / FILE)
     base.execute("BEGIN EXCLUSIVE")
-    monkeypatch.setattr("twin.operate.database.WAIT", 0.1)
+    monkeypatch.setattr("twin.operate.record.database.WAIT", 0.1)
     result = invoke(app, "status", tmp_path / "record")
     base.close()
     assert (result.exit_code, "database is locked" in result.stderr) == (1, True)

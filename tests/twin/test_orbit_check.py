@@ -14,6 +14,7 @@ from scenes.specs.measured.orbit_data import OrbitCheckSpec
 from scenes.specs.measured.orbit_data_setup import CheckSetup
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.orbit.setup import load_three_line_camera
+from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke
@@ -282,3 +283,26 @@ def test_files_that_are_wrong_are_refused_by_file_and_line(files, tmp_path: Path
     assert told in result.stderr
     assert name in result.stderr
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.second
+def test_places_in_images_of_a_gcp_file(files: tuple[Path, dict[str, Any]]) -> None:
+    """The .gcp of the Ames Stereo Pipeline holds ground points and image points; the answer is that of the tables."""
+    folder, _ = files
+    ground = [row.split(",") for row in (folder / "ground.csv").read_text().splitlines()[1:]]
+    images: dict[str, list[str]] = {}
+    for row in (folder / "image_points.csv").read_text().splitlines()[1:]:
+        point, camera, line, pixel, line_sigma, pixel_sigma = row.split(",")
+        images.setdefault(point, []).append(f"{camera}.tif {pixel} {line} {pixel_sigma} {line_sigma}")
+    rows = [f"{name} {a} {b} {h} 1 1 1 {' '.join(images[name])}" for name, a, b, h in ground]
+    (folder / "points.gcp").write_text("\n".join(rows) + "\n")
+    table = checked(files)
+    both = ((("ground",), {"file": "points.gcp", "crs": "EPSG:4979", "sigma_axes": "enu"}),)
+    found = checked(files, *both, (("image_points", "file"), "points.gcp"))
+    assert found.verdict == table.verdict == "stands"
+    assert found.best.fit.chi_square == pytest.approx(table.best.fit.chi_square, rel=1e-9)
+    (folder / "other.gcp").write_text("\n".join(rows).replace("nadir.tif", "down.tif") + "\n")
+    with pytest.raises(InputError, match=r"none of the camera's lines.*'down.tif'"):
+        checked(files, (("ground", "file"), "other.gcp"), (("image_points", "file"), "other.gcp"))
+    with pytest.raises(InputError, match=r"another \.gcp file"):
+        checked(files, *both, (("image_points", "file"), "other.gcp"))

@@ -16,6 +16,8 @@ from rich.console import Console
 from twin.run.cli import BackendName, InputErrorText, Quiet, check_backend, explained
 
 PORT = 8790
+TOKEN = "TWIN_LIVE_TOKEN"
+"""Environment variable with a token that stays the same when the server is started again."""
 EXTRA = (
     "the live twin needs starlette, uvicorn and websockets, which are not installed; install them with "
     "`bash setup.sh --live`"
@@ -103,14 +105,15 @@ def _serve(
         InputErrorText: the extra is missing, the address is taken, or the instrument cannot be built.
     """
     try:
-        from twin.live.server import LiveServer, listen
+        from twin.live.server import LiveServer
+        from twin.serving.guard import BadToken, Guard, new_token
+        from twin.serving.server import addresses, listen
     except ImportError as error:
         raise InputErrorText(f"{EXTRA} ({error.name})") from None
     from twin.live.computer import CannotStart, Computer
-    from twin.live.guard import EVERYWHERE, BadToken, Guard, names_of_this_machine, new_token
 
     try:
-        token = new_token()
+        token = new_token(TOKEN)
         listening = listen(host, port)
     except BadToken as error:
         raise InputErrorText(str(error)) from None
@@ -128,11 +131,8 @@ def _serve(
         if console is not None:
             for line in about:
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
-            shown = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
-            console.print(f"open http://{shown}:{bound}/?token={token}", highlight=False, soft_wrap=True)
-            for name in names_of_this_machine()[:1] if host in EVERYWHERE else ():
-                text = f"from other machines: http://{name}:{bound}/?token={token}"
-                console.print(text, highlight=False, soft_wrap=True)
+            for line in addresses(host, bound, f"token={token}"):
+                console.print(line, highlight=False, soft_wrap=True)
             console.print("Ctrl-C ends it" + ("." if stay else ", and so does closing the last page."))
         LiveServer(computer, guard, stay).run(listening)
     except CannotStart as error:

@@ -20,6 +20,9 @@ from scenes.yaml.errors import InputError, Problem, nearest
 from scenes.yaml.standard_output import FAILURE, print_error
 from twin.operate.estimate_commands import alarms, estimate_of, forecast, show_estimate
 from twin.operate.followed import PlanFile
+from twin.operate.life_commands import judge, simulate
+from twin.operate.products_command import products
+from twin.operate.shown_commands import report, serve
 from twin.operate.terminal import Place, line, tell, told
 from twin.run import durable
 from twin.run.cli import (
@@ -34,8 +37,8 @@ from twin.run.cli import (
 )
 
 if TYPE_CHECKING:
-    from twin.operate.history import History
-    from twin.operate.taking import Taken
+    from twin.operate.record.history import History
+    from twin.operate.record.taking import Taken
 
 POLL = 10.0
 """Seconds between two looks at what is watched."""
@@ -88,8 +91,8 @@ def init(
     """
     from scenes.specs.operation import read_operation
     from scenes.specs.resolved import resolve_with
-    from twin.operate.history import History, initialised
-    from twin.operate.plans import keep_plan, read_plan
+    from twin.operate.estimate.plans import keep_plan, read_plan
+    from twin.operate.record.history import History, initialised
 
     with told() as errors:
         if plan is not None:  # a mistake in it is told before anything is made
@@ -148,8 +151,8 @@ def ingest(
 
     Exit codes: 0 success, 2 bad input or something was refused (all else is taken), 1 anything else.
     """
-    from twin.operate.history import History
-    from twin.operate.sources import Sources
+    from twin.operate.record.history import History
+    from twin.operate.record.sources import Sources
 
     with told() as errors, durable.exit_on_terminate(), History(record) as history:
         sources = Sources(files, _moment(moment), _is_stated(instrument, history), watch)
@@ -205,7 +208,7 @@ def _new_alarms(errors: Console, history: History, quiet: bool) -> list[str]:
 
 
 def _moment(text: str | None) -> int | None:
-    from twin.operate.entries import micros, one_line
+    from twin.operate.record.entries import micros, one_line
 
     if text is None:
         return None
@@ -218,7 +221,7 @@ def _moment(text: str | None) -> int | None:
 def _is_stated(instrument: str | None, history: History) -> bool:
     """Whether run folders are said to be of the record's instrument. Raises InputErrorText: of another one."""
     from scenes.specs.resolved import resolve_with
-    from twin.operate.entries import digest_of_job
+    from twin.operate.record.entries import digest_of_job
 
     if instrument is None:
         return False
@@ -252,7 +255,7 @@ def status(record: Place, plan: PlanFile = None, as_json: AsJson = False, quiet:
 
     Exit codes: 0 success, whether alarms are open or not, 2 bad input, 1 anything else.
     """
-    from twin.operate.history import History
+    from twin.operate.record.history import History
 
     with told() as errors, History(record) as history:
         found = estimate_of(errors, history, plan, quiet or as_json)
@@ -304,8 +307,8 @@ def export(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    from twin.operate.history import History
-    from twin.operate.record_tables import tables as all_tables
+    from twin.operate.record.history import History
+    from twin.operate.record.record_tables import tables as all_tables
     from twin.run.data_files import TABLE_FORMATS, MissingPackage
 
     with told() as errors, History(record) as history:
@@ -331,6 +334,12 @@ def export(
 
 app.command("forecast")(forecast)
 app.command("alarms")(alarms)
+app.command("products")(products)
+app.command("simulate")(simulate)
+app.command("judge")(judge)
+app.command("report")(report)
+app.command("serve")(serve)
+
 
 if __name__ == "__main__":
     app()

@@ -15,9 +15,9 @@ from twin.operate.terminal import Place, line, tell, told
 from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict, print_whole, result_table
 
 if TYPE_CHECKING:
-    from twin.operate.entries import Alarm
-    from twin.operate.history import History
-    from twin.operate.operation import Course, Following
+    from twin.operate.estimate.operation import Course, Following
+    from twin.operate.record.entries import Alarm
+    from twin.operate.record.history import History
 
 STEPS = 4
 """Columns of a forecast after the first, now."""
@@ -42,7 +42,7 @@ def forecast(
 
     Exit codes: 0 success, 2 bad input, 1 anything else.
     """
-    from twin.operate.history import History
+    from twin.operate.record.history import History
 
     with told() as errors, History(record) as history:
         operation = operation_of(history, plan, errors, quiet)
@@ -63,7 +63,7 @@ def forecast(
 
 def _end(until: str | None, start: int, horizon: float) -> int:
     """Microseconds of the end of a forecast. Raises InputErrorText: it is not after its beginning."""
-    from twin.operate.entries import MICRO, micros, one_line, utc_text
+    from twin.operate.record.entries import MICRO, micros, one_line, utc_text
 
     if until is None:
         return start + round(horizon * MICRO)
@@ -95,8 +95,8 @@ def alarms(
 
     Exit codes: 0 success, whether alarms are open or not, 2 bad input, 1 anything else.
     """
-    from twin.operate.entries import one_line
-    from twin.operate.history import History
+    from twin.operate.record.entries import one_line
+    from twin.operate.record.history import History
 
     with told() as errors, History(record) as history:
         if acknowledge is not None:
@@ -157,8 +157,8 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
         rows: alarms of the record.
         console: the terminal.
     """
-    from twin.operate.alarms import sized
-    from twin.operate.entries import utc_text
+    from twin.operate.estimate.alarms import sized
+    from twin.operate.record.entries import utc_text
 
     scores, count = following.scores, following.readings
     print_verdict(console, f"estimate at {utc_text(following.time)} from {count} readings of the monitor")
@@ -168,6 +168,12 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
         one, two = (100.0 * part / scores.components for part in (scores.within_one, scores.within_two))
         text = f"{one:.1f} % within one sigma (68.3 % expected), {two:.1f} % within two (95.4 %)"
         line(console, f"predictions before the readings came: {text}; mean log score {scores.log_score:.2f}")
+    if following.widened > 1.0:
+        text = f"all sigmas are {following.widened:.3g} times as wide as it would make them"
+        line(console, f"warning: the last readings contradict what is stated; {text}")
+    if following.too_many_jumps:
+        text = f"{len(following.jumps)} jumps are more than is stated: something else moves, or more of it"
+        line(console, f"warning: {text}")
     for jump in following.jumps:
         between = f"between {utc_text(jump.after_us)} and {utc_text(jump.until_us)}"
         sizes = ", ".join(f"{name.removeprefix(f'{jump.body} ')} {sized(z, s, u)}" for name, u, z, s in jump.sizes)
@@ -190,7 +196,7 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
 
 def _show_course(course: Course, console: Console) -> None:
     """A row for each quantity, a column for each time."""
-    from twin.operate.alarms import name_of, sized
+    from twin.operate.estimate.alarms import name_of, sized
 
     table = result_table()
     table.add_column("change of")
@@ -205,8 +211,8 @@ def _show_course(course: Course, console: Console) -> None:
 
 def show_requirements(following: Following, console: Console) -> None:
     """A row for each requirement."""
-    from twin.operate.alarms import name_of, percent
-    from twin.operate.entries import utc_text
+    from twin.operate.estimate.alarms import name_of, percent
+    from twin.operate.record.entries import utc_text
     from twin.run.artefact import plain
 
     if not following.breaks:

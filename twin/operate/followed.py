@@ -12,9 +12,9 @@ from twin.run.cli import InputErrorText, Standing, heartbeat
 
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup
-    from twin.operate.entries import Alarm
-    from twin.operate.history import History
-    from twin.operate.operation import Following, Operation
+    from twin.operate.estimate.operation import Following, Operation
+    from twin.operate.record.entries import Alarm
+    from twin.operate.record.history import History
 
 PlanFile = Annotated[
     Path | None,
@@ -24,7 +24,7 @@ PlanFile = Annotated[
 
 def plan_of(history: History, plan: Path | None) -> OperationSetup | None:
     """The plan in a file, or that of the record; None where the record keeps none. Raises InputError."""
-    from twin.operate.plans import kept_plan, read_plan
+    from twin.operate.estimate.plans import kept_plan, read_plan
 
     return kept_plan(history) if plan is None else read_plan(plan, history)
 
@@ -54,8 +54,8 @@ def operation_of(history: History, plan: Path | None, errors: Console, quiet: bo
 def followed(history: History, setup: OperationSetup, errors: Console, quiet: bool = False) -> Operation:
     """The same of a plan that was read."""
     from scenes.yaml.errors import Problem
-    from twin.operate.entries import one_line
-    from twin.operate.operation import Operation
+    from twin.operate.estimate.operation import Operation
+    from twin.operate.record.entries import one_line
 
     standing = Standing("follow the record")
     try:
@@ -69,7 +69,7 @@ def followed(history: History, setup: OperationSetup, errors: Console, quiet: bo
 
 def known_of(operation: Operation) -> tuple[Following, list[Alarm]]:
     """What is known after all readings, and the alarms that are new, which are then in the record."""
-    from twin.operate.alarms import raise_alarms
+    from twin.operate.estimate.alarms import raise_alarms
 
     following = operation.follow()
     return following, raise_alarms(operation.history, operation.plan.operation, following)

@@ -23,8 +23,8 @@ Place = Annotated[
 @contextmanager
 def told() -> Iterator[Console]:
     """Errors as one sentence and an exit code."""
-    from twin.operate.database import RecordFailed
-    from twin.operate.schema import NotARecord
+    from twin.operate.record.database import RecordFailed
+    from twin.operate.record.schema import NotARecord
 
     errors = Console(stderr=True)
     with explained(errors):

@@ -8,6 +8,7 @@ if __name__ == "__main__":
     end_quietly()
 
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,16 +17,27 @@ import typer
 from scenes.specs.orbit.sensors import SENSORS
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import Problem
-from scenes.yaml.units import DISTANCE, parse_quantity
+from scenes.yaml.units import ANGLE, DISTANCE, parse_quantity
 from twin.run.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed
 from twin.run.command import Result, add_tests, finished, run_command, run_test
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.measured.adjust_setup import AnyAdjust
-    from twin.orbit.export.export_run import ExportSource
+    from twin.orbit.export.export_run import ExportSource, SceneSource
+    from twin.orbit.export.polynomial_export import PolynomialSource
+    from twin.orbit.export.quality import Wishes
+
+    Exportable = ExportSource | SceneSource | PolynomialSource
 
 PROGRAM = "twin.orbit"
+
+
+class Correction(StrEnum):
+    """What control points correct in an image."""
+
+    shift = "shift"
+    affine = "affine"
 
 
 app = typer.Typer(
@@ -81,7 +93,8 @@ def export(
         Path,
         typer.Argument(
             readable=False,
-            help="Run folder of a simulation, or the YAML file of a simulation or of a test of intersection angles.",
+            help="Run folder or YAML file of a simulation or of a test of intersection angles, "
+            "the DIMAP file of a scene, DIM_NAME.XML, or a file of rational polynomials.",
         ),
     ],
     lowest: Annotated[
@@ -97,6 +110,34 @@ def export(
     truth: Annotated[
         bool, typer.Option("--truth", help="Camera and orbit as they are, not as the user of the images knows them.")
     ] = False,
+    band: Annotated[str | None, typer.Option("--band", help="Of a scene whose bands do not look alike.")] = None,
+    control: Annotated[
+        Path | None,
+        typer.Option(
+            "--control",
+            readable=False,
+            help="Control points with their places in the images, .gcp: they correct the polynomials.",
+        ),
+    ] = None,
+    correction: Annotated[
+        Correction, typer.Option("--correction", help="What control points correct in the image.")
+    ] = Correction.affine,
+    position_sigma: Annotated[
+        str | None,
+        typer.Option("--position-sigma", help="Of the orbit along each axis, '1 m'. Any sigma asks for a map."),
+    ] = None,
+    attitude_sigma: Annotated[
+        str | None, typer.Option("--attitude-sigma", help="Of the attitude about each axis, '2 arcsec'.")
+    ] = None,
+    interior_sigma: Annotated[
+        float | None, typer.Option("--interior-sigma", min=0.0, max=1e4, help="Of each line's place, pixels.")
+    ] = None,
+    image_sigma: Annotated[
+        float | None, typer.Option("--image-sigma", min=0.0, max=1e3, help="Of a place measured in an image, pixels.")
+    ] = None,
+    height_sigma: Annotated[
+        str | None, typer.Option("--height-sigma", help="Of the heights that points of one line have, '3 m'.")
+    ] = None,
     out: Out = None,
     seed: Seed = None,
     backend: BackendName = "llvm",
@@ -115,37 +156,98 @@ def export(
     inside. Of a YAML file the models are those of whole images. export.json says how far each model is from the
     rigorous sensor, which neither can carry in full.
 
+        python -m twin.orbit export DIM_SCENE.XML --control points.gcp --attitude-sigma '2 arcsec'
+
+    Of a scene of Pléiades or SPOT 6 and 7 the rigorous model of its DIMAP file is exported. Control points correct the
+    polynomials, with ERR_BIAS by their covariance; they do so for NAME_RPC.TXT, RPC_NAME.XML or a GeoTIFF alone, too.
+    Sigmas of camera and orbit make a map of CE90 and LE90.
+
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
+    sigmas = {
+        "position": (position_sigma, "--position-sigma"),
+        "attitude": (attitude_sigma, "--attitude-sigma"),
+        "interior": (interior_sigma, "--interior-sigma"),
+        "image": (image_sigma, "--image-sigma"),
+        "height": (height_sigma, "--height-sigma"),
+    }
 
-    def resolve() -> tuple[ExportSource, tuple[float, float] | None]:
-        from twin.orbit.export.export_run import read_source
+    def resolve() -> tuple[Exportable, tuple[float, float] | None, Wishes]:
+        from twin.orbit.export.export_run import read_exportable
+        from twin.orbit.export.ground_accuracy import CameraUncertainty
+        from twin.orbit.export.polynomial_export import read_polynomial_source
+        from twin.orbit.export.quality import Wishes, read_control
 
-        return read_source(source, seed), _ground(lowest, highest)
+        stated = {name: _sigma(name, *one) for name, one in sigmas.items() if one[0] is not None}
+        uncertainty = CameraUncertainty.of(**stated) if stated else None
+        points = None if control is None else read_control(control, correction.value)
+        read = read_polynomial_source(source) or read_exportable(source, seed, band)
+        return read, _ground(lowest, highest), Wishes(uncertainty, points)
 
-    def work(given: tuple[ExportSource, tuple[float, float] | None], session: Session) -> Result:
-        from scenes.yaml.errors import InputError
-        from twin.orbit.export import export_report
-        from twin.orbit.export.export_run import run_export
+    def work(given: tuple[Exportable, tuple[float, float] | None, Wishes], session: Session) -> Result:
+        from scenes.yaml.errors import InputError, Issue
+        from twin.orbit.export import export_report, polynomial_export
+        from twin.orbit.export.export_run import SceneSource, run_export
+        from twin.orbit.export.polynomial_export import PolynomialSource, run_polynomial_export
+        from twin.orbit.export.quality_run import with_quality
         from twin.run.procedure import BenchError
 
-        read, heights = given
-        try:
-            run = run_export(read, session.backend, heights, truth, session.advance)
-        except BenchError as error:
-            raise InputError(*read.setup.test.error(str(error), error.key, allowed=error.remedy).issues) from error
-        for name, content in export_report.export_files(run).items():
+        read, heights, wishes = given
+        contents: dict[str, bytes]
+        if isinstance(read, PolynomialSource):
+            alone = run_polynomial_export(read, wishes)
+            contents, drawn = polynomial_export.polynomial_files(alone), 0
+            shown, numbers = polynomial_export.polynomial_report(alone), polynomial_export.POLYNOMIALS(alone)
+        else:
+            try:
+                run = with_quality(run_export(read, session.backend, heights, truth, session.advance), wishes)
+            except BenchError as error:
+                if isinstance(read, SceneSource):
+                    raise InputError(Issue(str(error), read.scene.read.file, allowed=error.remedy)) from error
+                raise InputError(*read.setup.test.error(str(error), error.key, allowed=error.remedy).issues) from error
+            contents, drawn = export_report.export_files(run), read.seed
+            shown, numbers = export_report.export_report(run), export_report.EXPORT(run)
+        for name, content in contents.items():
             session.folder.write_bytes(name, content)
         ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
-        options = (*ends, *(("--truth",) if truth else ()), "--seed", str(read.seed))
+        asked = [word for one in sigmas.values() if one[0] is not None for word in (one[1], str(one[0]))]
+        asked += [] if band is None else ["--band", band]
+        asked += [] if control is None else ["--control", str(control), "--correction", correction.value]
+        options = (*ends, *(("--truth",) if truth else ()), *asked, "--seed", str(drawn))
         again = (PROGRAM, "export", str(source), *options, *(() if name == "llvm" else ("--backend", name)))
-        facts = {"config": read.config, "seed": read.seed, "again": again, "given": (source,)}
-        shown, numbers = export_report.export_report(run), export_report.EXPORT(run)
+        inputs = (source,) if control is None else (source, control)
+        facts = {"config": read.config, "seed": drawn, "again": again, "given": inputs}
         return finished(session, "export", shown, numbers, program=PROGRAM, **facts)
 
     stem = source.resolve().name if source.is_dir() else source.stem
     run_command(f"{stem}-export", Options(out, seed, backend, force, as_json, quiet), resolve, work)
+
+
+def _sigma(name: str, given: str | float | None, option: str) -> float:
+    """A standard deviation in SI units; pixels stay pixels.
+
+    Raises:
+        InputErrorText: none, or one that is too large.
+    """
+    if not isinstance(given, str):
+        return float(given or 0.0)
+    kind, most, example = _SIGMAS[name]
+    try:
+        value = parse_quantity(given, kind)
+    except Problem as problem:
+        raise InputErrorText(f"{option}: {problem}; for example '{example}'") from None
+    if not 0.0 <= value <= most:
+        raise InputErrorText(f"{option} must lie between 0 and {most:g} in SI units; for example '{example}'")
+    return value
+
+
+_SIGMAS = {
+    "position": (DISTANCE, 1e5, "1 m"),
+    "attitude": (ANGLE, 0.1, "2 arcsec"),
+    "height": (DISTANCE, 1e4, "3 m"),
+}
+"""Kind of quantity, largest value, example."""
 
 
 def _ground(lowest: str | None, highest: str | None) -> tuple[float, float] | None:

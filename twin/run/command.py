@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from inspect import Signature, signature
 from pathlib import Path
@@ -88,15 +89,9 @@ def run_command(
         started, clock = time.time(), time.monotonic()
         tracer = load_backend(options.backend)
         provenance.program_digest()  # of the files that compute, which may be others when the run ends
-        silent, standing = options.as_json or options.quiet, cli.Standing()
-        hidden = silent or not errors.is_terminal
-        with (
-            durable.exit_on_terminate(),
-            folder,
-            Progress(*cli.progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
-            cli.heartbeat(errors, standing.__str__, silent),
-        ):
-            result = work(given, Session(folder, tracer, _advance(bar, standing), started, clock))
+        silent = options.as_json or options.quiet
+        with durable.exit_on_terminate(), folder, progress_shown(errors, silent) as advance:
+            result = work(given, Session(folder, tracer, advance, started, clock))
     with to_stdout(errors, f"the run is complete in {folder.target}"):
         if options.as_json:
             print_json(result.numbers)
@@ -109,6 +104,23 @@ def run_command(
         raise typer.Exit(FAILURE)
     if result.code:
         raise typer.Exit(result.code)
+
+
+@contextmanager
+def progress_shown(errors: Console, silent: bool) -> Iterator[Advance]:
+    """Inside the block a terminal shows how far each part of the work is and how long it still takes; elsewhere a line
+    now and then says it.
+
+    Args:
+        errors: where it is shown.
+        silent: whether nothing shall be.
+    """
+    standing, hidden = cli.Standing(), silent or not errors.is_terminal
+    with (
+        Progress(*cli.progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
+        cli.heartbeat(errors, standing.__str__, silent),
+    ):
+        yield _advance(bar, standing)
 
 
 def _advance(bar: Progress, standing: cli.Standing) -> Advance:

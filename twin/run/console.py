@@ -28,7 +28,7 @@ PROGRAMS = {
     "design": ("twin.design", "optimise a camera, or find the layout of a monitor"),
     "tolerance": ("twin.tolerance", "tolerances with compensators: sensitivities, yield, allocation"),
     "asbuilt": ("twin.asbuilt", "one instrument as built: its state by all that was measured"),
-    "operate": ("twin.operate", "init, ingest, status, forecast, alarms, export: a record"),
+    "operate": ("twin.operate", "ingest, status, forecast, alarms, report, serve: a record"),
     "camera": ("twin.camera", "wavefront, spots, MTF, distortion of a camera; refocus it"),
     "lens": ("scenes.lens", "read and write prescriptions of Zemax, CODE V and batoid"),
     "mtf": ("analysis.mtf", "MTF from a slanted edge or bars in any image"),

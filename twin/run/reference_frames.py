@@ -52,6 +52,12 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "times_s": "seconds from the beginning of the course",
             "motions": "in the moved body's own nominal axes, about its pivot",
         },
+        "life": {
+            **_CHANGES,
+            "times_us": "microseconds of TAI since 2000-01-01T00:00:00 TAI",
+            "steps": "in the moved body's own nominal axes, about its pivot",
+        },
+        "judged": {"quantities": f"{_CAMERA}; {_ANGLE}; ground: {_GROUND}"},
         "uncertainty": {
             **_CHANGES,
             "motion": "in the moved body's own nominal axes",
@@ -173,9 +179,18 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
         "georeference": {"longitude, latitude": _GEODETIC, "rows, columns": "to the south, to the east"},
         "export": {
             "times": _SECONDS,
-            "heights_m": "above the ellipsoid",
+            "heights_m, height_m": "above the ellipsoid",
+            "coefficients_px, covariance_px2": "of line and sample, measured minus predicted",
+            "artefacts/accuracy_map.csv": f"longitude and latitude: {_GEODETIC}; sigmas in the local horizon",
             "models/*.json": f"{_ITRS}; lines and samples count from the image's corner, pixel centres are at halves",
             "models/*_RPC.TXT, models/*.tif": f"{_GEODETIC}; line 0 and sample 0 are the centres of the first pixel",
+        },
+        "products": {
+            **_CHANGES,
+            "changes, covariance": _CAMERA,
+            "bias_east_m, bias_north_m": "local horizon of each point, located minus true",
+            "models/*.json": f"{_ITRS}; lines and samples count from the image's corner, pixel centres are at halves",
+            "models/*_RPC.TXT": f"{_GEODETIC}; line 0 and sample 0 are the centres of the first pixel",
         },
         "simulate-truth": {
             "itrs_m": _ITRS,

@@ -277,7 +277,8 @@ class LineTimesFileSpec(Spec):
     """When lines were exposed: a table of camera, line and time.
 
     Attributes:
-        file: path, CSV with columns `camera`, `line` and `time [s]` or `date_time`.
+        file: path, CSV with columns `camera`, `line` and `time [s]` or `date_time`; or the DIMAP file of a scene, for a
+            camera of one line.
         time_scale: of the clock.
         epoch: reading of that clock at 0 s, for tables with `time [s]`.
         moment: which moment of its exposure a line's time is.
@@ -294,7 +295,8 @@ class ImagePointsFileSpec(Spec):
 
     Attributes:
         file: path, CSV with columns `point`, `camera`, `line`, `pixel`, `line_sigma`, `pixel_sigma` and perhaps
-            `correlation`.
+            `correlation`; or the .gcp of the Ames Stereo Pipeline that is the file of the ground points, with images
+            that are called as the lines, `nadir.tif`.
         centre: image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
         first_pixel: number of the first pixel of a line.
         first_pixel_sees: to which side of the track the first pixel looks.

@@ -63,7 +63,8 @@ ClockReading = Annotated[str, BeforeValidator(_reading)]
 
 
 class OrbitFileSpec(Spec):
-    """An orbit in a file: SP3-c or d, CCSDS OEM, or CSV. What a file says itself may be left out here; else both agree.
+    """An orbit in a file: SP3-c or d, CCSDS OEM, DIMAP, or CSV. What a file says itself may be left out here; else both
+    agree.
 
     Attributes:
         file: path.
@@ -85,7 +86,7 @@ class OrbitFileSpec(Spec):
 
 
 class AttitudeFileSpec(Spec):
-    """An attitude in a file: CCSDS AEM, or CSV of quaternions or of roll, pitch and yaw.
+    """An attitude in a file: CCSDS AEM, DIMAP, or CSV of quaternions or of roll, pitch and yaw.
 
     Attributes:
         file: path.

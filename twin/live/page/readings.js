@@ -1,14 +1,9 @@
 // Readings of all estimators beside the truth, and a strip chart of one of them.
+import { decimals, fixed } from './format.js';
+
 const byId = (id) => document.getElementById(id);
 const MOST = 6000; // points of the strip chart
 const FAR = 3; // sigma from which an error is marked
-
-// decimals that show two digits of sigma
-const decimals = (sigma) => (sigma > 0 && Number.isFinite(sigma) ? Math.max(0, Math.min(9, 1 - Math.floor(Math.log10(sigma)))) : 4);
-const fixed = (value, places) => {
-  if (value === undefined || value === null || !Number.isFinite(value)) return '–';
-  return (Number(value.toFixed(places)) + 0).toFixed(places).replace('-', '−');
-};
 
 export class Readings {
   constructor() {

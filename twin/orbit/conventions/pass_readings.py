@@ -11,14 +11,16 @@ import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.csv_table import Column, read_table
-from scenes.yaml.errors import nearest, shown
+from scenes.yaml.errors import names_text, nearest, shown
 from scenes.yaml.units import TIME
 from twin.orbit.measured.clock import Readings
+from twin.orbit.measured.dimap_file import is_dimap, read_dimap
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
 from twin.orbit.measured.measurement_tables import COLUMNS, image_covariance, require_known
 from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.orbit.measured.platform_files import Conventions, PlatformReadings, clock_of, read_platform
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings
+from twin.orbit.measured.text_file import first_lines
 
 if TYPE_CHECKING:
     from scenes.specs.measured.orbit_data import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
@@ -106,7 +108,10 @@ def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -
     platform, meant = read_platform(spec.platform, folder)
     lines = read_line_clocks(spec.lines, tuple(camera.lines), folder)
     ground = read_ground_points(spec.ground, folder)
-    images = _image_points(spec.image_points, ground, lines, folder)
+    if Path(spec.image_points.file).suffix.lower() == ".gcp":
+        images = _gcp_points(spec, ground, lines, folder)
+    else:
+        images = _image_points(spec.image_points, ground, lines, folder)
     half = 0.5 if spec.image_points.centre == "half" else 0.0
     stated = PassConventions(
         meant,
@@ -132,6 +137,8 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
         InputError: the table cannot be read, a camera that is none, fewer than two lines of one, lines or times that do
             not rise.
     """
+    if is_dimap(list(first_lines(folder / spec.file, "line times: CSV, or DIMAP"))):
+        return _scene_lines(spec, cameras, folder)
     table = read_table(folder / spec.file, _LINES, 2)
     clock = clock_of(table, spec)
     names = table["camera"].astype(str)
@@ -149,6 +156,21 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
                 raise table.error(row, head, f"{what}s of {name} do not rise", None, "rows in order, each line once")
         found[name] = LineClock(line, taken)
     return found
+
+
+def _scene_lines(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path) -> dict[str, LineClock]:
+    """Line times of a DIMAP file, which has one line; its lines count from 0."""
+    if len(cameras) != 1:
+        allowed = "a camera of one line, or a table"
+        raise spec.error("a scene has the times of one line", ("file",), found=names_text(cameras), allowed=allowed)
+    if spec.time_scale != "UTC":
+        raise spec.error("a scene's times are in UTC", ("time_scale",), found=spec.time_scale, allowed="UTC")
+    read = read_dimap(folder / spec.file)
+    last = max(read.lines - 1, 1)
+    second = read.first_line.second[0] + np.array([0.0, last * read.line_time])
+    over = np.floor(second / 86400.0)
+    clock = Readings(read.first_line.day[0] + over.astype(np.int64), second - 86400.0 * over)
+    return {cameras[0]: LineClock(np.array([0.0, float(last)]), clock)}
 
 
 def _image_points(
@@ -172,6 +194,31 @@ def _image_points(
             raise table.error(row, "point", f"twice in {camera}", shown(str(names[row])), "each point once")
         spread = image_covariance(table, rows)
         found[camera] = ImagePoints(number[rows], table["line"][rows], table["pixel"][rows], spread)
+    return FrozenMap(found)
+
+
+def _gcp_points(
+    spec: OrbitCheckSpec, ground: GroundFile, lines: Mapping[str, LineClock], folder: Path
+) -> Mapping[str, ImagePoints]:
+    """Image points of the .gcp file that holds the ground points; an image is that of the line of its name."""
+    file = spec.image_points.file
+    if (folder / file) != (folder / spec.ground.file):
+        allowed = "the file of `ground`, or a table"
+        raise spec.image_points.error("image points of another .gcp file", ("file",), found=file, allowed=allowed)
+    found = {}
+    for image, rows in ground.images.items():
+        camera = Path(image).stem
+        if camera not in lines:
+            problem, allowed = (
+                "an image that is none of the camera's lines",
+                names_text(f"{name}.tif" for name in lines),
+            )
+            raise spec.image_points.error(problem, ("file",), found=shown(image), allowed=allowed)
+        number = rows[:, 0].astype(np.intp)
+        covariance = rows[:, 3:, None] ** 2 * np.eye(2)
+        found[camera] = ImagePoints.of(number, rows[:, 1], rows[:, 2], covariance)
+    if not found:
+        raise spec.image_points.error("a .gcp file without images", ("file",), allowed="image, column, row, two sigmas")
     return FrozenMap(found)
 
 

@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import json
 
-from twin.orbit.export.export_run import Export, ExportedLine
+from twin.orbit.export.estimated_change import GroundSigma
+from twin.orbit.export.export_run import Export, ExportedLine, SceneSource
 from twin.orbit.export.line_scanner import ModelError
+from twin.orbit.export.quality_sections import (
+    ACCURACY,
+    CONTROL,
+    PRODUCT,
+    quality_answers,
+    quality_sections,
+    quality_warnings,
+)
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.run.artefact import Cell, Table, significant
 from twin.run.data_files import FrameFacts, tiff
@@ -39,6 +48,16 @@ RPC_ERROR: Record[RationalPolynomial] = Record(
     Quantity("rms_line_px", lambda model: model.rms_px[0], "root mean square along the track"),
     Quantity("rms_sample_px", lambda model: model.rms_px[1], "root mean square along the line"),
 )
+GROUND: Record[GroundSigma] = Record(
+    "What the error of the camera's estimated change is on the ground, root mean square over the image.",
+    Quantity("height_m", lambda one: one.height_m, "of the ground above the ellipsoid"),
+    Quantity("err_bias_m", lambda one: one.bias_m, "ERR_BIAS: horizontal, in common with other images"),
+    Quantity("err_rand_m", lambda one: one.random_m, "ERR_RAND: horizontal, another in every image"),
+    Quantity("bias_east_m", lambda one: one.bias_east_m, "part of ERR_BIAS to the east"),
+    Quantity("bias_north_m", lambda one: one.bias_north_m, "part of ERR_BIAS to the north"),
+    Quantity("random_east_m", lambda one: one.random_east_m, "part of ERR_RAND to the east"),
+    Quantity("random_north_m", lambda one: one.random_north_m, "part of ERR_RAND to the north"),
+)
 LINE: Record[ExportedLine] = Record(
     "One line's image and its models; files are paths in the run folder, None for those that were not written.",
     Quantity("lines", lambda line: line.window.sensor.lines, "how many"),
@@ -53,6 +72,13 @@ LINE: Record[ExportedLine] = Record(
     Quantity("isd_errors", lambda line: line.scanner.errors, "at every height", record=ISD_ERROR),
     Quantity("rpc_errors", lambda line: line.polynomial, "over all heights", record=RPC_ERROR),
     Quantity("rpc_refused", lambda line: line.refused or None, "why there are no polynomials"),
+    Quantity(
+        "ground",
+        lambda line: line.ground,
+        "what is uncertain of the camera's estimated change, where one was estimated",
+        record=GROUND,
+        where_known=True,
+    ),
 )
 EXPORT: Record[Export] = Record(
     "export.json. Line cameras for other software.",
@@ -60,6 +86,27 @@ EXPORT: Record[Export] = Record(
     Quantity("truth", lambda run: run.truth, "whether camera and orbit are the true ones"),
     Quantity("heights_m", lambda run: run.heights, "of the ground that models were fitted to: lowest, middle, highest"),
     Quantity("lines", lambda run: run.lines, "every line and its models", record=LINE),
+    Quantity(
+        "accuracy",
+        lambda run: (run.quality and run.quality.maps) or None,
+        "line, or `together` for points that all lines intersect: errors on the ground, where they were asked for",
+        record=ACCURACY,
+        where_known=True,
+    ),
+    Quantity(
+        "control",
+        lambda run: (run.quality and run.quality.control) or None,
+        "line: how control points corrected its polynomials, where there are some",
+        record=CONTROL,
+        where_known=True,
+    ),
+    Quantity(
+        "product_rpc",
+        lambda run: (run.quality and run.quality.products) or None,
+        "line: the polynomials that came with a scene, where there are some",
+        record=PRODUCT,
+        where_known=True,
+    ),
 )
 
 
@@ -97,6 +144,7 @@ def export_report(run: Export) -> Report:
         f"the polynomials are within {significant(max(rpc)[0], 2)} pixels ({max(rpc)[1]})"
         if rpc
         else "there are no polynomials",
+        *quality_answers(run.quality),
     )
     rows: list[tuple[Cell, ...]] = []
     for name, line in run.lines.items():
@@ -115,15 +163,31 @@ def export_report(run: Export) -> Report:
         digits=2,
     )
     known = "camera and orbit as they truly are" if run.truth else "the laboratory's camera on the measured orbit"
+    if isinstance(run.source, SceneSource):
+        refracted = run.source.scene.read.refracted
+        known = f"the rigorous model of the file, {'with' if refracted else 'without'} refraction"
     facts = (
         ("Lines", known),
         ("Second 0 of the orbit", run.epoch),
         ("Ground", f"{low:.0f} to {high:.0f} m above the ellipsoid"),
-        ("Read", "the run folder of a simulation" if run.source.folder is not None else "a test without images"),
+        ("Read", _read(run)),
     )
     return Report(
-        "Line cameras for other software", verdict, more, facts, summary, _sections(run), warnings=_warnings(run)
+        "Line cameras for other software",
+        verdict,
+        more,
+        facts,
+        summary,
+        (*_sections(run), *quality_sections(run)),
+        warnings=(*_warnings(run), *quality_warnings(run.quality)),
     )
+
+
+def _read(run: Export) -> str:
+    if isinstance(run.source, SceneSource):
+        read = run.source.scene.read
+        return f"{read.profile} {read.name}, DIMAP {read.version}"
+    return "the run folder of a simulation" if run.source.folder is not None else "a test without images"
 
 
 def _sections(run: Export) -> tuple[Section, ...]:
@@ -153,6 +217,11 @@ def _sections(run: Export) -> tuple[Section, ...]:
 
 def _warnings(run: Export) -> tuple[str, ...]:
     found = []
+    if isinstance(run.source, SceneSource) and run.source.scene.read.light_speed:
+        found.append(
+            "the file's LIGHT_SPEED_SETTING is true: light time and aberration are not in the model, up to 13 m along "
+            "the track; compare it with the product's own polynomials"
+        )
     for name, line in run.lines.items():
         if line.polynomial is None:
             found.append(f"{name} has no rational polynomials: {line.refused}")

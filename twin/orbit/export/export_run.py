@@ -2,11 +2,13 @@
 software, with their images where there are any.
 
 The camera is the laboratory's and the way the measured one, as the user of the images knows them; or, where asked for,
-both as they truly are.
+both as they truly are. An instrument's cameras can be those that its monitor has estimated in orbit. The scene of a
+DIMAP file is as that file tells it.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,18 +17,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tifffile
 
+from analysis.orbit.forward_intersection import CalibratedLine
 from optics.numerics.frozen_map import FrozenMap
 from scenes.kinds.file_kinds import kind_of
+from scenes.models.instrument_builder import build_instrument
 from scenes.specs.orbit.setup import AngleSetup, SimulateSetup, resolve_angle, resolve_simulate
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.yaml_file import read_yaml
+from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.orbit.angle.angle_flight import angle_camera, fly
+from twin.orbit.export.estimated_change import EstimatedChange, GroundSigma, ground_sigma
 from twin.orbit.export.line_scanner import LineScanner, line_scanner
+from twin.orbit.export.quality import Quality
 from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.flight.corrected_lines import calibrated_lines, corrected_line
 from twin.orbit.flight.line_camera import LineCamera
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.images.simulate_run import fly_simulation
+from twin.orbit.measured.dimap_sensor import DimapScene, read_scene
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.run_folder import read_manifest
 
@@ -58,6 +66,29 @@ class ExportSource:
 
 
 @dataclass(frozen=True, eq=False)
+class SceneSource:
+    """The scene of a DIMAP file.
+
+    Attributes:
+        scene: what the file tells.
+        config: its path and what was chosen of it, as YAML.
+    """
+
+    scene: DimapScene
+    config: str
+
+    @property
+    def folder(self) -> None:
+        """No run."""
+        return None
+
+    @property
+    def seed(self) -> int:
+        """Any: nothing is drawn."""
+        return 0
+
+
+@dataclass(frozen=True, eq=False)
 class ImagedWindow:
     """A line's image, or where it would be.
 
@@ -67,6 +98,7 @@ class ImagedWindow:
         first_pixel, pixels: of the window on the line.
         pitch: of the pixels, metres.
         frame: grey values, (lines, pixels); None where nothing was rendered.
+        calibrated: the line before its estimated change; None where none was estimated.
     """
 
     name: str
@@ -75,6 +107,7 @@ class ImagedWindow:
     pixels: int
     pitch: float
     frame: np.ndarray | None
+    calibrated: CalibratedLine | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +119,14 @@ class ExportedLine:
         scanner: community sensor model.
         polynomial: rational polynomials; None where they cannot be, and why.
         refused: why there are no polynomials, empty where there are.
+        ground: what is uncertain of the camera's estimated change, on the ground; None where none was estimated.
     """
 
     window: ImagedWindow
     scanner: LineScanner
     polynomial: RationalPolynomial | None
     refused: str
+    ground: GroundSigma | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,17 +139,40 @@ class Export:
         truth: whether camera and orbit are the true ones.
         heights: of the ground above the ellipsoid that models were fitted to: lowest, middle, highest, metres.
         lines: by name.
+        quality: what they are worth; None where it was not looked at.
     """
 
-    source: ExportSource
+    source: ExportSource | SceneSource
     epoch: str
     truth: bool
     heights: tuple[float, float, float]
     lines: Mapping[str, ExportedLine]
+    quality: Quality | None = None
+
+
+def read_exportable(path: Path, seed: int | None = None, band: str | None = None) -> ExportSource | SceneSource:
+    """Whatever has a camera and its way: what `read_source` takes, or the DIMAP file of a scene.
+
+    Args:
+        path: of it.
+        seed: in place of the file's.
+        band: of a scene whose bands do not look alike.
+
+    Raises:
+        InputError: it is neither, or cannot be read.
+    """
+    if path.is_file() and path.suffix.lower() in _SCENES:
+        return SceneSource(read_scene(path, band), dump_yaml({"source": str(path)} | ({"band": band} if band else {})))
+    if band is not None:
+        raise InputError(Issue("only the scene of a DIMAP file has bands", str(path), None, ("band",), band))
+    return read_source(path, seed)
+
+
+_SCENES = (".xml", ".dim")
 
 
 def read_source(path: Path, seed: int | None = None) -> ExportSource:
-    """The run folder of a simulation, or the YAML file of one or of a test of angles.
+    """The run folder of a simulation or of a test of angles, or the YAML file of one.
 
     Args:
         path: of it.
@@ -128,7 +186,7 @@ def read_source(path: Path, seed: int | None = None) -> ExportSource:
     kind = kind_of(read_yaml(path).data)
     if kind is None or kind.name not in READS:
         found = None if kind is None else kind.what
-        allowed = "a simulation, a test of intersection angles, or the run folder of a simulation"
+        allowed = "a simulation, a test of intersection angles, the run folder of one, or DIM_NAME.XML of a scene"
         hint = _PAYLOAD_HINT if kind is not None and kind.name in ("three_line_camera", "instrument") else allowed
         raise InputError(Issue("twin.orbit export does not read this", str(path), found=found, allowed=hint))
     resolve: Callable[[Path], SimulateSetup | AngleSetup] = (
@@ -140,9 +198,12 @@ def read_source(path: Path, seed: int | None = None) -> ExportSource:
 
 def _of_run(folder: Path) -> ExportSource:
     manifest = read_manifest(folder)
-    if manifest is None or (manifest.program, manifest.test) != ("twin.orbit", "simulate"):
+    if manifest is None or manifest.program != "twin.orbit" or manifest.test not in ("simulate", "angle"):
         found = None if manifest is None else f"a run of {' '.join(filter(None, (manifest.program, manifest.test)))}"
-        raise InputError(Issue("not the run folder of twin.orbit simulate", str(folder), found=found))
+        raise InputError(Issue("not the run folder of twin.orbit simulate or angle", str(folder), found=found))
+    if manifest.test == "angle":  # has no images
+        tested = resolve_angle(folder / "config.yaml")
+        return ExportSource(tested, tested.to_yaml(), None, manifest.seed, FrozenMap())
     setup = resolve_simulate(folder / "config.yaml")
     numbers = read_yaml(folder / "simulate.json").data
     try:
@@ -157,11 +218,12 @@ def _of_run(folder: Path) -> ExportSource:
 
 
 def run_export(
-    source: ExportSource,
+    source: ExportSource | SceneSource,
     backend: Backend,
     heights: tuple[float, float] | None,
     truth: bool = False,
     advance: Advance = silent,
+    changes: Mapping[str, EstimatedChange] | None = None,
 ) -> Export:
     """Fit the models of all lines.
 
@@ -172,17 +234,24 @@ def run_export(
             for 0 to 2 000 m.
         truth: camera and orbit as they are in place of those that the user knows.
         advance: told how far it is.
+        changes: camera -> what is estimated of it in orbit; of an instrument, and not of the truth.
 
     Raises:
         InputError: an image of the run is missing or another one.
         BenchError: no such orbit, or ground that cannot be modelled.
+        ValueError: changes of a payload, or of the truth.
     """
+    setup = None if isinstance(source, SceneSource) else source.setup
+    if changes is not None and (truth or not isinstance(setup, AngleSetup) or setup.instrument is None):
+        raise ValueError("only the cameras of an instrument, as their user knows them, have estimated changes")
     chosen = _heights(source, heights)
-    epoch, windows = _windows(source, backend, truth)
+    epoch, windows = _windows(source, backend, truth, changes)
     lines = {}
     for k, (name, window) in enumerate(windows.items()):
         advance("models", k, len(windows))
-        lines[name] = _exported(window, epoch, chosen)
+        lines[name] = _exported(
+            window, epoch, chosen, None if changes is None else changes[name], _level(source, chosen)
+        )
     advance("models", len(windows), len(windows))
     return Export(source, epoch, truth, chosen, FrozenMap(lines))
 
@@ -193,7 +262,7 @@ _ROOM = 100.0
 """Metres about the heights of an elevation model, which has errors."""
 
 
-def _heights(source: ExportSource, heights: tuple[float, float] | None) -> tuple[float, float, float]:
+def _heights(source: ExportSource | SceneSource, heights: tuple[float, float] | None) -> tuple[float, float, float]:
     if heights is not None:
         return heights[0], 0.5 * (heights[0] + heights[1]), heights[1]
     if source.folder is None:
@@ -203,11 +272,22 @@ def _heights(source: ExportSource, heights: tuple[float, float] | None) -> tuple
     return low, float(np.mean(ground)), high
 
 
-def _windows(source: ExportSource, backend: Backend, truth: bool) -> tuple[str, dict[str, ImagedWindow]]:
+def _level(source: ExportSource | SceneSource, heights: tuple[float, float, float]) -> float:
+    """Mean height of the ground, metres: that of a test's terrain, within the heights that are modelled."""
+    if isinstance(source, ExportSource) and isinstance(source.setup, AngleSetup):
+        return float(np.clip(source.setup.test.terrain.height, heights[0], heights[2]))
+    return heights[1]
+
+
+def _windows(
+    source: ExportSource | SceneSource, backend: Backend, truth: bool, changes: Mapping[str, EstimatedChange] | None
+) -> tuple[str, dict[str, ImagedWindow]]:
     """Epoch, and the images by line."""
+    if isinstance(source, SceneSource):
+        return source.scene.epoch, _of_scene(source.scene, truth)
     setup = source.setup
     if isinstance(setup, AngleSetup):
-        return str(setup.test.orbit.epoch), _of_angle(setup, backend, source.seed, truth)
+        return str(setup.test.orbit.epoch), _of_angle(setup, backend, source.seed, truth, changes)
     flight = fly_simulation(setup, source.seed)
     windows = {}
     for name, sensor in (flight.sensors if truth else flight.users).items():
@@ -225,12 +305,19 @@ def _windows(source: ExportSource, backend: Backend, truth: bool) -> tuple[str, 
     return str(setup.test.orbit.epoch), windows
 
 
-def _of_angle(setup: AngleSetup, backend: Backend, seed: int, truth: bool) -> dict[str, ImagedWindow]:
+def _of_angle(
+    setup: AngleSetup, backend: Backend, seed: int, truth: bool, changes: Mapping[str, EstimatedChange] | None
+) -> dict[str, ImagedWindow]:
     """Images as long as they are wide, their lines spaced as their pixels are, about the moment of the test."""
     camera = angle_camera(setup, backend)
     flown = fly(setup, camera, np.random.SeedSequence(seed))
     windows = {}
-    for name, line in (camera.cameras if truth else camera.laboratory).items():
+    chosen, known = camera.cameras if truth else camera.laboratory, {}
+    if changes is not None and setup.instrument is not None:
+        instrument = build_instrument(setup.instrument, setup.cameras, backend)
+        known = calibrated_lines(camera.laboratory, instrument, backend)
+        chosen = {name: corrected_line(line, known[name], changes[name].values) for name, line in chosen.items()}
+    for name, line in chosen.items():
         pitch = _pitch(setup, name)
         time = setup.test.time
         step = _line_time(line, flown.trajectory, flown.earth, time)
@@ -240,8 +327,24 @@ def _of_angle(setup: AngleSetup, backend: Backend, seed: int, truth: bool) -> di
             raise BenchError("the orbit ends at the moment of the test", ("time",), "a longer orbit")
         first = time - 0.5 * (lines - 1) * step
         sensor = Sensor(line, flown.trajectory, flown.earth, step, first, lines, flown.effects)
-        windows[name] = ImagedWindow(name, sensor, 0, line.pixels, pitch, None)
+        windows[name] = ImagedWindow(name, sensor, 0, line.pixels, pitch, None, known.get(name))
     return windows
+
+
+def _of_scene(scene: DimapScene, truth: bool) -> dict[str, ImagedWindow]:
+    """The one image of a scene. What is told of it is all that is known."""
+    read = scene.read
+    if truth:
+        raise InputError(Issue("nobody knows the truth of a scene", read.file, allowed="no --truth"))
+    name = _UNSAFE.sub("_", read.name)[:_LONGEST] or "scene"
+    return {name: ImagedWindow(name, scene.sensor, 0, read.pixels, read.pitch or _USUAL_PITCH, None)}
+
+
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
+"""Letters of a data set's name that names of files do without."""
+_LONGEST = 100
+_USUAL_PITCH = 13e-6
+"""Metres, of Pleiades; a camera model is the same for every pitch, as its principal distance goes with it."""
 
 
 def _pitch(setup: AngleSetup, name: str) -> float:
@@ -262,18 +365,30 @@ def _line_time(line: LineCamera, trajectory: Trajectory, earth: Any, time: float
     return 1e-3 * float(np.linalg.norm(ground[1] - ground[0]) / np.linalg.norm(after[0] - before[0]))
 
 
-def _exported(window: ImagedWindow, epoch: str, heights: tuple[float, float, float]) -> ExportedLine:
+def _exported(
+    window: ImagedWindow,
+    epoch: str,
+    heights: tuple[float, float, float],
+    change: EstimatedChange | None,
+    level: float,
+) -> ExportedLine:
+    ground = None
     try:
         place = window.first_pixel, window.pixels
-        scanner = line_scanner(window.sensor, window.name, epoch, window.pitch, heights, place)
+        notes = () if change is None else change.notes
+        scanner = line_scanner(window.sensor, window.name, epoch, window.pitch, heights, place, notes)
+        if change is not None and window.calibrated is not None:
+            ground = ground_sigma(window.sensor, window.calibrated, change, level)
     except ValueError as error:
         raise BenchError(f"{window.name}: {error}", ("orbit",), "an orbit over ground that every line sees") from error
     try:
         ends = heights[0], heights[2]
         polynomial = RationalPolynomial.fit(window.sensor, window.first_pixel, window.pixels, ends)
     except ValueError as error:
-        return ExportedLine(window, scanner, None, str(error))
-    return ExportedLine(window, scanner, polynomial, "")
+        return ExportedLine(window, scanner, None, str(error), ground)
+    if ground is not None:
+        polynomial = replace(polynomial, bias_m=ground.bias_m, random_m=ground.random_m)
+    return ExportedLine(window, scanner, polynomial, "", ground)
 
 
 def _file(folder: Path, name: str) -> Path:

@@ -121,6 +121,7 @@ def line_scanner(
     pitch: float,
     heights: tuple[float, float, float],
     window: tuple[int, int] | None = None,
+    notes: tuple[str, ...] = (),
 ) -> LineScanner:
     """The ISD of an image, or of a window of it.
 
@@ -131,6 +132,7 @@ def line_scanner(
         pitch: of the pixels, metres.
         heights: of the ground above the ellipsoid, lowest, middle, highest, metres; it is right at the middle one.
         window: its first pixel on the line, and how many; None for the whole line.
+        notes: more of them, on what the line is taken to be.
 
     Raises:
         ValueError: a look misses the Earth, or the trajectory is too rough for `_MOST` nodes.
@@ -138,7 +140,9 @@ def line_scanner(
     camera = _effective_camera(sensor, pitch, heights[1], epoch)
     first, pixels = (0, camera.pixels) if window is None else window
     errors = tuple(_error(sensor, camera, height, (first, pixels)) for height in heights)
-    return LineScanner(_isd(sensor, camera, name, epoch, heights, (first, pixels), errors), camera, errors)
+    isd = _isd(sensor, camera, name, epoch, heights, (first, pixels), errors)
+    isd["notes"] += notes
+    return LineScanner(isd, camera, errors)
 
 
 def _effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -> EffectiveCamera:

@@ -44,8 +44,12 @@ class RationalPolynomial:
         offset: of line, sample, latitude, longitude (degrees) and height (metres), (5,).
         scale: likewise.
         line_numerator, line_denominator, sample_numerator, sample_denominator: (20,) each.
-        error_px: largest difference from the rigorous sensor at places that were not fitted, lines and samples.
+        error_px: largest difference from the rigorous sensor at places that were not fitted, lines and samples; NaN of
+            polynomials that were read.
         rms_px: root mean square of them.
+        bias_m: ERR_BIAS, horizontal error on the ground that does not go with time, 68 %, so that images have it in
+            common; None where nobody states it.
+        random_m: ERR_RAND, likewise of what goes with time and is another in every image.
     """
 
     offset: Array
@@ -54,8 +58,10 @@ class RationalPolynomial:
     line_denominator: Array
     sample_numerator: Array
     sample_denominator: Array
-    error_px: tuple[float, float]
-    rms_px: tuple[float, float]
+    error_px: tuple[float, float] = (np.nan, np.nan)
+    rms_px: tuple[float, float] = (np.nan, np.nan)
+    bias_m: float | None = None
+    random_m: float | None = None
 
     @classmethod
     def fit(cls, sensor: Sensor, first_pixel: int, pixels: int, heights: tuple[float, float]) -> RationalPolynomial:
@@ -71,16 +77,52 @@ class RationalPolynomial:
             ValueError: a look misses the Earth, or the ground crosses a pole or the 180th meridian.
         """
         fitted = _seen(sensor, first_pixel, pixels, heights, _GRID, at_ends=True)
+        others = tuple(count - 1 for count in _GRID)
+        return cls.through(fitted, _seen(sensor, first_pixel, pixels, heights, others, at_ends=False))
+
+    @classmethod
+    def through(cls, fitted: Array, checked: Array) -> RationalPolynomial:
+        """Rational polynomials through places of an image and of the ground.
+
+        Args:
+            fitted: (N, 5) line, sample, latitude, longitude (degrees) and height (metres).
+            checked: (M, 5) of the same, between them.
+
+        Raises:
+            ValueError: the ground crosses a pole or the 180th meridian.
+        """
         ends = np.stack([np.min(fitted, axis=0), np.max(fitted, axis=0)])
         if ends[1, 3] - ends[0, 3] > _WIDEST:
             raise ValueError("the ground lies on the 180th meridian or a pole, where longitudes jump")
         offset, scale = np.mean(ends, axis=0), 0.5 * (ends[1] - ends[0])
-        others = tuple(count - 1 for count in _GRID)
-        checked = _seen(sensor, first_pixel, pixels, heights, others, at_ends=False)
         sides = [(_monomials((seen[:, 2:] - offset[2:]) / scale[2:]), seen) for seen in (fitted, checked)]
         best = [_best(sides, k, offset[k], scale[k]) for k in range(2)]
         (line, line_most, line_rms), (sample, sample_most, sample_rms) = best
         return cls(offset, scale, *line, *sample, (line_most, sample_most), (line_rms, sample_rms))
+
+    def ground(self, line: ArrayLike, sample: ArrayLike, height: ArrayLike) -> tuple[Array, Array]:
+        """Latitude and longitude (N,), degrees, that a line and a sample (N,) see at a height, metres (N,).
+
+        Newton steps from the middle of the ground; NaN where they do not arrive.
+        """
+        wanted = np.stack(np.broadcast_arrays(line, sample), axis=-1).astype(np.float64)
+        at = np.broadcast_to(np.asarray(height, np.float64), wanted.shape[:-1])
+        place = np.tile(self.offset[2:4], (len(wanted), 1))
+        step = _STEP * self.scale[2:4]
+        for _ in range(_MOST_STEPS):
+            here, north, east = (
+                np.stack(self.image(place[:, 0] + up, place[:, 1] + aside, at), axis=-1)
+                for up, aside in ((0.0, 0.0), (step[0], 0.0), (0.0, step[1]))
+            )
+            slope = np.stack([(north - here) / step[0], (east - here) / step[1]], axis=-1)
+            move = np.linalg.solve(slope, (wanted - here)[..., None])[..., 0]
+            # a step over the whole ground leaves where the polynomials say anything
+            place = place + np.clip(move, -self.scale[2:4], self.scale[2:4])
+            if np.all(np.abs(move) < _ARRIVED * self.scale[2:4]):
+                break
+        arrived = np.all(np.abs(move) < _ARRIVED * self.scale[2:4], axis=-1)
+        found = np.where(arrived[:, None], place, np.nan)
+        return found[:, 0], found[:, 1]
 
     def image(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> tuple[Array, Array]:
         """Line and sample (N,) of ground points: degrees (N,), degrees, metres above the ellipsoid."""
@@ -93,7 +135,9 @@ class RationalPolynomial:
     def text(self) -> str:
         """Contents of NAME_RPC.TXT, as GDAL reads it beside NAME.tif."""
         names = (("LINE", "pixels"), ("SAMP", "pixels"), ("LAT", "degrees"), ("LONG", "degrees"), ("HEIGHT", "meters"))
-        rows = [
+        errors = (("ERR_BIAS", self.bias_m), ("ERR_RAND", self.random_m))
+        rows = [f"{name}: {value!r} meters" for name, value in errors if value is not None]
+        rows += [
             f"{name}_{what}: {value!r} {unit}"
             for what, values in (("OFF", self.offset), ("SCALE", self.scale))
             for (name, unit), value in zip(names, values.tolist(), strict=True)
@@ -108,17 +152,22 @@ class RationalPolynomial:
         return "\n".join(rows) + "\n"
 
     def tags(self) -> list[tuple[Any, ...]]:
-        """The tag of a GeoTIFF that holds them (RPCCoefficientTag): errors that nobody states, offsets, scales and
-        coefficients, in the order of RPC00B.
+        """The tag of a GeoTIFF that holds them (RPCCoefficientTag): errors, -1 where nobody states them, offsets,
+        scales and coefficients, in the order of RPC00B.
         """
         parts = (self.line_numerator, self.line_denominator, self.sample_numerator, self.sample_denominator)
-        values = (*_UNSTATED, *self.offset.tolist(), *self.scale.tolist(), *np.concatenate(parts).tolist())
+        errors = (_UNSTATED if error is None else error for error in (self.bias_m, self.random_m))
+        values = (*errors, *self.offset.tolist(), *self.scale.tolist(), *np.concatenate(parts).tolist())
         return [(_COEFFICIENTS, "d", len(values), values, True)]
 
 
+_STEP = 1e-6
+_ARRIVED = 1e-9
+_MOST_STEPS = 30
+"""Of the ground's size: of a derivative, of the last step to the ground; and how many."""
 _COEFFICIENTS = 50844
-_UNSTATED = (-1.0, -1.0)
-"""Error bias and random error, metres."""
+_UNSTATED = -1.0
+"""Of an error, metres."""
 _WIDEST = 90.0
 """Degrees of longitude."""
 

@@ -236,6 +236,25 @@ def line_cameras(spec: ThreeLineCameraSpec) -> dict[str, LineCamera]:
     }
 
 
+def polynomial_line(name: str, pixels: int, forward: ArrayLike, right: ArrayLike) -> LineCamera:
+    """A line whose looks have polynomials of the pixel as tangents (no approximation).
+
+    Args:
+        name: of the line.
+        pixels: how many.
+        forward: coefficients (K,) of the tangent of a look's angle forward, ascending powers of the pixel.
+        right: likewise to the right.
+    """
+    ahead, aside = np.atleast_1d(forward), np.atleast_1d(right)
+
+    def look(pixel: np.ndarray) -> np.ndarray:
+        x, y = (np.polynomial.polynomial.polyval(pixel, c) for c in (ahead, aside))
+        return np.stack([x, y, np.ones_like(pixel)], axis=-1)
+
+    directions = _coefficients(look, pixels, max(len(ahead), len(aside)))
+    return LineCamera(name, pixels, directions, np.zeros((1, 3)))
+
+
 def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> LineCamera:
     to_body = about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate))
     degree = 5 if line.k2 else 3

@@ -14,13 +14,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree import ElementTree
 
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
 from twin.orbit.measured import platform_readings
 from twin.orbit.measured.clock import Readings, known_scale
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, Segment, known_frame
 from twin.orbit.measured.text_file import numbers, readings, require_rising, text_lines
+from twin.orbit.measured.xml_file import parsed_xml
 
 _COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")
 
@@ -159,26 +159,22 @@ _TURN = {"LAST": ("EPOCH", "Q1", "Q2", "Q3", "QC"), "FIRST": ("EPOCH", "QC", "Q1
 
 
 def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(Issue("XML with a document type", file, 1, (), None, "elements alone"))
-    try:
-        root = ElementTree.fromstring(text.encode())
-    except ElementTree.ParseError as error:
-        raise InputError(Issue(f"not XML: {error.msg}", file, error.position[0])) from None
+    root = parsed_xml(text, file)
     for one in root.iter("segment"):
         segment = _Segment()
         for meta in one.iter("metadata"):
-            segment.keys |= {item.tag: ((item.text or "").strip(), 1) for item in meta}
+            segment.keys |= {item.tag: (item.text, item.line) for item in meta.children}
         heads = (
             _STATE if kind == "OEM" else _TURN[segment.keys.get("QUATERNION_TYPE", ("LAST", 1))[0].upper() or "LAST"]
         )
         for state in (*one.iter("stateVector"), *one.iter("attitudeState")):
-            cells = {item.tag: (item.text or "").strip() for item in state.iter()}
+            cells = {item.tag: item.text for item in state.below()}
             if missing := [head for head in heads if not cells.get(head)]:
                 number = len(segment.rows) + 1
-                raise InputError(Issue(f"state {number} has no {missing[0]}", file, None, (), None, names_text(heads)))
+                problem = f"state {number} has no {missing[0]}"
+                raise InputError(Issue(problem, file, state.line, (), None, names_text(heads)))
             segment.rows.append([cells[head] for head in heads])
-            segment.lines.append(1)
+            segment.lines.append(state.line)
         yield segment
 
 

@@ -22,6 +22,7 @@ from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured import earth_orientation, orbit_files
 from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
+from twin.orbit.measured.dimap_file import is_dimap, read_dimap
 from twin.orbit.measured.earth_orientation import EarthOrientation, TableRotation
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
 from twin.orbit.measured.text_file import first_lines, require_rising
@@ -266,7 +267,9 @@ def _earth(spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, meant: C
 
 def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
     path = folder / spec.file
-    head = list(first_lines(path, "an orbit: SP3, CCSDS OEM, or CSV"))
+    head = list(first_lines(path, "an orbit: SP3, CCSDS OEM, DIMAP, or CSV"))
+    if is_dimap(head):
+        return read_dimap(path).spanning_orbit()
     if head and orbit_files.is_sp3(head[0]):
         return orbit_files.read_sp3(path, spec.satellite)
     if (kind := orbit_files.message_kind(head)) is not None:
@@ -288,7 +291,9 @@ def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
 
 def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
     path = folder / spec.file
-    head = list(first_lines(path, "an attitude: CCSDS AEM, or CSV"))
+    head = list(first_lines(path, "an attitude: CCSDS AEM, DIMAP, or CSV"))
+    if is_dimap(head):
+        return read_dimap(path).samples()
     if (kind := orbit_files.message_kind(head)) is not None:
         if kind != "AEM":
             raise InputError(Issue("a CCSDS message of another kind", str(path), 1, (), kind, "AEM"))

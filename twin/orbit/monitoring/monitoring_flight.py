@@ -26,6 +26,7 @@ from scenes.specs.course import moment
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
+from twin.orbit.flight.corrected_lines import calibrated_line
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineCamera, look_angle, traced_line_cameras
@@ -176,7 +177,7 @@ class MonitorFlight:
 
 def in_analysis(line: LineCamera, like: CalibratedLine) -> CalibratedLine:
     """A traced line in the analysis's form, with the axes and principal distance of another."""
-    return CalibratedLine(line.pixels, line.directions, line.origins, like.axes, like.principal_distance)
+    return calibrated_line(line, like.axes, like.principal_distance)
 
 
 def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorFlight:
@@ -220,8 +221,7 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
         raise BenchError(f"the instrument cannot be rendered: {error}", ("course",), TOO_FAR) from error
     calibrated = {}
     for name in pair:
-        line, axes = lines[spec.referred][name], experiment.sight.axes[name]
-        calibrated[name] = CalibratedLine(line.pixels, line.directions, line.origins, axes, distance[name])
+        calibrated[name] = calibrated_line(lines[spec.referred][name], experiment.sight.axes[name], distance[name])
     smoothed = {}
     if experiment.disturbances is not None:
         smoothed = {interval: monitor.smoothed(used, interval) for interval in {spec.interval, *spec.compared}}

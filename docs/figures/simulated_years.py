@@ -1,0 +1,108 @@
+"""Figures and picture of the simulated years on the page operation.md: three lives, each followed and held against its
+truth.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+SEED = 1
+PICTURE = ROOT / "docs/operation.svg"
+_LONG = 2000
+"""Letters of a line from which on it is one of the data's."""
+_YEARS = ("--from", "2027-01-01T00:00:00Z", "--days", "1096", "--every", "6d", "--coefficient-error", "30%")
+SENSORS = (
+    "base",
+    "base/forward",
+    "base/backward",
+    "base/central_prism",
+    "base/forward/focal_plane",
+    "base/backward/focal_plane",
+)
+"""Bodies with a sensor in the life in which some fail."""
+STUCK = "base/forward"
+DEAD = ("base/backward", "base/central_prism")
+_FAILING = (
+    *(word for body in SENSORS for word in ("--sensor", body)),
+    *(word for body in DEAD for word in ("--dead", f"{body}@2028-01-01T00:00:00Z")),
+    *("--stuck", f"{STUCK}@2028-07-01T00:00:00Z"),
+)
+LIVES: Mapping[str, tuple[str, ...]] = {
+    "pair": ("scenes/examples/operation.yaml",),
+    "two": ("scenes/examples/operation_two.yaml",),
+    "failing": ("scenes/examples/operation.yaml", *_FAILING),
+}
+"""Name of a life -> its plan and further words of the command that simulates it."""
+_QUANTITIES = {
+    "angle": ("intersection_angle", "change_arcsec", "arcsec"),
+    "height": ("ground", "height_m", "m"),
+    "forward": ("forward", "d_f_um", "um"),
+    "backward": ("backward", "d_f_um", "um"),
+}
+_WAYS = ("ground", "single", "filtered", "smoothed")
+_DIGITS = {
+    "pair": {"angle": 3, "height": 2, "forward": 1, "backward": 1},
+    "two": {"angle": 4, "height": 4, "forward": 2, "backward": 2},
+}
+"""Lives whose errors the page tells -> decimals of each."""
+
+
+def short(drawn: str) -> str:
+    """A drawing whose long lines are told to a hundredth of a pixel: half of the bytes.
+
+    Args:
+        drawn: an SVG; letters and scales keep their digits.
+    """
+
+    def rounded(line: re.Match[str]) -> str:
+        return re.sub(r"(\d+\.\d\d)\d+", r"\1", line[0])
+
+    return re.sub(rf'd="[^"]{{{_LONG},}}"', rounded, drawn)
+
+
+def judged(words: tuple[str, ...], place: Path, picture: bool) -> dict[str, Any]:
+    """Simulate a life and judge it.
+
+    Args:
+        words: plan and further words.
+        place: folder for all of it.
+        picture: whether the page shows this one.
+    """
+    record, out = place / "life", place / "judged"
+    plan, *more = words
+    for command in (
+        ("simulate", plan, str(record), *_YEARS, "--seed", str(SEED), *more),
+        ("judge", str(record), "--out", str(out)),
+    ):
+        subprocess.run([sys.executable, "-m", "twin.operate", *command, "--quiet"], cwd=ROOT, check=True)
+    if picture:
+        PICTURE.write_text(short((out / "artefacts/with_and_without.svg").read_text("utf-8")), "utf-8")
+    found: dict[str, Any] = json.loads((out / "judged.json").read_text("utf-8"))
+    return found
+
+
+def measured() -> Mapping[str, tuple[float, int, str]]:
+    """Name of a figure -> value, decimals, unit; the picture of the page is drawn as well."""
+    out: dict[str, tuple[float, int, str]] = {}
+    for life, words in LIVES.items():
+        with tempfile.TemporaryDirectory(prefix="operation-") as place:
+            found = judged(words, Path(place), life == "pair")
+        for name, (group, key, unit) in _QUANTITIES.items():
+            own = found["quantities"][group][key]
+            for way in _WAYS if life in _DIGITS else ():
+                digits = 1 if way == "ground" else _DIGITS[life][name]
+                out[f"operation.{life}.{name}.{way}"] = (own[way]["rms"], digits, unit)
+            if name in ("forward", "backward") and life != "two":
+                share = found["explained_by_temperatures"][f"{group} {key}"]
+                out[f"operation.{life}.{name}.explained"] = (100.0 * share, 0, "%")
+        for share in ("within_one", "within_two"):
+            out[f"operation.{life}.{share}"] = (100.0 * found["predictions"][share], 0, "%")
+    return out

@@ -1,0 +1,35 @@
+"""Circles and intervals that hold a share of errors, against closed forms and draws."""
+
+import numpy as np
+import pytest
+
+from analysis.orbit.ground_errors import circular_error, linear_error
+
+
+def test_closed_forms() -> None:
+    """Rayleigh's distribution for a round covariance, the normal one along a line, to the 5e-4 that is promised."""
+    for share in (0.5, 0.9, 0.95, 0.99):
+        assert circular_error(4.0 * np.eye(2), share) == pytest.approx(2.0 * np.sqrt(-2.0 * np.log1p(-share)), rel=1e-9)
+        line = linear_error(9.0, share)
+        assert circular_error(np.diag([9.0, 0.0]), share) == pytest.approx(line, rel=5e-4)
+    assert linear_error(1.0) == pytest.approx(1.6448536, rel=1e-7)
+    assert circular_error(np.zeros((2, 2))) == 0.0
+
+
+@pytest.mark.parametrize("ratio", [0.03, 0.2, 0.6])
+def test_turned_ellipses_hold_their_share_of_draws(ratio: float) -> None:
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    covariance = turn @ np.diag([2.5, 2.5 * ratio]) ** 2 @ turn.T
+    radius = circular_error(np.stack([covariance, 0.25 * covariance]))
+    assert radius[1] == pytest.approx(0.5 * radius[0], rel=1e-12)
+    draws = np.random.default_rng(2).standard_normal((400_000, 2)) @ np.linalg.cholesky(covariance).T
+    # 400 000 draws: the share has a sigma of 5e-4
+    assert np.mean(np.hypot(*draws.T) < radius[0]) == pytest.approx(0.9, abs=2e-3)
+
+
+def test_what_is_no_covariance_or_share() -> None:
+    with pytest.raises(ValueError, match="negative"):
+        circular_error(np.diag([1.0, -1.0]))
+    for share in (0.0, 1.0, 90.0):
+        with pytest.raises(ValueError, match="share"):
+            circular_error(np.eye(2), share)

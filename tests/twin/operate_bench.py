@@ -1,0 +1,191 @@
+"""A record with readings of the monitor and a stand-in for what is estimated from it; for tests of what is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from analysis.monitor.limits import quantities
+from optics.numerics.backend import load_backend
+from tests.twin.operation_records import life_of, plan_of, record_of
+from tests.twin.operation_records import monitor_entry as own_entry
+from tests.twin.record_bench import START, given, made, pair
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.operate.estimate.following import Break, Course, Following, FoundJump, SensorState
+from twin.operate.estimate.plans import keep_plan
+from twin.operate.estimate.standing import Scores
+from twin.operate.record.entries import MICRO, Alarm, Entry
+from twin.operate.record.history import History
+
+HOUR = 3600 * MICRO
+DAY = 24 * HOUR
+COUNT = 160
+"""Readings of the record, three hours apart."""
+REFOCUS = START + 20 * DAY - 2 * HOUR
+EVIL = '<img src=x onerror="alert(1)">'
+
+
+@cache
+def experiment() -> MonitorExperiment:
+    return MonitorExperiment(pair(), load_backend("llvm"))
+
+
+@cache
+def all_quantities() -> tuple[Any, ...]:
+    own = experiment()
+    return quantities(own.cameras, own.ground)
+
+
+def monitor_entry(k: int, frames: bool = False) -> Entry:
+    """A reading as a run of the main job leaves it."""
+    names = {"forward": 1.0, "backward": -1.0}
+    cameras = {
+        camera: {
+            "posterior": {
+                one.key: sign * (0.02 * k + 0.3 * np.sin(0.7 * k)) for one in all_quantities() if one.group == camera
+            }
+            | {f"{one.key}_sigma": 0.3 for one in all_quantities() if one.group == camera}
+        }
+        for camera, sign in names.items()
+    }
+    spot = {"row": 47.5, "column": 47.5, "row_sigma": 8e-4, "column_sigma": 8e-4}
+    spots = {
+        camera: {
+            channel: {"before": spot, "after": {**spot, "row": 47.5 - 0.002 * k, "column": 47.5 + sign * 0.004 * k}}
+            for channel in ("left", "right")
+        }
+        for camera, sign in names.items()
+    }
+    angles = {"posterior": {"change_arcsec": 0.04 * k, "change_arcsec_sigma": 0.4}}
+    numbers = {"cameras": cameras, "spots": spots, "intersection_angle": angles, "sigma_holds": True}
+    return Entry("monitor", "monitor", START + 3 * HOUR * k, {"sha256": f"{k:064x}", "state": 0, "numbers": numbers})
+
+
+def filled(place: Any, count: int = COUNT) -> History:
+    """A new record with readings and two alarms, of which one was acknowledged."""
+    history = made(place)
+    events = [Entry("event", name, time, {}) for time, name in ((START + 5 * DAY, "safe_mode"), (REFOCUS, "refocus"))]
+    history.take(given("passes.csv", [monitor_entry(k) for k in range(count)]))
+    history.take(given("events.csv", events if count > 100 else []))
+    texts = (f"the height will break its requirement {EVIL}", "a jump of base/forward/M2")
+    for k, (kind, text) in enumerate(zip(("breaks", "jump"), texts, strict=True)):
+        history.raise_alarm(Alarm(kind, "ground height_m", START + (20 - 7 * k) * DAY - 3 * HOUR, text))
+    history.acknowledge(2, "A. Nurse", "seen in the images, too")
+    return history
+
+
+def plan(events: bool = True) -> Any:
+    """What is asked of a plan."""
+    own = {"safe_mode": ("settling",)} if events else {}
+    return SimpleNamespace(operation=SimpleNamespace(disturbances="in_service", horizon=30 * 86_400.0, events=own))
+
+
+@dataclass
+class StandIn:
+    """In place of `twin.operate.estimate.operation.Operation`: quantities grow evenly, one jump, one stuck sensor."""
+
+    history: History
+    plan: Any = field(default_factory=plan)
+
+    @property
+    def experiment(self) -> MonitorExperiment:
+        return experiment()
+
+    @property
+    def quantities(self) -> tuple[Any, ...]:
+        return all_quantities()
+
+    def _course(self, times: Any) -> Course:
+        times = np.asarray(times, np.int64)
+        days = (times - START) / DAY
+        rate = np.array([0.05 * (1 + k) for k in range(len(self.quantities))])
+        jump = 0.4 * (days > 12.0)
+        values = rate * (days + jump)[:, None]
+        sigmas = (0.05 + 0.02 * np.clip(days - 20.0, 0.0, None))[:, None] * np.ones_like(rate)
+        return Course(times, self.quantities, values, sigmas, np.zeros((len(times), 8)), np.zeros((len(times), 8, 8)))
+
+    def follow(self) -> Following:
+        times = [int(entry["time_us"]) for entry in self.history.entries("monitor")]
+        newest = times[-1]
+        now = self._course([newest])
+        breaks = []
+        for q, limit, probability in ((0, 0.4, 0.99), (8, 20.0, 0.95)):
+            value, sigma = now.values[0, q], now.sigmas[0, q]
+            beyond = float(norm.sf((limit - value) / sigma) + norm.cdf((-limit - value) / sigma))
+            when = newest if q == 0 else newest + 9 * DAY
+            one = self.quantities[q]
+            name = f"{one.group} {one.key}"
+            holds = beyond <= 1.0 - probability
+            breaks.append(Break(name, one.parameter.unit, limit, probability, beyond, holds, when))
+        chi = np.random.default_rng(3).chisquare(8, len(times))
+        chi[-5] = 60.0
+        jump = FoundJump(
+            "base/forward/M2",
+            START + 12 * DAY - 3 * HOUR,
+            START + 12 * DAY,
+            START + 12 * DAY + 6 * HOUR,
+            (("base/forward/M2 rotate x", "arcsec", 0.1, 0.1), ("base/forward/M2 shift z", "um", 1.234, 0.056)),
+            88.2,
+            1e-9,
+            {"base/backward": 3.25, "base/forward/M3": 70.5},
+        )
+        stuck = f"40 readings in a row of 293.1 K {EVIL}"
+        reason = "its own sigma does not hold"
+        return Following(
+            newest,
+            len(times),
+            now,
+            Scores(len(times), 8 * len(times), 800, 1220, 7.764),
+            tuple((time, float(one), 8) for time, one in zip(times, chi, strict=True)),
+            (jump,),
+            ((START + 5 * DAY, "safe_mode", ("settling",)),),
+            (
+                SensorState("base", "ok", START, newest, ""),
+                SensorState("base/forward/M1", "stuck", START + 18 * DAY, newest, stuck),
+            ),
+            ((START + 3 * DAY, "monitor", "monitor", reason),),
+            {"forward d_alpha_arcsec": 0.62, "forward d_beta_arcsec": float("nan")},
+            1.5,
+            False,
+            tuple(breaks),
+        )
+
+    def smoothed(self, times: Any) -> Course:
+        return self._course(times)
+
+    def forecast(self, times: Any) -> Course:
+        return self._course(times)
+
+    def states(self, times: Any) -> tuple[Course, np.ndarray, dict[str, Any]]:
+        """Every third motion grows to two of its standard deviations, the others to a tenth of that."""
+        stated = self.experiment.stated.components
+        size = np.array([one.sigma / one.unit_size for one in stated])
+        days = (np.asarray(times) - START) / DAY
+        mean = 0.1 * days[:, None] * size * np.where(np.arange(len(size)) % 3 == 0, 1.0, 0.1)
+        together = {}
+        for name in dict.fromkeys(one.name for one in stated):
+            own = np.array([one.name == name for one in stated])
+            together[name] = mean[:, own].sum(axis=1), np.full(len(mean), np.sqrt(0.3 * np.sum(size[own] ** 2)))
+        return self._course(times), mean, together
+
+
+def lived(folder: Path, days: float = 80.0) -> tuple[Path, Path]:
+    """A plan, and a record that keeps it, of a simulated life of `tests.twin.operation_records`; a mount slips."""
+    setup = plan_of(folder)
+    own = MonitorExperiment(setup.model, load_backend())
+    stated = own.disturbances
+    assert stated is not None
+    slip = {50.0: {stated.labels.index("base/backward/M2 shift x"): 60.0}}
+    life = life_of(stated, days, 4, 3, slip)
+    with record_of(folder / "record", setup) as history:
+        entries = [own_entry(own, stated, life, k, 3) for k in range(len(life.times))]
+        entries.append(Entry("event", "safe_mode", int(life.times[0]) + 30 * DAY + HOUR, {}))
+        history.take(given("all", sorted(entries, key=lambda one: one.time)))
+        keep_plan(setup, folder / "plan.yaml", history)
+    return folder / "record", folder / "plan.yaml"

@@ -1,0 +1,342 @@
+"""Scenes of DIMAP files: the rigorous model against the format's formulas anew and against the RPC of the same file,
+and what is refused.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from scenes.specs.measured.orbit_data import LineTimesFileSpec
+from scenes.specs.measured.pass_files import PlatformFilesSpec
+from scenes.yaml.errors import InputError
+from tests.twin.dimap_bench import Oracle, Scene, clock, dimap, rpc, write
+from twin.orbit.conventions.pass_readings import read_line_clocks
+from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.export.rpc_files import read_rpc
+from twin.orbit.flight.earth import east_north_up
+from twin.orbit.flight.platform_table import TabulatedTrajectory
+from twin.orbit.measured import xml_file
+from twin.orbit.measured.dimap_file import read_dimap
+from twin.orbit.measured.dimap_sensor import read_scene
+from twin.orbit.measured.platform_files import platform_table, read_platform
+
+PLEIADES = Scene()
+SPOT = Scene(
+    profile="S6_SENSOR",
+    attitude="samples",
+    bands=("P",),
+    ylos=(1e-4, 2e-9),
+    xlos=(-0.022, 2.2e-6, 1e-12),
+    first_column=501,
+    period=0.2e-3,
+    start=86_399.2,  # over midnight
+)
+NEO = Scene(
+    profile="PNEO_SENSOR",
+    version="3.0",
+    attitude="samples",
+    interval=0.004363,
+    ephemeris=(0.3, 8),
+    bands=("P",),
+    period=43.555e-6,
+)
+SCENES = {"pleiades": PLEIADES, "spot": SPOT, "neo": NEO}
+AGREE = 1e-6
+"""Metres: the oracle's polynomial of eight points differs by less from ours of ten, and from a spline through
+quaternions 30 ms apart by 1e-12 rad.
+"""
+
+
+def places(scene: Scene, count: int = 30) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(5)
+    row, column = (random.uniform(0.0, n - 1.0, count) for n in (scene.lines, scene.pixels))
+    return row, column, random.uniform(-100.0, 4000.0, count)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_rigorous_model_is_that_of_the_format(tmp_path: Path, name: str) -> None:
+    scene = SCENES[name]
+    path = write(tmp_path, scene)
+    if scene is SPOT:  # the oracle counts seconds of one day
+        early = replace(scene, start=80_000.0)
+        path = write(tmp_path, early)
+    sensor, oracle = read_scene(path).sensor, Oracle(path)
+    row, column, height = places(scene)
+    there = np.array([oracle.ground(*one) for one in zip(row, column, height, strict=True)])
+    assert np.abs(sensor.ground(row, column, height) - there).max() < AGREE
+    back = sensor.image(there)
+    np.testing.assert_allclose(back, (row, column), rtol=0, atol=3e-6)  # AGREE in pixels of 0.5 m and more
+
+
+def test_refraction_is_there_where_the_file_says_so(tmp_path: Path) -> None:
+    """At sea level a look of z leaves its straight line by 2.3 m tan z / cos^2 z, toward the satellite; 1 % for the
+    exact layers."""
+    tilted = replace(PLEIADES, pitch=0.4)
+    row, column = np.array([6000.0]), np.array([10_000.0])
+    straight = read_scene(write(tmp_path, tilted)).sensor
+    for value, on in (("true", True), ("1", True), ("false", False), ("TRUE", True)):
+        scene = replace(tilted, settings={"ATMOSPHERIC_REFRACTION_SETTING": value, "LIGHT_SPEED_SETTING": "false"})
+        sensor = read_scene(write(tmp_path, scene)).sensor
+        assert (sensor.effects.refraction, sensor.effects.aberration, sensor.effects.light_time) == (on, False, False)
+        moved = (sensor.ground(row, column) - straight.ground(row, column))[0]
+        ground = straight.ground(row, column)[0]
+        look = straight.trajectory.position(straight.time(row))[0] - ground
+        longitude, latitude, _ = straight.earth.geodetic(ground[None])
+        up = east_north_up(longitude, latitude)[0, 2] @ look / np.linalg.norm(look)
+        zenith = np.arccos(up)
+        wanted = 2.33 * np.tan(zenith) / np.cos(zenith) ** 2 if on else 0.0
+        assert np.linalg.norm(moved) == pytest.approx(wanted, rel=0.01)
+        assert moved @ look >= 0.0
+    scene = replace(tilted, settings={"ATMOSPHERIC_REFRACTION_SETTING": "perhaps"})
+    with pytest.raises(InputError, match="ATMOSPHERIC_REFRACTION_SETTING: neither true nor false"):
+        read_scene(write(tmp_path, scene))
+
+
+def test_midnight_within_a_scene_changes_nothing(tmp_path: Path) -> None:
+    """Sensors whose times count from another day; the Earth turns alike, as positions are Earth-fixed."""
+    row, column, height = places(SPOT)
+    for scene in (SPOT, replace(SPOT, attitude="polynomial")):
+        late, noon = (read_scene(write(tmp_path, replace(scene, start=s))).sensor for s in (scene.start, 43_000.0))
+        # texts of times have nanoseconds, in which the satellite moves by 7 um
+        assert np.abs(late.ground(row, column, height) - noon.ground(row, column, height)).max() < 3e-5
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_rpc_of_the_same_file_agrees(tmp_path: Path, name: str) -> None:
+    """The polynomials go into the product's file by the project's fitter, and come back as the user reads them."""
+    scene = SCENES[name]
+    sensor = read_scene(write(tmp_path, scene)).sensor
+    model = RationalPolynomial.fit(sensor, 0, scene.pixels, (0.0, 3000.0))
+    (tmp_path / "RPC_SCENE.XML").write_text(rpc(model, scene.version))
+    found = read_rpc(tmp_path / "RPC_SCENE.XML")
+    row, column, height = places(scene, 300)
+    height = height.clip(0.0, 3000.0)
+    ground = sensor.ground(row, column, height)
+    longitude, latitude, _ = sensor.earth.geodetic(ground)
+    line, sample = found.image(np.degrees(latitude), np.degrees(longitude), height)
+    # random places do not reach the corners, where the fit is worst; rounding of the offsets is 1e-11
+    assert np.abs(line - row).max() < max(model.error_px[0], 1e-7) * 1.01
+    assert np.abs(sample - column).max() < max(model.error_px[1], 1e-7) * 1.01
+    assert max(model.error_px) < 2e-3
+    back = found.ground(row, column, height)
+    np.testing.assert_allclose(back, np.degrees((latitude, longitude)), rtol=0, atol=2e-3 * 1e-5)  # 2e-3 px of 0.7 m
+
+
+def test_an_rpc_that_is_off_is_seen(tmp_path: Path) -> None:
+    """Half a pixel between the conventions of the versions is half a pixel here."""
+    sensor = read_scene(write(tmp_path, PLEIADES)).sensor
+    model = RationalPolynomial.fit(sensor, 0, PLEIADES.pixels, (0.0, 3000.0))
+    (tmp_path / "RPC.XML").write_text(
+        rpc(model, "3.0").replace('version="3.0"', 'version="2.1"').replace("GroundtoImage_Values", "Inverse_Model")
+    )
+    found = read_rpc(tmp_path / "RPC.XML")
+    assert found.offset[0] == pytest.approx(model.offset[0] - 1.0, abs=1e-9)
+
+
+def test_signs_of_the_body(tmp_path: Path) -> None:
+    """By the file's own orbit, without any model: pixels count from the right of the track, lines with the flight, and
+    a look that is turned forward lies ahead.
+    """
+    scene = replace(PLEIADES, pitch=0.0, roll=0.0, rate=(0.0, 0.0), ylos=(0.0,))
+    ahead = replace(scene, ylos=(0.05,))
+    middle = np.array([0.5 * (scene.lines - 1)])
+    time = scene.start + middle * scene.period
+    place, speed = scene.orbit(time)
+    right = np.cross(-place[0], speed[0])
+    first, last = (read_scene(write(tmp_path, scene)).sensor.ground(middle, c) for c in (0.0, scene.pixels - 1.0))
+    assert (first[0] - last[0]) @ right > 0.0
+    forward = read_scene(write(tmp_path, ahead)).sensor.ground(middle, 0.0)
+    assert (forward[0] - first[0]) @ speed[0] > 0.0
+    sensor = read_scene(write(tmp_path, scene)).sensor
+    assert (sensor.ground(middle + 10.0, 0.0)[0] - first[0]) @ speed[0] > 0.0
+
+
+def test_an_orbit_that_begins_with_the_image_is_carried_on(tmp_path: Path) -> None:
+    """As real files of Pléiades Neo have it: the first point 3 ms after the first line."""
+    scene = replace(NEO, lines=4000)
+    path = write(tmp_path, scene)
+    whole = read_scene(path).sensor
+    text = path.read_text()
+    points = re.findall(r" *<Point>.*?</Point>\n", text, re.DOTALL)
+    # points every 4 ms from 3 ms after the first line on
+    seconds = scene.start + 0.003 + 0.0043 * np.arange(60)
+    place, speed = scene.orbit(seconds)
+    made = "".join(
+        f"<Point><LOCATION_XYZ>{' '.join(map(repr, p.tolist()))}</LOCATION_XYZ>"
+        f"<VELOCITY_XYZ>{' '.join(map(repr, v.tolist()))}</VELOCITY_XYZ><TIME>{clock(scene, t)}</TIME></Point>\n"
+        for t, p, v in zip(seconds, place, speed, strict=True)
+    )
+    path.write_text(text.replace("".join(points), made))
+    found = read_scene(path).sensor
+    row = np.array([0.0, 20.0, 68.0, 2000.0])
+    away = found.ground(row, 100.0) - whole.ground(row, 100.0)
+    # times with nanoseconds make 4 um of position, which a spline 3 ms beyond its first points enlarges tenfold
+    assert np.abs(away).max() < 1e-3
+    for gap, within in ((0.08, 8e-3), (0.2, None)):
+        # gravity alone, and not the axes' turn, bends the path: a seventh of 2.7 cm in 80 ms
+        later = made
+        for t in seconds:
+            later = later.replace(clock(scene, t), clock(scene, t + gap - 0.003), 1)
+        for (p, v), (q, u) in zip(
+            zip(place, speed, strict=True), zip(*scene.orbit(seconds + gap - 0.003), strict=True), strict=True
+        ):
+            later = later.replace(" ".join(map(repr, p.tolist())), " ".join(map(repr, q.tolist())), 1)
+            later = later.replace(" ".join(map(repr, v.tolist())), " ".join(map(repr, u.tolist())), 1)
+        path.write_text(text.replace("".join(points), later))
+        if within is not None:
+            first = read_dimap(path).spanning_orbit()
+            there = scene.orbit(first.clock.second[:1])[0]
+            assert np.abs(first.position[0] - there[0]).max() < within
+    with pytest.raises(InputError, match="begins before the ephemeris"):
+        read_scene(path)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_orbit_and_attitude_of_a_dimap_are_those_of_a_platform(tmp_path: Path, name: str) -> None:
+    """Files of a pass take it as they take SP3 and AEM."""
+    path = write(tmp_path, SCENES[name])
+    spec = PlatformFilesSpec.model_validate(
+        {"orbit": {"file": path.name}, "attitude": {"file": path.name, "body_axes": ["forward", "right", "down"]}}
+    )
+    table = platform_table(*read_platform(spec, tmp_path))
+    scene = read_scene(path)
+    trajectory = TabulatedTrajectory(table)
+    t = scene.sensor.time(np.array([0.0, 100.0, SCENES[name].lines - 1.0]))
+    assert scene.epoch == table.epoch
+    assert np.array_equal(trajectory.position(t), scene.sensor.trajectory.position(t))
+    assert np.array_equal(trajectory.body_to_itrs(t), scene.sensor.trajectory.body_to_itrs(t))
+
+
+def test_bands(tmp_path: Path) -> None:
+    path = write(tmp_path, replace(SPOT, bands=("B0", "B1")))
+    read_dimap(path)  # they look alike
+    text = path.read_text()
+    other = text.replace("<XLOS_0>-0.022<", "<XLOS_0>-0.021<", 1)
+    assert other != text
+    path.write_text(other)
+    with pytest.raises(InputError, match="bands do not look alike"):
+        read_dimap(path)
+    one, two = (read_dimap(path, band) for band in ("B0", "B1"))
+    assert one.right[0] == pytest.approx(two.right[0] - 0.001)
+    with pytest.raises(InputError, match="no such band"):
+        read_dimap(path, "B7")
+
+
+def _edit(old: str, new: str):
+    return lambda text: text.replace(old, new, 1)
+
+
+REFUSED = {
+    "no start": (_edit("<START>", "<STRAT>"), r"mismatched tag"),
+    "renamed": (lambda t: t.replace("START>", "STRAT>"), r"Time_Range: no element START; did you mean 'STRAT'"),
+    "empty": (lambda t: re.sub(r"<NROWS>\d+<", "<NROWS><", t), r"NROWS: another number of numbers"),
+    "text": (lambda t: re.sub(r"<NROWS>\d+<", "<NROWS>many<", t), r"NROWS: not a number; found 'many'"),
+    "half a line": (lambda t: re.sub(r"<NROWS>\d+<", "<NROWS>7.5<", t), r"NROWS: not a whole number"),
+    "negative": (lambda t: re.sub(r"<NCOLS>\d+<", "<NCOLS>-3<", t), r"NCOLS: out of bounds"),
+    "not finite": (lambda t: re.sub(r"<XLOS_1>[^<]*<", "<XLOS_1>nan<", t), r"XLOS_1: not a finite number"),
+    "unit": (_edit('LINE_PERIOD unit="ms"', 'LINE_PERIOD unit="furlong"'), r"LINE_PERIOD: another unit"),
+    "microseconds": (_edit('LINE_PERIOD unit="ms"', 'LINE_PERIOD unit="us"'), r"LINE_PERIOD: out of bounds"),
+    "seconds": (_edit('LINE_PERIOD unit="ms">0.', 'LINE_PERIOD unit="ms">1.'), r"line period, number of lines and tim"),
+    "profile": (_edit("PHR_SENSOR", "PHR_ORTHO"), r"METADATA_PROFILE: a product that is not read"),
+    "version": (_edit('version="2.15"', 'version="1.1"'), r"METADATA_FORMAT: not this format"),
+    "no model": (lambda t: t.replace("Refined_Model", "Sensor_Model"), r"no rigorous model"),
+    "no attitude": (lambda t: t.replace("Polynomial_Quaternions", "Quaternions"), r"the attitude is not given once"),
+    "degree": (_edit("<DEGREE>3<", "<DEGREE>2<"), r"COEFFICIENTS: another number of numbers"),
+    "huge degree": (_edit("<DEGREE>3<", "<DEGREE>99<"), r"DEGREE: out of bounds"),
+    "five coefficients": (
+        _edit("<DEGREE>3</DEGREE><COEFFICIENTS>", "<DEGREE>3</DEGREE><COEFFICIENTS>1 "),
+        r"COEFFICIENTS: another number of",
+    ),
+    "not unit": (lambda t: re.sub(r"(<Q1><DEGREE>3</DEGREE><COEFFICIENTS>)\S+", r"\g<1>3.5", t), r"not a quaternion"),
+    "a coordinate lost": (lambda t: re.sub(r'"m">(-?)(\d+)', r'"m">\1', t), r"no place of a satellite"),
+    "offset": (lambda t: re.sub(r"<OFFSET>[^<]*<", "<OFFSET>9e9<", t), r"OFFSET: out of bounds"),
+    "twice": (_edit("<NROWS>", "<NROWS>5</NROWS><NROWS>"), r"NROWS stands more than once"),
+    "a time": (_edit("<START>2017-09-28T", "<START>2017-09-31T"), r"START: not a date and time"),
+    "entity": (_edit("<Dimap_Document>", '<!DOCTYPE d [<!ENTITY a "b">]><Dimap_Document>'), r"a document type or ent"),
+    "external": (
+        _edit("<Dimap_Document>", '<!DOCTYPE d SYSTEM "file:///etc/passwd"><Dimap_Document>'),
+        r"a document type or entities",
+    ),
+    "unknown entity": (_edit("PHR_SENSOR", "&lol;"), r"not XML: undefined entity"),
+    "another file": (lambda t: t.replace("Dimap_Document", "Document"), r"not a DIMAP file"),
+    "cut": (lambda t: t[: len(t) // 2], r"not XML"),
+    "inertial": (
+        lambda t: re.sub(
+            r'<VELOCITY_XYZ unit="m/s">(\S+) ', lambda m: f'<VELOCITY_XYZ unit="m/s">{float(m[1]) + 490.0} ', t
+        ),
+        r"VELOCITY_XYZ: not the velocity of these positions",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused_and_where(tmp_path: Path, name: str) -> None:
+    edit, message = REFUSED[name]
+    text = dimap(PLEIADES)
+    assert edit(text) != text
+    (tmp_path / "DIM.XML").write_text(edit(text))
+    with pytest.raises(InputError) as caught:
+        read_scene(tmp_path / "DIM.XML")
+    issue = caught.value.issues[0]
+    assert re.search(message, str(issue)), str(issue)
+    assert issue.file == str(tmp_path / "DIM.XML")
+
+
+def test_a_billion_laughs_and_files_that_are_too_deep_or_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused where they begin: expanded, the first would have 10^13 letters."""
+    monkeypatch.setattr(xml_file, "_MOST_ELEMENTS", 1000)
+    laughs = "".join(f'<!ENTITY a{k + 1} "{f"&a{k};" * 10}">' for k in range(12))
+    bad = {
+        "entities": f'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a0 "ha">{laughs}]><x>&a12;</x>',
+        "too deep or too long": "<a>" * 100_000,
+        "deep or too long": f"<a>{'<b/>' * 1000}</a>",
+    }
+    for message, text in bad.items():
+        (tmp_path / "DIM.XML").write_text(text)
+        with pytest.raises(InputError, match=message):
+            read_dimap(tmp_path / "DIM.XML")
+
+
+TEXT = dimap(replace(PLEIADES, lines=2000))
+TOKENS = [m.span() for m in re.finditer(r"[^<>\s]+|<[^>]*>", TEXT)]
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.integers(0, len(TOKENS) - 1),
+    st.sampled_from(
+        ["", "0", "-1", "1e400", "nan", "x", "<", "&", "1 2 3", "9" * 400, "<a/>", "\u0661", "2017", "1e12"]
+    ),
+)
+def test_any_edit_is_read_or_told(tmp_path: Path, which: int, put: str) -> None:
+    """Whatever one piece of the file becomes, it is a scene or a message with file and place, and nothing else."""
+    start, end = TOKENS[which]
+    path = tmp_path / "DIM.XML"
+    path.write_text(TEXT[:start] + put + TEXT[end:])
+    told = []
+    try:
+        assert read_scene(path).read.lines >= 1
+    except InputError as error:
+        told = error.issues
+    assert all(issue.file == str(path) and issue.problem for issue in told)
+
+
+def test_line_times_of_a_scene(tmp_path: Path) -> None:
+    path = write(tmp_path, SPOT)  # over midnight
+    said = {"file": path.name, "time_scale": "UTC", "moment": "middle"}
+    found = read_line_clocks(LineTimesFileSpec.model_validate(said), ("pan",), tmp_path)["pan"]
+    scene = read_scene(path)
+    moments = found.clock.instants("UTC").since(scene.epoch)
+    # the table's seconds of the day have 1e-11 s
+    np.testing.assert_allclose(moments, scene.sensor.time(found.line), rtol=0, atol=1e-9)
+    for change, cameras, message in (
+        ({}, ("pan", "ms"), "the times of one line"),
+        ({"time_scale": "GPS"}, ("pan",), "in UTC"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_line_clocks(LineTimesFileSpec.model_validate(said | change), cameras, tmp_path)

@@ -1,0 +1,250 @@
+"""``twin.orbit export`` of scenes: DIMAP in, models, corrections and maps out; what is refused."""
+
+import json
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+
+import twin.orbit.__main__ as command
+from tests.twin.commands import files, invoke
+from tests.twin.dimap_bench import Scene, rpc, write
+from tests.twin.line_scanner_model import LineScannerModel
+from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.export.rpc_files import read_rpc
+from twin.orbit.measured.dimap_sensor import read_scene
+from twin.run.data_files import FrameFacts, tiff
+
+run = partial(invoke, command.app)
+SCENE = Scene(lines=4000, pixels=6000)
+TRUE = np.array([12.0, -31.0])
+NOISE = 0.2
+COUNT = 14
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene with its polynomials and control points, one of which is wrong by 20 pixels."""
+    place = tmp_path_factory.mktemp("scene")
+    sensor = read_scene(write(place, SCENE)).sensor
+    (place / "RPC_SCENE.XML").write_text(rpc(RationalPolynomial.fit(sensor, 0, SCENE.pixels, (0.0, 2000.0))))
+    (place / "points.gcp").write_text(gcp(sensor, "SCENE_P.tif"))
+    return place
+
+
+def gcp(sensor, image: str, count: int = COUNT, wrong: int = 3) -> str:
+    """Control points as the Ames Stereo Pipeline has them: name, place, sigmas, image, column, row, sigmas."""
+    random = np.random.default_rng(11)
+    row, column = random.uniform(50.0, SCENE.lines - 50.0, count), random.uniform(50.0, SCENE.pixels - 50.0, count)
+    longitude, latitude, height = sensor.earth.geodetic(sensor.ground(row, column, random.uniform(0.0, 1500.0, count)))
+    seen = np.stack([row, column], axis=-1) + TRUE + NOISE * random.standard_normal((count, 2))
+    seen[wrong] += 20.0
+    values = np.degrees(latitude), np.degrees(longitude), height, seen[:, 1], seen[:, 0]
+    lines = [
+        f"{k} {a!r} {b!r} {h!r} 0.05 0.05 0.05 {image} {c!r} {r!r} {NOISE} {NOISE}"
+        for k, (a, b, h, c, r) in enumerate(zip(*(v.tolist() for v in values), strict=True))
+    ]
+    return "# WGS 84\n" + "\n".join(lines) + "\n"
+
+
+def test_a_scene_becomes_models(folder: Path, tmp_path: Path) -> None:
+    """ISD and RPC agree with the sensor of the file; the file's own polynomials are compared."""
+    result = run("export", folder / "DIM_SCENE.XML", "--out", tmp_path / "out", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert {"models/SCENE_P.json", "models/SCENE_P_RPC.TXT"} <= files(tmp_path / "out")
+    numbers = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert numbers["product_rpc"]["SCENE_P"]["largest_px"] < 1e-4  # both are fits of one sensor
+    assert "accuracy" not in numbers
+    assert "control" not in numbers
+    sensor = read_scene(folder / "DIM_SCENE.XML").sensor
+    random = np.random.default_rng(1)
+    row, column = random.uniform(0.0, SCENE.lines - 1.0, 50), random.uniform(0.0, SCENE.pixels - 1.0, 50)
+    ground = sensor.ground(row, column, 1000.0)
+    model = LineScannerModel(json.loads((tmp_path / "out" / "models" / "SCENE_P.json").read_text()))
+    line, sample = model.image(ground)
+    # corner of the image and centre of the pixel; the sensor model's frame time is told to a microsecond of a line
+    np.testing.assert_allclose((line - 0.5, sample - 0.5), (row, column), rtol=0, atol=2e-5)
+    longitude, latitude, height = sensor.earth.geodetic(ground)
+    there = read_rpc(tmp_path / "out" / "models" / "SCENE_P_RPC.TXT").image(
+        np.degrees(latitude), np.degrees(longitude), height
+    )
+    np.testing.assert_allclose(there, (row, column), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["shift", "affine"])
+def test_control_points_correct_the_polynomials(folder: Path, tmp_path: Path, kind: str) -> None:
+    arguments = ("--control", folder / "points.gcp", "--correction", kind)
+    result = run("export", folder / "DIM_SCENE.XML", *arguments, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    told = json.loads((tmp_path / "out" / "export.json").read_text())["control"]["SCENE_P"]
+    assert (told["kind"], told["points"], told["left_out"]) == (kind, COUNT, ["3"])
+    found = read_rpc(tmp_path / "out" / "models" / "SCENE_P_RPC.TXT")
+    assert found.bias_m == pytest.approx(told["err_bias_m"])
+    assert 0.02 < found.bias_m < 0.4  # 0.2 px of 0.7 m, of 13 points; at the corners of an affine function more
+    sensor = read_scene(folder / "DIM_SCENE.XML").sensor
+    row, column = np.array([500.0, 3500.0, 2000.0]), np.array([500.0, 3000.0, 5500.0])
+    longitude, latitude, height = sensor.earth.geodetic(sensor.ground(row, column, 700.0))
+    off = np.stack(found.image(np.degrees(latitude), np.degrees(longitude), height)) - (row, column) - TRUE[:, None]
+    assert np.abs(off).max() < 4.0 * NOISE * (0.3 if kind == "shift" else 1.0)
+    assert "left out: 3" in result.output.replace("\n", " ")
+    again = run("export", folder / "DIM_SCENE.XML", *arguments, "--out", tmp_path / "again", "--quiet")
+    assert again.exit_code == 0
+    same = ("models/SCENE_P_RPC.TXT", "models/SCENE_P.json", "artefacts/control.csv")
+    assert all((tmp_path / "out" / n).read_bytes() == (tmp_path / "again" / n).read_bytes() for n in same)
+
+
+def test_a_map_of_the_accuracy(folder: Path, tmp_path: Path) -> None:
+    """By hand for a look near the vertical: the attitude's turn times the distance, and the position, on each axis."""
+    sigmas = (
+        "--attitude-sigma",
+        "2 arcsec",
+        "--position-sigma",
+        "1 m",
+        "--image-sigma",
+        "0.5",
+        "--height-sigma",
+        "3 m",
+    )
+    result = run("export", folder / "DIM_SCENE.XML", *sigmas, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    numbers = json.loads((tmp_path / "out" / "export.json").read_text())["accuracy"]["SCENE_P"]
+    sensor = read_scene(folder / "DIM_SCENE.XML").sensor
+    middle = np.array([2000.0]), np.array([3000.0])
+    ground = sensor.ground(*middle, 1000.0)[0]
+    station = sensor.trajectory.position(sensor.time(middle[0]))[0]
+    distance = np.linalg.norm(station - ground)
+    sigma = np.hypot(2.0 / 206264.8 * distance, 1.0)
+    # a look 13 deg from the vertical draws the ground by 1 / cos^2 at most
+    assert 2.146 * sigma < numbers["ce90_median_m"] < 2.146 * sigma * 1.08
+    assert numbers["le90_largest_m"] == pytest.approx(1.6449 * 3.0, rel=1e-4)
+    found = read_rpc(tmp_path / "out" / "models" / "SCENE_P_RPC.TXT")
+    assert (found.bias_m, found.random_m) == pytest.approx((numbers["common_m"], numbers["random_m"]))
+    notes = json.loads((tmp_path / "out" / "models" / "SCENE_P.json").read_text())["notes"]
+    assert any("CE90" in note and "m^2" in note for note in notes)
+    assert {"artefacts/accuracy-map.svg", "artefacts/accuracy_map.csv"} <= files(tmp_path / "out")
+    table = (tmp_path / "out" / "artefacts" / "accuracy_map.csv").read_text().splitlines()
+    assert len(table) == 1 + 13 * 13
+
+
+def test_what_control_determines_is_not_what_the_camera_leaves_open(folder: Path, tmp_path: Path) -> None:
+    arguments = ("--control", folder / "points.gcp", "--attitude-sigma", "2 arcsec", "--image-sigma", "0.5")
+    result = run("export", folder / "DIM_SCENE.XML", *arguments, "--out", tmp_path / "out", "--quiet")
+    assert result.exit_code == 0
+    numbers = json.loads((tmp_path / "out" / "export.json").read_text())
+    found = read_rpc(tmp_path / "out" / "models" / "SCENE_P_RPC.TXT")
+    assert found.bias_m == pytest.approx(numbers["control"]["SCENE_P"]["err_bias_m"])
+    assert numbers["accuracy"]["SCENE_P"]["common_m"] > 10.0 * found.bias_m
+
+
+REFUSED = {
+    "no control": (("--control", "none.gcp"), "no such file"),
+    "another ending": (("--control", "RPC_SCENE.XML"), "not a .gcp file"),
+    "no unit": (("--attitude-sigma", "2"), "--attitude-sigma"),
+    "a length": (("--attitude-sigma", "2 m"), "--attitude-sigma"),
+    "too large": (("--position-sigma", "1e9 m"), "--position-sigma must lie between"),
+    "a band": (("--band", "B7"), "no such band"),
+    "the truth": (("--truth",), "nobody knows the truth of a scene"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused(folder: Path, tmp_path: Path, name: str) -> None:
+    arguments, message = REFUSED[name]
+    known = {one: folder / one for one in ("none.gcp", "RPC_SCENE.XML")}
+    result = run("export", folder / "DIM_SCENE.XML", *(known.get(a, a) for a in arguments), "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert message in re.sub(r"\s+", " ", result.stderr)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda t: "\n".join(" ".join(row.split()[:7]) for row in t.splitlines()[1:]), "without places in images"),
+        (lambda t: "\n".join(t.splitlines()[:3]), "3 or more"),
+        (
+            lambda t: re.sub(r"SCENE_P.tif", lambda m: "a.tif", t, count=2).replace("SCENE_P", "b"),
+            "in one of the images",
+        ),
+    ],
+)
+def test_control_points_that_do_not_correct(folder: Path, tmp_path: Path, edit, message: str) -> None:
+    (tmp_path / "p.gcp").write_text(edit((folder / "points.gcp").read_text()))
+    result = run("export", folder / "DIM_SCENE.XML", "--control", tmp_path / "p.gcp", "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert message in re.sub(r"\s+", " ", result.stderr)
+    assert "p.gcp" in result.stderr
+
+
+def test_gcp_files_as_others_write_them(folder: Path, tmp_path: Path) -> None:
+    """Commas, comments, a header with the system, several images in a row, a path before the image's name."""
+    text = (folder / "points.gcp").read_text()
+    rows = [row for row in text.splitlines() if not row.startswith("#")]
+    wkt = f"# WKT: {pyproj.CRS('EPSG:4326').to_wkt('WKT1_GDAL')}"
+    variants = {
+        "commas": "\n".join(row.replace(" ", ", ") for row in rows),
+        "header": wkt + "\n" + "\n".join(rows),
+        "two images": "\n".join(f"{row} other.tif 5 5 1 1" for row in rows),
+        "a folder": text.replace("SCENE_P.tif", "left/SCENE_P.tif"),
+        "blank lines": text.replace("\n", "\n\n# again\n"),
+    }
+    found = {}
+    for name, content in {"plain": text, **variants}.items():
+        (tmp_path / "p.gcp").write_text(content)
+        out = tmp_path / name.replace(" ", "-")
+        result = run("export", folder / "DIM_SCENE.XML", "--control", tmp_path / "p.gcp", "--out", out, "--quiet")
+        assert result.exit_code == 0, (name, result.stderr)
+        found[name] = json.loads((out / "export.json").read_text())["control"]["SCENE_P"]["coefficients_px"]
+    for name in variants:
+        # PROJ's two ways from the same datum differ by 1e-9 m
+        np.testing.assert_allclose(found[name], found["plain"], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("form", ["a_RPC.TXT", "RPC_SCENE.XML", "a.tif"])
+def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str) -> None:
+    """The same polynomials from three formats take the same correction, as the scene's own do."""
+    model = read_rpc(folder / "RPC_SCENE.XML")
+    (tmp_path / "a_RPC.TXT").write_text(model.text())
+    (tmp_path / "a.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts(place=model)))
+    (tmp_path / "RPC_SCENE.XML").write_bytes((folder / "RPC_SCENE.XML").read_bytes())
+    points = ("--control", folder / "points.gcp")
+    result = run("export", tmp_path / form, *points, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    name = form.partition(".")[0].removesuffix("_RPC")
+    told = json.loads((tmp_path / "out" / "export.json").read_text())["control"][name]
+    whole = run("export", folder / "DIM_SCENE.XML", *points, "--out", tmp_path / "whole", "--quiet")
+    assert whole.exit_code == 0
+    scene = json.loads((tmp_path / "whole" / "export.json").read_text())["control"]["SCENE_P"]
+    # offsets of DIMAP 2 have lost 1e-12 by the 1 that was added
+    np.testing.assert_allclose(told["coefficients_px"], scene["coefficients_px"], rtol=0, atol=1e-6)
+    assert told["left_out"] == ["3"]
+    found, other = (
+        read_rpc(tmp_path / place / "models" / f"{one}_RPC.TXT") for place, one in (("out", name), ("whole", "SCENE_P"))
+    )
+    latitude, longitude = model.ground([100.0, 3900.0], [5000.0, 30.0], [0.0, 2000.0])
+    np.testing.assert_allclose(
+        found.image(latitude, longitude, [0.0, 2000.0]), other.image(latitude, longitude, [0.0, 2000.0]), atol=1e-5
+    )
+    assert "ISD" not in result.output
+    for options, message in (
+        ((), "nothing to do"),
+        ((*points, "--attitude-sigma", "1 arcsec"), "no camera and no orbit"),
+    ):
+        bad = run("export", tmp_path / form, *options, "--out", tmp_path / "bad")
+        assert bad.exit_code == 2
+        assert message in re.sub(r"\s+", " ", bad.stderr)
+
+
+def test_the_speed_of_light_is_not_passed_over(folder: Path, tmp_path: Path) -> None:
+    """Nobody knows what the setting does to the geometry: the model leaves it out and says so."""
+    scene = replace(SCENE, settings={"LIGHT_SPEED_SETTING": "true", "ATMOSPHERIC_REFRACTION_SETTING": "true"})
+    result = run("export", write(tmp_path, scene), "--out", tmp_path / "out")
+    assert result.exit_code == 0
+    assert "LIGHT_SPEED_SETTING is true" in result.output.replace("\n", " ")
+    # and refraction, which straight sensor models carry at one height only, is in the numbers: 1e-8 px without
+    errors = json.loads((tmp_path / "out" / "export.json").read_text())["lines"]["SCENE_P"]["isd_errors"]
+    assert max(one["line_px"] for one in errors) > 0.05

@@ -1,0 +1,720 @@
+"""Products of an operation for the time of a scene: camera models, the state as a job, and a prior."""
+
+import hashlib
+import json
+import warnings
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+from scipy.stats import chi2
+
+from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.limits import Quantity
+from analysis.monitor.parameters import ANGLE, ANGLE_GROUP
+from optics.numerics.backend import load_backend
+from scenes.models.disturbances import Component, motions_of_spec, state_of
+from scenes.specs.disturbances import MOST_JOINT
+from scenes.specs.load import ORBIT, SCENES, load_disturbances
+from scenes.specs.operation import OperationSetup
+from scenes.specs.resolved import resolve, resolve_with
+from scenes.yaml.errors import Problem
+from tests.twin import operation_records as records
+from tests.twin.commands import files, invoke
+from tests.twin.line_scanner_model import LineScannerModel
+from tests.twin.products_bench import StandIn
+from tests.twin.record_bench import START, given, made, pair
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import StateReader
+from twin.operate.__main__ import app as operate
+from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.plans import keep_plan
+from twin.operate.estimated_motions import EstimatedMotions, perturbation, prior_files, state_file
+from twin.operate.product_files import product_files
+from twin.operate.products import Products
+from twin.operate.products import made as products_of
+from twin.operate.record.entries import MICRO, Entry, micros, utc_text
+from twin.operate.record.history import History, initialised
+from twin.operate.validity import Mark, validity
+from twin.orbit.export.estimated_change import ground_sigma
+from twin.orbit.export.export_run import ExportSource, read_source
+from twin.orbit.flight.corrected_lines import corrected_line
+from twin.orbit.flight.line_camera import traced_line_cameras
+from twin.render import app as render
+
+SCENE = SCENES / ORBIT / "angle_gf7.yaml"
+NOISE = 0.005**2 * np.eye(8)
+
+
+@cache
+def experiment() -> MonitorExperiment:
+    return MonitorExperiment(pair(), load_backend())
+
+
+def experiment_of(plan: OperationSetup) -> MonitorExperiment:
+    return MonitorExperiment(plan.model, load_backend())
+
+
+def drawn(seed: int, count: int = 1) -> np.ndarray:
+    """Amounts (count, M), SI."""
+    stated = experiment().stated
+    assert stated is not None
+    return stated.draw(np.random.default_rng(seed), count)
+
+
+def stand_in(amounts: np.ndarray, times: tuple[int, ...] = (START,), **more: object) -> StandIn:
+    """Readings of states by their linear effect on the spots."""
+    stated = experiment().disturbances
+    assert stated is not None
+    unit = stated.sigmas * np.array([one.unit_size for one in experiment().stated.components])
+    return StandIn(experiment(), np.array(times), (amounts / unit) @ stated.spots.T, NOISE, **more)
+
+
+@pytest.fixture(scope="module")
+def history(tmp_path_factory: pytest.TempPathFactory) -> History:
+    record = made(tmp_path_factory.mktemp("record") / "record")
+    record.take(given("reading", [Entry("monitor", "monitor", START, {"numbers": {}})]))
+    return record
+
+
+@cache
+def scene() -> ExportSource:
+    return read_source(SCENE)
+
+
+@pytest.fixture(scope="module")
+def one(history: History) -> Products:
+    """Of a large disturbance, with a scene."""
+    return products_of(stand_in(drawn(3)), history, START, scene(), load_backend())
+
+
+# --- the span in which an estimate holds --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A quantity whose variance grows by `rate` per second on either side of a time, and whose mean by `slope`."""
+
+    rate: float
+    slope: float
+    quantities = (Quantity(ANGLE_GROUP, ANGLE, np.ones(8)),)
+
+    def __call__(self, times):
+        away = (np.array(times, float) - START)[:, None] / MICRO
+        return replace_course(self, self.slope * away, np.sqrt(1.0 + self.rate * np.abs(away)))
+
+
+def replace_course(walk: Walk, values: np.ndarray, sigmas: np.ndarray) -> SimpleNamespace:
+    return SimpleNamespace(quantities=walk.quantities, values=values, sigmas=sigmas)
+
+
+FIRST, LAST = Mark(START - 10**12, "first"), Mark(START + 10**13, "last")
+
+
+@pytest.mark.parametrize(
+    ("walk", "seconds", "reason"),
+    [
+        # the mean square may grow to 1.44
+        (Walk(1e-3, 0.0), 440.0, "its sigma grows"),
+        (Walk(0.0, 1e-2), np.sqrt(0.44) / 1e-2, "its estimate goes on"),
+    ],
+)
+def test_an_estimate_holds_until_its_error_is_a_fifth_larger(walk: Walk, seconds: float, reason: str) -> None:
+    found = validity(walk, START, FIRST, LAST)
+    # times are looked at on a grid of which the last step is below a hundredth of the way
+    for away in (found.until - START, START - found.since):
+        assert 0.99 * seconds < away / MICRO <= seconds
+    assert found.until_reason == found.since_reason
+    assert found.until_reason.endswith(reason)
+    assert found.until_reason.startswith("intersection_angle change_arcsec")
+
+
+def test_an_estimate_does_not_hold_across_what_is_known_to_have_happened() -> None:
+    still = Walk(0.0, 0.0)
+    found = validity(still, START, FIRST, LAST)
+    assert (found.since, found.until) == (FIRST.time, LAST.time)
+    assert (found.since_reason, found.until_reason) == ("first", "last")
+    marks = [Mark(START - MICRO, "before"), Mark(START, "now"), Mark(START + 7, "after"), Mark(START + 9, "later")]
+    found = validity(still, START, FIRST, LAST, marks)
+    assert (found.since, found.since_reason, found.until, found.until_reason) == (START, "now", START + 7, "after")
+    # a mark far away does not widen what a growing error allows
+    assert validity(Walk(1e-3, 0.0), START, FIRST, LAST, marks[:1]).since_reason == "before"
+    assert "grows" in validity(Walk(1.0, 0.0), START, FIRST, LAST, marks[:1]).since_reason
+
+
+# --- the state as a job, the prior --------------------------------------------------------------------------------
+
+
+def found_at(operation: StandIn, time: int = START) -> EstimatedMotions:
+    motions = operation.motions(time)
+    return EstimatedMotions.in_units(experiment().stated.components, motions.mean, motions.covariance)
+
+
+def test_the_job_of_a_state_is_that_state(tmp_path: Path) -> None:
+    found = found_at(stand_in(drawn(5)))
+    text, left = state_file(found, experiment().thermal, "gf7_pair", "orbit", "remark\nmore")
+    assert text.startswith("# remark\n# more\ninstrument: gf7_pair\n")
+    assert left == ()
+    (tmp_path / "state.yaml").write_text(text, "utf-8")
+    job = resolve(tmp_path / "state.yaml")
+    assert job.disturbances is not None
+    assert job.disturbances.name == "orbit"
+    states = [experiment().state(job.job), state_of(found.mean, found.components, experiment().thermal)]
+    truth = experiment().sight.truth(states)
+    for camera in truth.cameras:
+        read, meant = truth.vector(camera)
+        # texts of quantities read back to the same bits, and the rest is the same trace
+        np.testing.assert_allclose(read, meant, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.second
+def test_spots_of_the_rendered_state_are_those_that_were_measured(history: History, tmp_path: Path) -> None:
+    """A state is drawn and its frames are read; twin.render of the product's job gives the spots of that reading."""
+    state = state_of(drawn(7)[0], experiment().stated.components, experiment().thermal)
+    read = StateReader(experiment(), 9, 5).read(state, number=1).recovery
+    operation = StandIn(experiment(), np.array([START]), read.shift, read.shift_covariance[0])
+    (tmp_path / "state.yaml").write_text(products_of(operation, history, START, None, load_backend()).state, "utf-8")
+    result = invoke(render, tmp_path / "state.yaml", "--out", tmp_path / "run", "--quiet")
+    assert result.exit_code == 0, result.stderr
+    rendered, sigma = shifts_of(tmp_path / "run")
+    away = rendered - read.shift[0]
+    # five sigma of both noises, and a thousandth of the shift for what is not linear in the motions
+    limit = 5.0 * np.sqrt(sigma**2 + np.diagonal(read.shift_covariance[0])) + 1e-3 * np.abs(read.shift[0])
+    assert np.all(np.abs(away) < limit)
+    assert np.abs(read.shift).max() > 100.0 * sigma.max()
+
+
+def shifts_of(run: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts that a run measured, row and column of one spot after the other, px, and their sigmas."""
+    found = json.loads((run / "recovered.json").read_text("utf-8"))["spots"]
+    spots = [(spot, axis) for camera in found.values() for spot in camera.values() for axis in ("row", "column")]
+    shifts = [spot["after"][axis] - spot["before"][axis] for spot, axis in spots]
+    sigmas = [np.hypot(spot["after"][f"{axis}_sigma"], spot["before"][f"{axis}_sigma"]) for spot, axis in spots]
+    return np.array(shifts), np.array(sigmas)
+
+
+def test_what_a_job_cannot_say_is_told() -> None:
+    prism = "base/forward/monitor/left/prism_180"
+    glass = Component("a", prism, "index_gradient", 1, "origin", 1e-6)
+    found = EstimatedMotions((glass,), np.array([2e-6]), np.eye(1))
+    assert perturbation(found, experiment().thermal) == {}
+    _, (left,) = state_file(found, experiment().thermal, "gf7_pair", "orbit", "")
+    assert (left.name, left.amount, left.unit) == (f"{prism} index_gradient y", 2e-6, "ppm/m")
+
+
+def test_two_causes_about_two_points_are_one_motion(tmp_path: Path) -> None:
+    """What they do together to the cameras is what the merged components of job and prior do."""
+    body = "base/forward/focal_plane"
+    components = (
+        Component("one", body, "rotate", 0, "origin", 1.0),
+        Component("two", body, "rotate", 0, "rear_node", 1.0),
+        Component("two", body, "rotate", 1, "rear_node", 1.0),
+        Component("one", "base/forward", "scale", 0, "origin", 1.0),
+        Component("one", body, "shift", 1, "origin", 1.0),
+    )
+    amounts = np.array([3e-6, -5e-6, 4e-6, 2e-6, 1e-6])
+    found = EstimatedMotions(components, amounts, np.diag(amounts**2))
+    own = state_of(amounts, components, experiment().thermal)
+    said = {path: what.motion() for path, what in perturbation(found, experiment().thermal).items()}
+    stated = Disturbances(
+        *("s", tuple(map(str, range(5))), (body,) * 5, ("a",) * 5, np.ones(5), ("1",) * 5),
+        *(np.ones((2, 5)), np.ones((8, 5)), np.eye(5), (None,) * 5),
+    )
+    prior = prior_files(found, stated, experiment().instrument, "p", "reason", "")
+    merged = state_of(prior.table @ amounts, prior.components, experiment().thermal)
+    truth = experiment().sight.truth([own, said, merged])
+    changes = truth.vector("forward")
+    assert abs(changes[0, 1]) > 1e-6
+    np.testing.assert_allclose(changes[1], changes[0], rtol=1e-9, atol=1e-14)
+    # linear in the motion: products of turns of 5e-6 rad, and of a turn and a growth, over 6 m
+    np.testing.assert_allclose(changes[2], changes[0], rtol=1e-4, atol=3e-10)
+    for name, text in prior.files.items():
+        (tmp_path / name).write_text(text, "utf-8")
+    back = motions_of_spec(load_disturbances(str(tmp_path / "p.yaml")), experiment().instrument)
+    np.testing.assert_allclose(back.covariance, prior.table @ found.covariance @ prior.table.T, rtol=1e-9, atol=1e-24)
+
+
+def test_the_prior_has_the_covariance_of_the_estimate(tmp_path: Path) -> None:
+    """Of every spot and every parameter, though readings leave a hundredth of what single motions do to a spot."""
+    found, stated = found_at(stand_in(drawn(6))), experiment().disturbances
+    prior = prior_files(found, stated, experiment().instrument, "prior", "reason", "remark")
+    assert prior.left_out == ()
+    for name, text in prior.files.items():
+        (tmp_path / name).write_text(text, "utf-8")
+    back = motions_of_spec(load_disturbances(str(tmp_path / "prior.yaml")), experiment().instrument)
+    assert [one.name for one in back.components] == [one.name for one in found.components]
+    sigma = experiment().stated.sigma
+    for rows in (stated.spots / sigma, stated.parameters / sigma):
+        own, read = (rows @ one @ rows.T for one in (found.covariance, back.covariance))
+        unit = np.sqrt(np.diagonal(own))
+        assert np.abs((read - own) / np.outer(unit, unit)).max() < 1e-6
+    # a job takes it as what is expected to move
+    (tmp_path / "job.yaml").write_text("instrument: gf7_pair\ndisturbances: ./prior.yaml\n", "utf-8")
+    assert resolve(tmp_path / "job.yaml").disturbances.joint is not None
+
+
+def test_of_too_many_components_those_that_matter_least_are_left_out() -> None:
+    """Figure terms of mirrors, each of another size; the spots and parameters see all alike."""
+    mirrors = [f"base/{c}/M{k}" for c in ("forward", "backward") for k in (1, 2, 3)]
+    components = tuple(Component("a", m, "figure", j, "origin", 1.0) for m in mirrors for j in range(4, 40))
+    count = len(components)
+    assert count > MOST_JOINT
+    amounts = 1e-9 * np.random.default_rng(1).permutation(np.arange(1.0, count + 1.0)) / count
+    stated = SimpleNamespace(sigmas=np.ones(count), spots=np.ones((2, count)), parameters=np.ones((8, count)))
+    found = EstimatedMotions(components, np.zeros(count), np.diag(amounts**2))
+    prior = prior_files(found, stated, experiment().instrument, "p", "reason", "")
+    assert len(prior.components) == MOST_JOINT
+    gone = {one.name for one in prior.left_out}
+    least = np.argsort(amounts)[: count - MOST_JOINT]
+    assert gone == {components[k].name for k in least}
+    share = amounts**2 / np.sum(amounts**2)
+    assert max(one.share for one in prior.left_out) == pytest.approx(share[least].max(), rel=1e-12)
+    assert {one.name: one.amount for one in prior.left_out} == pytest.approx(
+        {components[k].name: amounts[k] for k in least}, rel=1e-9
+    )
+
+
+# --- what is refused and what limits ------------------------------------------------------------------------------
+
+
+def problem(history: History, time: int, source: ExportSource | None = None) -> Problem:
+    with pytest.raises(Problem) as told:
+        products_of(stand_in(drawn(3)), history, time, source, load_backend())
+    return told.value
+
+
+def test_times_of_which_nothing_is_known_are_refused(history: History) -> None:
+    early = problem(history, START - 1)
+    assert "before the first reading" in early.problem
+    assert early.allowed == f"a time from {utc_text(START)} to {utc_text(START + 30 * 86400 * MICRO)}"
+    late = problem(history, START + 30 * 86400 * MICRO + 1)
+    assert "forecast does not go so far" in late.problem
+    assert "a longer horizon in the plan" in (late.allowed or "")
+
+
+def test_a_record_without_readings_has_no_products(tmp_path: Path) -> None:
+    told = problem(made(tmp_path / "record"), START)
+    assert "no reading of the monitor" in told.problem
+    assert "twin.operate ingest" in (told.allowed or "")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("camera: gf7_pair", "camera: zy3_pair"), "another instrument"),
+        (None, "of a payload"),
+    ],
+)
+def test_a_scene_of_another_instrument_is_refused(history: History, tmp_path: Path, change, said: str) -> None:
+    text = SCENE.read_text("utf-8")
+    if change is None:
+        source = read_source(SCENES / ORBIT / "angle.yaml")
+    else:
+        library = SCENES / "library" / "instruments" / "gf7_pair.yaml"
+        other = (
+            library.read_text("utf-8")
+            .replace("name: gf7_pair", "name: zy3_pair")
+            .replace("look: 26 deg", "look: 25 deg")
+        )
+        (tmp_path / "zy3_pair.yaml").write_text(other, "utf-8")
+        (tmp_path / "angle.yaml").write_text(text.replace("camera: gf7_pair ", "camera: ./zy3_pair.yaml "), "utf-8")
+        source = read_source(tmp_path / "angle.yaml")
+    told = problem(history, START, source)
+    assert said in told.problem
+    assert "camera: gf7_pair" in (told.allowed or "")
+
+
+def test_the_version_goes_with_the_record_and_the_plan(tmp_path: Path) -> None:
+    record, backend = made(tmp_path / "record"), load_backend()
+    record.take(given("reading", [Entry("monitor", "monitor", START, {"numbers": {}})]))
+    operation = stand_in(drawn(3))
+    first, again, other = (
+        products_of(one, record, START, None, backend).version
+        for one in (operation, operation, replace(operation, horizon=3600.0))
+    )
+    assert first == again != other
+    record.take(given("later", [Entry("temperature", "base", START, {"sigma": 1.0, "unit": "K", "values": [293.0]})]))
+    assert products_of(operation, record, START, None, backend).version not in (first, other)
+
+
+def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
+    """With motions that do not go on in time nothing else does."""
+    told = SimpleNamespace(
+        **{name: getattr(experiment(), name) for name in ("stated", "instrument", "thermal", "cameras", "ground")}
+    )
+    told.disturbances = replace(experiment().disturbances, laws=(TimeLaw(),) * len(experiment().stated.components))
+    hour = 3600 * MICRO
+    quantity = "ground height_m"
+    base = {
+        "events": ((START + hour, "safe_mode", ("settling",)), (START + 1, "heater_set_point", ())),
+        "jumps": (SimpleNamespace(body="base/forward/M2", after_us=START + 4 * hour, until_us=START + 5 * hour),),
+        "breaks": (SimpleNamespace(quantity=quantity, breaks_us=START + 9 * hour, holds_now=True),),
+    }
+    operation = replace(stand_in(drawn(3), **base), experiment=told)
+    spans = []
+    for time in (0, 2, 6, 10):
+        held = products_of(operation, history, START + time * hour, None, load_backend()).validity
+        spans.append(tuple(round((t - START) / hour) for t in (held.since, held.until)))
+        assert held.since_reason
+    assert spans == [(0, 1), (1, 4), (5, 9), (9, 720)]
+    broken = replace(operation, breaks=(SimpleNamespace(quantity=quantity, breaks_us=None, holds_now=False),))
+    found = products_of(broken, history, START, None, load_backend())
+    assert found.warnings == ("ground height_m does not keep its requirement",)
+
+
+# --- camera models ------------------------------------------------------------------------------------------------
+
+
+def places(sensor, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(8)
+    return rng.uniform(0.0, sensor.lines - 1.0, count), rng.uniform(0.0, sensor.camera.pixels - 1.0, count)
+
+
+def horizontal(sensor, away: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """(N, 2) east and north of errors (N, 3)."""
+    longitude, latitude, _ = sensor.earth.geodetic(ground)
+    east = np.stack([-np.sin(longitude), np.cos(longitude), np.zeros_like(longitude)], axis=-1)
+    north = np.stack(
+        [-np.sin(latitude) * np.cos(longitude), -np.sin(latitude) * np.sin(longitude), np.cos(latitude)], axis=-1
+    )
+    return np.stack([np.sum(away * east, axis=-1), np.sum(away * north, axis=-1)], axis=-1)
+
+
+def test_err_bias_is_the_scatter_of_points_of_drawn_cameras(one: Products) -> None:
+    """Cameras drawn from the covariance see the ground beside where the estimated one does: their mean square is that
+    of ERR_BIAS to the error of 200 draws, and the derivatives are those of the exact turn.
+    """
+    line = one.export.lines["forward"]
+    change, window = one.changes["forward"], line.window
+    laboratory = replace(window.sensor.camera, directions=window.calibrated.directions)
+    root = np.linalg.cholesky(change.constant)
+    rng = np.random.default_rng(4)
+    square = []
+    at, pixel = np.full(9, 16000.0), np.linspace(-0.5, 32767.5, 9)
+    base = window.sensor.ground(at, pixel, line.ground.height_m)
+    for unit in rng.standard_normal((200, 4)):
+        camera = corrected_line(laboratory, window.calibrated, change.values + root @ unit)
+        away = replace(window.sensor, camera=camera).ground(at, pixel, line.ground.height_m) - base
+        square.append(np.mean(horizontal(window.sensor, away, base) ** 2, axis=0))
+    east, north = np.sqrt(np.mean(square, axis=0))
+    # a mean square of 200 normal numbers is known to 10 %, its root to 5 %: three of these
+    assert line.ground.bias_east_m == pytest.approx(east, rel=0.15)
+    assert line.ground.bias_north_m == pytest.approx(north, rel=0.15)
+    assert line.ground.bias_m == pytest.approx(np.hypot(line.ground.bias_east_m, line.ground.bias_north_m), rel=1e-12)
+    assert line.ground.random_m == 0.0
+
+
+def test_what_is_white_in_time_is_err_rand_and_not_applied(history: History) -> None:
+    """The mirrors' mounts, once stated as white: whether an image is taken at a reading or a microsecond later makes no
+    difference, though the estimate at the reading itself knows of them.
+    """
+    base = stand_in(drawn(3))
+    laws = tuple(
+        replace(law, white=True, drift_s=None, period_s=None) if c == "mirror_mounts" else law
+        for law, c in zip(base.stated.laws, base.stated.causes, strict=True)
+    )
+    stated = replace(base.stated, laws=laws)
+    told = SimpleNamespace(
+        disturbances=stated,
+        stated=experiment().stated,
+        instrument=experiment().instrument,
+        thermal=experiment().thermal,
+        cameras=experiment().cameras,
+        ground=experiment().ground,
+    )
+    white = [law.white for law in laws]
+    rows = stated.parameters[:4] * white
+    at_once, beside = (
+        products_of(replace(base, experiment=told), history, time, None, load_backend()) for time in (START, START + 1)
+    )
+    for found in (at_once, beside):
+        np.testing.assert_allclose(found.changes["forward"].random, rows @ rows.T, rtol=1e-9)
+    assert np.any(rows)
+    # motions with a drift of 20 h are the same a microsecond later
+    for key in ("values", "constant"):
+        one, two = (getattr(found.changes["forward"], key) for found in (at_once, beside))
+        unit = np.sqrt(np.diagonal(at_once.changes["forward"].constant))
+        scale = unit if key == "values" else np.outer(unit, unit)
+        assert np.abs((one - two) / scale).max() < 1e-6
+    assert beside.course.covariance[0, 0, 0] > 1.001 * at_once.course.covariance[0, 0, 0]
+
+
+def test_models_see_what_the_changed_instrument_sees(one: Products, tmp_path: Path) -> None:
+    """ISD and RPC of the product, read by independent programs, against exact chief rays of the true state: wrong by
+    what ERR_BIAS says, where the models of the laboratory's cameras are wrong by several times more.
+    """
+    backend = load_backend()
+    state = state_of(drawn(3)[0], experiment().stated.components, experiment().thermal)
+    true = traced_line_cameras(experiment().instrument, backend, state)
+    written, numbers = product_files(one)
+    for name, content in written.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    for name, line in one.export.lines.items():
+        sensor = line.window.sensor
+        at, pixel = places(sensor)
+        height = one.export.heights[1]  # where the ISD is right
+        ground = replace(sensor, camera=true[name]).ground(at, pixel, height)
+        # metres on the ground of a pixel along the line and of a line along the track
+        metres = [
+            np.linalg.norm(sensor.ground(at + a, pixel + b, height) - sensor.ground(at, pixel, height), axis=-1)
+            for a, b in ((0.5, 0.0), (0.0, 0.5))
+        ]
+        seen = LineScannerModel(json.loads(written[f"models/{name}.json"])).image(ground)
+        isd = np.hypot(2.0 * metres[0] * (seen[0] - 0.5 - at), 2.0 * metres[1] * (seen[1] - 0.5 - pixel))
+        laboratory = replace(sensor.camera, directions=line.window.calibrated.directions)
+        before = np.linalg.norm(replace(sensor, camera=laboratory).ground(at, pixel, height) - ground, axis=-1)
+        bias = line.ground.bias_m
+        # one state: an error of twice the root mean square comes in 2 of 100
+        assert np.sqrt(np.mean(isd**2)) < 2.5 * bias
+        assert np.sqrt(np.mean(before**2)) > 3.0 * np.sqrt(np.mean(isd**2))
+        told = json.loads(written[f"models/{name}.json"])["notes"]
+        assert any(one.version in text for text in told)
+        assert any(utc_text(one.validity.until) in text for text in told)
+        image = tmp_path / f"models/{name}.tif"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(image, "w", driver="GTiff", width=8, height=8, count=1, dtype="uint8"):
+                pass
+            with rasterio.open(image) as file:
+                rpcs = file.rpcs
+        assert rpcs.err_bias == pytest.approx(bias, rel=1e-9)
+        assert rpcs.err_rand == 0.0
+        (tag,) = line.polynomial.tags()
+        assert tag[3][:2] == (line.ground.bias_m, line.ground.random_m)
+        longitude, latitude, _ = sensor.earth.geodetic(ground)
+        rpc = np.stack(line.polynomial.image(np.degrees(latitude), np.degrees(longitude), np.full(len(at), height)))
+        assert np.hypot(2.0 * metres[0] * (rpc[0] - at), 2.0 * metres[1] * (rpc[1] - pixel)).max() < 4.0 * bias
+    assert set(numbers["models"]) == {"forward", "backward"}
+
+
+@pytest.mark.slow
+def test_errors_on_the_ground_are_as_large_as_stated(history: History) -> None:
+    """Twenty states drawn from what is stated, read from rendered frames: errors of the corrected cameras' points, and
+    of the parameters, against ERR_BIAS and the covariance.
+    """
+    backend, reader = load_backend(), StateReader(experiment(), 9, 5)
+    components = experiment().stated.components
+    lines = products_of(stand_in(drawn(3)), history, START, scene(), backend).export.lines
+    chi, ratio, inside, uncorrected = [], [], [], []
+    for number, amounts in enumerate(drawn(11, 20)):
+        state = state_of(amounts, components, experiment().thermal)
+        read = reader.read(state, number=number)
+        operation = StandIn(experiment(), np.array([START]), read.recovery.shift, read.recovery.shift_covariance[0])
+        found = products_of(operation, history, START, None, backend)
+        error = np.concatenate([read.truth.vector(c)[0] for c in lines]) - found.course.changes[0]
+        chi.append(float(error @ np.linalg.solve(found.course.covariance[0], error)))
+        true = traced_line_cameras(experiment().instrument, backend, state)
+        for name, line in lines.items():
+            sensor, known = line.window.sensor, line.window.calibrated
+            laboratory = replace(sensor.camera, directions=known.directions)
+            own = replace(sensor, camera=corrected_line(laboratory, known, found.changes[name].values))
+            sigma = ground_sigma(own, known, found.changes[name], 300.0).bias_m
+            at, pixel = np.repeat(16000.0, 9), np.linspace(-0.5, 32767.5, 9)
+            ground = replace(sensor, camera=true[name]).ground(at, pixel, 300.0)
+            away = [
+                np.linalg.norm(one.ground(at, pixel, 300.0) - ground, axis=-1)
+                for one in (own, replace(sensor, camera=laboratory))
+            ]
+            ratio.append(np.mean(away[0] ** 2) / sigma**2)
+            inside.append(np.mean(away[0] < sigma))
+            uncorrected.append(np.mean(away[1] ** 2) / sigma**2)
+    # 160 degrees of freedom, chances of 1e-4
+    assert chi2.ppf(1e-4, 160) < np.sum(chi) < chi2.isf(1e-4, 160)
+    # 40 mean squares, each of one or two normal numbers: known to a quarter
+    assert 0.5 < np.mean(ratio) < 1.75
+    # 63 to 68 % within one radius; of 40 images that are each mostly one number it is known to 8 %
+    assert 0.45 < np.mean(inside) < 0.88
+    assert np.mean(uncorrected) > 25.0 * np.mean(ratio)
+
+
+# --- of a record that is followed ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A record with six readings of a drawn life, one each day, and the plan that it keeps."""
+
+    place: Path
+    life: records.Life
+    time: int
+
+
+@pytest.fixture(scope="module")
+def followed(tmp_path_factory: pytest.TempPathFactory) -> Followed:
+    folder = tmp_path_factory.mktemp("followed")
+    plan = records.plan_of(folder, "gf7_pair")
+    place = folder / "record"
+    initialised(str(place), pair(), True)
+    own = experiment_of(plan)
+    assert own.disturbances is not None
+    life = records.life_of(own.disturbances, 6.0, 1.0, 3, {})
+    with History(str(place)) as record:
+        keep_plan(plan, folder / "plan.yaml", record)
+        entries = [records.monitor_entry(own, own.disturbances, life, k, 3) for k in range(len(life.times))]
+        record.take(records.given("readings", entries))
+    return Followed(place, life, int(life.times[-1]))
+
+
+def command(*words: object):
+    return invoke(operate, "products", *words)
+
+
+def test_the_command_writes_products_of_a_record(followed: Followed, tmp_path: Path) -> None:
+    """Within the sigma of the truth, and the same files whenever they are asked for."""
+    out = tmp_path / "products"
+    when = utc_text(followed.time)
+    result = command(followed.place, "--time", when, "--scene", SCENE, "--out", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    told = json.loads(result.stdout)
+    assert told == json.loads((out / "products.json").read_text("utf-8"))
+    assert files(out) == {"products.json", *told["sha256"]}
+    for name, digest in told["sha256"].items():
+        assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
+    assert (told["time_utc"], told["readings"], told["newest_utc"]) == (when, 6, when)
+    assert micros(told["valid_from_utc"]) <= followed.time <= micros(told["valid_until_utc"])
+    assert told["warnings"] == [f"the scene was taken at 2021-09-15T03:20:00Z, and the estimate is for {when}"]
+    # the plan that a record keeps has the cameras in the order of their names
+    places = [("forward", "backward").index(camera) for camera in told["cameras"]]
+    truth = followed.life.changes[-1].reshape(2, 4)[places].ravel()
+    error = truth - np.concatenate([told["changes"][camera] for camera in told["cameras"]])
+    # eight degrees of freedom, a chance of 1e-4
+    assert error @ np.linalg.solve(np.array(told["covariance"]), error) < chi2.isf(1e-4, 8)
+    assert np.abs(followed.life.changes[-1][:3]).max() > 10.0 * np.sqrt(told["covariance"][0][0])
+    again = command(followed.place, "--time", when, "--scene", SCENE, "--out", tmp_path / "again", "--json")
+    assert json.loads(again.stdout) == told
+    # the plan as its user wrote it has causes and cameras in another order than the one that the record keeps
+    plan = followed.place.parent / "plan.yaml"
+    other = json.loads(command(followed.place, plan, "--time", when, "--out", tmp_path / "other", "--json").stdout)
+    assert other["changes"] == told["changes"]
+    assert {name: other["sha256"][name] for name in ("state.yaml", "prior.yaml")} == {
+        name: told["sha256"][name] for name in ("state.yaml", "prior.yaml")
+    }
+    text = command(followed.place, "--time", when, "--out", tmp_path / "text").stdout
+    assert f"gf7_pair at {when}, from 6 readings" in text
+    assert files(tmp_path / "text") == files(out) - {
+        f"models/{c}{e}" for c in ("forward", "backward") for e in (".json", "_RPC.TXT")
+    }
+
+
+def test_the_files_of_a_record_are_its_estimate(followed: Followed, tmp_path: Path) -> None:
+    """Motions of the job make the changes of the estimate, and the prior their covariance."""
+    later = utc_text(followed.time + 3600 * MICRO)
+    result = command(followed.place, "--time", later, "--out", tmp_path / "p", "--json")
+    told = json.loads(result.stdout)
+    job = resolve(tmp_path / "p" / "state.yaml")
+    own = MonitorExperiment(job, load_backend())
+    truth = own.sight.truth([own.state(job.job)])
+    changes = np.concatenate([truth.vector(camera)[0] for camera in told["cameras"]])
+    stated = np.concatenate([told["changes"][camera] for camera in told["cameras"]])
+    covariance = np.array(told["covariance"])
+    # what is not linear of motions of some arcseconds is below a hundredth of a sigma
+    assert np.abs((changes - stated) / np.sqrt(np.diagonal(covariance))).max() < 0.02
+    prior = own.stating(resolve_with("gf7_pair", str(tmp_path / "p" / "prior.yaml"))).disturbances
+    order = [4 * list(own.instrument.cameras).index(camera) + k for camera in told["cameras"] for k in range(4)]
+    unit = np.sqrt(np.diagonal(covariance))
+    away = prior.parameter_covariance[np.ix_(order, order)] - covariance
+    assert np.abs(away / np.outer(unit, unit)).max() < 1e-6
+
+
+def test_a_state_has_the_temperatures_that_do_what_was_found(tmp_path: Path) -> None:
+    """Heat does twice what the thermal model says, and sensors tell the temperatures. The job of the state has those by
+    which the thermal model does as much, so that its changes are the estimate's, and so has the prior.
+    """
+    plan = records.plan_of(tmp_path, "gf7_pair")
+    own = experiment_of(plan)
+    stated, components = own.disturbances, own.stated.components
+    heat = [k for k, one in enumerate(components) if one.kind == "temperature"]
+    life = records.life_of(stated, 12.0, 1.0, 4, {})
+    acting = life.motions.copy()
+    acting[:, heat] *= 2.0
+    initialised(str(tmp_path / "record"), pair(), True)
+    with History(str(tmp_path / "record")) as history:
+        twice = replace(life, motions=acting)
+        readings = [records.monitor_entry(own, stated, twice, k, 4) for k in range(len(life.times))]
+        history.take(records.given("readings", readings))
+        for k in heat:
+            kelvin = history.temperature + life.motions[:, k] * components[k].sigma
+            warm = [
+                records.temperature_entry(components[k].body, int(time), value, 0.01)
+                for time, value in zip(life.times, kelvin.tolist(), strict=True)
+            ]
+            history.take(records.given(components[k].body, warm))
+        operation = Operation(history, plan)
+        one = products_of(operation, history, int(life.times[-1]), None, load_backend())
+        plain, found = (operation.motions(int(life.times[-1]), acting=which) for which in (False, True))
+    by = stated.parameters / stated.sigmas
+    unit = np.sqrt(np.diagonal(one.course.covariance[0]))
+    assert np.abs((by @ found.mean - one.course.changes[0]) / unit).max() < 1e-6
+    away = by @ found.covariance @ by.T - one.course.covariance[0]
+    assert np.abs(away / np.outer(unit, unit)).max() < 1e-6
+    assert one.warnings == ()
+    # what the sensors read is half of it
+    assert np.abs((by @ plain.mean - one.course.changes[0]) / unit).max() > 3.0
+    np.testing.assert_allclose(plain.mean[heat], life.motions[-1, heat] * stated.sigmas[heat], atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--time", "2026-02-01T00:00:00Z"), "before the first reading"),
+        (("--time", "2027-02-01T00:00:00Z"), "a longer horizon in the plan"),
+        (("--time", "yesterday"), "--time"),
+        ((), "of which time? --time UTC, or --scene FILE"),
+        (("--scene", SCENE), "before the first reading"),
+        (("--time", "2026-03-03T00:00:00Z", "--scene", SCENES / ORBIT / "angle.yaml"), "the record's instrument"),
+        (("--time", "2026-03-03T00:00:00Z", "--scene", SCENES / ORBIT / "monitor.yaml"), "does not read this"),
+        (("--time", "2026-03-03T00:00:00Z", "--scene", "no.yaml"), "no.yaml"),
+    ],
+)
+def test_what_the_command_refuses(followed: Followed, tmp_path: Path, words, said: str) -> None:
+    result = command(followed.place, *words, "--out", tmp_path / "products")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert said in result.stderr
+    assert not (tmp_path / "products").exists()
+
+
+def test_a_record_without_a_plan_says_how_to_keep_one(tmp_path: Path) -> None:
+    made(tmp_path / "record").close()
+    result = command(tmp_path / "record", "--time", "2026-03-03T00:00:00Z", "--out", tmp_path / "products")
+    assert result.exit_code == 2
+    assert "init RECORD gf7_pair --plan FILE" in result.stderr
+    (tmp_path / "there").mkdir()
+    result = command(tmp_path / "record", "--time", "2026-03-03T00:00:00Z", "--out", tmp_path / "there")
+    assert result.exit_code == 2
+    assert "is there already" in result.stderr
+
+
+@pytest.mark.slow
+def test_rendered_runs_are_followed_and_rendered_again(followed: Followed, tmp_path: Path) -> None:
+    """Three states of a life, rendered and taken into a record as a user does it, all against the same images before.
+    The job of the product gives the spots of the last reading, and its changes are those of the last run's truth.
+    """
+    plan = tmp_path / "plan.yaml"
+    own = experiment_of(records.plan_of(tmp_path, "gf7_pair"))
+    motions = followed.life.motions[-3:] * own.stated.sigma
+    assert invoke(operate, "init", tmp_path / "record", "gf7_pair", "--simulated", "--plan", plan).exit_code == 0
+    for k, amounts in enumerate(motions):
+        found = EstimatedMotions(own.stated.components, amounts, np.zeros((len(amounts),) * 2))
+        text, _ = state_file(found, own.thermal, "gf7_pair", "orbit", "")
+        (tmp_path / "job.yaml").write_text(text, "utf-8")
+        run = tmp_path / f"run{k}"
+        assert invoke(render, tmp_path / "job.yaml", "--out", run, "--quiet").exit_code == 0
+        taken = invoke(operate, "ingest", tmp_path / "record", run, "--time", f"2026-03-0{k + 1}T00:00:00Z")
+        assert taken.exit_code == 0, taken.stdout
+    result = command(tmp_path / "record", "--time", "2026-03-03T00:00:00Z", "--out", tmp_path / "p", "--json")
+    assert result.exit_code == 0, result.stderr
+    told = json.loads(result.stdout)
+    truth = own.sight.truth([state_of(motions[-1], own.stated.components, own.thermal)])
+    error = np.concatenate([truth.vector(c)[0] - told["changes"][c] for c in told["cameras"]])
+    assert error @ np.linalg.solve(np.array(told["covariance"]), error) < chi2.isf(1e-4, 8)
+    assert invoke(render, tmp_path / "p" / "state.yaml", "--out", tmp_path / "again", "--quiet").exit_code == 0
+    measured, again = (shifts_of(tmp_path / name) for name in ("run2", "again"))
+    away = np.abs(again[0] - measured[0])
+    assert np.all(away < 5.0 * np.hypot(again[1], measured[1]) + 1e-3 * np.abs(measured[0]))
+    assert np.abs(measured[0]).max() > 100.0 * measured[1].max()

@@ -1,0 +1,287 @@
+"""The daily report of an instrument in operation: what it says first, what it lists, and that it needs nothing else."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from scenes.yaml.errors import Problem
+from tests.twin.commands import invoke
+from tests.twin.operate_bench import COUNT, DAY, EVIL, HOUR, StandIn, filled, lived, monitor_entry
+from tests.twin.policed_page import breaches
+from tests.twin.record_bench import START, given
+from twin.operate.__main__ import app
+from twin.operate.daily_report import daily_report, end_of_day, report_html, state_table
+from twin.operate.estimate.alarms import percent
+from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.plans import kept_plan
+from twin.operate.overview import Overview, coverage, points_of, spread, trend
+from twin.operate.record.entries import Alarm, Entry, micros
+from twin.operate.record.history import History, PastHistory, content_of, initialised
+from twin.operate.shown_readings import first_time, last_time, readings
+
+
+@pytest.fixture(scope="module")
+def history(tmp_path_factory: pytest.TempPathFactory):
+    with filled(tmp_path_factory.mktemp("record") / "record") as history:
+        yield history
+
+
+@pytest.fixture(scope="module")
+def overview(history: History) -> Overview:
+    return Overview.of(history, StandIn(history))
+
+
+@pytest.fixture(scope="module")
+def page(history: History, overview: Overview) -> str:
+    made = daily_report(history, overview, end_of_day(None, overview.time))
+    return report_html(made, ("twin.operate", "report", "record")).decode()
+
+
+def shown(page: str, words: str) -> bool:
+    return words in re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page))
+
+
+def test_the_first_sentence_is_the_state_and_the_second_what_changed(history, overview):
+    made = daily_report(history, overview, end_of_day(None, overview.time))
+    first, second = made.verdict.split(". ", 1)[0], made.verdict
+    assert first.startswith(
+        "1 of 2 requirements does not hold: Δα of forward is 1.014 ± 0.050 arcsec, limit 0.4 arcsec"
+    )
+    assert second.endswith("One event was recorded and one alarm was raised on 2026-01-20.")
+    assert made.lead[0].startswith(
+        "Δθ between the cameras is expected to break its requirement of 20 arcsec on 2026-01-29"
+    )
+    assert any("alarm waits" in one for one in made.warnings)
+    assert "all sigmas are 1.5 times as wide" in made.warnings[0]
+    for day, text in (
+        ("2026-01-10", "Nothing happened on it"),
+        ("2026-01-13", "One jump was found and one alarm was raised on it"),
+        ("2026-01-19", "One sensor turned doubtful on it"),
+    ):
+        end = end_of_day(day, 0)
+        assert overview.change_sentence(end - DAY, end, "on it") == text
+
+
+def test_the_table_has_every_quantity_with_its_requirement(overview):
+    table = state_table(overview)
+    assert len(table.rows) == len(overview.quantities)
+    assert table.full is not None
+    rows = {(row[0], row[1]): row for row in table.full.rows}
+    broken = rows["forward", "Δα [arcsec]"]
+    assert (broken[2], broken[3]) == pytest.approx((1.01375, 0.05))
+    assert [str(cell) for cell in broken[4:]] == ["±0.4", "more than 99.9999", "1.0", "no", "broken"]
+    holds = rows["angle between the cameras", "Δθ [arcsec]"]
+    assert (holds[7], holds[8]) == ("yes", "2026-01-29")
+    assert rows["ground", "height [m]"][4] == ""
+    assert list(table.bands.values()) == ["forward", "backward", "angle between the cameras", "ground"]
+
+
+def test_everything_stands_in_the_page(page):
+    for words in (
+        "the event refocus",
+        "base/forward/M2",
+        "safe mode, which may step settling",
+        "40 readings in a row of 293.1 K",
+        "its own sigma does not hold",
+        "A. Nurse",
+        "seen in the images, too",
+        "1 of 2 wait for an acknowledgement",
+        "Of the last 160 readings",
+        "62.50",
+        "59.8 to 65.2",
+    ):
+        assert shown(page, words), words
+    assert page.count("<svg") == 3
+
+
+def test_the_page_needs_nothing_else_and_runs_nothing_that_a_text_brings(page):
+    assert breaches(page) == []
+    assert EVIL not in page
+    assert "&lt;img src=x" in page
+    assert not re.search(r'(src|href)="(?!#|data:)', page)
+
+
+@pytest.mark.parametrize(("within", "count"), [(0, 10), (10, 10), (800, 1272), (1, 3)])
+def test_intervals_are_the_exact_binomial_ones(within, count):
+    found = coverage(1, within, count)
+    exact = binomtest(within, count).proportion_ci(0.95, "exact")
+    assert found.low == pytest.approx(exact.low, abs=1e-12)
+    assert found.high == pytest.approx(exact.high, abs=1e-12)
+    assert found.expected == pytest.approx(0.682689492, abs=1e-9)
+    assert found.holds == (found.low <= found.expected <= found.high)
+
+
+def test_nothing_predicted_is_no_failure():
+    found = coverage(2, 0, 0)
+    assert np.isnan(found.share)
+    assert found.holds
+
+
+@pytest.mark.parametrize(
+    ("chance", "text"),
+    [
+        (1.0, "more than 99.9999 %"),
+        (1e-9, "less than 0.0001 %"),
+        (0.5, "50 %"),
+        (0.993, "99.30 %"),
+        (0.99993, "99.9930 %"),
+        (0.012, "1.2 %"),
+    ],
+)
+def test_a_chance_is_told_apart_from_certainty(chance, text):
+    assert percent(chance) == text
+
+
+def test_a_day_is_a_date_of_utc():
+    assert end_of_day("2026-01-02", 0) == micros("2026-01-03T00:00:00Z")
+    assert end_of_day(None, START + HOUR) == micros("2026-01-02T00:00:00Z")
+    # a leap second belongs to the day that it ends
+    assert end_of_day("2016-12-31", 0) == micros("2017-01-01T00:00:00Z") - 1_000_000
+    for bad in ("yesterday", "2026-13-01", "2026-01-02T00:00", "", "2026-1-2"):
+        with pytest.raises(Problem):
+            end_of_day(bad, 0)
+
+
+def test_points_are_what_the_readings_say(history, overview):
+    found = readings(history, START, START + 40 * DAY, 1000)
+    assert len(found) == COUNT
+    points = points_of(found, overview.quantities)
+    assert points.values[7, 0] == pytest.approx(0.14 + 0.3 * np.sin(4.9))
+    assert points.sigmas[7, 0] == 0.3
+    names = [(one.group, one.key) for one in overview.quantities]
+    assert points.values[7, names.index(("intersection_angle", "change_arcsec"))] == pytest.approx(0.28)
+    assert np.isnan(points.values[7, names.index(("ground", "height_m"))])
+
+
+def test_of_many_readings_some_are_shown_and_the_newest_is_one(history):
+    found = [one["time_us"] for one in readings(history, START, START + 40 * DAY, 25)]
+    assert len(found) <= 25
+    assert found[-1] == last_time(history)
+    assert len(set(np.diff(found))) == 1
+    assert first_time(history) == START
+
+
+def test_a_trend_has_times_at_both_sides_of_a_jump(history, overview):
+    found = trend(history, overview, START, START + 30 * DAY)
+    jump = overview.following.jumps[0]
+    assert {jump.after_us, jump.until_us} <= set(found.past.times.tolist())
+    assert found.past.times[-1] == overview.time == found.future.times[0]
+    assert found.future.times[-1] == START + 30 * DAY
+    assert (np.diff(found.past.times) > 0).all()
+    assert trend(history, overview, START, overview.time - DAY).future is None
+    assert len(spread(5, 5, 10)) == 1
+
+
+def test_the_past_is_without_what_came_later_and_takes_nothing(tmp_path: Path):
+    with filled(tmp_path / "record", 24) as history:
+        until = START + DAY
+        history.raise_alarm(Alarm("jump", "x", until, "then"))
+        history.save_checkpoint("p", 1, until - HOUR, 99, b"early")
+        history.save_checkpoint("p", 2, until + HOUR, 99, b"late")
+        with PastHistory(str(tmp_path / "record"), until) as past:
+            assert max(one["time_us"] for one in past.entries("monitor")) == until
+            assert [one["text"] for one in past.alarms()] == ["then"]
+            assert [one.content for one in past.checkpoints("p")] == [b"early"]
+            assert not past.save_checkpoint("p", 3, until, 9, b"new")
+            assert not past.raise_alarm(Alarm("jump", "y", until, "new"))
+            assert past.drop_checkpoints("p", 0) == 0
+            with pytest.raises(TypeError):
+                past.take(given("more.csv", [monitor_entry(99)]))
+        assert [one.content for one in history.checkpoints("p")] == [b"early", b"late"]
+
+
+# --- of a record, by the command --------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def life(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return lived(tmp_path_factory.mktemp("life"))
+
+
+def run(*words: object):
+    return invoke(app, "report", *words)
+
+
+def test_the_command_writes_the_report_of_the_newest_day(life, tmp_path):
+    record, _ = life
+    told = run(record, "--out", tmp_path / "r.html", "--json")
+    assert told.exit_code == 0
+    said = json.loads(told.stdout)
+    page = (tmp_path / "r.html").read_text("utf-8")
+    assert said["verdict"] in html.unescape(page)
+    assert said["verdict"].startswith("The requirement holds: Δθ between the cameras is ")
+    assert breaches(page) == []
+    for words in ("base/backward/M2", "safe mode, which may step settling", "monitor_pair in operation, 2026-05-16"):
+        assert shown(page, words), words
+    with History(str(record)) as history:
+        assert {one["kind"] for one in history.alarms()} == {"jump"}
+
+
+def test_the_report_of_a_past_day_is_what_was_known_then(life, tmp_path):
+    record, _ = life
+    for day, jumps in (("2026-04-20", False), ("2026-04-22", True)):
+        assert run(record, "--day", day, "--out", tmp_path / "r.html", "--quiet").exit_code == 0
+        page = (tmp_path / "r.html").read_text("utf-8")
+        assert shown(page, "Jumps that were found") == jumps
+        assert f"--day {day}" in page
+    # a record that ended then says the same, to the last digit of the table of the state
+    with History(str(record)) as history:
+        end = end_of_day("2026-04-22", 0)
+        with PastHistory(str(record), end) as past:
+            then = state_table(Overview.of(past, Operation(past, kept_plan(history)))).content()
+        initialised(str(tmp_path / "short"), kept_plan(history).model, True)
+        with History(str(tmp_path / "short")) as short:
+            rows = [one for one in history.entries() if one["time_us"] <= end]
+            entries = [
+                Entry(one["kind"], one["subject"], one["time_us"], content_of(one), None, one["origin"] or "")
+                for one in rows
+            ]
+            assert not short.take(given("all", entries)).refused
+            assert state_table(Overview.of(short, Operation(short, kept_plan(history)))).content() == then
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--day", "2026-3-1"], "--day: not a day"),
+        (["--day", "2026-02-27"], "no reading of the monitor before the end"),
+        (["nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_what_cannot_be_reported_is_told(life, tmp_path, words, said):
+    out = tmp_path / "r.html"
+    told = run(life[0], *words, "--out", out)
+    assert told.exit_code == 2
+    assert said in told.stderr
+    assert not out.exists()
+
+
+def test_a_place_that_cannot_be_written_and_a_record_without_a_plan_are_told(life, tmp_path, history):
+    assert run(life[0], "--out", tmp_path / "no" / "r.html").exit_code == 1
+    told = run(Path(history.url.removeprefix("sqlite:///")).parent)
+    assert told.exit_code == 2
+    assert "keeps no plan" in told.stderr
+
+
+@pytest.mark.second
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_the_report_opens_in_a_browser_and_fits_a_phone(page, tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
+    place = tmp_path / "report.html"
+    place.write_text(page, encoding="utf-8")
+    with playwright.sync_playwright() as made:
+        browser = made.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        opened = browser.new_page(viewport={"width": 390, "height": 844})
+        said: list[str] = []
+        opened.on("console", lambda told: said.append(told.text))
+        opened.goto(place.as_uri())
+        assert said == []
+        assert opened.evaluate("document.documentElement.scrollWidth") <= 390
+        assert opened.title() == "gf7_pair in operation, 2026-01-20"
+        browser.close()

@@ -1,0 +1,164 @@
+"""Rational polynomials from files, and corrected by control points."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from scenes.yaml.errors import InputError
+from tests.twin.dimap_bench import Scene, rpc, write
+from twin.orbit.export.polynomial_control import controlled, image_slope, polynomial_correction
+from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.export.rpc_files import read_rpc
+from twin.orbit.flight.earth import Earth, east_north_up
+from twin.orbit.measured.dimap_sensor import read_scene
+from twin.run.data_files import FrameFacts, tiff
+
+SCENE = Scene()
+HEIGHTS = (0.0, 2000.0)
+
+
+@pytest.fixture(scope="module")
+def sensor(tmp_path_factory: pytest.TempPathFactory):
+    return read_scene(write(tmp_path_factory.mktemp("scene"), SCENE)).sensor
+
+
+@pytest.fixture(scope="module")
+def model(sensor) -> RationalPolynomial:
+    return RationalPolynomial.fit(sensor, 0, SCENE.pixels, HEIGHTS)
+
+
+def parts(model: RationalPolynomial) -> np.ndarray:
+    names = ("offset", "scale", "line_numerator", "line_denominator", "sample_numerator", "sample_denominator")
+    return np.concatenate([getattr(model, name) for name in names])
+
+
+def ground_points(sensor, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places in the image (N, 2), and their ground, ITRS (N, 3)."""
+    random = np.random.default_rng(seed)
+    place = random.uniform(100.0, [SCENE.lines - 100.0, SCENE.pixels - 100.0], (count, 2))
+    return place, sensor.ground(*place.T, random.uniform(*HEIGHTS, count))
+
+
+@pytest.mark.parametrize("bias", [(None, None), (1.25, 0.5)])
+def test_what_is_written_comes_back(tmp_path: Path, model: RationalPolynomial, bias) -> None:
+    stated = replace(model, bias_m=bias[0], random_m=bias[1])
+    (tmp_path / "a_RPC.TXT").write_text(stated.text())
+    (tmp_path / "a.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts(place=stated)))
+    for name in ("a_RPC.TXT", "a.tif"):
+        found = read_rpc(tmp_path / name)
+        assert np.array_equal(parts(found), parts(stated)), name
+        assert (found.bias_m, found.random_m) == bias
+    for version in ("2.15", "3.0"):
+        (tmp_path / "RPC.XML").write_text(rpc(model, version))
+        # offsets of version 2 are written with 1 added
+        np.testing.assert_allclose(parts(read_rpc(tmp_path / "RPC.XML")), parts(model), rtol=0, atol=1e-11)
+
+
+EDITS = {
+    "no offset": (r"LINE_OFF: .*\n", "", "no LINE_OFF"),
+    "no coefficient": (r"SAMP_DEN_COEFF_20: .*\n", "", "no SAMP_DEN_COEFF_20"),
+    "text": (r"LAT_SCALE: \S+", "LAT_SCALE: wide", "LAT_SCALE: not a number; found 'wide'"),
+    "zero": (r"LAT_SCALE: \S+", "LAT_SCALE: 0", "LAT_SCALE: a scale that is not above zero"),
+    "radians": (r"LONG_OFF: \S+", "LONG_OFF: 5e4", "no latitude and longitude"),
+    "twice": (r"(LINE_OFF: .*\n)", r"\1\1", "LINE_OFF: a key that stands twice"),
+    "prose": (r"LINE_OFF: .*", "the line offset is small", "not NAME: value"),
+    "infinite": (r"LINE_NUM_COEFF_3: \S+", "LINE_NUM_COEFF_3: inf", "LINE_NUM_COEFF_3: not a finite number"),
+    "denominator": (r"(LINE_DEN_COEFF_\d+): \S+", r"\1: 0", "a denominator of zeros"),
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_what_is_refused(tmp_path: Path, model: RationalPolynomial, name: str) -> None:
+    old, new, message = EDITS[name]
+    (tmp_path / "a_RPC.TXT").write_text(re.sub(old, new, model.text()))
+    with pytest.raises(InputError, match=re.escape(message)):
+        read_rpc(tmp_path / "a_RPC.TXT")
+
+
+def test_other_files_are_refused(tmp_path: Path, model: RationalPolynomial) -> None:
+    text = rpc(model)
+    for bad, message in (
+        (text.replace('version="2.15"', 'version="1.1"'), "not this format"),
+        (text.replace("Inverse_Model", "Direct_Model"), "no element Inverse_Model"),
+        (text.replace("LINE_NUM_COEFF_7", "LINE_NUM_COEFF_77"), "no element LINE_NUM_COEFF_7; did you mean"),
+        ("<a/>", "not a DIMAP file"),
+    ):
+        (tmp_path / "RPC.XML").write_text(bad)
+        with pytest.raises(InputError, match=message):
+            read_rpc(tmp_path / "RPC.XML")
+    (tmp_path / "a.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts()))
+    with pytest.raises(InputError, match="without rational polynomials"):
+        read_rpc(tmp_path / "a.tif")
+    (tmp_path / "b.tif").write_bytes(b"II*\0nothing")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_rpc(tmp_path / "b.tif")
+
+
+def test_slopes_are_those_of_the_rigorous_sensor(sensor, model: RationalPolynomial) -> None:
+    _, itrs = ground_points(sensor, 12, 1)
+    longitude, latitude, height = Earth().geodetic(itrs)
+    found = image_slope(model, latitude, longitude, height)
+    level = east_north_up(longitude, latitude)
+    for k in range(3):
+        ends = [np.stack(sensor.image(itrs + sign * level[:, k]), axis=-1) for sign in (5.0, -5.0)]
+        # steps of 10 m, of which the sensor's own inverse is right to 1e-7 px
+        np.testing.assert_allclose(found[:, :, k], (ends[0] - ends[1]) / 10.0, rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("kind", ["shift", "affine"])
+def test_a_known_bias_is_recovered_within_its_sigma(sensor, model: RationalPolynomial, kind: str) -> None:
+    """Over 200 draws of points, with errors in the image and on the ground: chi-square of the corrected polynomials'
+    errors at places that no point stands at. The false alarm of all bounds is 1e-4.
+    """
+    place, itrs = ground_points(sensor, 12, 2)
+    check, check_itrs = ground_points(sensor, 1, 3)
+    longitude, latitude, height = Earth().geodetic(check_itrs)
+    where = np.degrees(latitude), np.degrees(longitude), height
+    predicted = np.stack(model.image(*where), axis=-1)
+
+    def bias(at: np.ndarray) -> np.ndarray:
+        tilt = np.array([[1e-4, 2e-4], [-1e-4, 3e-4]]) if kind == "affine" else np.zeros((2, 2))
+        return np.array([12.0, -31.0]) + (at - [6000.0, 10_000.0]) @ tilt
+
+    on_ground = np.diag([0.5, 0.4, 0.8]) ** 2
+    in_image = np.array([[0.09, 0.02], [0.02, 0.16]])
+    roots = np.linalg.cholesky(on_ground), np.linalg.cholesky(in_image)
+    total, left, freedom = 0.0, 0.0, 0
+    for seed in range(200):
+        random = np.random.default_rng(seed)
+        told = itrs + random.standard_normal((12, 3)) @ roots[0].T
+        seen = place + bias(place) + random.standard_normal((12, 2)) @ roots[1].T
+        spreads = np.tile(on_ground, (12, 1, 1)), np.tile(in_image, (12, 1, 1))
+        found = polynomial_correction(model, told, spreads[0], seen, spreads[1], kind, screened=False)
+        off = predicted + found.at(*predicted.T) - check - bias(check)
+        known = found.covariance_at(*check.T)
+        total += float(off[0] @ np.linalg.solve(known[0], off[0]))
+        left += found.chi_square
+        freedom += found.freedom
+    # polynomials with the last of them inside are as good as it: 1e-5 px of the fit
+    after = np.stack(controlled(model, found).after.image(*where), axis=-1)
+    np.testing.assert_allclose(after, predicted + found.at(*predicted.T), rtol=0, atol=1e-5)
+    for value, count in ((total, 2 * 200), (left, freedom)):
+        assert chi2.ppf(2.5e-5, count) < value < chi2.isf(2.5e-5, count)
+
+
+def test_err_bias_and_err_rand(sensor, model: RationalPolynomial) -> None:
+    """Of a shift: its sigma times the pixels on the ground. What scatters beyond the sigmas is the other."""
+    place, itrs = ground_points(sensor, 40, 4)
+    none, spread = np.tile(1e-8 * np.eye(3), (40, 1, 1)), np.tile(0.04 * np.eye(2), (40, 1, 1))
+    noise = np.random.default_rng(5).standard_normal((40, 2))
+    middle = 0.5 * (np.array([SCENE.lines, SCENE.pixels]) - 1.0)
+    ground = sensor.ground(middle[0] + [0.0, 1.0, 0.0], middle[1] + [0.0, 0.0, 1.0], 1000.0)
+    size = np.linalg.norm(ground[1:] - ground[0], axis=1)
+    quiet = controlled(model, polynomial_correction(model, itrs, none, place + 0.2 * noise, spread, "shift")).after
+    assert quiet.bias_m == pytest.approx(0.2 * np.hypot(*size) / np.sqrt(40.0), rel=0.02)
+    assert quiet.random_m == 0.0
+    rough = controlled(
+        model, polynomial_correction(model, itrs, none, place + noise, spread, "shift", screened=False)
+    ).after
+    assert rough.bias_m == pytest.approx(quiet.bias_m, rel=1e-6)
+    assert rough.random_m == pytest.approx(np.sqrt(1.0 - 0.04) * np.hypot(*size), rel=0.25)  # 40 points: 11 %

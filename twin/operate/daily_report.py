@@ -1,0 +1,376 @@
+"""The daily report of an instrument in operation: one page that needs no other file, to be kept or sent by mail."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from analysis.chi_square import limit_of
+from analysis.monitor.disturbances import FALSE_ALARM
+from analysis.monitor.limits import Quantity
+from scenes.yaml.errors import Problem
+from twin.operate.daily_plots import courses_svg, innovations_svg
+from twin.operate.estimate.alarms import name_of, percent
+from twin.operate.overview import (
+    CONFIDENCE,
+    DAY,
+    Overview,
+    carried_text,
+    code_of,
+    day_text,
+    group_name,
+    largest_part,
+    minute_text,
+    trend,
+    with_sigma,
+)
+from twin.operate.record.entries import micros, utc_text
+from twin.operate.record.history import History
+from twin.run.artefact import Artefact, Cell, Marked, OwnDecimals, SvgFigure, Table, Text, decimals_for
+from twin.run.page import report_page
+from twin.run.report import Report, Section, answer
+
+if TYPE_CHECKING:
+    from twin.operate.estimate.following import FoundJump
+
+RECENT = 30 * DAY
+"""Before the newest reading, of the second figure of courses."""
+MOST_EXPLAINED = 4
+"""Quantities of which the lead says how much of their scatter temperatures explain."""
+MOST_SHOWN = 40
+"""Rows of a table in which the newest are shown; CSV has them all."""
+_NOT = "\N{EM DASH}"
+
+
+def daily_report(history: History, overview: Overview, end: int) -> Report:
+    """What there is to say of a day.
+
+    Args:
+        history: the record.
+        overview: of it, at the day's end.
+        end: of the day, microseconds of TAI since 2000.
+    """
+    told = overview.following
+    begin = end - DAY
+    last = min(end, overview.time)
+    verdict, lead = answer(
+        overview.state_sentence(),
+        overview.change_sentence(begin, end, f"on {day_text(begin)}"),
+        *overview.break_sentences(),
+        overview.score_sentence(),
+        _explained(overview),
+    )
+    sections = (
+        _changed_section(overview, begin, end),
+        _trend_section(history, overview, last),
+        _prediction_section(overview),
+        _jump_section(overview),
+        _sensor_section(overview),
+        _alarm_section(overview),
+        _left_out_section(history, overview),
+    )
+    facts = (
+        ("Instrument", f"{history.name} ({history.sha256[:12]})"),
+        ("Record", history.url),
+        ("Readings", f"{told.readings}, the newest of {minute_text(overview.time)} UTC"),
+        ("Disturbances", str(overview.operation.plan.operation.disturbances)),
+        ("Forecast", f"{overview.horizon / DAY:g} d"),
+    )
+    return Report(
+        f"{history.name} in operation, {day_text(begin)}",
+        verdict,
+        lead,
+        facts,
+        state_table(overview),
+        tuple(section for section in sections if section is not None),
+        warnings=_warnings(overview, end),
+    )
+
+
+def report_html(report: Report, words: Sequence[str]) -> bytes:
+    """The report as one page.
+
+    Args:
+        report: of a day.
+        words: of the command that makes it again.
+    """
+    return report_page(report, words).encode()
+
+
+def end_of_day(text: str | None, newest: int) -> int:
+    """The end of a day of UTC, microseconds of TAI since 2000; by default of the newest reading's.
+
+    Raises:
+        Problem: not a date.
+    """
+    name = day_text(newest) if text is None else text.strip()
+    allowed = "a date of UTC: 2028-03-05"
+    if len(name) != len("2028-03-05"):
+        raise Problem("not a day", repr(name), allowed)
+    try:
+        return micros(f"{name}T00:00:00Z", seconds=86_400.0)
+    except Problem:
+        raise Problem("not a day", repr(name), allowed) from None
+
+
+def state_table(overview: Overview) -> Table:
+    """Every quantity now: value, sigma, requirement, chance, and when it is expected to break."""
+    now = overview.following.now
+    heads = ("change", "now", "σ", "limit", "beyond it [%]", "allowed [%]", "holds", "expected to break")
+    rows: list[list[Cell]] = []
+    full: list[list[Cell]] = []
+    bands: dict[int, str] = {}
+    for q, quantity in enumerate(overview.quantities):
+        value, sigma, group = float(now.values[0, q]), float(now.sigmas[0, q]), group_name(quantity.group)
+        if group not in bands.values():
+            bands[q] = group
+        places = decimals_for(sigma)
+        row: list[Cell] = [quantity.parameter.label, OwnDecimals(value, places), OwnDecimals(sigma, places)]
+        row += _required_cells(overview, quantity)
+        rows.append(row)
+        full.append([group, *(str(cell) if isinstance(cell, Marked) else cell for cell in row)])
+    caption = (
+        f"Changes since the reference images at {minute_text(overview.time)} UTC, with all readings until then. A "
+        "requirement holds while the chance that the size of the change is beyond its limit is not larger than what "
+        "is allowed. It is expected to break when that chance of the forecast is."
+    )
+    name = "state"
+    digits = Table(name, "State", "", ("of", *heads), full, within="")
+    return Table(name, "State", caption, heads, rows, within="", full=digits, bands=bands)
+
+
+def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
+    one = overview.required(quantity)
+    if one is None:
+        return ["", "", "", "", ""]
+    horizon = overview.horizon / DAY
+    when = day_text(one.breaks_us) if one.breaks_us is not None else f"not within {horizon:g} d"
+    look = "text" if one.holds_now else "text wrong"
+    return [
+        f"±{one.limit:g}",
+        percent(one.chance_now).removesuffix(" %"),
+        percent(1.0 - one.probability).removesuffix(" %"),
+        Marked("yes" if one.holds_now else "no", look=look, key=f"{quantity.group} {quantity.key}"),
+        when if one.holds_now else "broken",
+    ]
+
+
+def _changed_section(overview: Overview, begin: int, end: int) -> Section:
+    found = [one for one in overview.changed(begin, end) if not one.again]
+    lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in found)
+    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC."
+    if not lines:
+        return Section("What changed", (f"{what} Nothing happened.",), name="changed")
+    return Section("What changed", (what,), (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),), name="changed")
+
+
+def _trend_section(history: History, overview: Overview, last: int) -> Section:
+    quantities = overview.quantities
+    chosen = [one for one in quantities if overview.required(one) is not None] or list(quantities)[:3]
+    others = [one for one in quantities if one not in chosen]
+    first = overview.begin
+    recent = trend(history, overview, max(first, last - RECENT), last + overview.horizon)
+    figures: list[Artefact] = []
+    if last - first > RECENT:
+        life = trend(history, overview, first, last)
+        figures.append(_figure("life", "Since the record began", courses_svg("life", overview, life, chosen)))
+    title = f"The last {min(RECENT, last - first) / DAY:.0f} days, and the forecast"
+    figures.append(_figure("recent", title, courses_svg("recent", overview, recent, chosen)))
+    if others:
+        more = courses_svg("others", overview, recent, others, 2)
+        figures.append(_figure("others", "All other changes", more))
+    words = (
+        "Lines are the estimate with all readings, bands hold the true change with a chance of 68 and 95 %. Jumps "
+        "stand between the readings before and after them, events where the record has them.",
+    )
+    return Section("Trends", words, tuple(figures), int(bool(others)), name="trends")
+
+
+def _figure(name: str, title: str, svg: str) -> SvgFigure:
+    return SvgFigure(name, title, "", svg, within="")
+
+
+def _prediction_section(overview: Overview) -> Section:
+    told = overview.following
+    rows: list[list[Cell]] = []
+    for one in overview.coverages:
+        if one.count:
+            look = "text" if one.holds else "text wrong"
+            interval = f"{100.0 * one.low:.1f} to {100.0 * one.high:.1f}"
+            words = Marked("yes" if one.holds else "no", look=look, key=f"coverage {one.sigmas}")
+            row: list[Cell] = [f"within {one.sigmas}σ", OwnDecimals(100.0 * one.expected, 2)]
+            rows.append([*row, OwnDecimals(100.0 * one.share, 2), interval, one.count, words])
+    heads = ("components", "expected [%]", "found [%]", f"interval of {100.0 * CONFIDENCE:.0f} % [%]", "of", "in it")
+    caption = (
+        "Each reading was predicted from all before it. Its components, made independent and of unit variance, lie "
+        "within 1 and 2σ as often as a normal distribution has it where the plan's disturbances are right; the "
+        "interval is the exact binomial one."
+    )
+    artefacts: list[Artefact] = []
+    text = [
+        f"Mean log score of a reading: {_score(overview)}." if told.scores.readings else "Nothing was predicted yet."
+    ]
+    if told.innovations:
+        above = sum(chi > limit_of(FALSE_ALARM, degrees) for _, chi, degrees in told.innovations)
+        text.append(
+            f"Of the last {len(told.innovations)} readings {above} "
+            f"{'is' if above == 1 else 'are'} above the limit, of {FALSE_ALARM * len(told.innovations):.1f} expected."
+        )
+        artefacts.append(_figure("innovations", "Departures from predictions", innovations_svg(overview)))
+    if rows:
+        artefacts.append(Table("coverage", "Coverage so far", caption, heads, rows, within=""))
+    return Section("Predictions", tuple(text), tuple(artefacts), name="predictions")
+
+
+def _score(overview: Overview) -> str:
+    scores = overview.following.scores
+    return f"{scores.log_score:.3f}, larger is better"
+
+
+def _explained(overview: Overview) -> str:
+    known = {name: share for name, share in overview.following.explained.items() if math.isfinite(share)}
+    if not known:
+        return ""
+    parts = [
+        f"{100.0 * known[code_of(one)]:.0f} % of that of {name_of(code_of(one), overview.quantities)}"
+        for one in overview.quantities
+        if known.get(code_of(one), 0.0) >= 0.005 and (overview.required(one) or not overview.following.breaks)
+    ]
+    if not parts:
+        return "Temperatures explain nothing of the scatter of what is required"
+    return f"Of the readings' scatter temperatures explain {', '.join(parts[:MOST_EXPLAINED])}"
+
+
+def _jump_section(overview: Overview) -> Section | None:
+    told = overview.following
+    heads = ("came until", "told", "body", "best known part", "did to the line", "log ratio", "false alarm", "or else")
+    digits = ("after", "until", "told", "body", "part", "size", "sigma", "unit", "log ratio", "false alarm", "or else")
+    rows: list[list[Cell]] = []
+    full: list[list[Cell]] = []
+    for jump in sorted(told.jumps, key=lambda one: -one.until_us):
+        label, unit, size, sigma = largest_part(jump)
+        part, others = label.removeprefix(f"{jump.body} "), rivals_text(jump)
+        row: list[Cell] = [Marked(minute_text(jump.until_us), f"after {minute_text(jump.after_us)}", "text")]
+        row += [minute_text(jump.told_us), jump.body]
+        row += [
+            Marked(part, with_sigma(size, sigma, unit.replace("um", "µm")), "text"),
+            carried_text(overview, jump) or _NOT,
+        ]
+        rows.append([*row, OwnDecimals(jump.log_ratio, 1), f"{jump.false_alarm:.1g}", others or _NOT])
+        when = [utc_text(time) for time in (jump.after_us, jump.until_us, jump.told_us)]
+        full.append([*when, jump.body, part, size, sigma, unit, jump.log_ratio, jump.false_alarm, others])
+    events = [
+        f"{minute_text(time)}: {name.replace('_', ' ')}{_causes(causes)}" for time, name, causes in overview.events
+    ]
+    artefacts: list[Artefact] = []
+    if rows:
+        caption = (
+            "A jump is a step of one body that the readings show and no event explains, at a time between two "
+            "readings. What it did to the line is by all bodies that can have made it, which stand at the end with "
+            "their log ratios. Times are UTC."
+        )
+        own = Table("jumps", "Jumps that were found", "", digits, full, within="")
+        artefacts.append(replace(_newest("jumps", own.title, caption, heads, rows), full=own))
+    if events:
+        artefacts.append(Text("events", "Events of the record", "", events[::-1][:MOST_SHOWN], within=""))
+    words = () if artefacts else ("No jump was found, and the record has no event.",)
+    return Section("Jumps and events", words, tuple(artefacts), name="jumps")
+
+
+def rivals_text(jump: FoundJump) -> str:
+    """Other bodies that a jump may be of, the likeliest first, with their log ratios."""
+    others = sorted(jump.rivals.items(), key=lambda one: -one[1])[:3]
+    return ", ".join(f"{body} ({ratio:.1f})" for body, ratio in others)
+
+
+def _causes(causes: Sequence[str]) -> str:
+    return f", which may step {', '.join(causes)}" if causes else ""
+
+
+def _newest(name: str, title: str, caption: str, heads: Sequence[str], rows: list[list[Cell]]) -> Table:
+    """A table of the newest rows, which stand first, with all of them to be taken away."""
+    if len(rows) <= MOST_SHOWN:
+        return Table(name, title, caption, heads, rows, within="")
+    full = Table(name, title, "", heads, rows, within="")
+    caption = f"The newest {MOST_SHOWN} of {len(rows)}. {caption}".strip()
+    return Table(name, title, caption, heads, rows[:MOST_SHOWN], within="", full=full)
+
+
+def _sensor_section(overview: Overview) -> Section:
+    rows: list[list[Cell]] = [
+        [
+            one.body,
+            Marked(one.state, look="text" if one.state == "ok" else "text wrong", key=f"sensor {one.body}"),
+            minute_text(one.since_us),
+            minute_text(one.last_us),
+            one.reason or _NOT,
+        ]
+        for one in sorted(overview.following.sensors, key=lambda one: (one.state == "ok", one.body))
+    ]
+    heads = ("body", "state", "since", "last reading", "why")
+    if not rows:
+        return Section("Sensors", ("The record has no temperature.",), name="sensors")
+    caption = (
+        "Sensors of temperatures as their own readings show them, those that are not in order first. Times are UTC."
+    )
+    return Section("Sensors", (), (Table("sensors", "", caption, heads, rows, within=""),), name="sensors")
+
+
+def _alarm_section(overview: Overview) -> Section:
+    if not overview.alarms:
+        return Section("Alarms", ("No alarm has been raised.",), name="alarms")
+    waiting = {id(one) for one in overview.open_alarms()}
+    rows: list[list[Cell]] = []
+    for one in sorted(overview.alarms, key=lambda one: (id(one) not in waiting, -int(one["time_us"]))):
+        known = one["acknowledged"]
+        who = "open" if known is None else _who(known)
+        state = Marked(who, look="text wrong" if known is None else "text", key=f"alarm {one['id']}")
+        rows.append([minute_text(int(one["time_us"])), str(one["kind"]).replace("_", " "), str(one["text"]), state])
+    heads = ("time", "sort", "alarm", "acknowledged")
+    words = (
+        f"{len(waiting)} of {len(overview.alarms)} wait for an acknowledgement." if waiting else "All are acknowledged."
+    )
+    return Section("Alarms", (words,), (_newest("alarms", "", "Times are UTC.", heads, rows),), name="alarms")
+
+
+def _who(ack: Mapping[str, Any]) -> str:
+    note = f": {ack['note']}" if ack.get("note") else ""
+    return f"{ack['by']}, {str(ack['acknowledged_utc'])[:16].replace('T', ' ')}{note}"
+
+
+def _left_out_section(history: History, overview: Overview) -> Section:
+    rows: list[list[Cell]] = [
+        [minute_text(time), kind, subject, reason]
+        for time, kind, subject, reason in sorted(overview.following.left_out, key=lambda one: -one[0])
+    ]
+    refused = [one for one in history.refusals() if not one["taken_since"]]
+    artefacts: list[Artefact] = []
+    if rows:
+        caption = "In the record, but not used for the estimate. Times are UTC."
+        artefacts.append(_newest("left-out", "Left out", caption, ("time", "sort", "of", "why"), rows))
+    if refused:
+        own: list[list[Cell]] = [
+            [one["refused_utc"], f"{one['file']}{'' if one['line'] is None else ':' + str(one['line'])}", one["reason"]]
+            for one in refused[::-1]
+        ]
+        caption = "Refused when their files were taken, and not in the record."
+        artefacts.append(_newest("refused", "Refused", caption, ("refused [UTC]", "in", "why"), own))
+    words = () if artefacts else ("Nothing was left out or refused.",)
+    return Section("What was left out", words, tuple(artefacts), name="left-out")
+
+
+def _warnings(overview: Overview, end: int) -> tuple[str, ...]:
+    out = overview.doubts()
+    age = (end - overview.time) / DAY
+    if age > 1.0:
+        out.append(f"the newest reading is {age:.0f} d older than the end of the day")
+    waiting = overview.open_alarms()
+    if waiting:
+        count = "one alarm waits" if len(waiting) == 1 else f"{len(waiting)} alarms wait"
+        out.append(f"{count} for an acknowledgement; the newest: {waiting[0]['text']}")
+    bad = [one for one in overview.following.sensors if one.state != "ok"]
+    if bad:
+        out.append("sensors that are not in order: " + ", ".join(f"{one.body} ({one.state})" for one in bad))
+    return tuple(out)

@@ -1,0 +1,478 @@
+"""The estimate of an instrument's state from its record: now, at any time past and ahead, with its sigma.
+
+A reading changes the estimate with the same work whatever the length of the record: where the estimate stands is kept
+in the record beside the readings, and what comes later goes on from there. What came late begins anew from what was
+kept before it. The result is the same to the bit whenever it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import pdtrc
+
+from analysis.monitor.disturbances import FALSE_ALARM
+from analysis.monitor.jump_detection import Jump, Step
+from analysis.monitor.limits import Quantity
+from analysis.monitor.series_following import hinted, smoothed
+from optics.numerics.backend import load_backend
+from optics.numerics.threads import one_blas_thread
+from scenes.specs.operation import OperationSetup
+from scenes.yaml.errors import Problem
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
+from twin.operate.estimate.operation_model import OperationModel, traced_model
+from twin.operate.estimate.plans import plan_digest
+from twin.operate.estimate.standing import Standing, Taking
+from twin.operate.record.entries import MICRO, digest_of_data, utc_text
+from twin.operate.record.history import History, content_of
+from twin.run.provenance import source_digest
+
+__all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "Operation", "SensorState", "beyond"]
+
+Array = NDArray[np.float64]
+DAY = 86_400 * MICRO
+EVERY = 1000
+"""Readings after which it is kept for good where the estimate stands."""
+_USED = ("monitor", "temperature")
+"""Sorts of entries that change the estimate; events do by what they step."""
+HEAD = 16
+"""Readings since it was kept after which it is kept at all: to follow as many again is as quick as to write it down."""
+_MODEL, _HEAD = -1, 0
+"""Numbers under which a record keeps what was traced, and where the estimate stands after all readings."""
+
+
+class Operation:
+    """The estimate of a record under a plan.
+
+    Args:
+        history: the record.
+        plan: with its instrument, that of the record.
+        advance: called with the number of readings that were taken, of how many.
+        before_it: the same before some readings came; None for none. See `again`.
+
+    Raises:
+        Problem: the record has no reading of the monitor.
+        InputError: the plan states what its instrument cannot do.
+    """
+
+    def __init__(
+        self,
+        history: History,
+        plan: OperationSetup,
+        advance: Callable[[int, int], None] = lambda done, of: None,
+        before_it: Operation | None = None,
+    ) -> None:
+        self.history, self.plan, self._advance = history, plan, advance
+        self._stood: tuple[Standing | None, int] = None, 0
+        self._newest = self._saved = 0
+        self._silent: tuple[tuple[str, int], ...] = ()
+        first = history.first("monitor")
+        if first is None:
+            allowed = "a run of twin.recover or twin.render; python -m twin.operate ingest takes one"
+            raise Problem("no reading of the monitor is in the record", None, allowed)
+        self.epoch = int(first["time_us"])
+        before = [
+            (camera, channel, one["before"])
+            for camera, own in content_of(first)["numbers"]["spots"].items()
+            for channel, one in own.items()
+        ]
+        self._before = {(camera, channel): one for camera, channel, one in before}
+        self._sensors = tuple(body for body in history.subjects("temperature") if body in history.bodies["warm"])
+        self._plan_digest: str = plan_digest(plan) if before_it is None else before_it._plan_digest
+        order = [list(plan.model.instrument.cameras), list(plan.disturbances.causes)]
+        own = [self._plan_digest, order, self.epoch, list(self._sensors), [list(one) for one in before]]
+        self.key = digest_of_data([source_digest(), *own])
+        """By which it is recognised what an estimate rests on beside the readings."""
+        if before_it is not None and before_it.key == self.key:
+            known = vars(before_it)
+            vars(self).update({name: known[name] for name in ("experiment", "model") if name in known})
+            if "_taking" in known and before_it.events == self.events:
+                vars(self)["_taking"] = known["_taking"]
+                self._stood, self._saved = (known.get("_standing"), before_it._newest), before_it._saved
+
+    def again(self) -> Operation:
+        """The estimate of the same record under the same plan with what has come since; quicker than a new one."""
+        return Operation(self.history, self.plan, self._advance, self)
+
+    @cached_property
+    def experiment(self) -> MonitorExperiment:
+        """The instrument."""
+        return MonitorExperiment(self.plan.model, load_backend())
+
+    @cached_property
+    def model(self) -> OperationModel:
+        """What was traced; of a record that knows it already it is taken from there."""
+        kept = self.history.checkpoint(self.key, number=_MODEL)
+        if kept is not None:
+            return OperationModel.from_bytes(kept.content)
+        sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in self._before.values()])
+        made = traced_model(self.plan, sigma, self._sensors, self.experiment)
+        self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, made.to_bytes())
+        return made
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """All that is read."""
+        return self.model.quantities
+
+    @cached_property
+    def events(self) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
+        """(time_us, name, causes) of the record's events that step something."""
+        found = ((int(one["time_us"]), str(one["subject"])) for one in self.history.entries("event"))
+        known = self.plan.operation.events
+        return tuple((time, name, tuple(known[name])) for time, name in found if known.get(name))
+
+    @cached_property
+    def _taking(self) -> Taking:
+        causes = self.model.how.stated.causes
+        steps = []
+        for time, _, own in self.events:
+            motions = tuple(k for k, cause in enumerate(causes) if cause in own)
+            steps.append(Step(((motions, 1.0),), (((time - self.epoch) / MICRO, 1.0),)))
+        how = replace(self.model.how, steps=tuple(steps))
+        reference = np.array([(self._before[spot]["row"], self._before[spot]["column"]) for spot in self.model.spots])
+        return Taking(self.model, how, self.epoch, reference, self.history.temperature)
+
+    def _moments(self, after_us: int | None, until_us: int | None = None) -> Iterator[list[dict[str, Any]]]:
+        """Entries that are used, those of one time together, in the order of time."""
+        own = (one for one in self.history.entries(after_us=after_us, until_us=until_us) if one["kind"] in _USED)
+        for _, together in groupby(own, key=lambda one: int(one["time_us"])):
+            yield [{**one, "content": content_of(one)} for one in together]
+
+    def standing(self) -> Standing:
+        """Take all readings that are new; where the estimate stands then."""
+        return self._standing
+
+    @cached_property
+    def _standing(self) -> Standing:
+        """After all readings."""
+        with one_blas_thread():
+            return self._followed()
+
+    def _followed(self) -> Standing:
+        taking, newest = self._taking, self.history.newest_id()
+        self._newest = newest
+        standing = self._kept()
+        moments = list(self._moments(None if standing is None else standing.time))
+        count = 0
+        while count < len(moments):
+            if standing is None:
+                standing = taking.start(int(moments[0][0]["time_us"]))
+            before = standing.scores.readings
+            standing = taking.take(standing, moments[count])
+            count += 1
+            if standing.found_stuck:
+                standing = self._without(standing)
+                moments, count = list(self._moments(None if standing is None else standing.time)), 0
+                if standing is None:
+                    standing = taking.start(int(moments[0][0]["time_us"]), self._silent)
+                continue
+            number = standing.scores.readings // EVERY
+            if number > before // EVERY:
+                self._keep(standing, number, newest)
+                standing = standing.anew()
+            self._advance(count, len(moments))
+        assert standing is not None  # there is a reading of the monitor
+        if standing.scores.readings >= self._saved + HEAD:
+            self._keep(standing, _HEAD, newest)
+            self._saved = standing.scores.readings
+        return standing
+
+    def _without(self, standing: Standing) -> Standing | None:
+        """Where the estimate stood before a sensor began to repeat itself; its readings from there on are not used."""
+        self._silent = (*standing.silent, *standing.found_stuck)
+        since = min(time for _, time in standing.found_stuck)
+        self.history.drop_checkpoints(self.key, since)
+        self._saved = 0
+        kept = self.history.checkpoint(self.key, before_us=since, valid=True)
+        return None if kept is None else replace(Standing.from_bytes(kept.content).anew(), silent=self._silent)
+
+    def _kept(self) -> Standing | None:
+        """Where the estimate stood before what is new; None for nowhere."""
+        standing, newest = self._stood
+        if standing is not None and not self.history.came_late(newest, standing.time):
+            return standing
+        kept = self.history.checkpoint(self.key, valid=True)
+        if kept is None:
+            return None
+        standing = Standing.from_bytes(kept.content)
+        self._saved = standing.scores.readings
+        if not self._fits(standing):
+            self.history.drop_checkpoints(self.key, self.epoch)
+            self._saved = 0
+            return None
+        # what was used up to one that is kept for good is kept with it
+        return standing.anew() if kept.number > _HEAD else standing
+
+    def _fits(self, standing: Standing) -> bool:
+        """Whether states that were kept are those of this computer's linear algebra."""
+        own = self._taking.how.space.basis
+        if standing.basis.shape != own.shape:
+            return False
+        return bool(np.all(np.abs(standing.basis - own) <= 1e-9 * np.abs(own).max(axis=1, keepdims=True)))
+
+    def _keep(self, standing: Standing, number: int, newest: int) -> None:
+        self.history.save_checkpoint(self.key, number, standing.time, newest, standing.to_bytes())
+
+    def follow(self) -> Following:
+        """Take all readings that are new, and tell what is known."""
+        standing = self._standing
+        now = self.forecast([standing.time])
+        jumps = tuple(self._found(one.time, one.jump) for one in standing.jumps)
+        sensors = []
+        for one in standing.sensors.values():
+            state, since, reason = one.state(standing.time)
+            sensors.append(SensorState(one.body, state, since, one.last_us, reason))
+        names = [f"{one.group} {one.key}" for one in self.quantities]
+        return Following(
+            standing.time,
+            standing.scores.readings,
+            now,
+            standing.scores,
+            standing.innovations,
+            jumps,
+            self.events,
+            tuple(sorted(sensors, key=lambda one: one.body)),
+            standing.left_out,
+            dict(zip(names, standing.explained.tolist(), strict=True)),
+            self._widened,
+            self.too_many_jumps,
+            self._breaks(),
+        )
+
+    def _found(self, told: int, jump: Jump) -> FoundJump:
+        sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
+        after, until = (self.epoch + round(time * MICRO) for time in (jump.after, jump.until))
+        change, spread, rows = np.array(jump.change), np.array(jump.spread), self.model.rows
+        width = self.model.how.space.width
+        read, changed = rows @ (self.model.reading @ change[:width]), rows @ change[width:]
+        sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, spread[width:, width:], rows))
+        names = [f"{one.group} {one.key}" for one in self.quantities]
+        carried = dict(zip(names, zip(read.tolist(), changed.tolist(), sigma.tolist(), strict=True), strict=True))
+        return FoundJump(jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals, carried)
+
+    def _breaks(self) -> tuple[Break, ...]:
+        operation, start = self.plan.operation, self._standing.time
+        if not operation.requirements:
+            return ()
+        days = max(1, round(operation.horizon * MICRO / DAY))
+        ahead = self.forecast([start + round(k * operation.horizon * MICRO / days) for k in range(days + 1)])
+        out = []
+        for one in operation.requirements:
+            k = ahead.column(one.group, one.key)
+            chance = beyond(ahead.values[:, k], ahead.sigmas[:, k], one.largest)
+            broken = np.flatnonzero(chance > 1.0 - one.probability)
+            breaks = int(ahead.times[broken[0]]) if len(broken) else None
+            unit = self.quantities[k].parameter.unit
+            holds = not (len(broken) and broken[0] == 0)
+            out.append(Break(one.name, unit, one.largest, one.probability, float(chance[0]), holds, breaks))
+        return tuple(out)
+
+    def forecast(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
+        """What is expected at times ahead, by all readings.
+
+        Args:
+            times_us: (T,) microseconds of TAI since 2000, not before the newest reading.
+
+        Raises:
+            Problem: a time before it.
+        """
+        times = np.asarray(times_us, np.int64)
+        if len(times) and times.min() < self._standing.time:
+            allowed = f"times from {utc_text(self._standing.time)} on, that of the newest reading"
+            raise Problem("a forecast of what is past", utc_text(int(times.min())), allowed)
+        how = self._taking.how
+        with one_blas_thread():
+            belief = how.blended(self._standing.belief)
+            found = [how.parameters(belief, self._taking.seconds(int(time))) for time in times]
+        return self._course(times, found, np.full(len(times), self._widened))
+
+    @cached_property
+    def _widened(self) -> float:
+        """Of sigmas now, where the last readings contradict what is stated."""
+        squares = self._unexplained(self._standing.innovations)
+        return float(widening(squares, [len(squares)], False)[0])
+
+    @cached_property
+    def too_many_jumps(self) -> bool:
+        """Whether more jumps were told than is stated, one in a thousand times by chance; a body of which nothing is
+        stated of how often it jumps does so once.
+        """
+        stated, lasted = self.model.how.stated, (self._standing.time - self.epoch) / MICRO
+        every = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
+        mean = sum(1.0 if rate is None else lasted / rate for rate in every.values())
+        count = len(self._standing.jumps)
+        return bool(count > 1 and pdtrc(count - 1, mean) < FALSE_ALARM)
+
+    def _unexplained(self, innovations: Sequence[tuple[int, float, int]]) -> Array:
+        """(N, 2) chi-square and degrees of freedom of readings; none of those that jumps explain which were told, but
+        where there are more of these than is stated: then it is not jumps that the readings ask for.
+        """
+        jumps = [] if self.too_many_jumps else [self._found(one.time, one.jump) for one in self._standing.jumps]
+        out = np.array([(square, degrees) for _, square, degrees in innovations], np.float64).reshape(-1, 2)
+        times = np.array([time for time, _, _ in innovations], np.int64)
+        for one in jumps:
+            out[(times > one.after_us) & (times <= one.told_us)] = 0.0
+        return out
+
+    def _course(self, times: NDArray[np.int64], found: Sequence[tuple[Array, Array]], widened: Array) -> Course:
+        rows = self.model.rows
+        changes = np.array([one for one, _ in found]).reshape(len(times), rows.shape[1])
+        covariance = np.array([one for _, one in found]).reshape(len(times), rows.shape[1], rows.shape[1])
+        covariance = covariance * widened[:, None, None] ** 2
+        variance = np.einsum("qi,tij,qj->tq", rows, covariance, rows)
+        sigmas = np.sqrt(np.maximum(variance, 0.0))
+        return Course(times, self.quantities, changes @ rows.T, sigmas, changes, covariance)
+
+    def smoothed(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
+        """What all readings say of times; of those after the newest it is the forecast.
+
+        Args:
+            times_us: (T,) microseconds of TAI since 2000, from the first reading on.
+
+        Raises:
+            Problem: a time before it.
+        """
+        times = np.asarray(times_us, np.int64)
+        found = self._past(times, self._taking.how.parameters_of)
+        return self._course(times, found, self._widened_at(times))
+
+    def _widened_at(self, times: NDArray[np.int64]) -> Array:
+        """(T,) of sigmas of times past; of those after the newest reading as it is now."""
+        told = [one for span in self._spans(None) for one in span.told]
+        squares = self._unexplained(told)
+        number = np.searchsorted([time for time, _, _ in told], times, side="right")
+        out = widening(squares, number, True)
+        out[times >= self._standing.time] = self._widened
+        return out
+
+    def motions(self, time_us: int, acting: bool = False) -> Motions:
+        """Every stated motion at one time, by all readings.
+
+        Args:
+            time_us: microseconds of TAI since 2000, from the first reading on.
+            acting: temperatures of bodies with sensors times the factor by which heat does more to light than was
+                computed, so that what is computed of the motions is what `smoothed` says.
+
+        Raises:
+            Problem: a time before it.
+        """
+        stated = self.model.how.stated
+        how = replace(self._taking.how, steps=(*self._taking.how.steps, *self._steps(self._standing)))
+        since = self._taking.seconds(self.epoch)
+        found = self._past(
+            np.array([time_us], np.int64),
+            lambda mean, covariance, time: how.motions_of(mean, covariance, time, since, acting),
+        )
+        (mean, spread), size = found[0], stated.sigmas
+        spread = spread * self._widened_at(np.array([time_us], np.int64))[0] ** 2
+        return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
+
+    def states(self, times_us: NDArray[np.int64]) -> tuple[Course, Array, dict[str, tuple[Array, Array]]]:
+        """What `smoothed` and `motions` say of times, with the work of one look at the past.
+
+        Args:
+            times_us: (T,) as of `smoothed`.
+
+        Returns:
+            The course; (T, M) means of every stated motion; and by name the motions of several causes together, (T,)
+            means and standard deviations.
+
+        Raises:
+            Problem: a time before it.
+        """
+        times, stated, own = times_us, self.model.how.stated, self._taking.how
+        how = replace(own, steps=(*own.steps, *self._steps(self._standing)))
+        since, names = self._taking.seconds(self.epoch), list(dict.fromkeys(stated.labels))
+        group, size = np.array([names.index(label) for label in stated.labels]), stated.sigmas
+        first, second = np.nonzero(group[:, None] == group)  # pairs of one name, whose errors go together
+
+        def each(mean: Array, covariance: Array, time: float) -> Any:
+            moved, spread = how.motions_of(mean, covariance, time, since)
+            shares = size[first] * spread[first, second] * size[second]
+            variance = np.bincount(group[first], shares, len(names))
+            return own.parameters_of(mean, covariance, time), size * moved, np.sqrt(np.maximum(variance, 0.0))
+
+        found: Any = self._past(times, each)
+        wide = self._widened_at(times)
+        moved = np.array([one for _, one, _ in found]).reshape(len(times), len(group))
+        sigmas = np.array([one for _, _, one in found]).reshape(len(times), len(names)) * wide[:, None]
+        together = {name: (moved[:, group == k].sum(axis=1), sigmas[:, k]) for k, name in enumerate(names)}
+        return self._course(times, [one for one, _, _ in found], wide), moved, together
+
+    @staticmethod
+    def _steps(standing: Standing, told_after: int | None = None) -> tuple[Step, ...]:
+        own = (one for one in standing.jumps if told_after is None or one.time > told_after)
+        return tuple(Step.of(one.jump) for one in own)
+
+    def _past(
+        self, times: NDArray[np.int64], each: Callable[[Array, Array, float], tuple[Array, Array]]
+    ) -> list[tuple[Array, Array]]:
+        """What is made of the states at times, by all readings."""
+        taking, last = self._taking, self._standing
+        begin = self._begin()
+        if not len(times):
+            return []
+        if times.min() < begin:
+            allowed = f"times from {utc_text(begin)} on, that of the first reading"
+            raise Problem("a time before all readings", utc_text(int(times.min())), allowed)
+        with one_blas_thread():
+            start = self._before_all(int(times.min()))
+            told = None if start is None else start.time
+            steps = (*taking.how.steps, *self._steps(last, told))
+            used, left = self._used(told)
+            entries = {int(one["id"]): one for together in self._moments(told) for one in together}
+            observed = [taking.observed(entries[number]) for number in used.tolist()]
+            belief = (taking.start(begin) if start is None else start).belief
+            belief = taking.how.blended(belief) if start is last else belief
+            belief = replace(
+                belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
+            )
+            seconds = [taking.seconds(int(time)) for time in times]
+            knowing = replace(taking.how, steps=steps, window=0)
+            shares = hinted(taking.how, knowing, belief, observed, list(left))
+            return smoothed(knowing, belief, observed, seconds, shares, each)
+
+    def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
+        """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""
+        spans = self._spans(after_us)
+        if not spans:
+            return np.zeros(0, np.int64), np.zeros((0, len(self._taking.how.walking)))
+        width = len(self._taking.how.walking)
+        left = np.concatenate([one.left.reshape(len(one.used), width) for one in spans])
+        return np.concatenate([one.used for one in spans]), left
+
+    def _spans(self, after_us: int | None) -> list[Standing]:
+        """Where the estimate was kept for good after a time and stands now; each knows what was used since the last."""
+        kept = [one for one in self.history.checkpoints(self.key) if one.number > _HEAD]
+        spans = [Standing.from_bytes(one.content) for one in kept if after_us is None or one.time > after_us]
+        if after_us is None or self._standing.time > after_us:
+            spans.append(self._standing)
+        return spans
+
+    def _begin(self) -> int:
+        first = min(int(one["time_us"]) for kind in _USED if (one := self.history.first(kind)) is not None)
+        return first
+
+    def _before_all(self, time: int) -> Standing | None:
+        """The newest that was kept for good before a time and before all jumps that were told since, or what stands now
+        for what is ahead; None for none.
+        """
+        last = self._standing
+        if time >= last.time:
+            return last
+        while True:
+            kept = self.history.checkpoint(self.key, before_us=time, valid=True)
+            if kept is None:
+                return None
+            earlier = [self.epoch + int(one.jump.chances[0][0] * MICRO) for one in last.jumps if one.time > kept.time]
+            if not earlier or min(earlier) >= kept.time:
+                return Standing.from_bytes(kept.content)
+            time = min(earlier)

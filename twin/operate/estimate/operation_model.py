@@ -1,0 +1,204 @@
+"""What an estimate of an instrument in operation rests on beside its readings: what moves and what that does to light,
+what sensors see of it, and what is read.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.limits import Quantity, quantities
+from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND
+from analysis.monitor.series_filter import SeriesFilter
+from analysis.monitor.state_space import HeatInputs
+from optics.numerics.backend import load_backend
+from optics.thermal.heat import Temperature
+from scenes.models.disturbances import HEAT, StatedMotions
+from scenes.models.thermal_model import ThermalModel
+from scenes.specs.operation import OperationSetup
+from twin.monitor.monitor_experiment import MonitorExperiment
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class OperationModel:
+    """What an estimate rests on beside readings.
+
+    Attributes:
+        how: the filter, which knows of no events yet.
+        spots: (camera, channel) of each spot, in the order of shifts.
+        quantities: Q of them that are read.
+        reading: (4 K, D) parameters per px by the estimator `model`, by which every camera moves as a whole.
+    """
+
+    how: SeriesFilter
+    spots: tuple[tuple[str, str], ...]
+    quantities: tuple[Quantity, ...]
+    reading: Array
+
+    @cached_property
+    def rows(self) -> Array:
+        """(Q, 4 K) each in its unit per rad and m of the parameters of one camera after the other."""
+        return np.stack([one.row for one in self.quantities])
+
+    def to_bytes(self) -> bytes:
+        """All of it, so that it need not be traced again."""
+        stated, heat = self.how.stated, self.how.heat
+        plain: dict[str, Any] = {
+            "name": stated.name,
+            "labels": stated.labels,
+            "bodies": stated.bodies,
+            "units": stated.units,
+            "causes": stated.causes,
+            "laws": [vars(law) for law in stated.laws],
+            "jump_false_alarm": stated.jump_false_alarm,
+            "spots": self.spots,
+            "quantities": [(one.group, one.key) for one in self.quantities],
+            "life_s": self.how.life_s,
+            "window": self.how.window,
+            "stepping": self.how.stepping,
+            "heat": None if heat is None else {"sensors": heat.sensors, "names": heat.names, "sigma": heat.sigma},
+        }
+        arrays: dict[str, np.ndarray] = {"sigmas": stated.sigmas, "see": stated.spots, "parameters": stated.parameters}
+        arrays |= {"correlation": stated.correlation, "rows": self.rows, "reading": self.reading}
+        if self.how.reference_noise is not None:
+            arrays["reference"] = self.how.reference_noise
+        if heat is not None:
+            arrays |= {"heat_motions": heat.motions, "heat_rows": heat.rows, "heat_factors": heat.factors}
+        return packed(plain, arrays)
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> OperationModel:
+        """What `to_bytes` gave."""
+        plain, arrays = unpacked(content)
+        laws = {canonical: _law(canonical) for canonical in {json.dumps(law) for law in plain["laws"]}}
+        stated = Disturbances(
+            plain["name"],
+            tuple(plain["labels"]),
+            tuple(plain["bodies"]),
+            tuple(plain["causes"]),
+            arrays["sigmas"],
+            tuple(plain["units"]),
+            arrays["see"],
+            arrays["parameters"],
+            arrays["correlation"],
+            tuple(laws[json.dumps(law)] for law in plain["laws"]),
+            plain["jump_false_alarm"],
+        )
+        heat = plain["heat"]
+        inputs = None
+        if heat is not None:
+            told = tuple(heat["sensors"]), arrays["heat_rows"], arrays["heat_factors"], tuple(heat["names"])
+            inputs = HeatInputs(arrays["heat_motions"], *told, heat["sigma"])
+        how = SeriesFilter(
+            stated,
+            arrays.get("reference"),
+            inputs,
+            life_s=plain["life_s"],
+            window=plain["window"],
+            stepping=tuple(plain["stepping"]),
+        )
+        spots = tuple((camera, channel) for camera, channel in plain["spots"])
+        known = {one.key: one for one in (*CAMERA_PARAMETERS, ANGLE, *GROUND)}
+        own = zip(plain["quantities"], arrays["rows"], strict=True)
+        read = tuple(Quantity(group, known[key], row) for (group, key), row in own)
+        return cls(how, spots, read, arrays["reading"])
+
+
+def _law(text: str) -> TimeLaw:
+    plain = json.loads(text)
+    return TimeLaw(**{**plain, "event": tuple((time, chance) for time, chance in plain["event"])})
+
+
+def packed(plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Plain data and arrays as one sequence of bytes, always the same for the same."""
+    file = io.BytesIO()
+    text = json.dumps(plain, sort_keys=True).encode()
+    np.savez(file, allow_pickle=False, plain=np.frombuffer(text, np.uint8), **{k: arrays[k] for k in sorted(arrays)})
+    return file.getvalue()
+
+
+def unpacked(content: bytes) -> tuple[Any, dict[str, np.ndarray]]:
+    """What `packed` was given; plain data as JSON has them."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    return json.loads(arrays.pop("plain").tobytes()), arrays
+
+
+def traced_model(
+    setup: OperationSetup, reference_sigma: Array, sensors: Sequence[str], experiment: MonitorExperiment | None = None
+) -> OperationModel:
+    """Trace what is stated to move.
+
+    Args:
+        setup: the plan with its instrument.
+        reference_sigma: (C, 2) px of the spots that all shifts are counted from, row and column.
+        sensors: bodies of which there are temperatures.
+        experiment: on the instrument, if it is there already.
+
+    Raises:
+        InputError: a body that the instrument does not have, or that cannot move or be warmed so.
+    """
+    plan = setup.operation
+    experiment = experiment or MonitorExperiment(setup.model, load_backend())
+    stated, motions = experiment.disturbances, experiment.stated
+    assert stated is not None  # a plan states what moves
+    assert motions is not None
+    stepping = {cause for causes in plan.events.values() for cause in causes}
+    how = SeriesFilter(
+        stated,
+        np.diag(reference_sigma.ravel() ** 2),
+        heat_inputs(motions, experiment.thermal, sensors, plan.coefficients),
+        life_s=plan.mission,
+        window=plan.window,
+        stepping=tuple(k for k, cause in enumerate(stated.causes) if cause in stepping),
+    )
+    spots = [(name, channel) for name, one in experiment.cameras.items() for channel in one.channels]
+    alone = [one.parameter_jacobian @ np.linalg.pinv(one.spot_jacobian) for one in experiment.cameras.values()]
+    return OperationModel(
+        how, tuple(spots), quantities(experiment.cameras, experiment.ground), np.asarray(block_diag(*alone))
+    )
+
+
+def heat_inputs(
+    stated: StatedMotions, thermal: ThermalModel, sensors: Sequence[str], sigma: float
+) -> HeatInputs | None:
+    """What sensors of bodies read of the temperatures that are stated; None if none of them reads any.
+
+    A sensor stands at its body's origin. A body of which no temperature is stated has that of the body that carries it.
+
+    Args:
+        stated: all that moves or gets warm, M components.
+        thermal: of the instrument.
+        sensors: bodies.
+        sigma: standard deviation of the factor of what heat of each body does.
+    """
+    heat = [k for k, one in enumerate(stated.components) if one.kind in HEAT]
+    still = {stated.components[k].body: Temperature() for k in heat}
+    rows = np.zeros((len(sensors), len(heat)))
+    for column, k in enumerate(heat):
+        one = stated.components[k]
+        gradient = tuple(one.sigma if one.kind == "gradient" and one.axis == axis else 0.0 for axis in range(3))
+        own = Temperature(one.sigma if one.kind == "temperature" else 0.0, (gradient[0], gradient[1], gradient[2]))
+        fields = thermal.fields({**still, one.body: own})
+        rows[:, column] = [fields[body].change if body in fields else 0.0 for body in sensors]
+    read = np.any(rows != 0.0, axis=1)
+    seen = np.any(rows != 0.0, axis=0)
+    if not np.any(seen):
+        return None
+    motions = np.array(heat)[seen]
+    bodies = [stated.components[k].body for k in motions.tolist()]
+    names = tuple(dict.fromkeys(bodies))
+    told = tuple(body for body, own in zip(sensors, read, strict=True) if own)
+    factors = np.array([names.index(body) for body in bodies])
+    return HeatInputs(motions, told, rows[np.ix_(read, seen)], factors, names, sigma)

@@ -1,0 +1,398 @@
+"""Where an estimate stands after some of a record's entries: what is believed, how good its predictions were, what the
+sensors are worth. It can be kept and taken up again, to the bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from analysis.monitor.jump_detection import Jump
+from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Track
+from twin.operate.estimate.operation_model import OperationModel, packed, unpacked
+from twin.operate.record.entries import MICRO
+
+Array = NDArray[np.float64]
+KEPT = 200
+"""Innovations and readings that were left out, of which the last are kept."""
+FAR = 6.0
+"""Standard deviations of a sensor's reading from what was expected, beyond which it is not used."""
+RECENT = 10
+"""Readings of a sensor by which it is judged."""
+DOUBTS = 3
+"""Of these, how many far ones make a sensor doubtful."""
+SILENT = 10.0
+"""Intervals after which a sensor from which nothing came is dead."""
+CHANCE = 1e-4
+"""Of as many equal readings in a row by a sensor that works, below which it is called stuck."""
+_STATES = ("mean", "covariance", "response", "score", "information")
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One sensor of temperature.
+
+    Attributes:
+        body: where it is.
+        readings: that came. first_us, last_us: the times of the first and of the newest, microseconds.
+        value: of the newest, kelvin; repeats: how often it came in a row before it; since_us: first of these.
+        step: smallest difference of two readings that followed each other, kelvin; infinite before there is one.
+        sigma: of its readings, kelvin.
+        far: whether each of the last readings was far from what was expected of it.
+        stuck: whether it repeats itself.
+    """
+
+    body: str
+    readings: int = 0
+    first_us: int = 0
+    last_us: int = 0
+    value: float = math.nan
+    repeats: int = 0
+    since_us: int = 0
+    step: float = math.inf
+    sigma: float = 0.0
+    far: tuple[bool, ...] = ()
+    stuck: bool = False
+
+    def came(self, time: int, value: float, sigma: float) -> Sensor:
+        """With one more reading."""
+        again = value == self.value
+        step = self.step if again or not self.readings else min(self.step, abs(value - self.value))
+        repeats = self.repeats + 1 if again else 0
+        # two readings of a working sensor agree in its last digit with this chance
+        alike = float(erf(0.5 * step / (2.0 * sigma))) if math.isfinite(step) else 0.0
+        return replace(
+            self,
+            readings=self.readings + 1,
+            first_us=self.first_us if self.readings else time,
+            last_us=time,
+            value=value,
+            repeats=repeats,
+            since_us=self.since_us if again else time,
+            step=step,
+            sigma=sigma,
+            stuck=bool(repeats >= 3 and alike**repeats * max(self.readings, 1) < CHANCE),
+        )
+
+    def judged(self, far: bool) -> Sensor:
+        """With what is thought of its newest reading."""
+        return replace(self, far=(*self.far, bool(far))[-RECENT:])
+
+    def state(self, now: int) -> tuple[str, int, str]:
+        """``ok``, ``dead``, ``stuck`` or ``doubtful``; since when, microseconds; and why.
+
+        Args:
+            now: time of the newest reading of all.
+        """
+        if self.stuck:
+            return "stuck", self.since_us, f"{self.repeats + 1} readings in a row of {self.value:.6g} K"
+        usual = (self.last_us - self.first_us) / max(self.readings - 1, 1)
+        if self.readings > 1 and now - self.last_us > SILENT * usual:
+            silent = (now - self.last_us) / MICRO / 86_400.0
+            return (
+                "dead",
+                self.last_us,
+                f"nothing came for {silent:.3g} days; it used to every {usual / MICRO / 86_400.0:.3g}",
+            )
+        if sum(self.far) >= DOUBTS:
+            return (
+                "doubtful",
+                self.last_us,
+                f"{sum(self.far)} of the last {len(self.far)} readings far from what was expected",
+            )
+        return "ok", self.first_us, ""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How good predictions of readings were that were made before these came.
+
+    Attributes:
+        readings: of the monitor.
+        components: independent numbers in them.
+        within_one, within_two: how many of these were within one and two standard deviations.
+        log_score: mean over the readings of the logarithm of the density stated for what came, px^-D.
+        chi_square: of all.
+    """
+
+    readings: int = 0
+    components: int = 0
+    within_one: int = 0
+    within_two: int = 0
+    log_score: float = 0.0
+    chi_square: float = 0.0
+
+    def with_one(self, white: Array, log_score: float) -> Scores:
+        """With one more reading."""
+        count = self.readings + 1
+        return Scores(
+            count,
+            self.components + len(white),
+            self.within_one + int(np.sum(np.abs(white) < 1.0)),
+            self.within_two + int(np.sum(np.abs(white) < 2.0)),
+            self.log_score + (log_score - self.log_score) / count,
+            self.chi_square + float(white @ white),
+        )
+
+
+@dataclass(frozen=True)
+class Told:
+    """A jump, and the reading at which it was told, microseconds."""
+
+    time: int
+    jump: Jump
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Where an estimate stands.
+
+    Attributes:
+        belief: what is believed; seconds count from the epoch.
+        time: of the newest entry, microseconds.
+        scores: of predictions.
+        innovations: (time_us, chi-square, degrees of freedom) of the last readings.
+        jumps: that were told.
+        sensors: by body.
+        left_out: (time_us, kind, subject, reason) of the last entries that were not used.
+        spread: (4, Q) sums over the readings of all that is read, of its square, of what temperatures leave of it and
+            of that one's square; see `explained`.
+        basis: (D + P, n) what the states do, by which it is seen that they are the states of this computer's linear
+            algebra.
+        used: (U,) ids of the entries that were used since it was last kept for good, in their order.
+        left: (U, m) what share of the mean square of jumps could not be told before each of them.
+        told: innovations since then.
+        silent: (body, time_us) of sensors that repeat themselves, and of the first of their equal readings: none counts
+            from there on.
+    """
+
+    belief: Belief
+    time: int
+    scores: Scores = field(default_factory=Scores)
+    innovations: tuple[tuple[int, float, int], ...] = ()
+    jumps: tuple[Told, ...] = ()
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
+    left_out: tuple[tuple[int, str, str, str], ...] = ()
+    spread: Array = field(default_factory=lambda: np.zeros((4, 0)))
+    basis: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    used: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    left: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    told: tuple[tuple[int, float, int], ...] = ()
+    silent: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def explained(self) -> Array:
+        """(Q,) share of the scatter of all that is read which temperatures of bodies with sensors explain; NaN before
+        there are two readings.
+        """
+        count = self.scores.readings
+        if count < 2:
+            return np.full(self.spread.shape[1], np.nan)
+        total, square, left, left_square = self.spread
+        whole = square / count - (total / count) ** 2
+        rest = left_square / count - (left / count) ** 2
+        return np.where(whole > 0.0, 1.0 - rest / np.where(whole > 0.0, whole, 1.0), np.nan)
+
+    def without(self, time: int, kind: str, subject: str, reason: str) -> Standing:
+        """With an entry that is not used."""
+        return replace(
+            self, time=max(self.time, time), left_out=(*self.left_out, (time, kind, subject, reason))[-KEPT:]
+        )
+
+    @property
+    def found_stuck(self) -> tuple[tuple[str, int], ...]:
+        """Sensors that repeat themselves, whose first equal readings have been used: (body, time_us of the first)."""
+        stuck = ((one.body, one.since_us) for one in self.sensors.values() if one.stuck)
+        return tuple(one for one in stuck if one not in self.silent)
+
+    def anew(self) -> Standing:
+        """The same, counting what is used from now on."""
+        return replace(self, used=self.used[:0], left=self.left[:0], told=())
+
+    def to_bytes(self) -> bytes:
+        """All of it."""
+        own = self.belief
+        arrays: dict[str, np.ndarray] = {
+            "after": own.after,
+            "until": own.until,
+            "left": own.left,
+            "spread": self.spread,
+            "basis": self.basis,
+            "used": self.used,
+            "span": self.left,
+        }
+        for name, track in (("state", own.state), ("search", own.search)):
+            if track is not None:
+                arrays |= {f"{name}_{part}": getattr(track, part) for part in _STATES}
+        plain = {
+            "belief": {"time": own.time, "last": own.last},
+            "time": self.time,
+            "scores": asdict(self.scores),
+            "innovations": self.innovations,
+            "told": self.told,
+            "silent": self.silent,
+            "jumps": [{"time": one.time, "jump": asdict(one.jump)} for one in self.jumps],
+            "sensors": [asdict(one) for one in self.sensors.values()],
+            "left_out": self.left_out,
+        }
+        return packed(plain, arrays)
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> Standing:
+        """What `to_bytes` gave."""
+        plain, arrays = unpacked(content)
+        tracks = [
+            Track(*(arrays[f"{name}_{part}"] for part in _STATES)) if f"{name}_mean" in arrays else None
+            for name in ("state", "search")
+        ]
+        assert tracks[0] is not None
+        told = plain["belief"]
+        belief = Belief(
+            told["time"], told["last"], arrays["after"], arrays["until"], tracks[0], tracks[1], arrays["left"]
+        )
+        sensors = [Sensor(**{**one, "far": tuple(one["far"])}) for one in plain["sensors"]]
+        return cls(
+            belief,
+            plain["time"],
+            Scores(**plain["scores"]),
+            tuple((time, square, degrees) for time, square, degrees in plain["innovations"]),
+            tuple(Told(one["time"], _jump(one["jump"])) for one in plain["jumps"]),
+            {one.body: one for one in sensors},
+            tuple((time, kind, subject, reason) for time, kind, subject, reason in plain["left_out"]),
+            arrays["spread"],
+            arrays["basis"],
+            arrays["used"],
+            arrays["span"],
+            tuple((time, square, degrees) for time, square, degrees in plain["told"]),
+            tuple((body, time) for body, time in plain["silent"]),
+        )
+
+
+def _jump(plain: dict[str, Any]) -> Jump:
+    lists = ("motions", "labels", "units", "sizes", "sigmas", "change")
+    chances = tuple((time, chance) for time, chance in plain["chances"])
+    rivals = dict(sorted(plain["rivals"].items(), key=lambda one: -one[1]))  # the best first, as they were
+    more = {"chances": chances, "rivals": rivals, "spread": tuple(map(tuple, plain["spread"]))}
+    more["parts"] = tuple((tuple(motions), variance) for motions, variance in plain["parts"])
+    return Jump(**{**plain, **{name: tuple(plain[name]) for name in lists}, **more})
+
+
+@dataclass(frozen=True, eq=False)
+class Taking:
+    """Takes a record's entries one after the other.
+
+    Attributes:
+        model: what the estimate rests on.
+        how: its filter, with the events of the record as steps.
+        epoch: from which seconds count, microseconds.
+        reference: (C, 2) px that all shifts are counted from.
+        temperature: of the instrument in its calibration, kelvin.
+    """
+
+    model: OperationModel
+    how: SeriesFilter
+    epoch: int
+    reference: Array
+    temperature: float
+
+    def seconds(self, time: int) -> float:
+        """Of a time in microseconds."""
+        return (time - self.epoch) / MICRO
+
+    def start(self, time: int, silent: tuple[tuple[str, int], ...] = ()) -> Standing:
+        """Before any entry.
+
+        Args:
+            time: of the first, microseconds.
+            silent: sensors that are known to repeat themselves.
+        """
+        spread = np.zeros((4, len(self.model.quantities)))
+        belief, basis = self.how.start(self.seconds(time)), self.how.space.basis
+        return Standing(belief, time, spread=spread, basis=basis, silent=silent)
+
+    def take(self, standing: Standing, entries: Sequence[Mapping[str, Any]]) -> Standing:
+        """All entries of one moment.
+
+        Args:
+            standing: before.
+            entries: of one time, each with its content as plain data.
+        """
+        standing = replace(standing, time=max(standing.time, int(entries[0]["time_us"])))
+        warm = sorted((one for one in entries if one["kind"] == "temperature"), key=lambda one: str(one["subject"]))
+        for one in warm:
+            standing = self._temperature(standing, one)
+        for one in entries:
+            if one["kind"] == "monitor":
+                standing = self._monitor(standing, one)
+        return standing
+
+    def observed(self, entry: Mapping[str, Any]) -> Observed:
+        """What an entry that is used says.
+
+        Args:
+            entry: of the monitor, or of a sensor that the filter knows.
+        """
+        time, content = self.seconds(int(entry["time_us"])), entry["content"]
+        if entry["kind"] == "temperature":
+            assert self.how.heat is not None
+            number = self.how.heat.sensors.index(str(entry["subject"]))
+            value, noise = np.array([float(content["values"][0]) - self.temperature]), float(content["sigma"]) ** 2
+            return Observed(time, value, np.array([[noise]]), (number,))
+        spots = content["numbers"]["spots"]
+        found = [spots[camera][channel]["after"] for camera, channel in self.model.spots]
+        place = np.array([(one["row"], one["column"]) for one in found])
+        sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in found])
+        return Observed(time, (place - self.reference).ravel(), np.diag(sigma.ravel() ** 2))
+
+    def _updated(self, standing: Standing, entry: Mapping[str, Any], observed: Observed) -> tuple[Standing, Innovation]:
+        belief, found = self.how.update(standing.belief, observed)
+        used = np.append(standing.used, np.int64(entry["id"]))
+        # of no motion that may jump there is nothing to count rows by
+        before = standing.left.reshape(len(standing.used), len(self.how.walking))
+        left = np.concatenate([before, standing.belief.left[None]])
+        return replace(standing, belief=belief, used=used, left=left), found
+
+    def _temperature(self, standing: Standing, entry: Mapping[str, Any]) -> Standing:
+        time, body, content = int(entry["time_us"]), str(entry["subject"]), entry["content"]
+        sensor = standing.sensors.get(body, Sensor(body)).came(
+            time, float(content["values"][0]), float(content["sigma"])
+        )
+        standing = replace(standing, sensors={**standing.sensors, body: sensor})
+        if self.how.heat is None or body not in self.how.heat.sensors:
+            return standing.without(time, "temperature", body, "nothing is stated of its temperature")
+        if sensor.stuck or (body, sensor.since_us) in standing.silent:
+            return standing.without(time, "temperature", body, "its sensor repeats itself")
+        observed = self.observed(entry)
+        there = self.how.at(standing.belief, observed.time)
+        white = float(self.how.whitened(there.state, observed).white[0])
+        far = abs(white) > FAR
+        standing = replace(standing, sensors={**standing.sensors, body: sensor.judged(far)})
+        if far:
+            reason = f"{abs(white):.3g} standard deviations from what was expected"
+            return standing.without(time, "temperature", body, reason)
+        return self._updated(standing, entry, observed)[0]
+
+    def _monitor(self, standing: Standing, entry: Mapping[str, Any]) -> Standing:
+        time = int(entry["time_us"])
+        if entry["content"]["numbers"].get("sigma_holds") is False:
+            return standing.without(time, "monitor", "monitor", "its own sigma does not hold")
+        observed = self.observed(entry)
+        standing, found = self._updated(standing, entry, observed)
+        belief, space, rows = standing.belief, self.how.space, self.model.rows
+        values = rows @ self.how.parameters_of(belief.mean, belief.covariance, observed.time)[0]
+        rest = values - rows @ space.heat_outputs(belief.mean, observed.time)[space.width :]
+        came = (time, found.chi_square, len(found.white))
+        return replace(
+            standing,
+            scores=standing.scores.with_one(found.white, found.log_score),
+            innovations=(*standing.innovations, came)[-KEPT:],
+            told=(*standing.told, came),
+            jumps=standing.jumps if found.jump is None else (*standing.jumps, Told(time, found.jump)),
+            spread=standing.spread + np.stack([values, values**2, rest, rest**2]),
+        )

@@ -1,0 +1,112 @@
+"""Commands on a simulated life: it is drawn, rendered and written; it is followed and held against its truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.operate.terminal import line, tell, told
+from twin.run import durable
+from twin.run.cli import LARGEST_SEED, AsJson, BackendName, Force, Options, Out, Quiet, check_backend
+
+
+def simulate(
+    plan: Annotated[
+        Path,
+        typer.Argument(metavar="PLAN.yaml", readable=False, help="Plan of the operation, or a life's config.yaml."),
+    ],
+    start: Annotated[str, typer.Option("--from", help="UTC of the first reading; laws of time count from it.")],
+    days: Annotated[float, typer.Option(help="How long the life takes, in days.")],
+    every: Annotated[str, typer.Option(help="Time from one reading to the next, with its unit: 6d, 12h.")],
+    record: Annotated[
+        str | None,
+        typer.Argument(metavar="[DIR_OR_URL]", help="Record to make. Without it there are the files alone."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of everything that is drawn.")] = 1,
+    frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames of every exposure.")] = 10,
+    coefficient_error: Annotated[
+        str, typer.Option(help="By how much heat does more or less to light than computed, one sigma: 30%.")
+    ] = "0%",
+    sensor_sigma: Annotated[str, typer.Option(help="Sigma of every sensor of temperature.")] = "0.05 K",
+    sensor: Annotated[
+        list[str] | None, typer.Option(help="Body with a sensor; once for each. Default: all that get warmer.")
+    ] = None,
+    dead: Annotated[list[str] | None, typer.Option(metavar="BODY@UTC", help="Sensor that then falls silent.")] = None,
+    stuck: Annotated[
+        list[str] | None, typer.Option(metavar="BODY@UTC", help="Sensor that then repeats its last reading.")
+    ] = None,
+    event: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME@UTC", help="Event; once for each. Default: each of the plan's once, at a drawn date."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            readable=False, help="Folder for the files. Default: `simulated` in the record's, or runs/life-001."
+        ),
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(readable=False, help="File for the truth, or none. Default: life.json among the files."),
+    ] = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate the life of an instrument into a new record: motions are drawn by the plan's laws of time, every reading
+    of the monitor is traced, rendered with noise and recovered, sensors read temperatures, and events come.
+
+    What a real instrument would send down is written as files, which the record takes as it takes any others. The truth
+    stands in a file of its own, which nothing of the operation reads.
+
+    Example: `python -m twin.operate simulate scenes/examples/operation.yaml life --from 2027-01-01T00:00:00Z
+    --days 1096 --every 6d --coefficient-error 30%`
+
+    Exit codes: 0 success, 2 bad input, 1 anything else.
+    """
+    with told() as errors, durable.exit_on_terminate():
+        check_backend(backend)
+        from optics.numerics.backend import load_backend
+        from twin.operate.lives.simulation_run import Places, simulate_into, simulation
+        from twin.run.command import progress_shown
+
+        options = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}
+        options |= {"--coefficient-error": coefficient_error, "--sensor-sigma": sensor_sigma}
+        several = {"--sensor": sensor or [], "--dead": dead or [], "--stuck": stuck or [], "--event": event or []}
+        what = simulation(options, several, seed)
+        with progress_shown(errors, as_json or quiet) as advance:
+            done = simulate_into(Places(plan, record, out, truth, force), what, load_backend(backend), advance)
+        place = done["record"] or done["files"]
+        text = f"{done['readings']} readings of the monitor in {place}"
+        lost = "".join(f"\nwarning: {one}" for one in done["lost"])
+        tell(errors, as_json, quiet, done, lambda console: line(console, f"{text}; truth: {done['truth']}{lost}"))
+
+
+def judge(
+    life: Annotated[Path, typer.Argument(metavar="RECORD", readable=False, help="Record made by `simulate`.")],
+    truth: Annotated[
+        Path | None, typer.Option(readable=False, help="File of the truth. Default: life.json among its files.")
+    ] = None,
+    out: Out = None,
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Follow a simulated life reading by reading, as it would have been, and hold what was said against the truth: by
+    the calibration on the ground, by each reading itself, and by the operation with the readings so far and with all of
+    them; and what was forecast against what came.
+
+    Example: `python -m twin.operate judge life`
+
+    The run folder gets report.html, judged.json, config.yaml, and figures and tables in artefacts/.
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+    from twin.operate.judge_command import judge_life
+
+    judge_life(life, truth, Options(out, None, "llvm", force, as_json, quiet))

@@ -1,0 +1,220 @@
+"""What was said of a simulated life against its truth, as numbers, a table and a figure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom
+
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
+from twin.operate.lives.judged_life import WAYS, JudgedLife, covered, rms
+from twin.operate.record.entries import MICRO, utc_text
+from twin.run import svg
+from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.report import Report, Section, answer
+
+SHARES = {1.0: math.erf(math.sqrt(0.5)), 2.0: math.erf(math.sqrt(2.0))}
+"""Sigmas -> share of normal errors within so many."""
+CHANCE = 1e-3
+"""That a share of independent normal numbers lies beyond the limits that are told."""
+SHOWN = ((ANGLE_GROUP, "change_arcsec"), (GROUND_GROUP, "height_m"))
+"""Group and key of what the figure shows, of instruments that have it, beside a camera's change of focal length."""
+_DAY = 86_400 * MICRO
+_YEAR = 365.25 * _DAY
+FORECAST = "forecast"
+_COVERED = ("filtered", FORECAST)
+"""Of which the table tells how often sigma holds."""
+
+
+def judged_numbers(life: JudgedLife) -> dict[str, Any]:
+    """As plain data: for each quantity and way the RMS error, errors and sigmas at all readings and the shares within
+    one and two sigmas, those of the forecasts, and what the operation said of its predictions, of temperatures, sensors
+    and jumps.
+
+    Args:
+        life: that was followed.
+    """
+    told: dict[str, dict[str, Any]] = {}
+    for number, one in enumerate(life.quantities):
+        own = {way: _told(life.errors(way)[:, number], said.sigmas[:, number]) for way, said in life.ways.items()}
+        for name, which in ((FORECAST, ~life.interrupted), ("forecast_over_events", life.interrupted)):
+            error = (life.forecast.values - life.came)[which, number]
+            own[name] = _told(error, life.forecast.sigmas[which, number])
+        told.setdefault(one.group, {})[one.key] = own
+    following = life.following.to_dict()
+    scores = life.following.scores
+    return {
+        "readings": len(life.times),
+        "first_utc": utc_text(int(life.times[0])),
+        "last_utc": utc_text(int(life.times[-1])),
+        "times_utc": [utc_text(int(time)) for time in life.times],
+        "horizon_s": life.horizon,
+        "quantities": told,
+        "predictions": {
+            "components": scores.components,
+            "within_one": scores.within_one / scores.components,
+            "within_one_limits": list(likely_shares(scores.components, 1.0)),
+            "within_two": scores.within_two / scores.components,
+            "within_two_limits": list(likely_shares(scores.components, 2.0)),
+            "limits_hold_but_for": CHANCE,
+        },
+        "explained_by_temperatures": following["explained"],
+        "sensors": following["sensors"],
+        "jumps": following["jumps"],
+    }
+
+
+def _told(error: Any, sigma: Any) -> dict[str, Any]:
+    """RMS and coverage of what is known."""
+    value = rms(error)
+    out: dict[str, Any] = {"rms": value if math.isfinite(value) else None}
+    out |= {"errors": _rounded(error), "sigmas": _rounded(sigma)}
+    for times, name in ((1.0, "within_one"), (2.0, "within_two")):
+        inside, known = covered(error, sigma, times)
+        out[name] = inside / known if known else None
+        out["known"] = known
+    return out
+
+
+def _rounded(values: Any) -> list[float | None]:
+    """To four digits, with nothing where nothing is known."""
+    return [float(f"{value:.4g}") if math.isfinite(value) else None for value in np.asarray(values).tolist()]
+
+
+def likely_shares(count: int, times: float) -> tuple[float, float]:
+    """Least and largest share of independent normal numbers within so many sigmas, but for a chance of ``CHANCE``.
+
+    Args:
+        count: of the numbers.
+        times: sigmas.
+    """
+    low, high = binom.ppf([0.5 * CHANCE, 1.0 - 0.5 * CHANCE], count, SHARES[times])
+    return float(low) / count, float(high) / count
+
+
+def judged_report(life: JudgedLife, name: str) -> Report:
+    """The report.
+
+    Args:
+        life: that was followed.
+        name: of the instrument.
+    """
+    numbers = judged_numbers(life)
+    shown = _shown(life)
+    verdict, lead = answer(*_sentences(life, numbers, shown))
+    years = (int(life.times[-1]) - int(life.times[0])) / _YEAR
+    facts = (
+        ("instrument", name),
+        ("readings", f"{len(life.times)} in {years:.2g} years, from {utc_text(int(life.times[0]))}"),
+        ("forecasts", f"{life.horizon / 86_400.0:.3g} days ahead"),
+    )
+    caption = (
+        "Errors are estimate minus truth. The instrument has changed since its calibration on the ground; a reading "
+        "by itself is read with what is stated to move; the operation follows readings, temperatures and events. "
+        "Errors at neighbouring times are alike: shares scatter more than those of as many independent errors."
+    )
+    figure = SvgFigure("with_and_without", "With and without the twin's operation", caption, judged_svg(life, shown))
+    section = Section("Errors over the years", (), (figure,), name="errors")
+    return Report(f"{name}: what was said of a simulated life", verdict, lead, facts, _table(life), (section,))
+
+
+def _shown(life: JudgedLife) -> tuple[tuple[str, str], ...]:
+    """Group and key of what the figure shows."""
+    names = [(one.group, one.key) for one in life.quantities]
+    focal = next(one for one in names if one[1] == "d_f_um")
+    return (*(one for one in SHOWN if one in names), focal)
+
+
+def _sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequence[tuple[str, str]]) -> list[str]:
+    told = []
+    for group, key in shown[-2:] if len(shown) > 1 else shown:
+        one, said = life.quantities[life.number(group, key)], numbers["quantities"][group][key]
+        values = " / ".join(_short(said[way]["rms"]) for way in WAYS)
+        told.append(f"{group} {one.parameter.symbol} {values} {one.parameter.unit}")
+    made = numbers["predictions"]
+    low, high = made["within_one_limits"]
+    out = [
+        f"RMS errors with the calibration on the ground / each reading by itself / the operation / all its readings: "
+        f"{', '.join(told)}",
+        f"of {made['components']} predictions of a reading before it came {100 * made['within_one']:.1f} % are within "
+        f"1 σ and {100 * made['within_two']:.1f} % within 2 σ; chance allows {100 * low:.1f} to {100 * high:.1f} % "
+        "within 1 σ",
+    ]
+    group, key = shown[-1]
+    explained = numbers["explained_by_temperatures"].get(f"{group} {key}")
+    if explained is not None:
+        symbol = life.quantities[life.number(group, key)].parameter.symbol
+        out.append(f"temperatures explain {100 * explained:.0f} % of the scatter of {group} {symbol}")
+    bad = [one for one in numbers["sensors"] if one["state"] != "ok"]
+    out += [f"the sensor of {one['body']} is {one['state']}: {one['reason']}" for one in bad]
+    return out
+
+
+def _table(life: JudgedLife) -> Table:
+    """RMS errors by way, and shares within one and two sigmas."""
+    heads = ("quantity", *("RMS: " + way for way in WAYS), "forecast")
+    heads += tuple(f"{way} within {n} σ [%]" for way in _COVERED for n in (1, 2))
+    rows: list[list[Cell]] = []
+    quantities = judged_numbers(life)["quantities"]
+    for one in life.quantities:
+        said = quantities[one.group][one.key]
+        row: list[Cell] = [f"{one.group} {one.parameter.label}"]
+        row += [_cell(said[way]["rms"]) for way in (*WAYS, FORECAST)]
+        for way in _COVERED:
+            row += [_cell(said[way][key], 100.0) for key in ("within_one", "within_two")]
+        rows.append(row)
+    caption = "RMS errors against the truth by four ways to know the cameras, and how often sigma holds them."
+    return Table("ways", "Four ways to know the cameras", caption, heads, rows, digits=3)
+
+
+def _cell(value: float | None, times: float = 1.0) -> Cell:
+    return "" if value is None else times * value
+
+
+def _short(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2g}"
+
+
+def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
+    """Errors of some quantities by four ways to know them, with one and two sigmas, over the years.
+
+    Args:
+        life: that was followed.
+        quantities: group and key of each, one column for each.
+    """
+    with svg.look("operation"):
+        figure = svg.new_figure(8.4)
+        grid = figure.subplots(len(WAYS), len(quantities), sharex=True, squeeze=False)
+        for column, name in enumerate(quantities):
+            number = life.number(*name)
+            one = life.quantities[number]
+            own = "" if one.group in (ANGLE_GROUP, GROUND_GROUP) else f"{one.group} "
+            for row, (way, title) in enumerate(WAYS.items()):
+                axes = grid[row, column]
+                _panel(axes, life, way, number)
+                size = f"RMS {rms(life.errors(way)[:, number]):.2g} {one.parameter.unit}"
+                axes.set_title(f"{title}: {size}", loc="left", fontsize=8.0)
+                axes.set_ylabel(f"error of {own}{one.parameter.label}")
+                if row > 2:  # the operation's two panels are compared with each other
+                    axes.sharey(grid[row - 1, column])
+            grid[-1, column].set_xlabel("years in operation")
+        svg.shared_legend(figure, grid[-1, 0])
+        figure.align_ylabels()
+        return svg.to_svg(figure)
+
+
+def _panel(axes: Any, life: JudgedLife, way: str, number: int) -> None:
+    """Errors of one way with its sigma, and when events came."""
+    years = (life.times - life.times[0]) / _YEAR
+    error, sigma = life.errors(way)[:, number], life.ways[way].sigmas[:, number]
+    svg.gridded(axes)
+    axes.axhline(0.0, color=svg.GREY, lw=0.7)
+    for times, colour, name in ((2.0, svg.SHADE, "±2σ"), (1.0, svg.LIGHT, "±σ")):
+        if np.any(np.isfinite(sigma)):
+            axes.fill_between(years, -times * sigma, times * sigma, color=colour, lw=0.0, label=name)
+    for k, (moment, *_) in enumerate(life.following.events):
+        axes.axvline((moment - life.times[0]) / _YEAR, color=svg.ORANGE, lw=0.9, ls="--", label="" if k else "event")
+    axes.plot(years, error, color=svg.BLUE, lw=1.1, label="estimate minus truth")

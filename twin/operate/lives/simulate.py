@@ -1,0 +1,254 @@
+"""An instrument in operation without one: its life is drawn, every reading is rendered and recovered, and what a real
+instrument would send down is written as files, which the record takes as it takes any others.
+
+What only a simulation knows stands in a file of its own, which nothing of the operation reads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from scenes.models.disturbances import state_of
+from scenes.specs.operation import OperationSetup
+from scenes.yaml.yaml_file import dump_yaml
+from twin.main_job.monitor_reading import MonitorReading, stated
+from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.monitor_memory import largest_piece
+from twin.monitor.observation import Observation, Observing, observe, one_detector
+from twin.monitor.reading_table import ReadingTable, reading_table
+from twin.operate.lives.simulated_life import Life, drawn_life
+from twin.operate.record.entries import MICRO, utc_text
+from twin.operate.record.run_readings import CONFIG, RESULTS
+from twin.run.procedure import Advance
+from twin.run.random_streams import stream
+from twin.run.reference_frames import described
+from twin.run.run_folder import RunFolder
+
+FOLDER = "simulated"
+"""Of a record in a folder: the files that its readings are taken from."""
+TELEMETRY, LIFE = "telemetry.yaml", "life"
+TEMPERATURES, PASSES, EVENTS = "temperatures.csv", "passes.csv", "events.csv"
+RENDER = "render and recover"
+_SENSORS = 15
+"""Random stream of the sensors' errors."""
+_KELVIN = 4
+"""Decimals of a temperature in kelvin: sensors show no more, and few less."""
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What is simulated.
+
+    Attributes:
+        start: of the first reading, microseconds of TAI since 2000; the laws of time count from it.
+        seconds: that the life takes.
+        every: from one reading of the monitor to the next, seconds; the temperatures are read with it.
+        seed: of everything that is drawn.
+        frames: of each exposure.
+        coefficient_error: standard deviation, from body to body, of what a temperature does to light beyond what is
+            computed, relative.
+        sensor_sigma: of a sensor of temperature, kelvin.
+        sensors: bodies that have one; None for all that are stated to get warmer.
+        dead: body -> moment from which on its sensor says nothing; stuck: from which on it repeats what it said last.
+        dates: when which event came; None to draw one date for each of the plan's.
+        words: by which a command asks for it, all but the seed.
+    """
+
+    start: int
+    seconds: float
+    every: float
+    seed: int = 0
+    frames: int = 10
+    coefficient_error: float = 0.0
+    sensor_sigma: float = 0.05
+    sensors: tuple[str, ...] | None = None
+    dead: Mapping[str, int] = field(default_factory=dict)
+    stuck: Mapping[str, int] = field(default_factory=dict)
+    dates: tuple[tuple[int, str], ...] | None = None
+    words: tuple[str, ...] = ()
+
+    @property
+    def times(self) -> np.ndarray:
+        """(T,) microseconds of TAI since 2000 of the readings, before the life is over."""
+        count = max(1, math.ceil(self.seconds / self.every - 1e-9))
+        return self.start + np.array([round(k * self.every * MICRO) for k in range(count)], np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What came of a simulated life.
+
+    Attributes:
+        life: as it was drawn.
+        times: (R,) microseconds of TAI since 2000 of the readings of the monitor.
+        readings: what recovered.json has of each.
+        truth: what the cameras truly did at these times, as JSON files nest it.
+        lost: moment of a reading that could not be, and why.
+    """
+
+    life: Life
+    times: np.ndarray
+    readings: tuple[dict[str, Any], ...]
+    truth: Mapping[str, Any]
+    lost: tuple[tuple[int, str], ...]
+
+
+def recorded(plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, advance: Advance) -> Recorded:
+    """Draw a life, trace and render its states, and recover what the monitor reads of them.
+
+    Args:
+        plan: of the operation: what moves, and what events do.
+        experiment: on its instrument, with its disturbances.
+        what: is simulated.
+        advance: told of the progress.
+    """
+    motions = experiment.stated
+    assert motions is not None  # a plan states them
+    causes = plan.operation.events
+    life = drawn_life(motions, what.times, what.start, what.seed, causes, what.dates, what.coefficient_error)
+    lost: list[tuple[int, str]] = []
+    record = one_detector(experiment, what.frames, what.seed)
+    chunk = largest_piece(what.frames * math.prod(experiment.nominal_photons.shape))
+
+    def leave(number: int, why: str) -> None:
+        lost.append((int(life.times[number]), why))
+
+    tables: list[ReadingTable] = []
+    readings: list[dict[str, Any]] = []
+    numbers: list[int] = []
+    suspects: Mapping[str, CameraCrosstalk] | None = None
+    how = Observing(record, chunk=chunk, leave=leave)
+    advance(RENDER, 0, len(life.times))
+    for first in range(0, len(life.times), chunk):
+        piece = np.arange(first, min(first + chunk, len(life.times)))
+        states = [state_of(life.acting[k], life.components, experiment.thermal) for k in piece]
+        for found in observe(experiment, states, how, piece):
+            suspects = crosstalk(experiment, found.recovery.shift_covariance[0]) if suspects is None else suspects
+            readings += _readings(experiment, found, what.frames, suspects)
+            tables.append(reading_table(found.recovery, experiment.cameras, found.truth, experiment.ground))
+            numbers += found.numbers.tolist()
+        advance(RENDER, int(piece[-1]) + 1, len(life.times))
+    truth = ReadingTable.joined(tables).true() if tables else {}
+    return Recorded(life, life.times[numbers], tuple(readings), truth, tuple(lost))
+
+
+def _readings(
+    experiment: MonitorExperiment, found: Observation, frames: int, suspects: Mapping[str, CameraCrosstalk]
+) -> Iterator[dict[str, Any]]:
+    """What recovered.json has of each state."""
+    channels = tuple((channel.camera, channel.name) for channel in experiment.path.channels)
+    told = channels, experiment.cameras, experiment.ground, experiment.disturbances
+    centroid = experiment.resolved.job.analysis.centroid
+    for k in range(len(found.numbers)):
+        one = MonitorReading(*told, found.recovery.at(slice(k, k + 1)), suspects, frames, centroid)
+        yield stated(one.recovered_dict())
+
+
+def write_simulated(
+    folder: RunFolder, plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, found: Recorded
+) -> None:
+    """Write what the instrument would send down, and a file that says what its tables hold; not the truth.
+
+    Args:
+        folder: open.
+        plan: of the operation.
+        experiment: on its instrument.
+        what: was simulated.
+        found: what came of it.
+    """
+    folder.write_text(CONFIG, dump_yaml(plan.plain()))
+    seconds = ((found.times - found.times[0]) / MICRO).tolist()
+    last = found.readings[-1]
+    numbers = {**last, "times_s": seconds, "series": list(found.readings)}
+    folder.write_json(RESULTS["monitor"], described("recovered", numbers))
+    folder.write_text(PASSES, f"UTC,run\n{utc_text(int(found.times[0]))},.\n")
+    events = "".join(f"{utc_text(moment)},{name}\n" for moment, name in found.life.dates)
+    folder.write_text(EVENTS, f"UTC,what\n{events}")
+    sensed = sensed_temperatures(experiment.instrument.spec.temperature, what, found.life)
+    heads = {body: f"T_{body.removeprefix('base/').replace('/', '_')}" for body in sensed}
+    rows = [",".join(("UTC", *heads.values()))]
+    for k, moment in enumerate(found.life.times.tolist()):
+        cells = ("" if math.isnan(own[k]) else f"{own[k]:.{_KELVIN}f}" for own in sensed.values())
+        rows.append(",".join((utc_text(moment), *cells)))
+    folder.write_text(TEMPERATURES, "\n".join(rows) + "\n")
+    columns = {
+        body: {"column": head, "unit": "K", "sigma": f"{what.sensor_sigma:.12g} K"} for body, head in heads.items()
+    }
+    tables: list[dict[str, Any]] = [{"kind": "event", "files": EVENTS, "time": "UTC", "name": "what"}]
+    if columns:
+        tables.append({"kind": "temperature", "files": TEMPERATURES, "time": "UTC", "columns": columns})
+    tables.append({"kind": "monitor", "files": PASSES, "time": "UTC", "name": "run"})
+    folder.write_text(TELEMETRY, dump_yaml({"instrument": plan.operation.instrument, "readings": tables}))
+
+
+def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[str, np.ndarray]:
+    """Body -> (T,) what its sensor says, kelvin; NaN where it says nothing.
+
+    Args:
+        reference: temperature of the instrument, kelvin.
+        what: is simulated.
+        life: as it was drawn.
+    """
+    out: dict[str, np.ndarray] = {}
+    for number, (body, change) in enumerate(life.temperatures.items()):
+        if what.sensors is not None and body not in what.sensors:
+            continue
+        rng = np.random.default_rng(stream(what.seed, _SENSORS, number))
+        said = np.round(reference + change + what.sensor_sigma * rng.standard_normal(len(change)), _KELVIN)
+        if body in what.stuck:
+            late = life.times >= what.stuck[body]
+            before = np.flatnonzero(~late)
+            said[late] = said[before[-1]] if len(before) else said[0]
+        if body in what.dead:
+            said[life.times >= what.dead[body]] = np.nan
+        out[body] = said
+    return out
+
+
+def truth_numbers(plan: OperationSetup, what: Simulation, found: Recorded) -> dict[str, Any]:
+    """What only the simulation knows, as plain data: changes of cameras, angle and ground by the exact trace, steps,
+    coefficients and temperatures.
+
+    Args:
+        plan: of the operation.
+        what: was simulated.
+        found: what came of it.
+    """
+    life = found.life
+    steps = [
+        {
+            "time_utc": utc_text(step.time),
+            "time_us": step.time,
+            "cause": step.cause,
+            "body": step.body,
+            "event": step.event,
+            "sizes": {
+                f"{one.name} [{one.unit}]": float(size) / one.unit_size
+                for one, size in zip(life.components, step.sizes, strict=True)
+                if size != 0.0
+            },
+        }
+        for step in life.steps
+    ]
+    return {
+        "instrument": plan.model.instrument.name,
+        "disturbances": plan.disturbances.name,
+        "seed": what.seed,
+        "times_us": found.times.tolist(),
+        "times_utc": [utc_text(moment) for moment in found.times.tolist()],
+        **found.truth,
+        "steps": steps,
+        "events": [{"time_utc": utc_text(moment), "event": name} for moment, name in life.dates],
+        "coefficients": dict(life.coefficients),
+        "temperature_times_us": life.times.tolist(),
+        "temperature_changes_K": {body: own.tolist() for body, own in life.temperatures.items()},
+        "sensors_dead": {body: utc_text(moment) for body, moment in what.dead.items()},
+        "sensors_stuck": {body: utc_text(moment) for body, moment in what.stuck.items()},
+        "lost": [{"time_utc": utc_text(moment), "reason": why} for moment, why in found.lost],
+    }

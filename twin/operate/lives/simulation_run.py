@@ -1,0 +1,274 @@
+"""A simulated life from the words of a command to a record: what is asked for, checked, computed, written and taken."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from optics.numerics.backend import Backend
+from scenes.specs.events import EVENTS
+from scenes.specs.operation import OperationSetup, read_operation
+from scenes.yaml.errors import Problem, unknown
+from scenes.yaml.spec import validate
+from scenes.yaml.units import MOMENT, SCALE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
+from scenes.yaml.yaml_file import read_yaml
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.operate.estimate.plans import keep_plan, read_plan
+from twin.operate.lives.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
+from twin.operate.record.entries import micros, one_line, utc_text
+from twin.operate.record.history import History, initialised
+from twin.operate.record.run_readings import CONFIG
+from twin.operate.record.taking import Taken
+from twin.operate.record.telemetry import read_table_file, read_telemetry, tables_of
+from twin.run.cli import InputErrorText
+from twin.run.durable import write_safely
+from twin.run.procedure import WRITE, Advance
+from twin.run.reference_frames import described
+from twin.run.run_folder import Numbered, RunFolder, chosen, json_text, write_manifest
+
+PROGRAM = "twin.operate"
+CALIBRATE, TAKE = "calibrate", "take into the record"
+NO_TRUTH = "none"
+"""In place of the truth's file: it is not written."""
+MOST = 100_000
+"""Readings of the monitor in one life: some hours, and a gigabyte of results."""
+DAY = 86_400.0
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where a life is read from and goes to.
+
+    Attributes:
+        plan: file of the plan of the operation, which the record keeps; or config.yaml of a life.
+        record: folder, or address of a database; None for the files alone.
+        out: folder for what the instrument would send down; None for one in the record's, or the next free run folder.
+        truth: file for what only the simulation knows; None for one in that folder, ``none`` for no file.
+        force: replace the folder, if it is that of such files.
+    """
+
+    plan: Path
+    record: str | None
+    out: Path | None = None
+    truth: Path | None = None
+    force: bool = False
+
+    @property
+    def folder(self) -> Path | Numbered:
+        """For the files.
+
+        Raises:
+            InputErrorText: there is no place for them.
+        """
+        if self.out is None and self.record is not None:
+            if "://" in self.record:
+                raise InputErrorText("--out: a database holds no files; name a folder for those that are simulated")
+            return Path(self.record) / FOLDER
+        return chosen(self.out, LIFE)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the plan's file holds all that a plan refers to, as config.yaml of a life does. Raises InputError."""
+        data = read_yaml(self.plan).data
+        return isinstance(data, dict) and "model" in data
+
+    def read(self) -> OperationSetup:
+        """The plan with all it refers to. Raises InputError."""
+        return validate(OperationSetup, read_yaml(self.plan)) if self.complete else read_operation(self.plan)
+
+
+def simulation(options: Mapping[str, str], several: Mapping[str, Sequence[str]], seed: int) -> Simulation:
+    """What the options of the command ask for.
+
+    Args:
+        options: by name, as they were written: ``--from``, ``--days``, ``--every``, ``--frames``,
+            ``--coefficient-error``, ``--sensor-sigma``.
+        several: likewise those that may be given more than once: ``--sensor`` BODY, ``--dead`` and ``--stuck``
+            BODY@UTC, ``--event`` NAME@UTC.
+        seed: of everything that is drawn.
+
+    Raises:
+        InputErrorText: an option that means nothing, by its name.
+    """
+    every, days = options["--every"], float(options["--days"])
+    step = _quantity("--every", every, MOMENT)
+    if not step > 0.0:
+        raise InputErrorText(f"--every: {every} is not a time from one reading to the next; write 6d, or 12 h")
+    if not 0.0 < days * DAY / step <= MOST:
+        raise InputErrorText(f"--days: {days:g} days with a reading every {every}; allowed: from 1 to {MOST} readings")
+    error = _quantity("--coefficient-error", options["--coefficient-error"], SCALE)
+    sigma = _quantity("--sensor-sigma", options["--sensor-sigma"], TEMPERATURE_DIFFERENCE)
+    if error < 0.0:
+        raise InputErrorText(f"--coefficient-error: {options['--coefficient-error']} is below zero; write 30%, or 0%")
+    if not sigma > 0.0:
+        raise InputErrorText(f"--sensor-sigma: {options['--sensor-sigma']} is no standard deviation; write 0.05 K")
+    start = _moment("--from", options["--from"])
+    dates = tuple((moment, name) for name, moment in (_at("--event", text, EVENTS) for text in several["--event"]))
+    return Simulation(
+        start,
+        days * DAY,
+        step,
+        seed,
+        int(options["--frames"]),
+        error,
+        sigma,
+        tuple(several["--sensor"]) or None,
+        dict(_at("--dead", text) for text in several["--dead"]),
+        dict(_at("--stuck", text) for text in several["--stuck"]),
+        dates or None,
+        (*(word for pair in options.items() for word in pair), *_words(several)),
+    )
+
+
+def _words(several: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    for option, texts in several.items():
+        for text in texts:
+            yield from (option, text)
+
+
+def _quantity(option: str, text: str, kind: Kind) -> float:
+    try:
+        return parse_quantity(text, kind)
+    except Problem as problem:
+        raise InputErrorText(f"{option}: {one_line(problem)}") from None
+
+
+def _moment(option: str, text: str) -> int:
+    try:
+        return micros(text)
+    except Problem as problem:
+        raise InputErrorText(f"{option}: {one_line(problem)}") from None
+
+
+def _at(option: str, text: str, known: Collection[str] | None = None) -> tuple[str, int]:
+    """Name and moment of ``NAME@UTC``."""
+    name, sign, moment = text.partition("@")
+    if not sign:
+        raise InputErrorText(f"{option}: {text!r} does not say when; write {name or 'NAME'}@2027-06-01T00:00:00Z")
+    if known is not None:
+        _known(option, name, known)
+    return name, _moment(option, moment)
+
+
+def _known(option: str, name: str, names: Collection[str]) -> None:
+    """Raises InputErrorText: none of these names."""
+    if name not in names:
+        raise InputErrorText(f"{option}: {one_line(unknown('no such name', name, sorted(names)))}")
+
+
+def simulate_into(places: Places, what: Simulation, backend: Backend, advance: Advance) -> dict[str, Any]:
+    """Simulate a life, write its files and take them into a record, which is made where there is none.
+
+    Args:
+        places: where it is read from and goes to.
+        what: is simulated.
+        backend: where to trace.
+        advance: told of the progress.
+
+    Returns:
+        What was done, as plain data.
+
+    Raises:
+        InputErrorText: a record that holds readings already, or is not of simulated ones; an unknown body.
+        InputError, RunFolderError, NotARecord, RecordFailed: of the plan, the instrument, the folder, the record.
+    """
+    started, clock = time.time(), time.monotonic()
+    plan, target = places.read(), places.folder
+    with ExitStack() as open_record:
+        history = None
+        if places.record is not None:
+            initialised(places.record, plan.model, simulated=True)
+            history = open_record.enter_context(History(places.record))
+            _is_empty(history)
+            # requirements are checked against the instrument; those of a life were when it was simulated
+            keep_plan(plan if places.complete else read_plan(places.plan, history), places.plan, history)
+        folder = RunFolder(target, places.force)
+        advance(CALIBRATE, 0, 1)
+        experiment = MonitorExperiment(plan.model, backend)
+        experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
+        _are_stated(experiment, what)
+        advance(CALIBRATE, 1, 1)
+        found = recorded(plan, experiment, what, advance)
+        if not found.readings:
+            raise InputErrorText(f"no state can be read, the first since {found.lost[0][1]}")
+        advance(WRITE, 0, 1)
+        life = described(LIFE, truth_numbers(plan, what, found))
+        told = [f"no reading at {utc_text(moment)}: {why}" for moment, why in found.lost]
+        with folder:
+            write_simulated(folder, plan, experiment, what, found)
+            if places.truth is None:
+                folder.write_json(f"{LIFE}.json", life)
+            facts = {"backend": backend.name, "seed": what.seed, "frames": what.frames, "warnings": told}
+            facts["again"] = list(_again(places, what, backend))
+            write_manifest(folder, PROGRAM, started, time.monotonic() - clock, test="simulate", **facts)
+        if places.truth is not None and str(places.truth) != NO_TRUTH:
+            _write(places.truth, json_text(life))
+        advance(TAKE, 0, 1)
+        taken = [] if history is None else take_files(history, folder.target / TELEMETRY)
+        advance(TAKE, 1, 1)
+    refused = [reason for one in taken for _, reason in one.refused]
+    if refused:
+        raise InputErrorText(f"{len(refused)} of what was simulated was refused, the first: {refused[0]}")
+    return {
+        "record": None if history is None else history.url,
+        "instrument": plan.model.instrument.name,
+        "files": str(folder.target),
+        "truth": str(places.truth or folder.target / f"{LIFE}.json"),
+        "readings": len(found.readings),
+        "entries": sum(one.new for one in taken),
+        "steps": len(found.life.steps),
+        "lost": told,
+        "seconds": time.monotonic() - clock,
+    }
+
+
+def _again(places: Places, what: Simulation, backend: Backend) -> Iterator[str]:
+    """Words of the command that makes the files again in their folder."""
+    yield from (PROGRAM, "simulate", CONFIG, *what.words, "--seed", str(what.seed), "--backend", backend.name)
+    if places.truth is not None:  # nothing outside of the folder is written by who makes a run again
+        yield from ("--truth", NO_TRUTH)
+
+
+def take_files(history: History, file: Path) -> list[Taken]:
+    """Take all tables that a file names into a record.
+
+    Args:
+        history: the record.
+        file: that says what the tables hold.
+    """
+    spec = read_telemetry(file, history)
+    every = ((table, path) for table in spec.readings for path in tables_of(spec, table))
+    return [history.take(read_table_file(table, path, history)) for table, path in every]
+
+
+def _is_empty(history: History) -> None:
+    """Raises InputErrorText: a record to which simulated readings do not belong."""
+    if not history.simulated:
+        text = "the record is not one of simulated readings; init --simulated makes such a record in another folder"
+        raise InputErrorText(f"{history.url}: {text}")
+    if history.status()["entries"]:
+        raise InputErrorText(f"{history.url}: the record holds readings already; a life begins in a record without any")
+
+
+def _are_stated(experiment: MonitorExperiment, what: Simulation) -> None:
+    """Raises InputErrorText: a sensor on a body that is not stated to get warmer, or that has none."""
+    assert experiment.stated is not None  # a plan states something
+    warm = {one.body for one in experiment.stated.components if one.kind == "temperature"}
+    for body in what.sensors or ():
+        _known("--sensor", body, warm)
+    options: Mapping[str, Mapping[str, int]] = {"--dead": what.dead, "--stuck": what.stuck}
+    for option, bodies in options.items():
+        for body in bodies:
+            _known(option, body, warm if what.sensors is None else what.sensors)
+
+
+def _write(place: Path, text: str) -> None:
+    """Raises InputErrorText: the file cannot be written."""
+    try:
+        write_safely(place, text.encode())
+    except OSError as error:
+        raise InputErrorText(f"--truth: {place} cannot be written: {error.strerror or error}") from None

@@ -1,0 +1,519 @@
+"""The record of one instrument: opened, added to, and read, also as it was; what is in it is never altered."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+from sqlalchemy import Connection, delete, func, insert, or_, select
+from sqlalchemy.exc import IntegrityError
+
+from optics.numerics.backend import load_backend
+from scenes.models.instrument_builder import build_instrument
+from scenes.specs.resolved import ResolvedJob
+from scenes.yaml.errors import Problem, names_text
+from scenes.yaml.json_file import parse_json
+from twin.operate.record import schema
+from twin.operate.record.database import RecordFailed, engine_of, failures_told, opened, said, url_of, writing
+from twin.operate.record.entries import (
+    Alarm,
+    Checkpoint,
+    Given,
+    canonical,
+    digest_of_data,
+    digest_of_job,
+    now,
+    utc_text,
+)
+from twin.operate.record.schema import (
+    ACKNOWLEDGEMENT,
+    ALARM,
+    CHECKPOINT,
+    ENTRY,
+    INSTRUMENT,
+    PLAN,
+    REFUSED,
+    SOURCE,
+    NotARecord,
+)
+from twin.operate.record.taking import Taken, Taking
+from twin.run.data_files import WRITER
+from twin.run.durable import make_folders, sync_folder
+
+
+class History:
+    """The record of one instrument in a database.
+
+    Attributes:
+        url: of the database, without its password.
+        name: of the instrument.
+        sha256: by which the instrument is recognised.
+        temperature: of the instrument as its file states it, kelvin.
+        simulated: whether its times are not compared with the computer's clock.
+        bodies: ``warm``, paths of those that have a temperature; ``cameras``, their names.
+    """
+
+    def __init__(self, place: str) -> None:
+        url = url_of(place)
+        self._engine = opened(url)
+        self.url = url.render_as_string(hide_password=True)
+        with self.reading() as connection:
+            found = schema.version(connection)
+            if found == 0:
+                raise NotARecord(f"no record in {self.url}; python -m twin.operate init makes one")
+            if found != schema.VERSION:
+                schema.migrate(connection, found) if found > schema.VERSION else None
+                raise NotARecord(
+                    f"the record in {self.url} is of version {found}, this program writes {schema.VERSION}; "
+                    "python -m twin.operate init with the same instrument brings it up"
+                )
+            row = connection.execute(select(INSTRUMENT)).mappings().one()
+        self.name, self.sha256 = str(row["name"]), str(row["sha256"])
+        self.temperature, self.simulated = float(row["temperature_k"]), bool(row["simulated"])
+        self.bodies: dict[str, list[str]] = parse_json(row["bodies"], "the record")
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self._engine.dispose()
+
+    def __enter__(self) -> History:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A transaction that sees the record at one moment."""
+        with failures_told(), self._engine.connect() as connection, connection.begin():
+            yield connection
+
+    def take(self, given: Given, late: bool = False) -> Taken:
+        """Add what a file holds, all of it in one step: after an interruption all of it is there, or nothing.
+
+        Args:
+            given: the file.
+            late: whether readings may be older than the newest of their sort and subject in the record.
+
+        Raises:
+            RecordFailed: nothing was added.
+        """
+        for attempt in (True, False):
+            try:
+                with writing(self._engine) as connection:
+                    return Taking(connection, self.simulated, late).take(given)
+            except IntegrityError as error:  # of databases without a lock: another writer was first
+                if not attempt:
+                    raise RecordFailed(said(error)) from None
+        raise AssertionError
+
+    def entries(
+        self,
+        kind: str = "",
+        subject: str = "",
+        after_us: int | None = None,
+        after_id: int | None = None,
+        until_us: int | None = None,
+    ) -> Iterator[dict[str, Any]]:
+        """Readings and events in the order of time, those of one moment in the order in which they were taken.
+
+        SQLite has no writer while they are read: take what is wanted, and write then.
+
+        Args:
+            kind: of reading; all if empty.
+            subject: likewise.
+            after_us: those after this time, microseconds of TAI since 2000.
+            after_id: those that were taken after the one of this id; beside ``after_us`` of those at that time only,
+                so that the two together name a place in the order.
+            until_us: those up to this time, it included.
+
+        Yields:
+            ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``, ``sha256``, ``line``, ``file`` and ``content``,
+            which is plain data.
+        """
+        c = ENTRY.c
+        query = select(*c, SOURCE.c.file).join(SOURCE, c.source_id == SOURCE.c.id)
+        query = query.where(c.kind == kind) if kind else query
+        query = query.where(c.subject == subject) if subject else query
+        if after_us is not None and after_id is not None:
+            query = query.where(c.time_us >= after_us, or_(c.time_us > after_us, c.id > after_id))
+        elif after_us is not None:
+            query = query.where(c.time_us > after_us)
+        elif after_id is not None:
+            query = query.where(c.id > after_id)
+        query = query if until_us is None else query.where(c.time_us <= until_us)
+        limited = not (after_us is None and until_us is None)
+        with self.reading() as connection:
+            if kind and not subject and limited:  # a look into the index for each subject, and no walk through all
+                query = query.where(c.subject.in_([own for of, own in _streams(connection) if of == kind]))
+            yield from map(dict, connection.execute(query.order_by(c.time_us, c.id)).mappings())
+
+    def refusals(self) -> list[dict[str, Any]]:
+        """What was refused, in the order in which it was; ``taken_since`` says whether the reading is there by now."""
+        there = select(ENTRY.c.id).where(ENTRY.c.sha256 == REFUSED.c.entry).exists()
+        query = select(*REFUSED.c, SOURCE.c.file, there.label("taken_since")).join(
+            SOURCE, REFUSED.c.source_id == SOURCE.c.id
+        )
+        with self.reading() as connection:
+            return [dict(row) for row in connection.execute(query.order_by(REFUSED.c.id)).mappings()]
+
+    def status(self) -> dict[str, Any]:
+        """What the record holds, as plain data."""
+        with self.reading() as connection:
+            streams = [(kind, subject, *_extent(connection, kind, subject)) for kind, subject in _streams(connection)]
+            sources = int(connection.execute(select(func.count()).select_from(SOURCE)).scalar_one())
+            guarded = schema.guarded(connection)
+        refused = [
+            {
+                "file": row["file"],
+                "line": row["line"],
+                "reason": row["reason"],
+                "refused_utc": row["refused_utc"],
+                "taken_since": bool(row["taken_since"]),
+            }
+            for row in self.refusals()
+        ]
+        return {
+            "record": self.url,
+            "version": schema.VERSION,
+            "instrument": self.name,
+            "instrument_sha256": self.sha256,
+            "simulated": self.simulated,
+            "guarded": guarded,
+            "files": sources,
+            "entries": sum(row[2] for row in streams),
+            "streams": [
+                {"kind": k, "subject": s, "entries": n, "first_utc": utc_text(a), "last_utc": utc_text(b)}
+                for k, s, n, a, b in streams
+            ],
+            "refused": refused,
+            "open": sum(not one["taken_since"] for one in refused),
+        }
+
+    def keep_plan(self, file: str, content: Mapping[str, Any]) -> bool:
+        """Keep a plan of operation, which from now on counts.
+
+        Args:
+            file: from which it is.
+            content: plain data.
+
+        Returns:
+            Whether it is another one than before.
+        """
+        digest = digest_of_data(content)
+        with writing(self._engine) as connection:
+            newest = select(PLAN.c.sha256).order_by(PLAN.c.id.desc()).limit(1)
+            if connection.execute(newest).scalar() == digest:
+                return False
+            # cameras and causes keep their order, which is that of all results
+            text = json.dumps(content, allow_nan=False, ensure_ascii=False)
+            row = {"sha256": digest, "file": file, "content": text, "kept_utc": utc_text(now())}
+            connection.execute(insert(PLAN).values(**row))
+        return True
+
+    def plan(self) -> dict[str, Any] | None:
+        """The plan that counts: ``sha256``, ``file``, ``content`` and ``kept_utc``; None where none was kept."""
+        with self.reading() as connection:
+            row = connection.execute(select(PLAN).order_by(PLAN.c.id.desc()).limit(1)).mappings().first()
+        return None if row is None else {**row, "content": content_of(dict(row))}
+
+    def first(self, kind: str) -> dict[str, Any] | None:
+        """The earliest entry of a kind, as of `entries`; None for none."""
+        c = ENTRY.c
+        query = select(*c).where(c.kind == kind).order_by(c.time_us, c.id).limit(1)
+        with self.reading() as connection:
+            row = connection.execute(query).mappings().first()
+        return None if row is None else dict(row)
+
+    def subjects(self, kind: str) -> list[str]:
+        """Of what there are readings of a kind, in alphabetical order."""
+        with self.reading() as connection:
+            return [subject for own, subject in _streams(connection) if own == kind]
+
+    def newest_id(self) -> int:
+        """The largest id of an entry; 0 where there is none."""
+        with self.reading() as connection:
+            return int(connection.execute(select(func.max(ENTRY.c.id))).scalar_one() or 0)
+
+    def came_late(self, after_id: int, until_us: int) -> bool:
+        """Whether an entry up to a time was taken after another one.
+
+        Args:
+            after_id: the id of that.
+            until_us: the time, microseconds of TAI since 2000.
+        """
+        query = select(ENTRY.c.id).where(ENTRY.c.id > after_id, ENTRY.c.time_us <= until_us).limit(1)
+        with self.reading() as connection:
+            return connection.execute(query).first() is not None
+
+    def checkpoint(
+        self, plan: str, number: int | None = None, before_us: int | None = None, valid: bool = False
+    ) -> Checkpoint | None:
+        """The newest of what was kept of an estimate; None for none.
+
+        Args:
+            plan: as of `save_checkpoint`.
+            number: the one of this number alone; without it none of a negative number, and where a time is asked for
+                none of number 0, which is not kept for good.
+            before_us: the newest before this time, microseconds of TAI since 2000.
+            valid: only one up to whose time no reading has come since it was kept.
+        """
+        c, e = CHECKPOINT.c, ENTRY.c
+        query = select(CHECKPOINT).where(c.plan == plan, _numbered(number, before_us))
+        query = query if before_us is None else query.where(c.time_us < before_us)
+        if valid:
+            query = query.where(~select(e.id).where(e.id > c.entry_id, e.time_us <= c.time_us).exists())
+        with self.reading() as connection:
+            row = connection.execute(query.order_by(c.time_us.desc(), c.number.desc()).limit(1)).first()
+        return None if row is None else Checkpoint(row.number, row.time_us, row.entry_id, row.content)
+
+    def checkpoints(self, plan: str) -> list[Checkpoint]:
+        """Where the estimate under a plan stood, in the order of time.
+
+        Args:
+            plan: digest of all that the estimate rests on besides the readings.
+        """
+        c = CHECKPOINT.c
+        with self.reading() as connection:
+            rows = connection.execute(select(CHECKPOINT).where(c.plan == plan).order_by(c.time_us, c.number)).all()
+        return [Checkpoint(row.number, row.time_us, row.entry_id, row.content) for row in rows]
+
+    def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
+        """Keep where an estimate stands, in place of what was kept under the number.
+
+        Args:
+            plan: digest of all that the estimate rests on besides the readings.
+            number: counts the checkpoints of a plan.
+            time_us: up to which readings are in it.
+            entry_id: the largest id that the record had when they were read.
+            content: the estimate.
+
+        Returns:
+            Whether it is kept; it is not if a reading up to that time has come since.
+        """
+        row = {"plan": plan, "number": number, "time_us": time_us, "entry_id": entry_id, "content": content}
+        newer = select(ENTRY.c.id).where(ENTRY.c.id > entry_id, ENTRY.c.time_us <= time_us).limit(1)
+        with writing(self._engine) as connection:
+            if connection.execute(newer).first() is not None:
+                return False
+            connection.execute(delete(CHECKPOINT).where(CHECKPOINT.c.plan == plan, CHECKPOINT.c.number == number))
+            connection.execute(insert(CHECKPOINT).values(**row))
+        return True
+
+    def drop_checkpoints(self, plan: str, from_time_us: int) -> int:
+        """Remove checkpoints of a plan from a time on; how many there were."""
+        c = CHECKPOINT.c
+        with writing(self._engine) as connection:
+            gone = connection.execute(delete(CHECKPOINT).where(c.plan == plan, c.time_us >= from_time_us))
+        return int(gone.rowcount)
+
+    def raise_alarm(self, alarm: Alarm) -> bool:
+        """Add an alarm, once.
+
+        Returns:
+            Whether it is new.
+        """
+        digest = alarm.digest
+        row = {"sha256": digest, "kind": alarm.kind, "subject": alarm.subject, "time_us": alarm.time}
+        row |= {"text": alarm.text, "content": canonical(alarm.content), "raised_utc": utc_text(now())}
+        with writing(self._engine) as connection:
+            if connection.execute(select(ALARM.c.id).where(ALARM.c.sha256 == digest)).first() is not None:
+                return False
+            connection.execute(insert(ALARM).values(**row))
+        return True
+
+    def alarms(self) -> list[dict[str, Any]]:
+        """All alarms in the order in which they were raised: ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``,
+        ``raised_utc``, ``text``, ``content``, and ``acknowledged``: ``by``, ``note`` and ``acknowledged_utc``, or None.
+        """
+        a = ACKNOWLEDGEMENT.c
+        query = select(*ALARM.c, a.by, a.note, a.acknowledged_utc).join(
+            ACKNOWLEDGEMENT, a.alarm_id == ALARM.c.id, isouter=True
+        )
+        with self.reading() as connection:
+            rows = connection.execute(query.order_by(ALARM.c.id)).mappings().all()
+        keys = ("id", "kind", "subject", "time_us", "raised_utc", "text")
+        seen = ("by", "note", "acknowledged_utc")
+        return [
+            {
+                **{key: row[key] for key in keys},
+                "time_utc": utc_text(row["time_us"]),
+                "content": content_of(dict(row)),
+                "acknowledged": None if row["by"] is None else {key: row[key] for key in seen},
+            }
+            for row in rows
+        ]
+
+    def acknowledge(self, alarm: int, by: str, note: str) -> None:
+        """Say who has seen an alarm, and what is done about it.
+
+        Args:
+            alarm: its id.
+            by: name of a person.
+            note: what is done.
+
+        Raises:
+            Problem: there is no such alarm, or somebody has said so.
+        """
+        a = ACKNOWLEDGEMENT.c
+        with writing(self._engine) as connection:
+            known = connection.execute(select(ALARM.c.id).order_by(ALARM.c.id)).scalars().all()
+            if alarm not in known:
+                allowed = names_text(known[-10:]) if known else "none: no alarm was raised"
+                raise Problem("no such alarm", str(alarm), allowed)
+            before = connection.execute(select(a.by, a.acknowledged_utc).where(a.alarm_id == alarm)).first()
+            if before is not None:
+                text = f"alarm {alarm} was acknowledged by {before.by} at {before.acknowledged_utc}"
+                raise Problem(text, None, "an alarm is acknowledged once")
+            row = {"alarm_id": alarm, "by": by, "note": note, "acknowledged_utc": utc_text(now())}
+            connection.execute(insert(ACKNOWLEDGEMENT).values(**row))
+
+
+class PastHistory(History):
+    """A record without what came later, by the times of the readings. What was traced of the instrument is kept in it
+    as in any.
+
+    Args:
+        place: folder or address of the record.
+        until: microseconds of TAI since 2000; what is of this time is in it.
+    """
+
+    def __init__(self, place: str, until: int) -> None:
+        super().__init__(place)
+        self.until = until
+
+    def entries(
+        self,
+        kind: str = "",
+        subject: str = "",
+        after_us: int | None = None,
+        after_id: int | None = None,
+        until_us: int | None = None,
+    ) -> Iterator[dict[str, Any]]:
+        """Readings and events as `History.entries` yields them, without what came later."""
+        until = self.until if until_us is None else min(until_us, self.until)
+        yield from super().entries(kind, subject, after_us, after_id, until)
+
+    def checkpoint(
+        self, plan: str, number: int | None = None, before_us: int | None = None, valid: bool = False
+    ) -> Checkpoint | None:
+        """The newest of what was kept of an estimate then; None for none."""
+        before = self.until + 1 if before_us is None else min(before_us, self.until + 1)
+        return super().checkpoint(plan, number, before, valid)
+
+    def checkpoints(self, plan: str) -> list[Checkpoint]:
+        """Where the estimate stood then and before."""
+        return [one for one in super().checkpoints(plan) if one.time <= self.until]
+
+    def alarms(self) -> list[dict[str, Any]]:
+        """Alarms that belong to that time or before; who has acknowledged them since is told."""
+        return [one for one in super().alarms() if one["time_us"] <= self.until]
+
+    def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
+        """Keep nothing but what has no time: the newest estimate stays where it is."""
+        return number < 0 and super().save_checkpoint(plan, number, time_us, entry_id, content)
+
+    def drop_checkpoints(self, plan: str, from_time_us: int) -> int:
+        """Remove nothing."""
+        return 0
+
+    def raise_alarm(self, alarm: Alarm) -> bool:
+        """Raise nothing: what was to be told then was told then."""
+        return False
+
+    def take(self, *given: Any, **how: Any) -> NoReturn:
+        """Refuse to take readings into the past. Raises TypeError."""
+        raise TypeError("nothing is taken into a record as it was")
+
+
+def _numbered(number: int | None, before_us: int | None) -> Any:
+    c = CHECKPOINT.c
+    if number is not None:
+        return c.number == number
+    return c.number >= 0 if before_us is None else c.number > 0
+
+
+def _streams(connection: Connection) -> Iterator[tuple[str, str]]:
+    """Sort and subject of all that was read, in order: found by looks into the index, not by a walk through it."""
+    c = ENTRY.c
+    in_order = select(c.kind, c.subject).order_by(c.kind, c.subject).limit(1)
+    found = connection.execute(in_order).first()
+    while found is not None:
+        yield found.kind, found.subject
+        same, next_kind = in_order.where(c.kind == found.kind, c.subject > found.subject), c.kind > found.kind
+        found = connection.execute(same).first() or connection.execute(in_order.where(next_kind)).first()
+
+
+def _extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, int]:
+    """How many readings a stream has, the first time and the last one; one query each, which the index answers."""
+    c = ENTRY.c
+    asked = (func.count(), func.min(c.time_us), func.max(c.time_us))
+    own = [select(one).select_from(ENTRY).where(c.kind == kind, c.subject == subject) for one in asked]
+    count, first, last = (int(connection.execute(query).scalar_one()) for query in own)
+    return count, first, last
+
+
+def content_of(row: Mapping[str, Any]) -> Any:
+    """What a row of `History.entries` holds, plain data."""
+    return parse_json(row["content"], "the record")
+
+
+def bodies_of(job: ResolvedJob) -> dict[str, list[str]]:
+    """Paths of the bodies of a job's instrument that have a temperature, and names of its cameras."""
+    nodes = build_instrument(job.instrument, job.cameras, load_backend()).nodes
+    warm = [path for path, info in nodes.items() if "temperature" in info.allows]
+    return {"warm": warm, "cameras": list(job.instrument.cameras)}
+
+
+def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
+    """Make a record, or bring one of an earlier version up to this one.
+
+    Args:
+        place: folder, or address of a database.
+        job: one on the instrument.
+        simulated: whether times are not compared with the computer's clock.
+
+    Returns:
+        Versions that the record has passed: this one of a new record, none where nothing was to be done.
+
+    Raises:
+        NotARecord: there is one of another instrument, or of a later version.
+        RecordFailed: it cannot be made.
+    """
+    url = url_of(place)
+    folder = Path(str(url.database)).parent if url.get_backend_name() == "sqlite" and "://" not in place else None
+    if folder is not None:
+        try:
+            make_folders(folder)
+        except OSError as error:
+            raise NotARecord(f"no folder can be made at {folder}: {error.strerror}") from None
+    engine, digest = engine_of(url), digest_of_job(job)
+    try:
+        with writing(engine) as connection:
+            found = schema.version(connection)
+            passed = schema.migrate(connection, found) if found else (schema.VERSION,)
+            if not found:
+                schema.create(connection)
+                row = {"name": job.instrument.name, "sha256": digest, "simulated": simulated}
+                row |= {"temperature_k": repr(job.instrument.temperature), "bodies": canonical(bodies_of(job))}
+                row |= {"plain": canonical(job.plain()["instrument"])}
+                connection.execute(insert(INSTRUMENT).values(**row))
+            own = connection.execute(select(INSTRUMENT)).mappings().one()
+            if own["sha256"] != digest:
+                raise NotARecord(
+                    f"the record is of {own['name']} ({own['sha256'][:12]}), not of {job.instrument.name} "
+                    f"({digest[:12]}): what an instrument is does not change in its record; make another record"
+                )
+            program = f"{WRITER} {importlib.metadata.version(WRITER)}"
+            rows = [{"version": one, "made_utc": utc_text(now()), "program": program} for one in passed]
+            if rows:
+                connection.execute(insert(schema.SCHEMA), rows)
+    finally:
+        engine.dispose()
+    if folder is not None:
+        sync_folder(folder)
+    return passed

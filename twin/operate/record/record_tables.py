@@ -1,0 +1,138 @@
+"""The record as numbers for programs: what `status --json` says, and tables of every sort of reading."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from scenes.specs.measured.telemetry import RUNS
+from twin.operate.record.entries import MICRO
+from twin.operate.record.history import History, content_of
+from twin.run.data_files import DataTable
+from twin.run.quantity import Quantity, Record, in_unit
+
+Row = Mapping[str, Any]
+
+
+def _key(key: str, meaning: str) -> Quantity[Row]:
+    return Quantity(key, lambda row: row[key], meaning)
+
+
+def _number(key: str, meaning: str) -> Quantity[Row]:
+    return Quantity(key, lambda row: row["numbers"].get(key), meaning, converted=False)
+
+
+_WHEN = (
+    _key("time_utc", "time of the reading, UTC"),
+    Quantity[Row]("time_s", lambda row: row["time_us"] / MICRO, "SI seconds since 2000-01-01T00:00:00 TAI"),
+)
+_FROM = (_key("file", "from which it was taken"), _key("sha256", "by which the reading is recognised"))
+
+
+def _value(k: int) -> Any:
+    return lambda row: row["content"]["values"][k] if k < len(row["content"]["values"]) else None
+
+
+def _sigma(row: Row) -> float:
+    return float(row["content"]["sigma"])
+
+
+TABLES: Mapping[str, Record[Row]] = {
+    "temperature": Record(
+        "Temperatures of bodies.",
+        *_WHEN,
+        _key("subject", "body"),
+        Quantity("temperature_K", _value(0), "of the body, absolute"),
+        Quantity("temperature_K_sigma", _sigma, "standard deviation of the sensor's error"),
+        *_FROM,
+    ),
+    "focus": Record(
+        "Foci found in orbit.",
+        *_WHEN,
+        _key("subject", "camera"),
+        Quantity("defocus_um", _value(0), "of the detector, positive downstream"),
+        Quantity("defocus_um_sigma", lambda row: 1e6 * _sigma(row), "standard deviation", converted=False),
+        *_FROM,
+    ),
+    "attitude": Record(
+        "Attitudes of star trackers.",
+        *_WHEN,
+        _key("subject", "star tracker"),
+        Quantity("form", lambda row: row["content"]["unit"], "quaternion, or rad of three angles"),
+        *(Quantity(f"component_{k + 1}", _value(k), "of the quaternion, the scalar last; or angle") for k in range(4)),
+        Quantity("angle_arcsec_sigma", lambda row: in_unit(_sigma(row), "arcsec"), "about each axis", converted=False),
+        *_FROM,
+    ),
+    "event": Record(
+        "What happened to the instrument.",
+        *_WHEN,
+        _key("subject", "event"),
+        Quantity("detail", lambda row: row["content"].get("detail"), "what the table says of it"),
+        *_FROM,
+    ),
+    "run": Record(
+        "Calibrations and angles found in orbit.",
+        *_WHEN,
+        _key("kind", "calibration or angle"),
+        Quantity("results_sha256", lambda row: row["content"]["sha256"], "of the file of results"),
+        Quantity("verdict", lambda row: row["content"]["numbers"].get("verdict"), "of the run"),
+        *_FROM,
+    ),
+    "monitor": Record(
+        "Changes of cameras that the monitor's frames gave, by camera and estimator; each states its sigma.",
+        *_WHEN,
+        _key("camera", "of the instrument"),
+        _key("estimator", "that found it"),
+        *(
+            _number(f"{name}{end}", said)
+            for name in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
+            for end, said in (("", "change"), ("_sigma", "its total sigma"), ("_sigma_noise", "its sigma of noise"))
+        ),
+        *_FROM,
+    ),
+    "intersection_angle": Record(
+        "Changes of the angle between cameras that the monitor's frames gave.",
+        *_WHEN,
+        _key("estimator", "that found it"),
+        *(
+            _number(key, "change of the angle, or its sigma")
+            for key in ("change_arcsec", "change_arcsec_sigma", "change_arcsec_sigma_noise")
+        ),
+        *_FROM,
+    ),
+    "refused": Record(
+        "What was refused.",
+        _key("refused_utc", "when"),
+        _key("file", "in which it stands"),
+        _key("line", "of the file"),
+        _key("reason", "what is wrong with it"),
+        _key("taken_since", "whether the reading is in the record by now"),
+    ),
+}
+"""Name of a table -> its columns."""
+
+
+def tables(history: History) -> list[DataTable]:
+    """All tables of a record that have rows."""
+    rows: dict[str, list[Row]] = {name: [] for name in TABLES}
+    for entry in history.entries():
+        row = {**entry, "content": content_of(entry)}
+        for name, one in _rows(row):
+            rows[name].append(one)
+    rows["refused"] = list(history.refusals())
+    made = {name: [record(row) for row in rows[name]] for name, record in TABLES.items()}
+    return [TABLES[name].data_table(name, TABLES[name].meaning, of) for name, of in made.items() if of]
+
+
+def _rows(row: Row) -> Iterator[tuple[str, Row]]:
+    """Rows of tables that an entry gives."""
+    kind = row["kind"]
+    if kind != "monitor":
+        yield ("run" if kind in RUNS else kind), row
+        return
+    numbers = row["content"]["numbers"]
+    for camera, found in numbers["cameras"].items():
+        for estimator, one in found.items():
+            yield "monitor", {**row, "camera": camera, "estimator": estimator, "numbers": one}
+    for estimator, one in (numbers.get("intersection_angle") or {}).items():
+        yield "intersection_angle", {**row, "estimator": estimator, "numbers": one}

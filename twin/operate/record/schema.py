@@ -1,0 +1,261 @@
+"""The tables of a record in a database, their versions, and what keeps them from being altered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    Column,
+    Connection,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+    func,
+    inspect,
+    select,
+    text,
+)
+from sqlalchemy.schema import CreateIndex, CreateTable
+
+from optics.numerics.frozen_map import FrozenMap
+
+VERSION = 3
+_METADATA = MetaData()
+_NUMBER = BigInteger().with_variant(Integer(), "sqlite")
+"""SQLite counts rows by itself only where their type is INTEGER."""
+
+
+def _table(name: str, *columns: Any) -> Table:
+    return Table(name, _METADATA, Column("id", _NUMBER, primary_key=True, autoincrement=True), *columns)
+
+
+def _digest(name: str, **more: Any) -> Column[Any]:
+    return Column(name, String(64), **more)
+
+
+SCHEMA = _table(
+    "record_schema",
+    Column("version", Integer, nullable=False, unique=True),
+    Column("made_utc", String(32), nullable=False),
+    Column("program", Text, nullable=False),
+)
+"""A row for each version that the record has had."""
+INSTRUMENT = _table(
+    "instrument",
+    Column("name", Text, nullable=False),
+    _digest("sha256", nullable=False, unique=True),
+    Column("temperature_k", Text, nullable=False),
+    Column("simulated", Boolean, nullable=False),
+    Column("bodies", Text, nullable=False),
+    Column("plain", Text, nullable=False),
+)
+"""The one instrument of which the record is."""
+SOURCE = _table(
+    "source",
+    Column("file", Text, nullable=False),
+    _digest("sha256", nullable=False),
+    _digest("taking", nullable=False, unique=True),
+    Column("taken_utc", String(32), nullable=False),
+    Column("rows_read", Integer, nullable=False),
+)
+"""A row for each file that was taken; ``taking`` is the digest of the file and of what was said of it."""
+FRAME = _table(
+    "frame",
+    Column("source_id", _NUMBER, ForeignKey("source.id"), nullable=False, index=True),
+    Column("file", Text, nullable=False),
+    _digest("sha256", nullable=False),
+)
+"""Files from which a source was found: recorded frames of a monitor."""
+ENTRY = _table(
+    "entry",
+    _digest("sha256", nullable=False, unique=True),
+    Column("kind", String(32), nullable=False),
+    Column("subject", String(200), nullable=False),
+    Column("time_us", BigInteger, nullable=False),
+    Column("time_utc", String(32), nullable=False),
+    Column("content", Text, nullable=False),
+    Column("source_id", _NUMBER, ForeignKey("source.id"), nullable=False),
+    Column("line", Integer),
+    _digest("origin"),
+    Index("entry_stream", "kind", "subject", "time_us"),
+    Index("entry_origin", "origin"),
+    Index("entry_time", "time_us", "id"),
+)
+"""A row for each reading or event, as `twin.operate.record.entries.Entry`."""
+REFUSED = _table(
+    "refused",
+    _digest("sha256", nullable=False, unique=True),
+    Column("source_id", _NUMBER, ForeignKey("source.id"), nullable=False),
+    Column("line", Integer),
+    Column("reason", Text, nullable=False),
+    _digest("entry"),
+    Column("refused_utc", String(32), nullable=False),
+    Index("refused_entry", "entry"),
+)
+"""A row for what was not taken, once for each reason; ``entry`` is the digest of the reading, if it is one."""
+PLAN = _table(
+    "plan",
+    _digest("sha256", nullable=False),
+    Column("file", Text, nullable=False),
+    Column("content", Text, nullable=False),
+    Column("kept_utc", String(32), nullable=False),
+)
+"""A row for each plan of operation under which the record was followed; the newest counts."""
+ALARM = _table(
+    "alarm",
+    _digest("sha256", nullable=False, unique=True),
+    Column("kind", String(32), nullable=False),
+    Column("subject", String(200), nullable=False),
+    Column("time_us", BigInteger, nullable=False),
+    Column("raised_utc", String(32), nullable=False),
+    Column("text", Text, nullable=False),
+    Column("content", Text, nullable=False),
+    Index("alarm_stream", "kind", "subject", "time_us"),
+)
+"""A row for each alarm, as `twin.operate.record.entries.Alarm`."""
+ACKNOWLEDGEMENT = _table(
+    "acknowledgement",
+    Column("alarm_id", _NUMBER, ForeignKey("alarm.id"), nullable=False, unique=True),
+    Column("by", Text, nullable=False),
+    Column("note", Text, nullable=False),
+    Column("acknowledged_utc", String(32), nullable=False),
+)
+"""A row for each alarm that somebody has seen."""
+CHECKPOINT = _table(
+    "checkpoint",
+    _digest("plan", nullable=False),
+    Column("number", Integer, nullable=False),
+    Column("time_us", BigInteger, nullable=False),
+    Column("entry_id", _NUMBER, nullable=False),
+    Column("content", LargeBinary, nullable=False),
+    UniqueConstraint("plan", "number"),
+    Index("checkpoint_time", "time_us"),
+)
+"""Where an estimate stood at some time: derived from the entries, and the only rows that may be altered and removed."""
+_DERIVED = (CHECKPOINT.name,)
+
+
+class NotARecord(Exception):
+    """A database that holds no record, or one of another version; the message says what to do."""
+
+
+def _guard(connection: Connection, table: str) -> None:
+    """Let the database refuse to alter or remove rows of a table; on others than these two only the program does."""
+    for what in ("UPDATE", "DELETE"):
+        name, says = f"{table}_no_{what.lower()}", f"a record is never altered: {what} of {table}"
+        if connection.dialect.name == "sqlite":
+            body = f"BEGIN SELECT RAISE(ABORT, '{says}'); END"
+            connection.execute(text(f"CREATE TRIGGER {name} BEFORE {what} ON {table} {body}"))
+        elif connection.dialect.name == "postgresql":
+            connection.execute(
+                text(
+                    f"CREATE TRIGGER {name} BEFORE {what} ON {table} "
+                    "FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
+                )
+            )
+    if connection.dialect.name == "postgresql":
+        connection.execute(
+            text(
+                f"CREATE TRIGGER {table}_no_truncate BEFORE TRUNCATE ON {table} "
+                "FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
+            )
+        )
+
+
+def _guard_function(connection: Connection) -> None:
+    if connection.dialect.name == "postgresql":
+        connection.execute(
+            text(
+                "CREATE OR REPLACE FUNCTION record_refuses() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "
+                "RAISE EXCEPTION 'a record is never altered: % of %', TG_OP, TG_TABLE_NAME; END $$"
+            )
+        )
+
+
+def guarded(connection: Connection) -> bool:
+    """Whether the database itself refuses to alter the record, and not the program alone."""
+    names = {
+        "sqlite": "SELECT count(*) FROM sqlite_master WHERE type = 'trigger' AND name LIKE '%_no_%'",
+        "postgresql": "SELECT count(*) FROM pg_trigger WHERE tgname LIKE '%\\_no\\_%' "
+        "AND tgrelid IN (SELECT oid FROM pg_class WHERE pg_table_is_visible(oid))",
+    }
+    query = names.get(connection.dialect.name)
+    if query is None:
+        return False
+    return int(connection.execute(text(query)).scalar_one()) >= 2 * (len(_METADATA.tables) - len(_DERIVED))
+
+
+def create(connection: Connection) -> None:
+    """Make all tables of this version, with what guards them."""
+    _METADATA.create_all(connection)
+    _guard_function(connection)
+    for table in _METADATA.sorted_tables:
+        if table.name not in _DERIVED:
+            _guard(connection, table.name)
+
+
+def version(connection: Connection) -> int:
+    """Version of the record in a database; 0 where there is none."""
+    if not inspect(connection).has_table(SCHEMA.name):
+        return 0
+    return int(connection.execute(select(func.max(SCHEMA.c.version))).scalar_one() or 0)
+
+
+def _to_two(connection: Connection) -> None:
+    """Add where a reading was found from, and what was refused; old rows get no origin, since none is altered."""
+    connection.execute(text("ALTER TABLE entry ADD COLUMN origin VARCHAR(64)"))
+    _make_index(connection, ENTRY, "entry_origin")
+    _make_table(connection, REFUSED)
+
+
+def _to_three(connection: Connection) -> None:
+    """Add plans of operation, what is derived under them, alarms, and who has seen them."""
+    _make_index(connection, ENTRY, "entry_time")
+    for table in (PLAN, ALARM, ACKNOWLEDGEMENT, CHECKPOINT):
+        _make_table(connection, table)
+
+
+def _make_table(connection: Connection, table: Table) -> None:
+    connection.execute(CreateTable(table))
+    for index in table.indexes:
+        connection.execute(CreateIndex(index))
+    if table.name not in _DERIVED:
+        _guard(connection, table.name)
+
+
+def _make_index(connection: Connection, table: Table, name: str) -> None:
+    (index,) = (one for one in table.indexes if one.name == name)
+    connection.execute(CreateIndex(index))
+
+
+MIGRATIONS: Mapping[int, Callable[[Connection], None]] = FrozenMap({1: _to_two, 2: _to_three})
+"""Version -> what makes the next one of it. Rows are added, none is altered."""
+
+
+def migrate(connection: Connection, found: int) -> tuple[int, ...]:
+    """Bring a record to this version.
+
+    Args:
+        connection: in a transaction.
+        found: its version.
+
+    Returns:
+        The versions that it passed, this one last.
+
+    Raises:
+        NotARecord: it is of a later version.
+    """
+    if found > VERSION:
+        raise NotARecord(f"the record is of version {found}, this program knows {VERSION}; use a later program")
+    for step in range(found, VERSION):
+        MIGRATIONS[step](connection)
+    return tuple(range(found + 1, VERSION + 1))

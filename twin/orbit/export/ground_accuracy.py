@@ -1,0 +1,329 @@
+"""What errors of camera, orbit and attitude are on the ground: covariances of points over a scene, CE90 and LE90.
+
+The rigorous sensor is asked where pixels see the ground after each error was given a little; these derivatives take the
+covariances to the ground. A point of one line has a height from elsewhere. A point that several lines see is
+intersected from all of them, weighted by the covariance of its places in the images; the errors of orbit and attitude
+are those of the pass, which its lines have in common, and each line has its own interior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.orbit.ground_errors import circular_error, linear_error
+from optics.geometry.pose import rotation_matrix
+from optics.numerics.frozen_map import FrozenMap
+from twin.orbit.flight.earth import east_north_up
+from twin.orbit.flight.sensor import Platform, Sensor
+
+Array = NDArray[np.float64]
+
+_GRID = (13, 13)
+"""Lines and pixels of an image at which errors are taken; they are smooth."""
+_MOVED = 1.0
+_TURNED = 1e-6
+"""Steps of derivatives, metres and radians: metres on the ground, over which it is straight to 1e-6."""
+_RAISED = 10.0
+"""Metres."""
+_EDGE = 0.5
+"""Pixels and lines: half a step, and from the image's edge."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraUncertainty:
+    """What is uncertain of a camera and of its way, as covariances.
+
+    Attributes:
+        platform: (6, 6) of the position along X, Y, Z of the body, metres, and of turns about X, Y, Z of the body,
+            radians; constant over the pass and shared by its lines.
+        interior: (3, 3) of line and pixel, pixels, and of the principal distance, relative; of each line on its own.
+        image: (2, 2) of a point's measured line and pixel, pixels^2; another in every point.
+        height: standard deviation of the heights that points of one line have from elsewhere, metres.
+    """
+
+    platform: Array
+    interior: Array
+    image: Array
+    height: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        position: float = 0.0,
+        attitude: float = 0.0,
+        interior: float = 0.0,
+        scale: float = 0.0,
+        image: float = 0.0,
+        height: float = 0.0,
+    ) -> CameraUncertainty:
+        """Independent errors, alike along and about all axes.
+
+        Args:
+            position: standard deviation along each axis, metres.
+            attitude: about each axis, radians.
+            interior: of line and pixel, pixels.
+            scale: of the principal distance, relative.
+            image: of a measured line and pixel, pixels.
+            height: of heights from elsewhere, metres.
+        """
+        platform = np.diag([position**2] * 3 + [attitude**2] * 3)
+        return cls(platform, np.diag([interior**2, interior**2, scale**2]), image**2 * np.eye(2), height)
+
+
+@dataclass(frozen=True, eq=False)
+class AccuracyMap:
+    """Covariances of points over a scene.
+
+    Attributes:
+        line, pixel: (N,) of the grid, in the image that it is of.
+        longitude, latitude: (N,) radians; NaN where a look misses the Earth or, of several lines, fewer than two see.
+        height: of the ground above the ellipsoid, metres.
+        constant: (N, 3, 3) to the east, to the north and up, m^2, of what points have in common.
+        random: (N, 3, 3) of what is another in every point: its measured places.
+        heights: (N, 3, 3) of the heights that points of one line have from elsewhere, which move them in plan as well.
+        shape: of the grid.
+    """
+
+    line: Array
+    pixel: Array
+    longitude: Array
+    latitude: Array
+    height: float
+    constant: Array
+    random: Array
+    heights: Array
+    shape: tuple[int, int]
+
+    @property
+    def covariance(self) -> Array:
+        """(N, 3, 3) of a point, m^2."""
+        return self.constant + self.random + self.heights
+
+    @property
+    def ce90(self) -> Array:
+        """(N,) radius of the circle that holds 90 % of the horizontal errors, metres."""
+        return self._where_seen(lambda c: circular_error(c[:, :2, :2]))
+
+    @property
+    def le90(self) -> Array:
+        """(N,) half width of the interval that holds 90 % of the vertical errors, metres."""
+        return self._where_seen(lambda c: linear_error(c[:, 2, 2]))
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(N,) where there is a covariance."""
+        return np.isfinite(self.longitude)
+
+    def horizontal(self) -> tuple[float, float]:
+        """Roots of the sums of the variances to the east and to the north, root mean square over the scene, metres:
+        of what points have in common, and of their measured places; without heights from elsewhere.
+        """
+        return tuple(  # type: ignore[return-value]
+            float(np.sqrt(np.mean(np.trace(part[self.seen, :2, :2], axis1=1, axis2=2))))
+            for part in (self.constant, self.random)
+        )
+
+    def _where_seen(self, function) -> Array:  # type: ignore[no-untyped-def]
+        found = np.full(len(self.line), np.nan)
+        found[self.seen] = function(self.covariance[self.seen])
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """A platform that is not quite where it is."""
+
+    platform: Platform
+    shift: Array
+    turn: Array
+
+    def position(self, seconds: Array) -> Array:
+        at = self.platform.position(seconds)
+        return np.asarray(at + np.einsum("nij,j->ni", self.platform.body_to_itrs(seconds), self.shift))
+
+    def inertial_velocity(self, seconds: Array) -> Array:
+        return self.platform.inertial_velocity(seconds)
+
+    def body_to_itrs(self, seconds: Array) -> Array:
+        return np.asarray(self.platform.body_to_itrs(seconds) @ rotation_matrix(self.turn))
+
+
+@dataclass(frozen=True, eq=False)
+class _Derivatives:
+    """Of where pixels (N,) see a height, east and north, metres.
+
+    Attributes:
+        place: (N, 2, 2) by line and pixel.
+        platform: (N, 2, 6) by the errors of the platform.
+        interior: (N, 2, 3) by those of the interior.
+        height: (N, 2) by the height.
+    """
+
+    place: Array
+    platform: Array
+    interior: Array
+    height: Array
+
+
+def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level: Array) -> _Derivatives:
+    def seen(at: Array, which: Array, up: float = height, moved: Array | None = None) -> Array:
+        where = sensor
+        if moved is not None:
+            where = replace(sensor, trajectory=_Moved(sensor.trajectory, moved[:3], moved[3:]))
+        return np.einsum("nij,nj->ni", level, where.ground(at, which, up))
+
+    by_line = (seen(line + _EDGE, pixel) - seen(line - _EDGE, pixel)) / (2.0 * _EDGE)
+    by_pixel = (seen(line, pixel + _EDGE) - seen(line, pixel - _EDGE)) / (2.0 * _EDGE)
+    columns = []
+    for k in range(6):
+        step = _MOVED if k < 3 else _TURNED
+        move = np.zeros(6)
+        move[k] = step
+        columns.append((seen(line, pixel, moved=move) - seen(line, pixel, moved=-move)) / (2.0 * step))
+    raised = (seen(line, pixel, height + _RAISED) - seen(line, pixel, height - _RAISED)) / (2.0 * _RAISED)
+    # a longer principal distance draws what pixels see toward the line's middle
+    from_middle = pixel - 0.5 * (sensor.camera.pixels - 1)
+    interior = np.stack([by_line, by_pixel, -by_pixel * from_middle[:, None]], axis=-1)
+    return _Derivatives(np.stack([by_line, by_pixel], axis=-1), np.stack(columns, axis=-1), interior, raised)
+
+
+def _grid(sensor: Sensor, first_pixel: int, pixels: int) -> tuple[Array, Array]:
+    """Lines and pixels (N,) over an image."""
+    line = np.linspace(min(0.0, 0.5 * (sensor.lines - 1)), sensor.lines - 1.0, _GRID[0])
+    pixel = np.linspace(first_pixel, first_pixel + pixels - 1.0, _GRID[1])
+    at, which = np.meshgrid(line, pixel, indexing="ij")
+    return at.ravel(), which.ravel()
+
+
+def single_accuracy(
+    sensor: Sensor, uncertainty: CameraUncertainty, height: float, first_pixel: int = 0, pixels: int | None = None
+) -> AccuracyMap:
+    """Errors of points of known height that one line locates.
+
+    Args:
+        sensor: of the line; its lines are those of the image.
+        uncertainty: of camera and way.
+        height: of the ground above the ellipsoid, metres.
+        first_pixel: of the image on the line.
+        pixels: of the image; None for the whole line.
+
+    Raises:
+        ValueError: no look meets the Earth.
+    """
+    line, pixel = _grid(sensor, first_pixel, sensor.camera.pixels if pixels is None else pixels)
+    longitude, latitude, level = _places(sensor, line, pixel, height)
+    found = _derivatives(sensor, line, pixel, height, level[:, :2])
+    constant, random = np.zeros((2, len(line), 3, 3))
+    constant[:, :2, :2] = _taken(found.platform, uncertainty.platform) + _taken(found.interior, uncertainty.interior)
+    tilt = np.concatenate([found.height, np.ones((len(line), 1))], axis=1)
+    heights = uncertainty.height**2 * tilt[:, :, None] * tilt[:, None, :]
+    random[:, :2, :2] = _taken(found.place, uncertainty.image)
+    return AccuracyMap(line, pixel, longitude, latitude, height, constant, random, heights, _GRID)
+
+
+def intersected_accuracy(
+    sensors: Mapping[str, Sensor],
+    uncertainty: CameraUncertainty,
+    height: float,
+    first_pixel: int = 0,
+    pixels: int | None = None,
+) -> AccuracyMap:
+    """Errors of points that several lines of one pass see and that are intersected from them.
+
+    Args:
+        sensors: line -> its sensor; the grid is that of the first one's image.
+        uncertainty: of camera and way; heights from elsewhere are not used.
+        height: of the ground above the ellipsoid, metres.
+        first_pixel: of the first one's image on its line.
+        pixels: of it; None for the whole line.
+
+    Raises:
+        ValueError: fewer than two lines, no look meets the Earth, images that nowhere show the same ground.
+    """
+    if len(sensors) < 2:
+        raise ValueError("an intersection takes two lines or more")
+    first = next(iter(sensors.values()))
+    line, pixel = _grid(first, first_pixel, first.camera.pixels if pixels is None else pixels)
+    longitude, latitude, level = _places(first, line, pixel, height)
+    ground = first.ground(line, pixel, height)
+    count = len(line)
+    weight = np.linalg.inv(uncertainty.image if np.any(uncertainty.image) else np.eye(2))
+    normal, platform = np.zeros((count, 3, 3)), np.zeros((count, 3, 6))
+    own: list[tuple[NDArray[np.bool_], Array, Array]] = []
+    views = np.zeros(count, dtype=int)
+    for sensor in sensors.values():
+        at, which = (line, pixel) if sensor is first else sensor.image(ground)
+        held = (at >= 0.0) & (at <= sensor.lines - 1.0) & (which >= 0.0) & (which <= sensor.camera.pixels - 1.0)
+        if not np.any(held):
+            continue
+        part = _derivatives(sensor, at[held], which[held], height, level[held, :2])
+        to_image = np.linalg.inv(part.place)
+        # a point's place in the image by its place on the ground, and by the errors at that place
+        by_ground = to_image @ np.concatenate(
+            [np.tile(np.eye(2), (int(np.sum(held)), 1, 1)), -part.height[:, :, None]], axis=2
+        )
+        turned = np.swapaxes(by_ground, 1, 2) @ weight
+        normal[held] += turned @ by_ground
+        platform[held] += turned @ to_image @ part.platform
+        own.append((held, turned @ to_image @ part.interior, turned))
+        views += held
+    good = views >= 2
+    if not np.any(good):
+        raise ValueError("the images nowhere show the same ground")
+    inverse = np.full((count, 3, 3), np.nan)
+    inverse[good] = np.linalg.inv(normal[good])
+    constant = _taken(inverse @ platform, uncertainty.platform)
+    random = np.zeros((count, 3, 3))
+    for held, interior, turned in own:
+        constant[held] += _taken(inverse[held] @ interior, uncertainty.interior)
+        random[held] += _taken(inverse[held] @ turned, uncertainty.image)
+    nowhere = np.where(good, 0.0, np.nan)
+    none = np.zeros_like(random)
+    return AccuracyMap(line, pixel, longitude + nowhere, latitude + nowhere, height, constant, random, none, _GRID)
+
+
+def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[Array, Array, Array]:
+    """Longitude and latitude (N,) that pixels see, and the level frame there (N, 3, 3)."""
+    ground = sensor.ground(line, pixel, height)
+    if not np.any(np.isfinite(ground)):
+        raise ValueError("no look meets the Earth")
+    longitude, latitude, _ = sensor.earth.geodetic(ground)
+    return longitude, latitude, east_north_up(longitude, latitude)
+
+
+def _taken(rows: Array, covariance: ArrayLike) -> Array:
+    """(N, K, K) covariances of what has these derivatives (N, K, P)."""
+    return np.asarray(rows @ np.asarray(covariance) @ np.swapaxes(rows, 1, 2))
+
+
+def maps_of(
+    sensors: Mapping[str, tuple[Sensor, int, int]], uncertainty: CameraUncertainty, height: float
+) -> dict[str, AccuracyMap]:
+    """The map of each line by itself and, of several whose images overlap, of points that are intersected, `together`.
+
+    Args:
+        sensors: line -> its sensor, and first pixel and number of pixels of its image.
+        uncertainty: of camera and way.
+        height: of the ground above the ellipsoid, metres.
+
+    Raises:
+        ValueError: no look meets the Earth.
+    """
+    found = {name: single_accuracy(one, uncertainty, height, at, count) for name, (one, at, count) in sensors.items()}
+    if len(sensors) > 1 and np.any(uncertainty.image):
+        _, at, count = next(iter(sensors.values()))
+        try:
+            found[TOGETHER] = intersected_accuracy(
+                FrozenMap({name: one for name, (one, _, _) in sensors.items()}), uncertainty, height, at, count
+            )
+        except ValueError:
+            pass  # images of different ground; each line has its own map
+    return found
+
+
+TOGETHER = "together"
+"""Name of the map of intersected points."""

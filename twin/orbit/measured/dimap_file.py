@@ -1,0 +1,377 @@
+"""Passes of Pléiades, Pléiades Neo and SPOT 6 and 7 as their DIMAP files (versions 2 and 3) tell of them: the rigorous
+model of a scene in the geometry of its sensor.
+
+- Rows and columns of the image count from 1, the centre of the first pixel. Row r is exposed at START + (r - 1)
+  LINE_PERIOD; times are UTC.
+- Positions and velocities are Earth-fixed, and velocities against the turning Earth.
+- A quaternion Q0 .. Q3 has its scalar first and turns the body's axes into the Earth-fixed ones, v_earth = R(q) v_body.
+  It is given in samples, or as polynomials of (t - OFFSET) / SCALE, where t is seconds of the day of START, which are
+  then made unit.
+- In the body X points forward, Z to the scene, Y to the right. A column's look is (tan psi_y, -tan psi_x, 1), where
+  tan psi_x = XLOS_0 + XLOS_1 c + ... and tan psi_y likewise by YLOS, of c = column - 1 + FIRST_COL - 1.
+- Looks are straight up to the atmosphere, whose refraction is part of the model where ATMOSPHERIC_REFRACTION_SETTING is
+  true: in a scene of Pleiades Neo, polynomials of 0 to 8 km leave looks that are constant to 0.03 urad with the
+  refraction of the standard atmosphere, and to 1 urad without.
+
+Orders and signs are those by which the Ames Stereo Pipeline reads these files. The formula of the looks is that of the
+imagery user guide of Pléiades; FIRST_COL is added as that program found it, where the guide subtracts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.errors import InputError, Issue, names_text, shown
+from twin.orbit.measured.clock import Readings
+from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
+from twin.orbit.measured.text_file import readings, require_rising
+from twin.orbit.measured.xml_file import Element, read_xml
+
+Array = NDArray[np.float64]
+
+PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
+"""Products with a rigorous model."""
+_WHAT = "a DIMAP file of a product in sensor geometry"
+_VERSIONS = ("2", "3")
+_PERIOD: Mapping[str, float] = FrozenMap(
+    {"ms": 1e-3, "millisecond": 1e-3, "s": 1.0, "second": 1.0, "us": 1e-6, "microsecond": 1e-6}
+)
+"""Unit -> seconds; milliseconds where none stands."""
+_LENGTH: Mapping[str, float] = FrozenMap({"micrometer": 1e-6, "um": 1e-6, "mm": 1e-3, "m": 1.0})
+_MOST_TERMS = 8
+_DAY = 86400.0
+_SAMPLES = 240
+"""Of a polynomial attitude: a cubic spline through them is right to 1e-12 rad for a turn by 30 deg."""
+_MARGIN = 0.05
+"""Share of an image's time, before its first line and after its last one, for which attitudes are sampled."""
+_NEAR = 0.1
+"""Seconds for which an orbit is carried on beyond its readings: the third derivative of its positions makes 2 um."""
+_MOVED = 0.02
+"""Share of the speed by which velocities may differ from the positions' change; those against the stars do by 6 %."""
+_LINES_OFF = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudePolynomial:
+    """Quaternions as polynomials of time.
+
+    Attributes:
+        day: modified Julian day whose seconds count.
+        offset: second of the day at which the polynomials' variable is 0.
+        scale: seconds by which it grows by 1.
+        coefficients: (4, K) of Q0, the scalar, to Q3, ascending powers.
+    """
+
+    day: int
+    offset: float
+    scale: float
+    coefficients: Array
+
+    def at(self, second: Array) -> Array:
+        """Unit quaternions (N, 4), scalar first, at seconds (N,) of the day."""
+        values = np.polynomial.polynomial.polyval((second - self.offset) / self.scale, self.coefficients.T).T
+        return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True, eq=False)
+class DimapPass:
+    """What a DIMAP file says of a pass.
+
+    Attributes:
+        file: where it is from.
+        profile: of the product, one of `PROFILES`.
+        version: of the format.
+        name: of the data set.
+        lines, pixels: of the image.
+        first_line: when the first line was exposed, UTC, one reading.
+        line_time: from one line to the next, seconds.
+        orbit: its readings, ITRS and UTC.
+        attitude: its samples, or polynomials.
+        forward, right: coefficients (K,) of the tangents of a pixel's look, ascending powers of the pixel from 0.
+        pitch: of the detector's pixels, metres; None where the file does not say.
+        settings: what the file says was done to it, by key.
+        refracted: whether its geometry knows refraction.
+        light_speed: whether it says that the speed of light was taken into account, of which nothing is known here.
+        accuracy: ACCURACY_STDV, metres; None where there is none.
+        rpc: names of files with its rational polynomials.
+    """
+
+    file: str
+    profile: str
+    version: str
+    name: str
+    lines: int
+    pixels: int
+    first_line: Readings
+    line_time: float
+    orbit: OrbitReadings
+    attitude: AttitudeReadings | AttitudePolynomial
+    forward: Array
+    right: Array
+    pitch: float | None
+    settings: Mapping[str, str]
+    refracted: bool
+    light_speed: bool
+    accuracy: float | None
+    rpc: tuple[str, ...]
+
+    @property
+    def duration(self) -> float:
+        """From the first line to the last, seconds."""
+        return (self.lines - 1) * self.line_time
+
+    def samples(self) -> AttitudeReadings:
+        """The attitude as readings; of polynomials those about the time of the image."""
+        if isinstance(self.attitude, AttitudeReadings):
+            return self.attitude
+        start, span = float(self.first_line.second[0]), max(self.duration, self.line_time)
+        second = start + span * np.linspace(-_MARGIN, 1.0 + _MARGIN, _SAMPLES + 1)
+        # half a line beyond the ends is part of the image
+        second[0], second[-1] = min(second[0], start - self.line_time), max(second[-1], start + span + self.line_time)
+        day = np.floor(second / _DAY)
+        clock = Readings(self.attitude.day + day.astype(np.int64), second - _DAY * day)
+        turns = self.attitude.at(second)
+        return AttitudeReadings(self.file, clock, turns, None, "ITRS", "UTC", "first", "body_to_frame")
+
+    def spanning_orbit(self) -> OrbitReadings:
+        """The orbit's readings, with one more at either end where the image begins or ends a moment beyond them.
+
+        Raises:
+            InputError: it does by more than that.
+        """
+        start, stop = -self.line_time, self.duration + self.line_time
+        time = self._since(self.orbit.clock)
+        assert self.orbit.velocity is not None
+        position, velocity = self.orbit.position, self.orbit.velocity
+        for at, end, place in ((start, 0, 0), (stop, -1, len(time))):
+            gap = time[end] - at if end == 0 else at - time[end]
+            if gap <= 0.0:
+                continue
+            if gap > _NEAR:
+                problem = f"the image {'begins before' if end == 0 else 'ends after'} the ephemeris"
+                found, allowed = f"by {gap:.6g} s", f"{_NEAR:g} s at most"
+                raise InputError(Issue(problem, self.file, None, ("Ephemeris",), found, allowed))
+            other = 1 if end == 0 else -2
+            rate = (velocity[end] - velocity[other]) / (time[end] - time[other])
+            # noise of velocities a few milliseconds apart is no acceleration
+            rate = rate if abs(time[end] - time[other]) > 0.5 else -_GRAVITY * position[end] / _norm(position[end]) ** 3
+            step = at - time[end]
+            position = np.insert(position, place, position[end] + velocity[end] * step + 0.5 * rate * step**2, axis=0)
+            velocity = np.insert(velocity, place, velocity[end] + rate * step, axis=0)
+            time = np.insert(time, place, at)
+        second = time + float(self.first_line.second[0])
+        day = np.floor(second / _DAY)
+        clock = Readings(int(self.first_line.day[0]) + day.astype(np.int64), second - _DAY * day)
+        return OrbitReadings(self.file, clock, position, velocity, "ITRS", "UTC")
+
+    def _since(self, clock: Readings) -> Array:
+        """Seconds (N,) from the first line."""
+        return np.asarray((clock.day - self.first_line.day[0]) * _DAY + clock.second - self.first_line.second[0])
+
+
+_GRAVITY = 3.986004418e14
+"""m^3/s^2; against the turning Earth an acceleration differs by a seventh, 6 mm in `_NEAR`."""
+
+
+def _norm(vector: Array) -> float:
+    return float(np.linalg.norm(vector))
+
+
+def is_dimap(lines: list[str]) -> bool:
+    """Whether a file that begins with these lines is one."""
+    return "<Dimap_Document" in "\n".join(lines)
+
+
+def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
+    """The rigorous model of a product.
+
+    Args:
+        path: of its file DIM_*.XML.
+        band: whose looks are taken; may be left out where all bands have the same.
+
+    Raises:
+        InputError: it cannot be read, or is another product; with file, line and element.
+    """
+    root = read_xml(path, _WHAT)
+    version, profile = _identified(root)
+    model = root.maybe("Geometric_Data", "Refined_Model")
+    if model is None:
+        allowed = "a product in sensor geometry with Geometric_Data/Refined_Model; of other files only the RPC are read"
+        raise InputError(Issue("no rigorous model", str(path), root.line, root.path, profile, allowed))
+    size = root.one("Raster_Data", "Raster_Dimensions")
+    lines, pixels = size.whole("NROWS", most=2_000_000), size.whole("NCOLS", most=200_000)
+    first, period = _times(model.one("Time"), lines)
+    orbit = _orbit(model.one("Ephemeris"), str(path))
+    attitude = _attitude(model.one("Attitudes"), str(path), int(first.day[0]))
+    calibration = model.one("Geometric_Calibration", "Instrument_Calibration")
+    forward, right = _looks(calibration, band)
+    title = root.maybe("Dataset_Identification", "DATASET_NAME")
+    pitch = model.maybe("Instrument_Configuration", "DETECTOR_SIZE_COL")
+    said = root.maybe("Processing_Information", "Product_Settings", "Geometric_Settings")
+    settings = {} if said is None else {one.tag: one.text for one in said.children if one.text}
+    accuracy = root.maybe("Quality_Assessment", "Planimetric_Accuracy_Measurement", "Quality_Values", "ACCURACY_STDV")
+    named = root.all("Geoposition", "Geoposition_Models", "Rational_Function_Model", "Component", "COMPONENT_PATH")
+    return DimapPass(
+        str(path),
+        profile,
+        version,
+        title.text if title is not None and title.text else Path(path).stem,
+        lines,
+        pixels,
+        first,
+        period,
+        orbit,
+        attitude,
+        forward,
+        right,
+        None if pitch is None else pitch.number(least=1e-7, most=1e-3, unit=_LENGTH),
+        FrozenMap(settings),
+        _switch(said, "ATMOSPHERIC_REFRACTION_SETTING"),
+        _switch(said, "LIGHT_SPEED_SETTING"),
+        None if accuracy is None else accuracy.number(least=0.0, most=1e5),
+        tuple(one.attributes["href"] for one in named if one.attributes.get("href")),
+    )
+
+
+def _switch(settings: Element | None, name: str) -> bool:
+    """Whether a setting is on; one that does not stand there is off."""
+    found = None if settings is None else settings.maybe(name)
+    if found is None:
+        return False
+    if found.text.lower() not in _SWITCHES:
+        found.wrong("neither true nor false", shown(found.text), names_text(_SWITCHES))
+    return _SWITCHES[found.text.lower()]
+
+
+_SWITCHES: Mapping[str, bool] = FrozenMap({"true": True, "1": True, "false": False, "0": False})
+
+
+def _identified(root: Element) -> tuple[str, str]:
+    """Version and profile."""
+    if root.tag != "Dimap_Document":
+        root.wrong("not a DIMAP file", f"<{root.tag}>", "<Dimap_Document>")
+    identity = root.one("Metadata_Identification")
+    form = identity.one("METADATA_FORMAT")
+    version = form.attributes.get("version", "")
+    if form.text != "DIMAP" or version.partition(".")[0] not in _VERSIONS:
+        form.wrong("not this format", shown(f"{form.text} {version}"), "DIMAP of version 2 or 3")
+    profile = identity.one("METADATA_PROFILE")
+    if profile.text not in PROFILES:
+        profile.wrong("a product that is not read", shown(profile.text), names_text(PROFILES))
+    return version, profile.text
+
+
+def _moment(element: Element) -> Readings:
+    """The UTC that stands in an element, with or without its Z."""
+    try:
+        return readings(element.file, [element.text], [element.line])
+    except InputError as error:
+        issue = error.issues[0]
+        element.wrong(issue.problem, issue.found, issue.allowed)
+
+
+def _times(time: Element, lines: int) -> tuple[Readings, float]:
+    """When the first line was exposed, and seconds from line to line."""
+    span = time.one("Time_Range")
+    first, last = _moment(span.one("START")), _moment(span.one("END"))
+    stamp = time.one("Time_Stamp", "LINE_PERIOD")
+    period = stamp.number(least=1e-6, most=0.1, unit=_PERIOD)
+    lasted = float((last.day[0] - first.day[0]) * _DAY + last.second[0] - first.second[0])
+    off = abs(lasted - (lines - 1) * period)
+    if off > max(_LINES_OFF * period, 0.002 * lines * period):
+        found = f"{lasted:.6g} s from START to END, and {lines} lines of {period * 1e3:.6g} ms"
+        stamp.wrong("line period, number of lines and times do not agree", found, "END at the last line")
+    return first, period
+
+
+def _clock(items: list[Element], file: str) -> Readings:
+    """Rising times of elements."""
+    moments = [_moment(one.one("TIME")) for one in items]
+    clock = Readings(np.array([m.day[0] for m in moments]), np.array([m.second[0] for m in moments]))
+    require_rising(file, clock, [one.line for one in items])
+    return clock
+
+
+def _orbit(ephemeris: Element, file: str) -> OrbitReadings:
+    points = ephemeris.all("Point_List", "Point")
+    if len(points) < 4:
+        ephemeris.wrong("too few points of the orbit", str(len(points)), "4 or more in Point_List")
+    clock, lines = _clock(points, file), [one.line for one in points]
+    position = np.stack([one.one("LOCATION_XYZ").floats(3) for one in points])
+    velocity = np.stack([one.one("VELOCITY_XYZ").floats(3) for one in points])
+    require_orbit(file, position, lines)
+    step = (np.diff(clock.day) * _DAY + np.diff(clock.second))[:, None]
+    moved = np.linalg.norm(np.diff(position, axis=0) / step - 0.5 * (velocity[1:] + velocity[:-1]), axis=1)
+    share = moved / np.linalg.norm(velocity[1:], axis=1).clip(1.0)
+    if np.median(share) > _MOVED:
+        found = f"they differ by {100.0 * np.median(share):.3g} % in the median"
+        points[0].one("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")
+    return OrbitReadings(file, clock, position, velocity, "ITRS", "UTC")
+
+
+def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | AttitudePolynomial:
+    polynomial = attitudes.maybe("Polynomial_Quaternions")
+    samples = attitudes.all("Quaternion_List", "Quaternion")
+    if (polynomial is None) == (not samples):
+        found = "neither" if polynomial is None else "both"
+        attitudes.wrong("the attitude is not given once", found, "Polynomial_Quaternions or Quaternion_List")
+    if polynomial is None:
+        if len(samples) < 4:
+            attitudes.wrong("too few quaternions", str(len(samples)), "4 or more in Quaternion_List")
+        clock = _clock(samples, file)
+        values = np.array([[one.number(f"Q{k}") for k in range(4)] for one in samples])
+        require_unit(file, values, [one.line for one in samples])
+        return AttitudeReadings(file, clock, values, None, "ITRS", "UTC", "first", "body_to_frame")
+    offset = polynomial.number("OFFSET", least=0.0, most=2.0 * _DAY)
+    scale = polynomial.number("SCALE", least=1e-6, most=1e6)
+    rows = []
+    for k in range(4):
+        part = polynomial.one(f"Q{k}")
+        degree = part.whole("DEGREE", least=0, most=_MOST_TERMS - 1)
+        rows.append(np.zeros(_MOST_TERMS))
+        rows[-1][: degree + 1] = part.one("COEFFICIENTS").floats(degree + 1)
+    made = AttitudePolynomial(day, offset, scale, np.array(rows))
+    # made unit where it is used; at the middle of its range it already is but for the fit
+    require_unit(file, made.coefficients[None, :, 0], [polynomial.line])
+    return made
+
+
+def _looks(calibration: Element, band: str | None) -> tuple[Array, Array]:
+    """Tangents forward and to the right, ascending powers of the pixel from 0."""
+    direct = calibration.all("Polynomial_Look_Angles")
+    bands = [*calibration.all("Band_Calibration_List", "Band_Calibration"), *calibration.all("Band_Calibration")]
+    named = {one.words("BAND_ID"): one.one("Polynomial_Look_Angles") for one in bands}
+    if direct and not named:
+        named = {"": direct[0]}
+    if band is not None:
+        if band not in named:
+            calibration.wrong("no such band", shown(band), names_text(named) or "none: the looks are of all bands")
+        named = {band: named[band]}
+    if not named:
+        calibration.wrong("no looks", None, "Polynomial_Look_Angles, or Band_Calibration with them")
+    start = calibration.maybe("Swath_Range", "FIRST_COL")
+    first = 0 if start is None else int(start.number(least=1, most=1e6)) - 1
+    found = [(_tangent(one, "YLOS", first), -_tangent(one, "XLOS", first)) for one in named.values()]
+    for name, other in zip(named, found, strict=True):
+        if not all(np.array_equal(a, b) for a, b in zip(other, found[0], strict=True)):
+            named[name].wrong("bands do not look alike", names_text(named), "one of them, as `band`")
+    if not found[0][1][1:].any():
+        next(iter(named.values())).wrong("all pixels look one way", "XLOS_1 of 0", "a slope along the line")
+    return found[0]
+
+
+def _tangent(element: Element, name: str, first: int) -> Array:
+    """Coefficients (K,) for powers of a pixel that is ``first`` columns behind the first of the calibration."""
+    terms = [element.number(f"{name}_0", least=-1.0, most=1.0)]
+    if name == "XLOS":
+        element.one("XLOS_1")
+    while element.maybe(f"{name}_{len(terms)}") is not None and len(terms) < _MOST_TERMS:
+        terms.append(element.number(f"{name}_{len(terms)}", least=-1.0, most=1.0))
+    moved = np.polynomial.Polynomial(terms)(np.polynomial.Polynomial([float(first), 1.0]))
+    return np.asarray(np.pad(moved.coef, (0, len(terms) - len(moved.coef))), np.float64)

@@ -1,0 +1,233 @@
+"""XML of other people's formats as elements that know their lines, read so that a file can do no more than be read.
+
+A document type and entities of its own are refused before anything is expanded, nothing is fetched, and size, depth and
+number of elements are bounded. The text is UTF-8, whatever its first line says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NoReturn
+from xml.parsers import expat
+
+import numpy as np
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.csv_table import table_text
+from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
+from twin.orbit.measured.text_file import numbers
+
+_MOST_BYTES = 1 << 26
+_MOST_DEPTH = 64
+_MOST_ELEMENTS = 2_000_000
+_NONE: Mapping[str, str] = FrozenMap()
+
+
+@dataclass(eq=False)
+class Element:
+    """An element.
+
+    Attributes:
+        tag: its name.
+        file: where it stands.
+        line: of its start, counted from 1.
+        attributes: by name.
+        path: tags from the document's root to it.
+        children: in order.
+        text: between its tags, without spaces at the ends; that of its children left out.
+    """
+
+    tag: str
+    file: str
+    line: int
+    attributes: Mapping[str, str]
+    path: tuple[str, ...]
+    children: list[Element] = field(default_factory=list)
+    text: str = ""
+
+    def iter(self, tag: str) -> Iterator[Element]:
+        """Elements of this name below it, and itself, in the order of the file."""
+        return (one for one in self.below() if one.tag == tag)
+
+    def below(self) -> Iterator[Element]:
+        """Itself and all elements below it, in the order of the file."""
+        waiting = [self]
+        while waiting:
+            one = waiting.pop()
+            yield one
+            waiting += reversed(one.children)
+
+    def all(self, *tags: str) -> list[Element]:
+        """Elements at a path below this one; none where there are none."""
+        found = [self]
+        for tag in tags:
+            found = [child for one in found for child in one.children if child.tag == tag]
+        return found
+
+    def maybe(self, *tags: str) -> Element | None:
+        """The element at a path below this one; None where there is none.
+
+        Raises:
+            InputError: there are several.
+        """
+        found = self.all(*tags)
+        if len(found) > 1:
+            self._wrong("stands more than once", tags, found[1].line, f"{len(found)} of them", "one")
+        return found[0] if found else None
+
+    def one(self, *tags: str) -> Element:
+        """The element at a path below this one.
+
+        Raises:
+            InputError: there is none, or there are several.
+        """
+        found = self.maybe(*tags)
+        if found is not None:
+            return found
+        here, missing = self, 0
+        while (deeper := here.all(tags[missing])) and missing < len(tags) - 1:
+            here, missing = deeper[0], missing + 1
+        names = [child.tag for child in here.children]
+        issue = Issue(
+            f"no element {tags[missing]}", self.file, here.line, here.path, None, None, nearest(tags[missing], names)
+        )
+        raise InputError(issue)
+
+    def words(self, *tags: str) -> str:
+        """The text at a path below this one; InputError where there is none, or it is empty."""
+        found = self.one(*tags)
+        if not found.text:
+            found.wrong("nothing stands in it", None, "a value")
+        return found.text
+
+    def floats(self, count: int | None = None) -> np.ndarray:
+        """Its numbers, (count,), parted by spaces or commas; any number of them where count is None.
+
+        Raises:
+            InputError: another number of them, something that is none, or not finite.
+        """
+        cells = self.text.replace(",", " ").split()
+        if not cells or (count is not None and len(cells) != count):
+            self.wrong("another number of numbers", shown(self.text), "one or more" if count is None else str(count))
+        try:
+            return numbers(self.file, [cells], [self.line], [self.tag] * len(cells))[0]
+        except InputError as error:
+            self.wrong(error.issues[0].problem, error.issues[0].found, error.issues[0].allowed)
+
+    def number(
+        self, *tags: str, least: float = -np.inf, most: float = np.inf, unit: Mapping[str, float] | None = None
+    ) -> float:
+        """The number at a path below this one.
+
+        Args:
+            tags: of the path.
+            least: it may be.
+            most: it may be.
+            unit: what its attribute ``unit`` may be -> by what the number is multiplied; the first where it has none.
+
+        Raises:
+            InputError: none, no number, beyond the bounds, another unit.
+        """
+        found = self.one(*tags) if tags else self
+        value = float(found.floats(1)[0])
+        if unit is not None:
+            name = found.attributes.get("unit", next(iter(unit)))
+            if name not in unit:
+                found.wrong("another unit", shown(name), names_text(unit))
+            value *= unit[name]
+        if not least <= value <= most:
+            found.wrong("out of bounds", f"{value:.9g}", f"{least:.9g} to {most:.9g}")
+        return value
+
+    def whole(self, *tags: str, least: int = 1, most: int = 10_000_000) -> int:
+        """The whole number at a path below this one; raises as `number`."""
+        found = self.one(*tags)
+        value = found.number(least=least, most=most)
+        if value != round(value):
+            found.wrong("not a whole number", shown(found.text), f"{least} to {most}")
+        return int(value)
+
+    def wrong(self, problem: str, found: str | None = None, allowed: str | None = None) -> NoReturn:
+        """Raise InputError that names file, line and path."""
+        raise InputError(Issue(problem, self.file, self.line, self.path, found, allowed))
+
+    def _wrong(self, problem: str, tags: tuple[str, ...], line: int, found: str, allowed: str) -> NoReturn:
+        raise InputError(Issue(f"{tags[-1]} {problem}", self.file, line, (*self.path, *tags), found, allowed))
+
+
+class _Builder:
+    """Elements from the parser's events."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.root: Element | None = None
+        self.parser = expat.ParserCreate("utf-8")
+        self.parser.buffer_text = True
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        self.parser.CharacterDataHandler = self._characters
+        self.parser.StartDoctypeDeclHandler = self._refused
+        self.parser.EntityDeclHandler = self._refused
+        self.parser.ExternalEntityRefHandler = self._refused
+        self._open: list[Element] = []
+        self._texts: list[list[str]] = []
+        self._count = 0
+
+    def _line(self) -> int:
+        return int(self.parser.CurrentLineNumber)
+
+    def _refused(self, *_: object) -> NoReturn:
+        raise InputError(
+            Issue("XML with a document type or entities", self.file, self._line(), (), None, "elements alone")
+        )
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._count += 1
+        if len(self._open) >= _MOST_DEPTH or self._count > _MOST_ELEMENTS:
+            allowed = f"{_MOST_DEPTH} levels and {_MOST_ELEMENTS} elements at most"
+            raise InputError(Issue("XML that is too deep or too long", self.file, self._line(), (), None, allowed))
+        path = (*self._open[-1].path, tag) if self._open else (tag,)
+        made = Element(tag, self.file, self._line(), FrozenMap(attributes) if attributes else _NONE, path)
+        if self._open:
+            self._open[-1].children.append(made)
+        else:
+            self.root = made
+        self._open.append(made)
+        self._texts.append([])
+
+    def _end(self, _tag: str) -> None:
+        self._open.pop().text = "".join(self._texts.pop()).strip()
+
+    def _characters(self, text: str) -> None:
+        self._texts[-1].append(text)
+
+
+def read_xml(path: str | Path, what: str) -> Element:
+    """The root of a file.
+
+    Args:
+        path: of the file, UTF-8.
+        what: it should be, for messages.
+
+    Raises:
+        InputError: there is none, it is too large, not XML, or has a document type or entities.
+    """
+    return parsed_xml(table_text(path, what, _MOST_BYTES), str(path))
+
+
+def parsed_xml(text: str, file: str) -> Element:
+    """The root of a document that was read; raises as `read_xml`.
+
+    Args:
+        text: of it.
+        file: for messages.
+    """
+    builder = _Builder(file)
+    try:
+        builder.parser.Parse(text.removeprefix("\ufeff").encode(), True)
+    except expat.ExpatError as error:
+        raise InputError(Issue(f"not XML: {expat.ErrorString(error.code)}", file, error.lineno)) from None
+    assert builder.root is not None
+    return builder.root
