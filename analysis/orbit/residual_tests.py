@@ -55,31 +55,49 @@ def standardised(equations: Equations, cofactors: Array, weights: Weights) -> Ar
         cofactors: of the adjusted image points, (M, 2, 2), metres^2.
         weights: of the observations.
     """
+    return standardised_packets(equations.residuals.image, cofactors, weights.image, weights.factor["image"])
+
+
+def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit: float) -> Array:
+    """(n, d) whitened residuals of n packets of d rows over their own standard deviation; see `standardised`.
+
+    Args:
+        residual: whitened, (n, d).
+        cofactors: covariance of the adjusted packets, whitened, (n, d, d).
+        weight: robust weights, (n,).
+        unit: variance factor of their group.
+    """
     values, axes = np.linalg.eigh(cofactors)
-    along = np.einsum("nji,nj->ni", axes, equations.residuals.image)
-    weight, unit = weights.image[:, None], weights.factor["image"]
+    along = np.einsum("nji,nj->ni", axes, residual)
+    weight = weight[:, None]
     left = 1.0 - weight * values / unit
     checked = left > _UNCHECKED
     spread = np.where(checked, left, 1.0) * (unit + (1.0 - weight) * np.maximum(values, 0.0))
     along = np.where(checked, along / np.sqrt(spread), 0.0)
-    return np.einsum("nij,nj->ni", axes, along)
+    return np.asarray(np.einsum("nij,nj->ni", axes, along))
 
 
 def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
-    """(M,) weights of image points from their standardised residuals (M, 2).
+    """(n,) weights of packets from their standardised residuals (n, d), d = 2 for image points.
 
     Huber's, IGG III that ends in zero, or "accept": 1 up to that end and zero beyond.
     """
     size = np.linalg.norm(standard, axis=1)
+    huber, reject = limits(standard.shape[1])
     if kind == "accept":
-        return np.asarray(size <= REJECT, np.float64)
-    weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
+        return np.asarray(size <= reject, np.float64)
+    weight = np.minimum(1.0, huber / np.maximum(size, 1e-300))
     if kind == "huber":
         return np.asarray(weight)
     if kind != "igg":
         raise ValueError(f"robust weights: kind must be huber, igg or accept, found {kind!r}")
-    fall = np.clip((REJECT - size) / (REJECT - HUBER), 0.0, 1.0)
-    return np.asarray(np.where(size <= HUBER, 1.0, weight * fall**2))
+    fall = np.clip((reject - size) / (reject - huber), 0.0, 1.0)
+    return np.asarray(np.where(size <= huber, 1.0, weight * fall**2))
+
+
+def limits(rows: int) -> tuple[float, float]:
+    """Lengths of standardised residuals of so many rows from which on a packet loses weight, and is left out."""
+    return float(np.sqrt(chi2.isf(0.05, rows))), float(np.sqrt(chi2.isf(1e-4, rows)))
 
 
 def median_factor(standard: Array) -> float:

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, NoiseTerm
 from analysis.orbit.three_line_model import Partials, Rays
 
-__all__ = ["Series", "SharedNoise", "ray_covariance", "reading_variance"]
+__all__ = ["Series", "SharedNoise", "ray_covariance", "reading_variance", "spline_blend", "spline_precision"]
 
 Array = NDArray[np.float64]
 _RHO = 2.0 - np.sqrt(3.0)
@@ -37,7 +37,7 @@ _NEEDED = 4
 
 def reading_variance(time: Array, interval: float) -> Array:
     """(n,) variance of the spline at times (n,) for readings of unit variance: 1 at a reading, 0.76 halfway."""
-    _, blend = _blend(time, interval)
+    _, blend = spline_blend(time, interval)
     return np.asarray(np.einsum("ni,ij,nj->n", blend, _covariance(_NEEDED), blend))
 
 
@@ -97,7 +97,7 @@ class Series:
 
     def correction_at(self, time: Array, shared: Array) -> Array:
         """(n, 3) at other times, for rays that took no part; zero, the prior's mean, far from all that did."""
-        first, blend = _blend(time, self.term.interval or 1.0)
+        first, blend = spline_blend(time, self.term.interval or 1.0)
         wanted = first[:, None] + np.arange(_NEEDED)
         where = np.minimum(np.searchsorted(self.numbers, wanted), len(self.numbers) - 1)
         z = shared[self.column : self.column + self.size].reshape(-1, 3)[where]
@@ -215,7 +215,7 @@ def _series(one: CalibrationField, term: NoiseTerm, column: int) -> Series | Non
     timed = {line: r.time for line, r in one.rays.items() if r.time is not None and r.point.size}
     if not timed:
         return None
-    found = {line: _blend(time, term.interval) for line, time in timed.items()}
+    found = {line: spline_blend(time, term.interval) for line, time in timed.items()}
     used = np.unique(np.concatenate([first[:, None] + np.arange(_NEEDED) for first, _ in found.values()]))
     if term.walks:
         places = {line: np.searchsorted(used, first) for line, (first, _) in found.items()}
@@ -224,7 +224,7 @@ def _series(one: CalibrationField, term: NoiseTerm, column: int) -> Series | Non
     filled = [np.arange(a, a + s) for a, s in zip(used[:-1], np.where(steps < _GAP, steps, 1), strict=True)]
     numbers = np.concatenate([*filled, used[-1:]])
     cuts = np.flatnonzero(np.diff(numbers) > 1) + 1
-    precision = sparse.block_diag([_precision(len(p)) for p in np.split(numbers, cuts)])
+    precision = sparse.block_diag([spline_precision(len(p)) for p in np.split(numbers, cuts)])
     places = {line: np.searchsorted(numbers, first) for line, (first, _) in found.items()}
     blends = {line: blend for line, (_, blend) in found.items()}
     return Series(term, column, numbers, sparse.csr_matrix(precision), places, blends)
@@ -241,7 +241,7 @@ def _walk_precision(numbers: NDArray[np.intp]) -> sparse.csr_matrix:
     return sparse.csr_matrix(precision + sparse.csr_matrix(([1.0], ([middle], [middle])), shape=(count, count)))
 
 
-def _blend(time: Array, interval: float) -> tuple[NDArray[np.intp], Array]:
+def spline_blend(time: Array, interval: float) -> tuple[NDArray[np.intp], Array]:
     """Number (n,) of the first of four cubic B-splines at times, and their values (n, 4)."""
     place = np.asarray(time, np.float64) / interval
     reading = np.floor(place)
@@ -256,7 +256,7 @@ def _covariance(count: int) -> Array:
     return np.asarray(toeplitz(3.0 * (-_RHO) ** n * (n + (1 + _RHO**2) / (1 - _RHO**2))))
 
 
-def _precision(count: int) -> sparse.csr_matrix:
+def spline_precision(count: int) -> sparse.csr_matrix:
     """Inverse of `_covariance`, for four or more: inside the square of (1 4 1) / 6, special in two rows at each end."""
     bands = [np.full(count - abs(k), v / 36.0) for k, v in ((0, 18.0), (1, 8.0), (2, 1.0))]
     matrix = sparse.diags([bands[2], bands[1], bands[0], bands[1], bands[2]], [-2, -1, 0, 1, 2]).tolil()

@@ -321,6 +321,7 @@ def _text(node: ast.expr, hole: str) -> str:
 FOLDERS = {
     "twin.lab": "twin/laboratory",
     "twin.orbit simulate": "twin/orbit/images",
+    "twin.orbit adjust": "twin/orbit/block",
     "twin.orbit angle": "twin/orbit/angle",
     "twin.orbit calibrate": "twin/orbit/calibration",
     "twin.orbit monitor": "twin/orbit/monitoring",

@@ -212,6 +212,35 @@ PROCEDURES: dict[str, Procedure] = {
     Example: `python -m twin.lab turntable scenes/lab/turntable.yaml --seed 2`
     """,
     ),
+    "orbit adjust": Procedure(
+        "block",
+        setup="scenes.specs.measured.adjust_setup:AdjustSetup",
+        resolve="scenes.specs.measured.adjust_setup:resolve_any_adjust",
+        run="twin.orbit.block.block_run:run_adjustment",
+        numbers="twin.orbit.block.block_numbers:BLOCK",
+        report="twin.orbit.block.block_report:block_report",
+        files=(
+            FileKind("orbit_adjust", "scenes.specs.orbit.adjust:OrbitAdjustSpec", "an adjustment of a block"),
+            FileKind(
+                "measured_adjust",
+                "scenes.specs.measured.adjust_data:MeasuredAdjustSpec",
+                "an adjustment of measured passes",
+            ),
+        ),
+        varied=True,
+        about="""
+    One adjustment of all scenes of a block: image points, control, the cameras' monitor, star trackers and their
+    angles, a laser altimeter and a terrain model, with the stated laws of the readings' errors.
+
+    A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does.
+
+    block.json holds the errors in plan and height at check points, with all sensors and without each, the tests of
+    observations and laws, what the observations leave to what is known beforehand, and the cameras' changes.
+    `--without SENSOR` adjusts without a sensor that the file has.
+
+    Example: `python -m twin.orbit adjust scenes/orbit/adjust.yaml`
+    """,
+    ),
     "orbit angle": Procedure(
         "angle",
         setup="scenes.specs.orbit.setup:AngleSetup",

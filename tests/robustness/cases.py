@@ -215,6 +215,7 @@ def _orbits() -> Iterator[Case]:
     for stem, whole in (("", 15), ("_images", 0), ("_monitor", 30), ("_strip", 30)):
         name = f"calibrate{stem}"
         yield _of_one(f"orbit-{name}", "calibration", orbit, "calibrate", f"{name}.yaml", whole=whole)
+    yield _of_one("orbit-adjust", "block", orbit, "adjust", "adjust.yaml", weight=0.5, whole=30)
     yield _of_one("orbit-monitor", "monitoring", orbit, "monitor", "monitor.yaml", weight=0.5, whole=40)
     yield _of_one("orbit-simulate", "simulation", orbit, "simulate", "simulate.yaml", whole=30)
     yield _of_one("orbit-export", "simulation", orbit, "export", "simulate.yaml", weight=0.5)

@@ -19,7 +19,15 @@ KINDS = (
     *("render", "render_targets", "render_course", "render_stray", "render_deformed", "recover", "uncertainty"),
     *("study_render", "study_lab", "study_orbit", "study_gradient", "design", "design_monitor", "camera"),
     *("lab_focus", "lab_distortion", "lab_turntable", "lab_focus_measured", "lab_turntable_measured"),
-    *("orbit_simulate", "orbit_angle", "orbit_angle_measured", "orbit_calibrate", "orbit_calibrate_measured"),
+    *(
+        "orbit_simulate",
+        "orbit_adjust",
+        "orbit_adjust_measured",
+        "orbit_angle",
+        "orbit_angle_measured",
+        "orbit_calibrate",
+        "orbit_calibrate_measured",
+    ),
     *(
         "orbit_check",
         "orbit_match",

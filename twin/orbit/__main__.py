@@ -7,19 +7,23 @@ if __name__ == "__main__":
 
     end_quietly()
 
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from scenes.specs.orbit.sensors import SENSORS
+from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import ANGLE, DISTANCE, parse_quantity
-from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet, Seed
-from twin.run.command import Result, add_tests, finished, run_command
+from twin.run.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed
+from twin.run.command import Result, add_tests, finished, run_command, run_test
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
+    from scenes.specs.measured.adjust_setup import AnyAdjust
     from twin.orbit.export.export_run import ExportSource, SceneSource
     from twin.orbit.export.polynomial_export import PolynomialSource
     from twin.orbit.export.quality import Wishes
@@ -54,7 +58,33 @@ def main() -> None:
     """
 
 
-add_tests(app, "orbit")
+add_tests(app, "orbit", apart=("adjust",))
+
+
+@app.command("adjust", help=PROCEDURES["orbit adjust"].about)
+def adjust(
+    file: File,
+    without: Annotated[
+        list[str] | None,
+        typer.Option("--without", metavar="SENSOR", help=f"A sensor that is not used: {', '.join(SENSORS)}."),
+    ] = None,
+    out: Out = None,
+    seed: Seed = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Adjust a block of scenes; its help is that of the test."""
+    procedure = PROCEDURES["orbit adjust"]
+
+    def resolve(path: Path) -> AnyAdjust:
+        from scenes.specs.measured.adjust_setup import resolve_any_adjust, without_sensors
+
+        return without_sensors(resolve_any_adjust(path), without or ())
+
+    options = Options(out, seed, backend, force, as_json, quiet)
+    run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve), file, options)
 
 
 @app.command("export")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from inspect import Signature, signature
@@ -136,11 +136,17 @@ def _advance(bar: Progress, standing: cli.Standing) -> Advance:
     return advance
 
 
-def add_tests(app: typer.Typer, program: str) -> None:
-    """Add to a program all its tests of `PROCEDURES`: ``lab focus`` to ``lab``, as ``twin.lab focus``."""
+def add_tests(app: typer.Typer, program: str, apart: Collection[str] = ()) -> None:
+    """Add to a program all its tests of `PROCEDURES`: ``lab focus`` to ``lab``, as ``twin.lab focus``.
+
+    Args:
+        app: of the program.
+        program: first word of the tests' names.
+        apart: commands that have options of their own and are added by the program itself.
+    """
     for name, procedure in PROCEDURES.items():
         of, command = name.split()
-        if of == program:
+        if of == program and command not in apart:
             add_test(app, f"twin.{program}", command, procedure)
 
 

@@ -148,6 +148,13 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "sin(2 pi f t + p), t from the epoch",
             "artefacts/attitude": "the same, less what is slow; seconds from the epoch in UTC of the pass",
         },
+        "block": {
+            "ce90_m, le90_m": "local horizon of each check point: east and north together, and up",
+            "cameras": _CAMERA,
+            "east_m, north_m, up_m, sigma_m": "local horizon at the middle of the control points: given minus all else",
+            "roll, pitch, yaw": f"rotation vector of the body from measured to true; {_BODY}",
+            "offset along, across, down": "true minus measured station in the mean body axes of the pass",
+        },
         "monitor": {
             "times_s, reference_time_s, monitored_times_s": "seconds from the epoch in UTC of the orbit in config.yaml",
             "cameras": _CAMERA,

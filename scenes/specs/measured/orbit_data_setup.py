@@ -32,7 +32,13 @@ DATA_FILE = "data.yaml"
 """Name of the file that says what a folder of measurements holds."""
 
 
-class _FixedSetup(ExperimentSetup[TestType], Generic[TestType]):
+class FixedSetup(ExperimentSetup[TestType], Generic[TestType]):
+    """A test of a payload in which nothing is drawn.
+
+    Attributes:
+        camera: the payload.
+    """
+
     camera: ThreeLineCameraSpec
 
     def with_seed(self, seed: int) -> Self:
@@ -40,7 +46,7 @@ class _FixedSetup(ExperimentSetup[TestType], Generic[TestType]):
         return self
 
 
-class MeasuredCalibrationSetup(_FixedSetup[orbit_data.MeasuredCalibrationSpec]):
+class MeasuredCalibrationSetup(FixedSetup[orbit_data.MeasuredCalibrationSpec]):
     """A calibration on measurements, with its camera.
 
     Attributes:
@@ -51,7 +57,7 @@ class MeasuredCalibrationSetup(_FixedSetup[orbit_data.MeasuredCalibrationSpec]):
     data: orbit_data.OrbitDataSpec
 
 
-class MeasuredAngleSetup(_FixedSetup[orbit_data.MeasuredAngleSpec]):
+class MeasuredAngleSetup(FixedSetup[orbit_data.MeasuredAngleSpec]):
     """Intersection angles on measurements, with the camera.
 
     Attributes:
@@ -62,7 +68,7 @@ class MeasuredAngleSetup(_FixedSetup[orbit_data.MeasuredAngleSpec]):
     data: orbit_data.OrbitDataSpec
 
 
-class MeasuredJitterSetup(_FixedSetup[orbit_data.MeasuredJitterSpec]):
+class MeasuredJitterSetup(FixedSetup[orbit_data.MeasuredJitterSpec]):
     """A search for jitter on measurements, with the camera.
 
     Attributes:
@@ -149,10 +155,10 @@ def _resolved(model: type[Setup], kind: type[Any], path: str | Path) -> Setup:
     if setup is not None:
         return setup
     test: Any = load_named(kind, ORBIT, path)
-    return model.model_construct(test=test, camera=load_payload(test), data=_data_of(test))
+    return model.model_construct(test=test, camera=load_payload(test), data=data_of(test))
 
 
-def _data_of(test: orbit_data.MeasuredTestSpec) -> orbit_data.OrbitDataSpec:
+def data_of(test: orbit_data.MeasuredTestSpec) -> orbit_data.OrbitDataSpec:
     """The passes of a test, with paths that hold from anywhere.
 
     Raises:
@@ -211,7 +217,7 @@ def _with_quaternions_said(owner: Spec, data: orbit_data.OrbitDataSpec) -> orbit
     return data
 
 
-class CheckSetup(_FixedSetup[orbit_data.OrbitCheckSpec]):
+class CheckSetup(FixedSetup[orbit_data.OrbitCheckSpec]):
     """A check of a pass in files with its camera.
 
     Attributes:
@@ -233,7 +239,7 @@ def resolve_check(path: str | Path) -> CheckSetup:
     return CheckSetup.model_construct(test=with_absolute_files(test), camera=load_payload(test))
 
 
-class MatchSetup(_FixedSetup[orbit_data.OrbitMatchSpec]):
+class MatchSetup(FixedSetup[orbit_data.OrbitMatchSpec]):
     """Points in a user's images with the camera.
 
     Attributes:

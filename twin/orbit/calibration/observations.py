@@ -204,7 +204,7 @@ class PassData:
         """
         # the calibration's own check comes first: a place without a height has no refraction
         field = CalibrationField.of(self.name, self.rays(images), ground, covariance, control)
-        return replace(field, rays=self._corrected(field.rays, images, removed, self._heights(ground)))
+        return replace(field, rays=self.corrected(field.rays, images, removed, self._heights(ground)))
 
     def check_rays(self, images: Mapping[str, ImagePoints], removed: LightEffects, noise: Noise) -> dict[str, Rays]:
         """Rays of points without ground control.
@@ -217,12 +217,22 @@ class PassData:
             ValueError: a point outside the image.
         """
         rays = self.rays(images)
-        return self._corrected(rays, images, removed, self._heights(intersect(rays, self.models, noise).ground))
+        return self.corrected(rays, images, removed, self._heights(intersect(rays, self.models, noise).ground))
 
-    def _corrected(
+    def corrected(
         self, rays: Mapping[str, Rays], images: Mapping[str, ImagePoints], removed: LightEffects, height: np.ndarray
     ) -> dict[str, Rays]:
-        """The rays without these effects; height: (m,) of the ground points, NaN where not known, metres."""
+        """The rays without these effects.
+
+        Args:
+            rays: line -> rays of the image points.
+            images: line -> the image points.
+            removed: effects on the light that are taken out.
+            height: of the ground points, (m,), NaN where not known, metres.
+
+        Raises:
+            ValueError: a point outside the image.
+        """
         known = np.clip(np.where(np.isfinite(height), height, self.height), *_HEIGHTS)
         found = {}
         for name, row in images.items():

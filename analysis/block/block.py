@@ -1,0 +1,266 @@
+"""What a block adjustment is given: scenes, passes, cameras, points and what else observes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.block.processes import BlockError, Law
+from analysis.orbit.three_line_model import LineModel, Rays
+
+__all__ = [
+    "SENSORS",
+    "Block",
+    "CameraKnowledge",
+    "Footprints",
+    "Pass",
+    "Points",
+    "Scene",
+    "Term",
+    "Terrain",
+    "TrackerAngle",
+]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Scope = Literal["pass", "tracker", "block"]
+SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
+"""What can be left out of a block by name."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A law of errors, and what shares one draw of it: a pass, all passes of one star tracker, or the block."""
+
+    law: Law
+    scope: Scope = "pass"
+
+
+@dataclass(frozen=True)
+class Pass:
+    """A pass of the satellite.
+
+    Attributes:
+        name: of the pass.
+        tracker: star tracker that gave its attitude.
+        middle: when rates and walks of its own are zero, seconds; None for the middle of its observations.
+    """
+
+    name: str
+    tracker: str = "tracker"
+    middle: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The image of one line camera in one pass.
+
+    Attributes:
+        name: of the scene.
+        of: name of its pass.
+        camera: of the block's cameras.
+        rays: image points with times; `point` counts the block's points.
+    """
+
+    name: str
+    of: str
+    camera: str
+    rays: Rays
+
+
+@dataclass(frozen=True, eq=False)
+class CameraKnowledge:
+    """What is known of a camera's d_alpha, d_beta, d_gamma (radians) and d_f (metres) in all passes of the block.
+
+    Attributes:
+        mean: (T, 4), in the order of the block's passes.
+        covariance: (4 T, 4 T), pass by pass.
+    """
+
+    mean: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Ground points.
+
+    Attributes:
+        ids: (m,) names.
+        start: (m, 3) given coordinates of control points, first guesses of the others, ITRS, metres.
+        role: (m,) "control", "tie" or "check". Check points are tie points that are compared afterwards.
+        covariance: (m, 3, 3) of control points, m^2.
+    """
+
+    ids: NDArray[np.object_]
+    start: Array
+    role: NDArray[np.object_]
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Laser footprints of one pass.
+
+    Attributes:
+        of: name of the pass.
+        point: (n,) of the block's points that they hit.
+        time: (n,) seconds. station: (n, 3) readings, ITRS, metres. attitude: (n, 3, 3) body to ITRS.
+        aim: (n, 3) unit vectors of the beam in the body frame.
+        distance: (n,) metres.
+        sigma: of the range, metres, and of the pointing with the beam's width about each of two axes, radians.
+    """
+
+    of: str
+    point: Indices
+    time: Array
+    station: Array
+    attitude: Array
+    aim: Array
+    distance: Array
+    sigma: tuple[float, float]
+
+    def taken(self, keep: NDArray[np.bool_]) -> Footprints:
+        """Some of them, by mask (n,)."""
+        rows = (self.time, self.station, self.attitude, self.aim, self.distance)
+        time, station, attitude, aim, distance = (row[keep] for row in rows)
+        return Footprints(self.of, self.point[keep], time, station, attitude, aim, distance, self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Terrain:
+    """A terrain model as weak control of heights.
+
+    Attributes:
+        point: (n,) of the block's points.
+        place: (n, 3) on the model's surface, ITRS, metres.
+        normal: (n, 3) unit normals of the surface there.
+        sigma: (n,) of a height, independent, metres.
+        common: standard deviation of an error that all heights have in common, metres.
+    """
+
+    point: Indices
+    place: Array
+    normal: Array
+    sigma: Array
+    common: float
+
+    def taken(self, keep: NDArray[np.bool_]) -> Terrain:
+        """The model at some of the points, by mask (n,)."""
+        return Terrain(self.point[keep], self.place[keep], self.normal[keep], self.sigma[keep], self.common)
+
+
+@dataclass(frozen=True)
+class TrackerAngle:
+    """Measured difference of two star trackers' constant errors about the body's axes, (3,) radians, with sigmas."""
+
+    between: tuple[str, str]
+    value: tuple[float, float, float]
+    sigma: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A block of scenes.
+
+    Attributes:
+        passes: in order of the cameras' knowledge.
+        scenes: of these passes.
+        cameras: name -> camera as calibrated, without a change.
+        known: name -> what is expected of its changes, without a monitor.
+        monitored: name -> the same after the monitor's readings; None for no monitor.
+        attitude: laws of its readings' errors. station: likewise along the axes of the pass.
+        image: unit of the rays' spread, metres.
+        points: on the ground.
+        footprints: of a laser altimeter.
+        terrain: heights; None for none.
+        angles: between star trackers.
+    """
+
+    passes: tuple[Pass, ...]
+    scenes: tuple[Scene, ...]
+    cameras: Mapping[str, LineModel]
+    known: Mapping[str, CameraKnowledge]
+    attitude: tuple[Term, ...]
+    station: tuple[Term, ...]
+    image: float
+    points: Points
+    monitored: Mapping[str, CameraKnowledge] | None = None
+    footprints: tuple[Footprints, ...] = ()
+    terrain: Terrain | None = None
+    angles: tuple[TrackerAngle, ...] = field(default=())
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Those of `SENSORS` that the block has."""
+        has = {
+            "ties": bool(np.any(self.points.role == "tie")),
+            "control": bool(np.any(self.points.role == "control")),
+            "monitor": self.monitored is not None,
+            "laser": bool(self.footprints),
+            "terrain": self.terrain is not None,
+            "tracker_angles": bool(self.angles),
+        }
+        return tuple(name for name in SENSORS if has[name])
+
+    def without(self, sensor: str) -> Block:
+        """The block without one of its sensors. Control points become check points, whose images stay.
+
+        Raises:
+            BlockError: no such sensor.
+        """
+        if sensor not in SENSORS:
+            raise BlockError(f"block: no sensor is called {sensor!r}; there are {', '.join(SENSORS)}")
+        points = self.points
+        if sensor == "control":
+            role = np.where(points.role == "control", "tie", points.role).astype(object)
+            return replace(self, points=replace(points, role=role))
+        if sensor == "ties":
+            kept = points.role != "tie"
+            for one in self.footprints:  # the images see them as part of the laser
+                kept[one.point] = True
+            scenes = tuple(replace(s, rays=s.rays.taken(kept[s.rays.point])) for s in self.scenes)
+            terrain = self.terrain
+            if terrain is not None:
+                use = kept[terrain.point]
+                terrain = terrain.taken(use) if np.any(use) else None
+            return replace(self, scenes=scenes, terrain=terrain)
+        if sensor == "monitor":
+            return replace(self, monitored=None)
+        if sensor == "laser":
+            return replace(self, footprints=())
+        if sensor == "terrain":
+            return replace(self, terrain=None)
+        return replace(self, angles=())
+
+    def check(self) -> None:
+        """Raises BlockError for what cannot be used: names that do not match, scenes without points, bad numbers."""
+        names = [one.name for one in self.passes]
+        if len(set(names)) != len(names) or len({s.name for s in self.scenes}) != len(self.scenes):
+            raise BlockError("block: two passes or two scenes have one name")
+        for scene in self.scenes:
+            if scene.of not in names:
+                raise BlockError(f"block: scene {scene.name!r}: no pass is called {scene.of!r}")
+            if scene.camera not in self.cameras or scene.camera not in self.known:
+                raise BlockError(f"block: scene {scene.name!r}: nothing is known of camera {scene.camera!r}")
+            if scene.rays.time is None:
+                raise BlockError(f"block: scene {scene.name!r}: its image points have no times")
+        if not (np.isfinite(self.image) and self.image > 0):
+            raise BlockError(f"block: the sigma of image points must be positive, found {self.image}")
+        points = self.points
+        if not np.all(np.isfinite(points.start)):
+            first = points.ids[np.flatnonzero(~np.isfinite(points.start).all(axis=1))[0]]
+            raise BlockError(f"block: point {first!r}: a coordinate is not finite")
+        control = points.role == "control"
+        if np.any(control) and not np.all(np.linalg.eigvalsh(points.covariance[control]) > 0):
+            raise BlockError("block: covariances of control points must be positive definite")
+        for name in self.cameras:
+            for known in (self.known, self.monitored or {}):
+                one = known.get(name)
+                if one is not None and one.covariance.shape != (4 * len(names), 4 * len(names)):
+                    shape = one.covariance.shape
+                    raise BlockError(f"block: camera {name!r}: covariance {shape} of {len(names)} passes")

@@ -1,0 +1,179 @@
+"""Errors of readings as processes in time, each with the sparse precision of its unknowns.
+
+A correction about (or along) three axes is, at time t,
+
+    sigma_axis * sum over k of b_k(t) z_k,axis,
+
+with unknowns z whose prior is that of the process at unit size, the same about every axis:
+
+- `constant`: one z of variance 1. `rate`: one, times the seconds from the middle of the scope.
+- `white`: readings at whole multiples of `interval`, independent, joined by the cubic spline through them
+  (`analysis.orbit.shared_noise` has the algebra). sigma is that of a reading.
+- `walk`: a random walk that is zero at the middle of the scope; sigma is what it gains in a second.
+- `slow`: a first-order Gauss-Markov process of standard deviation sigma and correlation time `time`.
+- `orbital`: amplitudes of cosine and sine of 2 pi t / `time`, of standard deviation sigma each.
+
+A walk and a slow process have unknowns at whole multiples of `interval` and are straight lines between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from analysis.measurement_error import MeasurementError
+from analysis.orbit.shared_noise import spline_blend, spline_precision
+
+__all__ = ["BlockError", "Kind", "Law", "Support"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital"]
+KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital")
+_GAP = 18
+"""Stretches of a spline's unknowns this far apart correlate by 1e-9 and are kept apart."""
+_MOST = 1e5
+"""Intervals from the first observation of a scope to the last; unknowns of more could not be adjusted together."""
+_PINNED = 1e8
+"""Precision of a walk's zero at the middle, in squares of what it gains in an interval."""
+
+
+class BlockError(MeasurementError, ValueError):
+    """Input of a block adjustment that cannot be used, or a block that cannot be solved."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """One source of error of attitude or station.
+
+    Attributes:
+        group: its name, and that of its variance component.
+        kind: of process, see the module.
+        sigma: about or along three axes, radians or metres; of a rate per second, of a walk in a second.
+        interval: between the unknowns of `white`, `walk` and `slow`, seconds.
+        time: correlation time of `slow`, period of `orbital`, seconds.
+    """
+
+    group: str
+    kind: Kind
+    sigma: tuple[float, float, float]
+    interval: float = 1.0
+    time: float = 0.0
+
+    def check(self) -> None:
+        """Raises BlockError for numbers that cannot be used."""
+        if self.kind not in KINDS:
+            raise BlockError(f"block: {self.group}: a law is one of {', '.join(KINDS)}, found {self.kind!r}")
+        if len(self.sigma) != 3 or not np.all(np.isfinite(self.sigma)) or min(self.sigma) < 0:
+            raise BlockError(f"block: {self.group}: three sigmas that are finite and not negative, found {self.sigma}")
+        if self.kind in ("white", "walk", "slow") and not (np.isfinite(self.interval) and self.interval > 0):
+            raise BlockError(f"block: {self.group}: the interval must be positive, found {self.interval}")
+        if self.kind in ("slow", "orbital") and not (np.isfinite(self.time) and self.time > 0):
+            raise BlockError(f"block: {self.group}: correlation time or period must be positive, found {self.time}")
+
+    def spread(self, seconds: float) -> tuple[float, float, float]:
+        """Standard deviation (3) of the process at `seconds` from the middle of its scope, radians or metres."""
+        grown = {"rate": abs(seconds), "walk": float(np.sqrt(abs(seconds)))}.get(self.kind, 1.0)
+        a, b, c = (s * grown for s in self.sigma)
+        return a, b, c
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """The unknowns of one law in one scope: a pass, all passes of a star tracker, or the block.
+
+    Attributes:
+        law: which.
+        numbers: (k,) of the unknowns of one axis: multiples of the interval where there is one, else 0, 1.
+        middle: time at which a rate vanishes, seconds.
+        precision: (k, k) sparse, of the unknowns of one axis.
+    """
+
+    law: Law
+    numbers: Indices
+    middle: float
+    precision: sparse.csr_matrix
+
+    @classmethod
+    def of(cls, law: Law, times: Array, middle: float | None = None) -> Support:
+        """The unknowns that observations meet.
+
+        Args:
+            law: of the process.
+            times: of the observations, (n,), seconds.
+            middle: where a rate and a walk are zero, seconds; None for the middle of the times.
+
+        Raises:
+            BlockError: numbers of the law that cannot be used, or no times.
+        """
+        law.check()
+        if not len(times):
+            raise BlockError(f"block: {law.group}: no observation meets it")
+        middle = 0.5 * float(times.min() + times.max()) if middle is None else middle
+        if law.kind in ("constant", "rate", "orbital"):
+            count = 2 if law.kind == "orbital" else 1
+            return cls(law, np.arange(count), middle, sparse.csr_matrix(sparse.eye(count)))
+        if np.ptp(times) / law.interval > _MOST:
+            raise BlockError(f"block: {law.group}: the interval is too short for {np.ptp(times):.3g} s of observations")
+        if law.kind == "white":
+            first, _ = spline_blend(times, law.interval)
+            used = np.unique(first[:, None] + np.arange(4))
+            steps = np.diff(used)
+            filled = [np.arange(a, a + s) for a, s in zip(used[:-1], np.where(steps < _GAP, steps, 1), strict=True)]
+            numbers = np.concatenate([*filled, used[-1:]])
+            runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+            parts = [spline_precision(len(run)) for run in runs]
+            return cls(law, numbers, middle, sparse.csr_matrix(sparse.block_diag(parts)))
+        first = np.asarray(np.floor(times / law.interval), np.intp)
+        zero = int(np.round(middle / law.interval))
+        ends = [zero] if law.kind == "walk" else []
+        numbers = np.unique(np.concatenate([first, first + 1, np.array(ends, np.intp)]))
+        step = np.diff(numbers) * law.interval
+        if law.kind == "walk":
+            precision = _chain(np.ones(len(step)), step)
+            pin = int(np.searchsorted(numbers, zero))
+            shape = (len(numbers), len(numbers))
+            extra = sparse.csr_matrix(([_PINNED / law.interval], ([pin], [pin])), shape=shape)
+            return cls(law, numbers, middle, sparse.csr_matrix(precision + extra))
+        kept = np.exp(-step / law.time)
+        precision = _chain(kept, 1.0 - kept**2).tolil()
+        precision[0, 0] += 1.0
+        return cls(law, numbers, middle, sparse.csr_matrix(precision))
+
+    @property
+    def size(self) -> int:
+        """Unknowns: three axes of each number, an axis after the other, then the next number."""
+        return 3 * len(self.numbers)
+
+    def blend(self, times: Array) -> tuple[Indices, Array]:
+        """Which numbers (n, w) of an axis' unknowns each time meets, counted from 0, and by how much (n, w)."""
+        count, law = len(times), self.law
+        if law.kind == "constant":
+            return np.zeros((count, 1), np.intp), np.ones((count, 1))
+        if law.kind == "rate":
+            return np.zeros((count, 1), np.intp), (times - self.middle)[:, None]
+        if law.kind == "orbital":
+            phase = 2.0 * np.pi * times / law.time
+            return np.tile(np.arange(2), (count, 1)), np.stack([np.cos(phase), np.sin(phase)], axis=1)
+        if law.kind == "white":
+            first, values = spline_blend(times, law.interval)
+            return np.searchsorted(self.numbers, first[:, None] + np.arange(4)), values
+        first = np.asarray(np.floor(times / law.interval), np.intp)
+        share = times / law.interval - first
+        where = np.searchsorted(self.numbers, np.stack([first, first + 1], axis=1))
+        return where, np.stack([1.0 - share, share], axis=1)
+
+    def whitened(self) -> Array:
+        """(k, k) dense root R of the precision, R R' = precision: R' z are independent and in order of time."""
+        return np.asarray(np.linalg.cholesky(self.precision.toarray()[::-1, ::-1])[::-1, ::-1])
+
+
+def _chain(kept: Array, gained: Array) -> sparse.csr_matrix:
+    """(k, k) precision of z_n+1 = kept_n z_n + noise of variance gained_n, without that of the first."""
+    count = len(kept) + 1
+    steps = sparse.diags([-kept, np.ones(count - 1)], [0, 1], shape=(count - 1, count))
+    return sparse.csr_matrix(steps.T @ sparse.diags(1.0 / gained) @ steps)

@@ -1,0 +1,119 @@
+"""An adjustment of a block together with its camera, and with its tables where it was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from scenes.specs import load
+from scenes.specs.measured.adjust_data import MeasuredAdjustSpec
+from scenes.specs.measured.orbit_data import OrbitDataSpec
+from scenes.specs.measured.orbit_data_setup import FixedSetup, data_of
+from scenes.specs.orbit.adjust import OrbitAdjustSpec
+from scenes.specs.orbit.setup import load_three_line_camera
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.resolved import ExperimentSetup, read_setup, test_keys
+from scenes.yaml.errors import unknown
+
+
+class AdjustSetup(ExperimentSetup[OrbitAdjustSpec]):
+    """A block with its camera.
+
+    Attributes:
+        camera: the payload.
+    """
+
+    camera: ThreeLineCameraSpec
+
+
+class MeasuredAdjustSetup(FixedSetup[MeasuredAdjustSpec]):
+    """A block of measured passes with its camera.
+
+    Attributes:
+        camera: the payload.
+        data: the passes, with paths that hold from anywhere.
+    """
+
+    data: OrbitDataSpec
+
+
+AnyAdjust = AdjustSetup | MeasuredAdjustSetup
+"""Simulated, or on measurements."""
+
+
+def resolve_any_adjust(path: str | Path) -> AnyAdjust:
+    """Read a block as `resolve_adjust`, or `resolve_measured_adjust` for a file that names measurements."""
+    said = test_keys(path)
+    # `passes` of a simulation are told by their epochs alone
+    return resolve_measured_adjust(path) if "data" in said or "conventions" in said else resolve_adjust(path)
+
+
+def resolve_measured_adjust(path: str | Path) -> MeasuredAdjustSetup:
+    """Read a block of measured passes and what it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or a pass or a line is named that there is not.
+    """
+    setup = read_setup(MeasuredAdjustSetup, path)
+    if setup is None:
+        test = load.load_named(MeasuredAdjustSpec, load.ORBIT, path)
+        camera = load_three_line_camera(load.find_named(load.PAYLOADS, test.camera, test, ("camera",)))
+        setup = MeasuredAdjustSetup.model_construct(test=test, camera=camera, data=data_of(test))
+    test = setup.test
+    for name in test.trackers:
+        if name not in setup.data.passes:
+            raise test.error(unknown("no such pass", name, setup.data.passes), ("trackers", name))
+    for name in test.changes:
+        if name not in setup.camera.lines:
+            raise test.error(unknown("no such line", name, setup.camera.lines), ("changes", name))
+    for name, lines in (test.monitor.readings if test.monitor is not None else {}).items():
+        if name not in setup.data.passes:
+            raise test.error(unknown("no such pass", name, setup.data.passes), ("monitor", "readings", name))
+        for line in lines:
+            if line not in test.changes:
+                raise test.error(unknown("no such line", line, test.changes), ("monitor", "readings", name, line))
+    _require_sensors(test)
+    return setup
+
+
+def resolve_adjust(path: str | Path) -> AdjustSetup:
+    """Read a block and the camera it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or the camera has no such line.
+    """
+    setup = read_setup(AdjustSetup, path)
+    if setup is None:
+        test = load.load_named(OrbitAdjustSpec, load.ORBIT, path)
+        camera = load_three_line_camera(load.find_named(load.PAYLOADS, test.camera, test, ("camera",)))
+        setup = AdjustSetup.model_construct(test=test, camera=camera)
+    for k, name in enumerate(setup.test.lines):
+        if name not in setup.camera.lines:
+            raise setup.test.error(unknown("no such line", name, setup.camera.lines), ("lines", k))
+    _require_sensors(setup.test)
+    return setup
+
+
+def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:
+    """The block adjusted without further sensors.
+
+    Args:
+        setup: the block.
+        names: of sensors.
+
+    Raises:
+        InputError: the block has no such sensor.
+    """
+    if not names:
+        return setup
+    every = tuple(dict.fromkeys((*setup.test.without, *names)))
+    test = setup.test.model_copy(update={"without": every})
+    _require_sensors(test)
+    return setup.model_copy(update={"test": test})
+
+
+def _require_sensors(test: OrbitAdjustSpec | MeasuredAdjustSpec) -> None:
+    """InputError for a sensor that is to be left out and is not there."""
+    for name in test.without:
+        if name not in test.sensors:
+            raise test.error(unknown("the block has no such sensor", name, test.sensors), ("without",))

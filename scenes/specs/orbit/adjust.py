@@ -1,0 +1,325 @@
+"""Adjustment of a block of line images with everything that is known of its passes, as a file in scenes/orbit gives it.
+
+The block is simulated from stated laws: the readings of orbit and attitude have errors that follow `truth` where it is
+given, and what the adjustment is told of them in any case.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from scenes.specs.orbit.angle import Relief, TerrainHeight
+from scenes.specs.orbit.calibration import CameraDriftSpec, FieldLength, LineTime, MonitorReadingSpec
+from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, Interval, Latitude, Longitude, UtcTime
+from scenes.specs.orbit.sensors import SENSORS
+from scenes.yaml.errors import Problem, unknown
+from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
+from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, TitledSpec, Whole, not_empty
+from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
+
+Sensor = Literal["ties", "control", "monitor", "laser", "terrain", "tracker_angles"]
+LawKind = Literal["constant", "rate", "white", "walk", "slow", "orbital"]
+Period = Annotated[float, Quantity(MOMENT, above_zero=True, largest="100000 h")]
+Sigmas = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, smallest="0 m", largest="10 km"))]
+Positive = Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")]
+PointCount = Annotated[Whole, Field(ge=0, le=1_000_000)]
+
+
+class LawSpec(Spec):
+    """How an error of readings behaves in time.
+
+    Attributes:
+        law: constant; rate, of even growth from the middle of what shares it; white, readings independent of one
+            another that a cubic spline joins; walk, a random walk that is zero in the middle; slow, a stationary
+            process that forgets itself over `time`; orbital, cosine and sine of the period `time`.
+        shared_by: what has one draw of it: each pass, all passes of a star tracker, or the block.
+        interval: between independent readings of `white`; between the values of `walk` and `slow` that are solved for,
+            seconds.
+        time: correlation time of `slow`, period of `orbital`, seconds.
+    """
+
+    law: LawKind
+    shared_by: Literal["pass", "tracker", "block"] = "pass"
+    interval: Interval = 1.0
+    time: Period | None = None
+
+    @model_validator(mode="after")
+    def _has_its_time(self) -> LawSpec:
+        if (self.time is None) == (self.law in ("slow", "orbital")):
+            what = {"slow": "a correlation time", "orbital": "a period"}.get(self.law, "no `time:`")
+            raise Problem(f"a {self.law} law has {what}", None, what, within=("time",))
+        return self
+
+
+class AttitudeLawSpec(LawSpec):
+    """A law of errors of the attitude.
+
+    Attributes:
+        law: how it behaves in time.
+        shared_by: what has one draw of it.
+        interval: between independent readings, or between values that are solved for, seconds.
+        time: correlation time or period, seconds.
+        sigma: standard deviation about body X, Y and Z, radians: of a constant, a reading, an amplitude; of a rate in
+            each second; of what a walk gains in a second.
+    """
+
+    sigma: AngleSigmas
+
+
+class OrbitLawSpec(LawSpec):
+    """A law of errors of the orbit.
+
+    Attributes:
+        law: how it behaves in time.
+        shared_by: what has one draw of it.
+        interval: between independent readings, or between values that are solved for, seconds.
+        time: correlation time or period, seconds.
+        sigma: standard deviation along body X, Y and Z of the middle of the pass, metres, as for the attitude.
+    """
+
+    sigma: Sigmas
+
+
+class ReadingLawsSpec(Spec):
+    """Laws of the errors of the readings, by names that reports show.
+
+    Attributes:
+        attitude: of the star trackers with their mounting.
+        orbit: of the positions.
+    """
+
+    attitude: Annotated[Named[AttitudeLawSpec], not_empty("no laws of the attitude", "at least one")]
+    orbit: Annotated[Named[OrbitLawSpec], not_empty("no laws of the orbit", "at least one")]
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> ReadingLawsSpec:
+        if both := set(self.attitude) & set(self.orbit):
+            raise Problem("one name for two laws", min(both), "names that differ", within=("orbit", min(both)))
+        return self
+
+
+class TrackerAngleSpec(Spec):
+    """A measured angle between two star trackers: the difference of what is constant in their errors.
+
+    Attributes:
+        between: the two.
+        sigma: about body X, Y and Z, radians.
+    """
+
+    between: tuple[Name, Name]
+    sigma: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, above_zero=True, largest="1 deg"))]
+
+
+class BlockPassSpec(Spec):
+    """A pass over the block.
+
+    Attributes:
+        epoch: UTC at which it passes vertically above a place.
+        longitude, latitude: of this place, radians; of the area's middle where not given.
+        direction: to the south or to the north.
+        roll: of the satellite about body X, radians; positive looks to the left of the track, toward -Y.
+        tracker: star tracker that gives its attitude.
+    """
+
+    epoch: UtcTime
+    longitude: Longitude | None = None
+    latitude: Latitude | None = None
+    direction: Literal["descending", "ascending"] = "descending"
+    roll: Annotated[float, Quantity(ANGLE, largest="40 deg")] = 0.0
+    tracker: Name = "tracker"
+
+
+class AreaSpec(Spec):
+    """Where the points lie.
+
+    Attributes:
+        longitude, latitude: of its middle, radians.
+        height: mean of the ground above the ellipsoid, metres.
+        relief: heights lie evenly within this on either side of the mean, metres.
+        east, north: its lengths, metres.
+    """
+
+    longitude: Longitude
+    latitude: Latitude
+    height: TerrainHeight = 0.0
+    relief: Relief = 0.0
+    east: FieldLength = 20e3
+    north: FieldLength = 20e3
+
+
+class BlockPointsSpec(Spec):
+    """Points of the block at random places of the area; every scene that sees one observes it.
+
+    Attributes:
+        control: points with known coordinates.
+        tie: points without.
+        check: tie points whose coordinates are compared with the truth afterwards.
+        image: standard deviation of an image point in x and in y, pixels.
+        control_sigma: of each axis in plan, and of the height, of control points, metres.
+        gross: share of the tie points' image points that are wrong.
+        gross_size: how far these are off, pixels.
+    """
+
+    control: PointCount = 10
+    tie: PointCount = 300
+    check: Annotated[Whole, Field(ge=2, le=100_000)] = 100
+    image: Annotated[Number, Field(gt=0, le=10)] = 0.3
+    control_sigma: Annotated[tuple[float, float], Vector(Quantity(LENGTH, above_zero=True, largest="1 km"), 2)] = (
+        0.2,
+        0.3,
+    )
+    gross: Annotated[Number, Field(ge=0, le=0.4)] = 0.0
+    gross_size: Annotated[Number, Field(gt=0, le=1000)] = 30.0
+
+
+class LaserSpec(Spec):
+    """A laser altimeter that looks along body Z.
+
+    Attributes:
+        footprints: of each pass, evenly spaced over the area; the images see them, too.
+        range: standard deviation of a range, metres.
+        pointing: of the beam about body X and Y, radians.
+        beam: full angle of the beam, radians; where in it the range is taken is not known.
+    """
+
+    footprints: Annotated[Whole, Field(ge=1, le=1000)] = 5
+    range: Positive = 0.3
+    pointing: Annotated[float, Quantity(ANGLE, above_zero=True, largest="1 deg")] = 5e-6
+    beam: Annotated[float, Quantity(ANGLE, smallest="0 deg", largest="1 deg")] = 0.0
+
+
+class TerrainModelSpec(Spec):
+    """A terrain model as weak control of the heights of tie points.
+
+    Attributes:
+        sigma: of a height, independent from point to point, metres.
+        common: of an error that all heights share, metres.
+    """
+
+    sigma: Positive = 4.0
+    common: Annotated[float, Quantity(LENGTH, smallest="0 m", largest="1 km")] = 1.0
+
+
+class CameraChangeSpec(Spec):
+    """How a line camera may have changed since its calibration, one standard deviation.
+
+    Attributes:
+        lasting: the same in all passes.
+        each_pass: of each pass by itself.
+        walk: what it gains in a day, as a random walk from the first pass on.
+    """
+
+    lasting: CameraDriftSpec = CameraDriftSpec()
+    each_pass: CameraDriftSpec = CameraDriftSpec()
+    walk: CameraDriftSpec = CameraDriftSpec()
+
+    @model_validator(mode="after")
+    def _may_change(self) -> CameraChangeSpec:
+        both = (self.lasting, self.each_pass)
+        for k, name in enumerate(("d_alpha", "d_beta", "d_gamma")):
+            if not any(one.angles[k] for one in both):
+                problem = f"{name} may not change at all, which no camera keeps"
+                raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
+        if not any(one.principal_distance for one in both):
+            problem = "the principal distance may not change at all, which no camera keeps"
+            raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
+        return self
+
+
+class OrbitAdjustSpec(TitledSpec):
+    """A block of scenes, adjusted at once.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file.
+        lines: of the camera that take part; each is a scene of each pass.
+        earth: its rotation.
+        altitude: of the sun-synchronous orbit, metres.
+        span: how long the orbit is followed before and after each pass' epoch, seconds.
+        line_time: from one image line to the next, seconds.
+        attitude: true attitude, without the roll of the passes.
+        area: where the points lie.
+        passes: by name.
+        points: and how well they are measured.
+        errors: what is stated of the readings.
+        truth: what the readings' errors follow in truth; None where they follow what is stated.
+        angles: between star trackers.
+        changes: line -> how its camera may have changed.
+        monitor: how well an on-board monitor reads these changes in each pass; None for no monitor.
+        laser: an altimeter; None for none.
+        terrain: a terrain model; None for none.
+        without: sensors that are there and are not used.
+        robust: whether gross errors are looked for.
+        components: laws and groups of measurements whose variances are estimated.
+        datum: by which control points are given too far east, north and up, unknown to the analysis, metres.
+        seed: of every random number.
+    """
+
+    camera: Reference
+    lines: tuple[Name, ...] = ("forward", "nadir", "backward")
+    earth: EarthSpec = EarthSpec()
+    altitude: Altitude = 500e3
+    span: Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")] = 60.0
+    line_time: LineTime = 0.7e-3
+    attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
+    area: AreaSpec
+    passes: Annotated[Named[BlockPassSpec], not_empty("no passes", "at least one pass")]
+    points: BlockPointsSpec = BlockPointsSpec()
+    errors: ReadingLawsSpec
+    truth: ReadingLawsSpec | None = None
+    angles: tuple[TrackerAngleSpec, ...] = ()
+    changes: Annotated[Named[CameraChangeSpec], not_empty("no changes", "how each line may have changed")]
+    monitor: MonitorReadingSpec | None = None
+    laser: LaserSpec | None = None
+    terrain: TerrainModelSpec | None = None
+    without: tuple[Sensor, ...] = ()
+    robust: Flag = True
+    components: tuple[Name, ...] = ()
+    datum: Annotated[tuple[float, float, float], Vector(Quantity(DISTANCE, largest="10 km"))] = (0.0, 0.0, 0.0)
+    seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> OrbitAdjustSpec:
+        if not self.lines or len(set(self.lines)) != len(self.lines):
+            raise Problem("no lines, or one twice", None, "each line once", within=("lines",))
+        for name in self.lines:
+            if name not in self.changes:
+                raise Problem(f"it is not said how {name} may have changed", None, f"`{name}:`", within=("changes",))
+        for name in self.changes:
+            if name not in self.lines:
+                raise unknown("no such line among `lines`", name, self.lines, ("changes", name))
+        trackers = tuple(dict.fromkeys(one.tracker for one in self.passes.values()))
+        for k, angle in enumerate(self.angles):
+            for j, name in enumerate(angle.between):
+                if name not in trackers:
+                    raise unknown("no such star tracker in the passes", name, trackers, ("angles", k, "between", j))
+        lasting = [one for one in self.errors.attitude.values() if (one.law, one.shared_by) == ("constant", "tracker")]
+        if self.angles and not lasting:
+            problem = "an angle between star trackers that have no constant error"
+            raise Problem(
+                problem, None, "a law `constant` of `shared_by: tracker` in errors.attitude", within=("angles",)
+            )
+        return self._has_known_groups()
+
+    def _has_known_groups(self) -> OrbitAdjustSpec:
+        groups = ("image", "control", "laser", "terrain", *self.errors.attitude, *self.errors.orbit)
+        for k, name in enumerate(self.components):
+            if name not in groups:
+                raise unknown("no such group of variances", name, groups, ("components", k))
+        return self
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Those of `SENSORS` that the block has."""
+        has = {
+            "ties": self.points.tie > 0,
+            "control": self.points.control > 0,
+            "monitor": self.monitor is not None,
+            "laser": self.laser is not None,
+            "terrain": self.terrain is not None,
+            "tracker_angles": bool(self.angles),
+        }
+        return tuple(name for name in SENSORS if has[name])

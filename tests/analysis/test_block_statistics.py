@@ -1,0 +1,208 @@
+"""Drawn blocks: sigmas, chi-squares and check points are right for every subset of sensors and for each law of the
+attitude; what is wrong with a block is told, by name."""
+
+from dataclasses import replace
+from itertools import chain, combinations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from analysis.block.accuracy import circle_of_points, interval_of_points, predicted, realised
+from analysis.block.block import Term
+from analysis.block.block_adjustment import adjust_block
+from analysis.block.law_tests import law_tests
+from analysis.block.network import datum_test, network_of, open_combinations
+from analysis.block.processes import BlockError, Law
+from analysis.orbit.ground_errors import circular_error, linear_error
+from optics.numerics.threads import one_blas_thread
+from tests.analysis.drawn_blocks import ARCSEC, EAST, PITCH, Plan, draw, without_errors_in_images
+from tests.tiers import quick
+
+WHITE = Law("attitude", "white", (0.7 * ARCSEC,) * 3, 0.5)
+WALK = Law("attitude", "walk", (1.0 * ARCSEC,) * 3, 0.5)
+SENSORS = ("control", "monitor", "laser", "terrain")
+SUBSETS = list(chain.from_iterable(combinations(SENSORS, n) for n in range(len(SENSORS) + 1)))
+
+
+def plan(law, **changes):
+    bias = Term(Law("tracker bias", "constant", (3 * ARCSEC,) * 3), "tracker")
+    small = Plan(ties=14, control=3, check=5, half=2e3, attitude=(bias, Term(law)))
+    return replace(small, **changes)
+
+
+@one_blas_thread()
+def judged(law, missing, blocks, seed):
+    """P-values of the sum of chi-squares and of that of check points, over drawn blocks without some sensors."""
+    square = freedom = check = count = 0
+    for number in range(blocks):
+        drawn = draw(plan(law), np.random.default_rng([seed, number]))
+        block = drawn.block
+        for sensor in missing:
+            block = block.without(sensor)
+        found = adjust_block(block)
+        square, freedom = square + found.chi_square, freedom + found.degrees_of_freedom
+        # one check point of a block: those of one block err alike
+        where = np.flatnonzero(block.points.role == "check")[:1]
+        error = found.ground[where] - drawn.ground[where]
+        check += float(np.einsum("ni,nij,nj->", error, np.linalg.inv(found.point_covariance(where)), error))
+        count += 3
+    return _two_sided(square, freedom), _two_sided(check, count)
+
+
+def _two_sided(square, freedom):
+    high = chi2.sf(square, freedom)
+    return 2 * min(high, 1 - high)
+
+
+# 64 p-values in all of the slow tier: 1e-4 each is a false alarm in 160 changes of the seeds
+_ALARM = 1e-4
+
+
+@pytest.mark.parametrize("law", [WHITE, WALK], ids=["white", "walk"])
+def test_chi_square_and_check_points_with_and_without_all_sensors(law):
+    for missing in ((), SENSORS):
+        assert min(judged(law, missing, 12, 4)) > _ALARM
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("missing", SUBSETS, ids=lambda s: "-".join(s) or "none")
+@pytest.mark.parametrize("law", [WHITE, WALK], ids=["white", "walk"])
+def test_chi_square_and_check_points_for_every_subset_of_sensors(law, missing):
+    assert min(judged(law, missing, 100, 11)) > _ALARM
+
+
+@pytest.mark.parametrize(("stated", "true"), quick(2, [(WHITE, WALK), (WALK, WHITE), (WHITE, WHITE), (WALK, WALK)]))
+@one_blas_thread()
+def test_a_wrong_law_is_told_and_a_right_one_is_not(stated, true):
+    for seed in range(3):
+        made = plan(stated, ties=60, half=5e3, image=0.1 * PITCH)
+        found = adjust_block(draw(made, np.random.default_rng(seed), replace(made, attitude=plan(true).attitude)).block)
+        test = next(t for t in law_tests(found) if t.group == "attitude")
+        if stated is true:
+            assert found.p_value > 1e-3
+            assert test.p_value > 1e-3
+        else:
+            assert found.p_value < 1e-6
+            assert np.sign(test.excess) == (1 if stated is WHITE else -1)
+        if stated is WHITE and true is WALK:
+            assert test.p_value < 1e-6
+            assert "not that of the readings" in str(test)
+
+
+@pytest.mark.second
+@one_blas_thread()
+def test_serial_correlation_has_unit_variance_under_the_right_law():
+    every = []
+    for seed in range(30):
+        found = adjust_block(draw(plan(WHITE, ties=20, half=4e3), np.random.default_rng([9, seed])).block)
+        every += [t.excess for t in law_tests(found) if t.group == "attitude"]
+    # sums of products are not quite normal; 30 draws give the spread to 13%
+    assert abs(np.mean(every)) < 0.65
+    assert 0.6 < np.std(every) < 1.5
+
+
+@one_blas_thread()
+def test_one_tenth_of_gross_errors_is_found_by_name():
+    drawn = draw(plan(WHITE, ties=60, half=4e3), np.random.default_rng(2))
+    random = np.random.default_rng(3)
+    rows = random.permutation(np.arange(3, 63))[:12]  # of 120 image points of ties in one pass
+    moved = 30 * PITCH * random.choice([-1.0, 1.0], (12, 2))
+    wrong = without_errors_in_images(drawn, "P0/fore", rows, moved)
+    assert adjust_block(wrong.block).p_value < 1e-9
+    found = adjust_block(wrong.block, robust="reject")
+    told = {point for point, of in found.rejected() if of == "P0/fore"}
+    bad = {str(drawn.block.points.ids[k]) for k in rows}
+    assert bad <= told
+    assert len(told - bad) <= 2
+    right = adjust_block(drawn.block)
+    where = np.flatnonzero(drawn.block.points.role == "check")
+    sigma = np.sqrt(np.diagonal(found.point_covariance(where), axis1=1, axis2=2))
+    assert np.max(np.abs(found.ground[where] - right.ground[where]) / sigma) < 1.5
+
+
+@one_blas_thread()
+def test_control_in_another_datum_is_told_with_its_shift():
+    drawn = draw(plan(WHITE, control=6), np.random.default_rng(5))
+    points = drawn.block.points
+    control = points.role == "control"
+    start = np.where(control[:, None], points.start + 120.0 * EAST, points.start)
+    test = datum_test(adjust_block(replace(drawn.block, points=replace(points, start=start)), datum=True))
+    assert test.chi_square > 100.0
+    # the orbit is known to 0.5 m and the attitude to 7 m on the ground
+    assert abs(test.east - 120.0) < 4 * test.sigma[0] < 40.0
+    right = datum_test(adjust_block(drawn.block, datum=True))
+    assert right.chi_square < chi2.isf(1e-3, 3)
+
+
+def test_swapped_coordinates_are_refused_by_name():
+    drawn = draw(plan(WHITE), np.random.default_rng(5))
+    points = drawn.block.points
+    start = points.start.copy()
+    start[1] = start[1][[1, 0, 2]]
+    with pytest.raises(BlockError, match=r"c1 in P0/fore.*order x, y, z"):
+        adjust_block(replace(drawn.block, points=replace(points, start=start)))
+
+
+@one_blas_thread()
+def test_a_network_in_two_parts_and_scenes_that_share_nothing_are_named():
+    drawn = draw(plan(WHITE, passes=3, footprints=0), np.random.default_rng(5))
+    block = drawn.block
+    half = np.arange(len(block.points.ids)) % 2 == 0
+    scenes = []
+    for scene in block.scenes:
+        kept = half if scene.of == "P0" else ~half
+        rays = scene.rays.taken(kept[scene.rays.point])
+        if scene.name == "P2/back":
+            rays = rays.taken(np.zeros(len(rays.point), bool))
+        scenes.append(replace(scene, rays=rays))
+    block = replace(block, scenes=tuple(scenes))
+    network = network_of(block)
+    assert set(network.parts[0]) == {"P1/fore", "P1/back", "P2/fore"}
+    assert set(network.parts[1]) == {"P0/fore", "P0/back"}
+    assert network.empty == ("P2/back",)
+    # the scenes are still adjusted, held together by what is known of the readings
+    assert np.isfinite(adjust_block(block).p_value)
+    alone = [s if s.name == "P0/fore" else replace(s, rays=s.rays.taken(~half[s.rays.point])) for s in block.scenes]
+    assert "P0/fore" in network_of(replace(block, scenes=tuple(alone))).alone
+
+
+@one_blas_thread()
+def test_open_combinations_without_any_control_are_shifts_and_turns_of_all_passes():
+    drawn = draw(plan(WHITE, control=0, monitor=None, terrain=None, footprints=0), np.random.default_rng(5))
+    found = open_combinations(adjust_block(drawn.block))
+    # three shifts of all passes together, and pitch against d_alpha of all cameras, are told by nothing
+    assert found[0].told < 1e-3
+    named = [set(one.names) for one in found if one.told < 1e-3]
+    for axis in ("along", "across", "down"):
+        assert any({f"P0 offset {axis}", f"P1 offset {axis}"} <= names for names in named), axis
+    assert any({"P0 pitch", "P0 fore d_alpha", "P0 back d_alpha"} <= names for names in named)
+
+
+@one_blas_thread()
+def test_variance_components_find_a_wrong_image_sigma():
+    stated = plan(WHITE, ties=60, half=4e3)
+    block = replace(draw(stated, np.random.default_rng(8)).block, image=0.5 * stated.image)
+    found = adjust_block(block, variance_components=("image",))
+    # 300 redundant observations give a variance to 8%
+    assert found.factors["image"] == pytest.approx(4.0, rel=0.35)
+    assert found.p_value > 1e-3
+
+
+def test_circular_and_linear_errors_of_known_normals():
+    # a circle: 2.1460 sigma; a line: 1.6449 sigma in both
+    assert circle_of_points(np.eye(2)[None] * 4.0) == pytest.approx(2 * 2.145966, rel=1e-5)
+    assert circle_of_points(np.diag([1.0, 1e-9])[None]) == pytest.approx(1.645, rel=5e-3)
+    assert interval_of_points(np.array([9.0])) == pytest.approx(3 * 1.644854, rel=1e-5)
+    # of one point, another way of integration
+    one = np.array([[4.0, 1.5], [1.5, 1.0]])
+    assert circle_of_points(one[None]) == pytest.approx(float(circular_error(one)), rel=1e-6)
+    assert interval_of_points(np.array([2.0])) == pytest.approx(float(linear_error(2.0)), rel=1e-6)
+    random = np.random.default_rng(1)
+    spread = np.diag([4.0, 1.0, 9.0])
+    error = random.standard_normal((40_000, 3)) * np.sqrt(np.diag(spread))
+    # at the pole of x, where up is x and east is y
+    place = np.tile([6378137.0, 0.0, 0.0], (len(error), 1))
+    found, said = realised(place, error), predicted(place[:1], spread[None])
+    assert found.ce90 == pytest.approx(said.ce90, rel=0.02)
+    assert found.le90 == pytest.approx(said.le90, rel=0.02)

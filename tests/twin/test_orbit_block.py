@@ -1,0 +1,236 @@
+"""``twin.orbit adjust``: what the command says of blocks that are right, and of blocks that are not."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.orbit.three_line_model import misclosure
+from scenes.specs.load import SCENES
+from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
+from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
+from scenes.yaml.errors import InputError
+from tests.twin.commands import invoke
+from twin.orbit.__main__ import app
+from twin.orbit.block.block_report import block_report
+from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
+from twin.orbit.block.drawn_block import draw_block
+from twin.orbit.block.measured_block import measured_block
+from twin.orbit.block.pass_knowledge import change_covariance
+from twin.orbit.calibration.calibration_run import source_of
+from twin.orbit.calibration.campaign_adjustment import simultaneous
+from twin.run.procedure import BenchError
+
+FILE = SCENES / "orbit" / "adjust.yaml"
+
+
+def setup(tmp_path=None, *changes):
+    """The shipped block with fewer points, and texts of its file replaced."""
+    text = FILE.read_text("utf-8").replace("tie: 120, check: 60", "tie: 40, check: 30")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    if tmp_path is None:
+        return resolve_adjust(FILE)
+    file = tmp_path / "adjust.yaml"
+    file.write_text(text, "utf-8")
+    return resolve_adjust(file)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return run_adjustment(setup(tmp_path_factory.mktemp("block")), None, 3)
+
+
+def test_errors_of_check_points_are_those_predicted_and_every_sensor_helps(run):
+    assert 0.3 < run.worth[ALL].agreement < 2.0
+    full = run.worth[ALL].predicted
+    for name, one in run.worth.items():
+        # less is known without a sensor; rounding of the quantiles
+        assert one.predicted.ce90 > full.ce90 * (1 - 1e-6), name
+        assert one.predicted.le90 > full.le90 * (1 - 1e-6), name
+    assert run.worth["without control"].predicted.ce90 > 2 * full.ce90
+    assert run.worth[NOTHING].predicted.le90 > 3 * full.le90
+    assert run.adjustment.p_value > 1e-4
+    assert block_report(run).warnings == ()
+
+
+def test_cameras_are_found_within_their_sigmas(run):
+    ratio = np.array([(c.found - c.truth) / c.sigma for c in run.cameras.values()])
+    # 16 normals: beyond 4 by chance in 1 of 1000 blocks
+    assert np.max(np.abs(ratio)) < 4.0
+    assert all(np.all(c.sigma < c.before) for c in run.cameras.values())
+
+
+def test_rays_meet_where_the_true_platform_saw_the_points():
+    """A block without errors: all misclosures vanish for true corrections."""
+    drawn = draw_block(setup(), np.random.SeedSequence(4))
+    for scene in drawn.block.scenes:
+        rays, platform = scene.rays, drawn.platforms[scene.of]
+        camera = drawn.block.cameras[scene.camera].drifted(drawn.change[scene.name])
+        seconds = rays.time - platform.begin
+        here = replace(rays, station=platform.position(seconds), attitude=platform.body_to_itrs(seconds))
+        zero = np.zeros(3)
+        miss = misclosure(camera, here, drawn.ground[rays.point], zero, zero)
+        sigma = np.sqrt(np.diagonal(rays.spread, axis1=1, axis2=2))
+        # image points have their own errors of one sigma, 0.2 px; nothing else is left
+        assert np.sqrt(np.mean((miss / sigma) ** 2)) == pytest.approx(1.0, abs=0.12)
+
+
+@pytest.mark.second
+def test_readings_of_another_law_are_told(tmp_path):
+    said = FILE.read_text("utf-8")
+    laws = said[said.index("errors:\n") : said.index("angles:")]
+    true = laws.replace("errors:", "truth:").replace(
+        "{law: white, sigma: [0.5 arcsec, 0.5 arcsec, 1 arcsec], interval: 1 s}",
+        "{law: walk, sigma: [1 arcsec, 1 arcsec, 1 arcsec], interval: 1 s}",
+    )
+    wrong = run_adjustment(setup(tmp_path, ("\nangles:", "\n" + true + "angles:")), None, 3)
+    told = " ".join(block_report(wrong).warnings)
+    assert "readings: errors that should be independent in a white process are alike" in told
+
+
+@pytest.mark.second
+def test_gross_errors_are_left_out_by_name(tmp_path):
+    found = run_adjustment(setup(tmp_path, ("image: 0.2", "image: 0.2, gross: 0.1, gross_size: 20")), None, 3)
+    ids = found.drawn.block.points.ids
+    bad = {(str(ids[p]), scene) for scene, points in found.drawn.gross.items() for p in points}
+    told = set(found.rejected)
+    assert len(bad) > 8
+    # an error along the ray of the other scenes is absorbed by the point's height
+    assert len(bad - told) <= 0.2 * len(bad)
+    assert 0.3 < found.worth[ALL].agreement < 2.0
+    assert any(w.startswith("left out as gross errors: ") for w in block_report(found).warnings)
+
+
+@pytest.mark.second
+def test_a_wrong_datum_is_told(tmp_path):
+    found = run_adjustment(setup(tmp_path, ("seed: 1", "seed: 1\ndatum: [80 m, 0 m, -20 m]")), None, 3)
+    assert found.datum.east == pytest.approx(80.0, abs=4 * found.datum.sigma[0])
+    assert found.datum.up == pytest.approx(-20.0, abs=4 * found.datum.sigma[2])
+    assert any("another datum" in w for w in block_report(found).warnings)
+
+
+def test_command_writes_its_numbers_and_takes_sensors_away(tmp_path):
+    setup(tmp_path)
+    out = tmp_path / "run"
+    words = ["adjust", tmp_path / "adjust.yaml", "--without", "control", "--out", out, "--json"]
+    result = invoke(app, *words)
+    assert result.exit_code == 0
+    numbers = json.loads((out / "block.json").read_text("utf-8"))
+    assert numbers["check_points"] == json.loads(result.stdout)["check_points"]
+    assert "control" not in numbers["sensors"]
+    assert "without: [control]" in (out / "config.yaml").read_text("utf-8")
+    assert numbers["verdict"].startswith("Nine ground points in ten lie within ")
+
+
+def test_sensors_that_are_not_there_are_refused():
+    with pytest.raises(InputError, match="no such sensor; did you mean 'control'"):
+        without_sensors(resolve_adjust(FILE), ["controls"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("lines: [forward, backward]", "lines: [forward, nadir]", "it is not said how nadir may have changed"),
+        ("between: [A, B]", "between: [A, C]", "no such star tracker in the passes"),
+        ("interval: 1 s}", "interval: 1 s, time: 3 s}", "a white law has no `time:`"),
+        ("seed: 1", "seed: 1\ncomponents: [noise]", "no such group of variances"),
+        ("orbit: {law: constant", "gyro: {law: constant", "one name for two laws"),
+    ],
+)
+def test_files_that_contradict_themselves_are_refused(tmp_path, old, new, told):
+    with pytest.raises(InputError, match=told):
+        setup(tmp_path, (old, new))
+
+
+def test_scenes_that_share_no_ground_are_an_error_with_a_key(tmp_path):
+    text = FILE.read_text("utf-8")
+    backward = text[text.index("  backward:\n") : text.index("monitor: {angles")]
+    one = (("lines: [forward, backward]", "lines: [forward]"), (backward, ""))
+    alone = setup(tmp_path, *one, ("longitude: 117.4 deg, ", "longitude: 120 deg, "))
+    with pytest.raises(BenchError, match=r"only 0 of .* places of the area are seen by two scenes"):
+        run_adjustment(alone, None, 1)
+
+
+def test_covariance_of_changes_holds_all_three_laws():
+    spec = setup().test.changes["forward"]
+    walk = spec.walk.model_copy(update={"angles": (1e-6, 0.0, 0.0)})
+    spread = change_covariance(spec.model_copy(update={"walk": walk}), np.array([0.0, 4.0, 9.0]))
+    lasting, each = spec.lasting.angles[0] ** 2, spec.each_pass.angles[0] ** 2
+    assert spread[0, 0] == pytest.approx(lasting + each)
+    assert spread[8, 8] == pytest.approx(lasting + each + 9e-12)
+    assert spread[4, 8] == pytest.approx(lasting + 4e-12)
+    assert spread[4, 9] == 0.0
+
+
+@pytest.mark.second
+def test_laser_and_monitor_of_a_gf7_pass_as_gf7_reports_it():
+    """GF-7 reports 2.15 m in height without and 0.75 m with its laser, a factor of 2.9."""
+    found = run_adjustment(resolve_adjust(SCENES / "orbit" / "adjust_gf7.yaml"), None, 1)
+    sigma = {name: one.predicted.le90 / 1.645 for name, one in found.worth.items()}
+    # inputs are chosen, so that the size and not the digit is compared
+    assert 1.2 < sigma["without laser"] < 2.6
+    assert 0.4 < sigma[ALL] < 0.9
+    assert 2.0 < sigma["without laser"] / sigma[ALL] < 4.0
+    # neither monitor nor laser: angles of the cameras of 0.7 arcsec, 5 m for each arcsec
+    assert 3.5 < sigma[NOTHING] < 6.0
+
+
+MEASURED = SCENES / "orbit" / "measured" / "adjust.yaml"
+
+
+@pytest.mark.second
+def test_measured_passes_as_their_calibration_has_them():
+    """The tables of the shipped campaign: two image points of control points were moved by some pixels."""
+    found = run_adjustment(resolve_any_adjust(MEASURED), None, 0)
+    assert found.drawn is None
+    assert {("Beijing c4", "Beijing/forward"), ("Beijing k33", "Beijing/nadir")} <= set(found.rejected)
+    assert len(found.rejected) <= 6
+    assert 0.5 < found.worth[ALL].agreement < 1.6
+    assert found.adjustment.p_value > 1e-3
+    assert len(found.network.parts) == 2
+    assert found.worth["without control"].predicted.le90 > 20 * found.worth[ALL].predicted.le90
+    # the same passes calibrated by the campaign's adjustment: the principal distances agree
+    calibrated = simultaneous(source_of(resolve_measured_calibration(MEASURED.with_name("calibrate.yaml")), None))
+    for line in ("forward", "nadir", "backward"):
+        change = found.cameras[f"Beijing/{line}"]
+        laboratory = found.adjustment.assembly.block.cameras[line].interior[0]
+        apart = laboratory + change.found[3] - calibrated.value(f"{line} f")
+        assert abs(apart) < 2.0 * calibrated.sigma[f"{line} f"]
+
+
+def test_monitor_readings_of_measured_passes_hold_the_cameras(tmp_path):
+    text = MEASURED.read_text("utf-8").replace("data: .", f"data: {MEASURED.parent}")
+    reading = "{angles: [1 arcsec, 2 arcsec, 3 arcsec], principal_distance: 20 um}"
+    monitor = (
+        "monitor:\n  angles: [0.1 arcsec, 0.1 arcsec, 0.1 arcsec]\n  principal_distance: 0.1 um\n"
+        f"  readings: {{Anhui: {{nadir: {reading}}}}}\n"
+    )
+    file = tmp_path / "adjust.yaml"
+    file.write_text(text + monitor, "utf-8")
+    block, given = measured_block(resolve_any_adjust(file))
+    known = block.monitored["nadir"]
+    # what lasts is read in one pass and known in both, to the reading's sigma
+    assert known.mean[0, 3] == pytest.approx(20e-6, rel=1e-3)
+    assert np.sqrt(known.covariance[3, 3]) == pytest.approx(0.1e-6, rel=1e-3)
+    assert np.allclose(block.monitored["forward"].covariance, block.known["forward"].covariance)
+    assert np.isfinite(given[block.points.role == "check"]).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("names: own", "names: own\ntrackers: {Peking: A}", "no such pass"),
+        ("names: own", "names: own\nwithout: [monitor]", "no monitor to do without"),
+        ("  nadir: {lasting", "  middle: {lasting", "no such line"),
+    ],
+)
+def test_measured_files_that_name_what_is_not_there_are_refused(tmp_path, old, new, told):
+    text = MEASURED.read_text("utf-8").replace("data: .", f"data: {MEASURED.parent}")
+    assert old in text
+    file = tmp_path / "adjust.yaml"
+    file.write_text(text.replace(old, new), "utf-8")
+    with pytest.raises(InputError, match=told):
+        resolve_any_adjust(file)

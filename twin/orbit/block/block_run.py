@@ -1,0 +1,256 @@
+"""Adjust a block, and adjust it again without each of its sensors: ``python -m twin.orbit adjust``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import chi2
+
+from analysis.block.accuracy import Accuracy, level_axes, predicted, realised
+from analysis.block.block import Block
+from analysis.block.block_adjustment import BlockAdjustment, adjust_block, kept_block
+from analysis.block.law_tests import LawTest, law_tests
+from analysis.block.network import DatumTest, Network, Open, datum_test, network_of, open_combinations
+from analysis.block.processes import BlockError
+from analysis.measurement_error import MeasurementError
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.threads import one_blas_thread
+from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup
+from twin.orbit.block.drawn_block import DrawnBlock, draw_block
+from twin.orbit.block.measured_block import measured_block
+from twin.run.procedure import Advance, BenchError, silent
+
+if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+
+_LEAST_CHECK = 2
+Rejected = tuple[tuple[str, str], ...]
+DATUM_ALARM = 1e-3
+"""Chance below which a common shift of the control points is told."""
+ALL = "all"
+NOTHING = "ties alone"
+"""Of the table of sensors: image points of unknown ground alone, beside what is stated of readings and cameras."""
+
+
+@dataclass(frozen=True, eq=False)
+class Worth:
+    """The block with some of its sensors.
+
+    Attributes:
+        left_out: sensors that were not used.
+        predicted: errors at check points by their covariances; at all tie points where there are no check points.
+        found: by their true or given places; None without check points.
+        agreement: mean square of the errors over their sigmas, of the three coordinates: 1 where sigmas are right;
+            None likewise.
+    """
+
+    left_out: tuple[str, ...]
+    predicted: Accuracy
+    found: Accuracy | None
+    agreement: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class CameraChange:
+    """A camera in one scene: found, sigma, expected sigma without the block, truth, (4,) each, radians and metres.
+
+    truth: None where nobody knows it.
+    """
+
+    found: np.ndarray
+    sigma: np.ndarray
+    before: np.ndarray
+    truth: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What check points and cameras are compared with: places (m, 3) and their covariances (m, 3, 3), metres; scene ->
+    true change of its camera, empty where nobody knows.
+    """
+
+    places: np.ndarray
+    covariance: np.ndarray
+    change: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class BlockRun:
+    """Everything that was computed.
+
+    Attributes:
+        setup: what the file says.
+        seed: of all that was drawn.
+        drawn: the block and its truth; None for a measured block.
+        adjustment: with all sensors that the file does not leave out.
+        worth: case -> check points: all sensors, without each, and ties alone.
+        network: how scenes hang together.
+        open: what observations leave to the priors.
+        laws: tests of the laws in time.
+        datum: of the control points against the rest; None without control points.
+        cameras: scene -> its camera.
+        check: (k,) check points, (k, 3) errors east, north and up, metres, and (k, 3) their sigmas.
+        rejected: point and set of observations of every gross error that was left out.
+    """
+
+    setup: AnyAdjust
+    seed: int
+    drawn: DrawnBlock | None
+    adjustment: BlockAdjustment
+    worth: Mapping[str, Worth]
+    network: Network
+    open: tuple[Open, ...]
+    laws: tuple[LawTest, ...]
+    datum: DatumTest | None
+    cameras: Mapping[str, CameraChange]
+    check: tuple[np.ndarray, np.ndarray, np.ndarray]
+    rejected: Rejected
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """Sensors of the adjustment."""
+        return self.adjustment.assembly.block.sensors
+
+    @property
+    def datum_chance(self) -> float:
+        """Chance of such a shift of the control points where there is none; 1 without control points."""
+        return 1.0 if self.datum is None else float(chi2.sf(self.datum.chi_square, 3))
+
+
+@one_blas_thread()  # of small matrices: threads would only wait for each other
+def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance: Advance = silent) -> BlockRun:
+    """Draw or read a block and adjust it. Nothing is traced: the backend is not used.
+
+    Raises:
+        InputError: tables that cannot be used.
+        BenchError: no such orbit, or a block that cannot be adjusted.
+    """
+    spec = setup.test
+    advance("block", 0, 2)
+    drawn = None
+    if isinstance(setup, MeasuredAdjustSetup):
+        block, places = measured_block(setup, advance)
+        known = _Known(places, block.points.covariance, {})
+    else:
+        drawn = draw_block(setup, np.random.SeedSequence(seed))
+        block = drawn.block
+        known = _Known(drawn.ground, np.zeros((len(drawn.ground), 3, 3)), drawn.change)
+    for sensor in spec.without:
+        block = block.without(sensor)
+    advance("block", 1, 2)
+    try:
+        network = network_of(block)
+        datum, block, rejected = _datum(block, spec.robust)
+        robust = spec.robust and rejected is None
+        found = adjust_block(
+            block, robust="reject" if robust else None, variance_components=_components(spec.components)
+        )
+        advance("block", 2, 2)
+        worth = _worth(kept_block(found), found, known, advance)
+    except (MeasurementError, np.linalg.LinAlgError) as error:
+        key = "data" if drawn is None else "points"
+        raise BenchError(str(error), (key,), "more points, or scenes that see the same ground") from error
+    where, wrong, spread = _check(found, known)
+    level = level_axes(found.ground[where])
+    sigma = np.sqrt(np.einsum("nij,njk,nik->ni", level, spread, level))
+    errors = np.einsum("nij,nj->ni", level, wrong)
+    return BlockRun(
+        setup,
+        seed,
+        drawn,
+        found,
+        worth,
+        network,
+        open_combinations(found),
+        law_tests(found),
+        datum,
+        _cameras(found, known),
+        (where, errors, sigma),
+        rejected or found.rejected(),
+    )
+
+
+def _datum(block: Block, robust: bool) -> tuple[DatumTest | None, Block, Rejected | None]:
+    """A common shift of the control points, the block to be adjusted, and what was left out of it already.
+
+    It is looked for first: control points of another datum would else all be taken for gross errors. Where there is
+    one, gross errors are those that stand out beside it, and the control points stay as they are given.
+    """
+    if not np.any(block.points.role == "control"):
+        return None, block, None
+    shifted = adjust_block(block, robust="reject" if robust else None, datum=True)
+    test = datum_test(shifted)
+    assert test is not None
+    if robust and chi2.sf(test.chi_square, 3) < DATUM_ALARM:
+        return test, kept_block(shifted), shifted.rejected()
+    return test, block, None
+
+
+def _components(names: tuple[str, ...]) -> bool | tuple[str, ...]:
+    return names or False
+
+
+def _check(found: BlockAdjustment, known: _Known) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Check points (k,) that were adjusted, their errors (k, 3), ITRS, metres, and covariances (k, 3, 3) of these."""
+    block = found.assembly.block
+    where = np.flatnonzero((block.points.role == "check") & np.isfinite(found.ground).all(axis=1))
+    spread = found.point_covariance(where) + known.covariance[where]
+    return where, found.ground[where] - known.places[where], spread
+
+
+def _worth(kept: Block, found: BlockAdjustment, known: _Known, advance: Advance) -> FrozenMap[str, Worth]:
+    """Check points by all sensors, without each, and by none but ties."""
+    sensors = [name for name in kept.sensors if name != "ties"]
+    cases: dict[str, tuple[str, ...]] = {ALL: ()}
+    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors if _leaves_points(kept, name)}
+    if len(sensors) > 1:
+        cases[NOTHING] = tuple(sensors)
+    rows = {}
+    for k, (case, left_out) in enumerate(cases.items()):
+        advance("sensors", k, len(cases))
+        block = kept
+        for name in left_out:
+            block = block.without(name)
+        one = found
+        if left_out:
+            one = adjust_block(block, variance_components=False)
+        rows[case] = _accuracy(left_out, one, known)
+    advance("sensors", len(cases), len(cases))
+    return FrozenMap(rows)
+
+
+def _leaves_points(block: Block, sensor: str) -> bool:
+    """Whether points are left to be judged by."""
+    return sensor != "ties" or int(np.sum(block.points.role == "check")) >= _LEAST_CHECK
+
+
+def _accuracy(left_out: tuple[str, ...], one: BlockAdjustment, known: _Known) -> Worth:
+    where, error, spread = _check(one, known)
+    if len(where) < _LEAST_CHECK:
+        role = one.assembly.block.points.role
+        ties = np.flatnonzero((role == "tie") & np.isfinite(one.ground).all(axis=1))
+        if not len(ties):
+            raise BlockError("block: neither check points nor tie points are left")
+        return Worth(left_out, predicted(one.ground[ties], one.point_covariance(ties)), None, None)
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(spread), error)
+    places = one.ground[where]
+    own = one.point_covariance(where)
+    return Worth(left_out, predicted(places, own), realised(places, error), float(np.mean(square)) / 3.0)
+
+
+def _cameras(found: BlockAdjustment, known: _Known) -> FrozenMap[str, CameraChange]:
+    block = found.assembly.block
+    order = [one.name for one in block.passes]
+    rows = {}
+    for scene in block.scenes:
+        if scene.name not in found.assembly.changes:
+            continue
+        value, spread = found.change(scene.name)
+        law = block.known[scene.camera].covariance
+        own = 4 * order.index(scene.of) + np.arange(4)
+        before = np.sqrt(np.diag(law)[own])
+        rows[scene.name] = CameraChange(value, np.sqrt(np.diag(spread)), before, known.change.get(scene.name))
+    return FrozenMap(rows)

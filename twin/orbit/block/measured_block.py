@@ -1,0 +1,188 @@
+"""A block of measured passes, from the tables that a calibration reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from analysis.block import block as known
+from analysis.orbit.calibration_parameters import CalibrationError, Noise
+from analysis.orbit.forward_intersection import intersect
+from analysis.orbit.three_line_model import LineModel, Rays
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.measured.adjust_setup import MeasuredAdjustSetup
+from twin.orbit.block.pass_knowledge import (
+    camera_sigmas,
+    change_covariance,
+    law_of,
+    monitored_camera,
+    pixels_per_line,
+)
+from twin.orbit.calibration.campaign import line_model
+from twin.orbit.calibration.observations import PassData, light_effects
+from twin.orbit.flight.earth import Earth, tai_of
+from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.platform_table import TabulatedTrajectory
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.measured.measurement_tables import read_measurements
+from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
+from twin.run.procedure import Advance, BenchError, silent
+
+_DAY = 86400.0
+
+
+def measured_block(setup: MeasuredAdjustSetup, advance: Advance = silent) -> tuple[known.Block, np.ndarray]:
+    """The block of the tables of all passes, and the given coordinates of its points (m, 3), ITRS, metres, NaN of ties.
+
+    Raises:
+        InputError: a table that cannot be used.
+        BenchError: points that cannot be intersected, or a line of which it is not said how it may change.
+    """
+    spec, payload = setup.test, setup.camera
+    passes = read_measurements(setup.data, payload, advance, {})
+    lines = tuple(dict.fromkeys(line for one in passes for line in one.images))
+    for line in lines:
+        if line not in spec.changes:
+            raise BenchError(f"it is not said how {line} may have changed", ("changes",), f"`{line}:`")
+    moments = {one.name: tai_of(one.platform.epoch) for one in passes}
+    zero = min(moments.values())
+    begin = {name: round((day - zero[0]) * _DAY + (part - zero[1]) * _DAY, 6) for name, (day, part) in moments.items()}
+    points, number = _points(passes, spec.names == "shared")
+    models = {line: line_model(payload, line) for line in lines}
+    data = {one.name: _pass_data(one, setup) for one in passes}
+    raw = {}
+    for one in passes:
+        for line, rays in data[one.name].rays(one.images).items():
+            raw[f"{one.name}/{line}"] = rays
+    given = np.where((points.role == "tie")[:, None], np.nan, points.start)
+    points = _started(points, raw, models, number)
+    earth = Earth()
+    height = earth.geodetic(points.start)[2]
+    removed = light_effects(spec.effects) if spec.effects.corrected else NO_EFFECTS
+    scenes = []
+    for one in passes:
+        mine = {line: raw[f"{one.name}/{line}"] for line in one.images}
+        corrected = data[one.name].corrected(mine, one.images, removed, height[number[one.name]])
+        for line, rays in corrected.items():
+            moved = _scene_rays(data[one.name], line, rays, one.images[line], begin[one.name], number[one.name])
+            scenes.append(known.Scene(f"{one.name}/{line}", one.name, line, moved))
+    days = np.array(list(begin.values())) / _DAY
+    expected = {
+        line: known.CameraKnowledge(np.zeros((len(days), 4)), change_covariance(spec.changes[line], days))
+        for line in lines
+    }
+    block = known.Block(
+        passes=tuple(known.Pass(name, spec.trackers.get(name, "tracker"), _middle(scenes, name)) for name in begin),
+        scenes=tuple(scenes),
+        cameras=FrozenMap(models),
+        known=expected,
+        attitude=tuple(law_of(name, law) for name, law in spec.errors.attitude.items()),
+        station=tuple(law_of(name, law) for name, law in spec.errors.orbit.items()),
+        image=1.0,
+        points=points,
+        monitored=_monitored(setup, lines, expected, tuple(begin)),
+    )
+    return block, given
+
+
+def _middle(scenes: Sequence[known.Scene], name: str) -> float | None:
+    times = [s.rays.time for s in scenes if s.of == name and s.rays.time is not None and len(s.rays.time)]
+    return 0.5 * float(np.concatenate(times).min() + np.concatenate(times).max()) if times else None
+
+
+def _pass_data(one: PassMeasurements, setup: MeasuredAdjustSetup) -> PassData:
+    cameras, path, earth = line_cameras(setup.camera), TabulatedTrajectory(one.platform), Earth()
+    sensors = {
+        name: Sensor.of_lines(cameras[name], path, earth, one.line_times[name], NO_EFFECTS) for name in one.images
+    }
+    known_places = one.ground.role != "tie"
+    height = 0.0
+    if np.any(known_places):
+        height = float(np.mean(earth.geodetic(one.ground.itrs[known_places])[2]))
+    models = FrozenMap({name: line_model(setup.camera, name) for name in one.images})
+    pitch = FrozenMap({name: setup.camera.pitch_of(name) for name in one.images})
+    return PassData(one.name, FrozenMap(sensors), models, pitch, height, lines=setup.camera.lines)
+
+
+def _points(passes: Sequence[PassMeasurements], shared: bool) -> tuple[known.Points, dict[str, np.ndarray]]:
+    """Points of all passes, and pass -> number of each of its points among them. Points of one name are one where names
+    are shared; the first pass that has coordinates gives them.
+    """
+    ids: dict[str, int] = {}
+    places: list[np.ndarray] = []
+    covariances: list[np.ndarray] = []
+    roles: list[str] = []
+    number = {}
+    for one in passes:
+        where = np.empty(len(one.ground), np.intp)
+        for k, name in enumerate(one.ground.ids.tolist()):
+            key = str(name) if shared else f"{one.name} {name}"
+            at = ids.setdefault(key, len(ids))
+            where[k] = at
+            if at == len(places):
+                places.append(one.ground.itrs[k])
+                covariances.append(one.ground.covariance[k])
+                roles.append(one.ground.role[k])
+            elif roles[at] == "tie" and one.ground.role[k] != "tie":
+                places[at], covariances[at], roles[at] = (
+                    one.ground.itrs[k],
+                    one.ground.covariance[k],
+                    one.ground.role[k],
+                )
+        number[one.name] = where
+    role = np.array(roles, object)
+    covariance = np.array(covariances)
+    # exact control points are known to a millimetre: a covariance has to have an inverse
+    exact = (role == "control") & ~np.any(covariance, axis=(1, 2))
+    covariance[exact] = 1e-6 * np.eye(3)
+    return known.Points(np.array(list(ids), object), np.array(places), role, covariance), number
+
+
+def _started(
+    points: known.Points, raw: Mapping[str, Rays], models: Mapping[str, LineModel], number: Mapping[str, np.ndarray]
+) -> known.Points:
+    """First places of tie and check points where two scenes see them; of the others the mean of all places."""
+    rays = {
+        scene: Rays(number[scene.rsplit("/", 1)[0]][r.point], r.image, r.station, r.attitude)
+        for scene, r in raw.items()
+    }
+    cameras = {scene: models[scene.rsplit("/", 1)[1]] for scene in raw}
+    try:
+        found = intersect(rays, cameras, Noise(1e-5), count=len(points.ids)).ground
+    except CalibrationError as error:
+        raise BenchError(str(error), ("data",), "points that two scenes see") from error
+    start = np.where((points.role == "control")[:, None], points.start, found)
+    unknown = ~np.isfinite(start).all(axis=1)
+    start[unknown] = np.nanmean(start, axis=0)
+    return known.Points(points.ids, start, points.role, points.covariance)
+
+
+def _scene_rays(data: PassData, line: str, rays: Rays, images: ImagePoints, begin: float, number: np.ndarray) -> Rays:
+    """Rays of a scene on the block's time and points, with the covariance of their image points, m^2."""
+    scale = pixels_per_line(data, line, images.line, images.pixel, data.height)
+    to_plane = data.pitch[line] * np.array([-scale, 1.0])
+    spread = images.covariance * to_plane[:, None] * to_plane
+    assert rays.time is not None
+    return Rays(number[rays.point], rays.image, rays.station, rays.attitude, rays.time + begin, spread)
+
+
+def _monitored(
+    setup: MeasuredAdjustSetup,
+    lines: Sequence[str],
+    expected: Mapping[str, known.CameraKnowledge],
+    passes: Sequence[str],
+) -> dict[str, known.CameraKnowledge] | None:
+    monitor = setup.test.monitor
+    if monitor is None:
+        return None
+    found = {}
+    for line in lines:
+        reading, sigma = np.zeros((len(passes), 4)), np.full((len(passes), 4), np.inf)
+        for k, name in enumerate(passes):
+            one = monitor.readings.get(name, {}).get(line)
+            if one is not None:
+                reading[k], sigma[k] = (*one.angles, one.principal_distance), camera_sigmas(monitor)
+        found[line] = monitored_camera(expected[line].covariance, reading.ravel(), sigma.ravel())
+    return found
