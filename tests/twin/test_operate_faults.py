@@ -12,7 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from optics.numerics.backend import load_backend
+from scenes.specs.resolved import resolve_with
 from tests.twin.commands import invoke
+from tests.twin.operation_records import life_of, monitor_entry, plan_of
 from tests.twin.record_bench import (
     TELEMETRY,
     given,
@@ -24,10 +27,12 @@ from tests.twin.record_bench import (
     temperatures,
 )
 from tests.twin.test_durability import mounted
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
+from twin.operate.estimate.operation import Operation
 from twin.operate.record.database import FILE, RecordFailed
 from twin.operate.record.entries import Alarm
-from twin.operate.record.history import History
+from twin.operate.record.history import History, initialised
 from twin.operate.record.record_tables import tables
 from twin.run.data_files import TABLE_FORMATS
 
@@ -232,6 +237,32 @@ def test_the_same_record_on_a_postgresql_server(server: str, tmp_path: Path) -> 
         for what in ("DELETE FROM entry", "UPDATE source SET file = 'x'", "TRUNCATE refused", "DELETE FROM alarm"):
             with pytest.raises(psycopg.errors.RaiseException, match="a record is never altered"), base.transaction():
                 base.execute(what)
+
+
+@HAS_SERVER
+@pytest.mark.second
+def test_the_same_estimate_on_a_postgresql_server(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is known now, of the past and ahead: the same bytes, also where it goes on from what was kept."""
+    monkeypatch.setattr("twin.operate.estimate.operation.HEAD", 1)
+    plan = plan_of(tmp_path)
+    experiment = MonitorExperiment(plan.model, load_backend())
+    stated = experiment.disturbances
+    assert stated is not None
+    slip = next(k for k, label in enumerate(stated.labels) if "forward/M2 shift z" in label)
+    life = life_of(stated, 60.0, 3.0, 2, {30.0: {slip: 4.0}})
+    entries = [monitor_entry(experiment, stated, life, k, 2) for k in range(len(life.times))]
+    found = []
+    for place in (database(server, "estimate"), str(tmp_path / "record")):
+        initialised(place, resolve_with("monitor_pair"), True)
+        with History(place) as history:
+            for name, own in (("a", entries[:12]), ("b", entries[12:])):
+                assert not history.take(given(name, own)).refused
+                estimate = Operation(history, plan)
+                told = estimate.follow().to_dict()
+            ahead = estimate.forecast(life.times[-1:] + 86_400_000_000).to_dict()
+            found.append(json.dumps([told, estimate.smoothed(life.times).to_dict(), ahead]))
+    assert json.loads(found[0])[0]["jumps"]
+    assert found[0] == found[1]
 
 
 @HAS_SERVER
