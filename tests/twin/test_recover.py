@@ -334,7 +334,7 @@ PLAIN = "forward/left: {before: a.tif, after: b.tif}"
     ("text", "told"),
     [
         ("frames: images\n", ["an instrument or its geometry is needed"]),
-        (HEAD, ["this is a job of the monitor"]),
+        (HEAD + "perturb: {base: {shift: [1 um, 0 um, 0 um]}}\n", ["this is a job of the monitor"]),
         (HEAD + "template: twin\ncorrections: none\n", ["'frames' is missing"]),
         (HEAD + "frames: imges\n", ["no such folder", "measurement.yaml:3: frames"]),
         (HEAD + "frames: measurement.yaml\n", ["neither a folder nor a table"]),

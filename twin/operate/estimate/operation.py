@@ -415,9 +415,18 @@ class Operation:
     def _past(
         self, times: NDArray[np.int64], each: Callable[[Array, Array, float], tuple[Array, Array]]
     ) -> list[tuple[Array, Array]]:
-        """What is made of the states at times, by all readings."""
+        """What is made of the states at times, by all readings; from the newest on it is what a forecast has."""
         taking, last = self._taking, self._standing
         begin = self._begin()
+        if len(times) and times.max() >= last.time:
+            with one_blas_thread():
+                now = taking.how.blended(last.belief)
+                ahead = []
+                for second in (taking.seconds(int(time)) for time in times[times >= last.time]):
+                    there = taking.how.at(now, second)
+                    ahead.append(each(there.mean, there.covariance, second))
+            past, ahead_of = iter(self._past(times[times < last.time], each)), iter(ahead)
+            return [next(ahead_of if time >= last.time else past) for time in times]
         if not len(times):
             return []
         if times.min() < begin:
@@ -431,7 +440,6 @@ class Operation:
             entries = {int(one["id"]): one for together in self._moments(told) for one in together}
             observed = [taking.observed(entries[number]) for number in used.tolist()]
             belief = (taking.start(begin) if start is None else start).belief
-            belief = taking.how.blended(belief) if start is last else belief
             belief = replace(
                 belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
             )
@@ -462,12 +470,8 @@ class Operation:
         return first
 
     def _before_all(self, time: int) -> Standing | None:
-        """The newest that was kept for good before a time and before all jumps that were told since, or what stands now
-        for what is ahead; None for none.
-        """
+        """The newest that was kept for good before a time and before all jumps that were told since; None for none."""
         last = self._standing
-        if time >= last.time:
-            return last
         while True:
             kept = self.history.checkpoint(self.key, before_us=time, valid=True)
             if kept is None:
