@@ -100,7 +100,8 @@ def test_the_console_command_knows_every_program(tmp_path):
         assert [name for name in commands(module) if len(commands(module)) > 2 and name.split()[-1] not in line] == []
     script = console(tmp_path)
     listed = started(tmp_path, script, "--help")
-    assert all(f"\n  {name:11}  {line}\n" in listed.stdout for name, (_, line) in PROGRAMS.items())
+    told = " ".join(listed.stdout.split())  # long ones take two lines
+    assert all(f" {name} {line} " in f"{told} " for name, (_, line) in PROGRAMS.items())
     assert started(tmp_path, script).returncode == 2
     wrong = started(tmp_path, script, "rendre")
     assert wrong.returncode == 2
