@@ -224,10 +224,18 @@ class History:
     def first(self, kind: str) -> dict[str, Any] | None:
         """The earliest entry of a kind, as of `entries`; None for none."""
         c = ENTRY.c
-        query = select(*c).where(c.kind == kind).order_by(c.time_us, c.id).limit(1)
         with self.reading() as connection:
-            row = connection.execute(query).mappings().first()
-        return None if row is None else dict(row)
+            # of each subject by the index, which has it before the time
+            rows = [
+                connection.execute(
+                    select(*c).where(c.kind == kind, c.subject == subject).order_by(c.time_us, c.id).limit(1)
+                )
+                .mappings()
+                .one()
+                for own, subject in _streams(connection)
+                if own == kind
+            ]
+        return dict(min(rows, key=lambda row: (row["time_us"], row["id"]))) if rows else None
 
     def subjects(self, kind: str) -> list[str]:
         """Of what there are readings of a kind, in alphabetical order."""

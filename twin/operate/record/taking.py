@@ -137,7 +137,12 @@ class Taking:
         own = _before(one.content)
         if self.first is None:
             c = ENTRY.c
-            query = select(c.time_utc, c.content).where(c.kind == "monitor").order_by(c.time_us, c.id).limit(1)
+            query = (
+                select(c.time_utc, c.content)
+                .where(c.kind == "monitor", c.subject == "monitor")
+                .order_by(c.time_us, c.id)
+                .limit(1)
+            )
             row = self.connection.execute(query).first()
             if row is None:
                 return ""
