@@ -44,11 +44,12 @@ TYPES = {
 _ROOM = Path(__file__).parents[1]
 SHARED: Mapping[str, Traversable] = {
     "scroll.css": _ROOM / "run" / "scroll.css",
+    "page.css": files(__package__) / "page" / "page.css",
     "format.js": files(__package__) / "page" / "format.js",
     "scene.js": files(__package__) / "page" / "scene.js",
     "three.min.js": _ROOM / "pictures" / "viewer" / "three.min.js",
 }
-"""Parts of every page that shows an instrument: sideways scrolling, numbers, the view in three dimensions."""
+"""Parts of every page that shows an instrument: scrolling sideways, looks, numbers, the view in three dimensions."""
 
 
 class PageServer:
