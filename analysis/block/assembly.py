@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,17 +156,8 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
         {},
     )
     sets, images = _sets(bare, common)
-    return Assembly(
-        block,
-        Reduction(tuple(sets), tuple(priors), size, len(block.points.ids)),
-        by_pass,
-        tuple(every),
-        changes,
-        units,
-        shift,
-        axes,
-        images,
-    )
+    whole = Reduction(tuple(sets), tuple(priors), size, len(block.points.ids))
+    return replace(bare, reduction=whole, images=images)
 
 
 def _times(block: Block) -> dict[str, Array]:

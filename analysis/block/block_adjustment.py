@@ -134,14 +134,7 @@ class BlockAdjustment:
 
     def attitude_at(self, of: str, times: Array) -> tuple[Array, Array]:
         """Correction of the attitude of a pass about the body's axes, (n, 3), radians, with covariances (n, 3, 3)."""
-        return self._correction(of, times, True)
-
-    def station_at(self, of: str, times: Array) -> tuple[Array, Array]:
-        """Correction of the station along the axes of the pass, (n, 3), metres, with covariances (n, 3, 3)."""
-        return self._correction(of, times, False)
-
-    def _correction(self, of: str, times: Array, turns: bool) -> tuple[Array, Array]:
-        columns, factors = self.assembly.corrections(of, times).factors(turns)
+        columns, factors = self.assembly.corrections(of, times).factors(True)
         value = np.sum(factors * self.x[columns], axis=1)
         spread = np.empty((len(times), 3, 3))
         for i in range(3):

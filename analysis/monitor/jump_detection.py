@@ -48,6 +48,7 @@ __all__ = [
     "likeliest",
     "sized",
     "steps",
+    "untold_share",
     "with_jumps",
     "with_unfound",
 ]
@@ -66,6 +67,9 @@ _AGAIN, _TWO_VALUED = 1.0, 1.5
 """Times that, for a smoother, what spots leave unknown of a told jump counts once more, and what it did counts."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
 """By how much the variance of a jump is tried to be larger than stated."""
+_SIZES = np.linspace(0.0, 8.0, 401)
+_MEAN_SQUARE = 2.0 * (_SIZES[1] - _SIZES[0]) * _SIZES**2 * np.exp(-0.5 * _SIZES**2) / np.sqrt(2.0 * np.pi)
+"""Shares of the mean square of a normal number by its size in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,6 +373,16 @@ def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
     return stated
 
 
+def untold_share(limit: float, seen: Array) -> Array:
+    """(n,) share of the mean square of normal jumps that is of those which are not told.
+
+    Args:
+        limit: standard deviations from which on a jump is told.
+        seen: (n,) standard deviations by which a jump of the stated size is seen.
+    """
+    return np.asarray(ndtr(limit - _SIZES * seen[:, None]) @ _MEAN_SQUARE)
+
+
 def with_unfound(
     model: Disturbances, found: Sequence[Steps], stated: Disturbances, looks: int, last: float
 ) -> Disturbances:
@@ -387,15 +401,13 @@ def with_unfound(
     )
     if not looks or not len(until):
         return model
-    size = np.linspace(0.0, 8.0, 401)
-    mean = 2.0 * (size[1] - size[0]) * size**2 * np.exp(-0.5 * size**2) / np.sqrt(2.0 * np.pi)
     limit = float(np.sqrt(limit_of(stated.jump_false_alarm / looks, 1)))
     for k, law in enumerate(stated.laws):
         if law.every_s is None:
             continue
         column = stated.spots[:, k]
         seen = np.sqrt(np.maximum(column @ information @ column, 0.0))
-        left = ndtr(limit - size * seen[:, None]) @ mean
+        left = untold_share(limit, seen)
         grown = np.cumsum(left * (until - after)) / law.every_s
         ahead = _AHEAD * (last - float(after[0]))
         knots = [(float(after[0]), 0.0), *zip(until.tolist(), grown.tolist(), strict=True)]

@@ -28,12 +28,21 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import ndtr
 
 from analysis.chi_square import limit_of
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.jump_detection import Amounts, Candidate, Jump, Step, Steps, candidates, knots, likeliest
+from analysis.monitor.jump_detection import (
+    Amounts,
+    Candidate,
+    Jump,
+    Step,
+    Steps,
+    candidates,
+    knots,
+    likeliest,
+    untold_share,
+)
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import HeatInputs, StateSpace
 from analysis.monitor.told_jumps import Bodies, mixed
@@ -44,9 +53,6 @@ __all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Track", "Whitene
 Array = NDArray[np.float64]
 _NEARLY = 1e-11
 """Of the sum of its eigenvalues, by which information is made regular."""
-_SIZES = np.linspace(0.0, 8.0, 201)
-_MEAN_SQUARE = 2.0 * (_SIZES[1] - _SIZES[0]) * _SIZES**2 * np.exp(-0.5 * _SIZES**2) / math.sqrt(2.0 * math.pi)
-"""Shares of the mean square of a normal number by its size in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +98,12 @@ class Innovation:
 
     Attributes:
         observed: the reading.
-        expected: its mean; spread: (d, d) covariance about it, noise included.
         white: (d,) the difference in independent standard deviations.
         log_score: logarithm of the density that was stated for what came.
         jump: told at this reading; None for none.
     """
 
     observed: Observed
-    expected: Array
-    spread: Array
     white: Array
     log_score: float
     jump: Jump | None = None
@@ -137,13 +140,11 @@ class Whitened:
     """A reading divided by the root of its covariance.
 
     Attributes:
-        expected: (d,); spread: (d, d) its covariance; root: Cholesky factor of that.
-        white: (d,) root^-1 (value - expected).
+        root: Cholesky factor (d, d) of its covariance, noise included.
+        white: (d,) root^-1 (value - what was expected).
         rows: (d, n) root^-1 H; gain: (d, n) root^-1 H P; picked: (d, q) root^-1 what unit outputs do to it.
     """
 
-    expected: Array
-    spread: Array
     root: Array
     white: Array
     rows: Array
@@ -412,9 +413,7 @@ class SeriesFilter:
         both = np.concatenate([(observed.value - expected)[:, None], rows, across.T, picked], axis=1)
         both = solve_triangular(root, both, lower=True, check_finite=False)
         n = len(track.mean)
-        return Whitened(
-            expected, spread, root, both[:, 0], both[:, 1 : n + 1], both[:, n + 1 : 2 * n + 1], both[:, 2 * n + 1 :]
-        )
+        return Whitened(root, both[:, 0], both[:, 1 : n + 1], both[:, n + 1 : 2 * n + 1], both[:, 2 * n + 1 :])
 
     def _taken(self, track: Track, observed: Observed) -> tuple[Track, Innovation]:
         w = self.whitened(track, observed)
@@ -429,7 +428,7 @@ class SeriesFilter:
             score = score + w.white @ seen
             information = information + seen.transpose(0, 2, 1) @ seen
         taken = Track(track.mean + w.gain.T @ w.white, covariance, response, score, information)
-        return taken, Innovation(observed, w.expected, w.spread, w.white, log_score)
+        return taken, Innovation(observed, w.white, log_score)
 
     def _unseen(self, belief: Belief) -> Array:
         """(m,) what share of the mean square of jumps is of those that cannot be told, by what is known of the oldest
@@ -439,7 +438,7 @@ class SeriesFilter:
         column = self._stacked.spots[:, self.walking]
         seen = np.sqrt(np.maximum(np.einsum("qm,qr,rm->m", column, information, column), 0.0))
         limit = math.sqrt(float(limit_of(self.stated.jump_false_alarm / self.looks(between), 1)))
-        return np.asarray(ndtr(limit - _SIZES * seen[:, None]) @ _MEAN_SQUARE)
+        return untold_share(limit, seen)
 
     def _told(self, belief: Belief) -> Jump | None:
         """The likeliest jump, if chance does not explain it."""

@@ -20,6 +20,7 @@ from scipy.special import pdtrc
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.limits import Quantity
+from analysis.monitor.series_filter import Belief
 from analysis.monitor.series_following import hinted, smoothed
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import one_blas_thread
@@ -290,9 +291,13 @@ class Operation:
             raise Problem("a forecast of what is past", utc_text(int(times.min())), allowed)
         how = self._taking.how
         with one_blas_thread():
-            belief = how.blended(self._standing.belief)
-            found = [how.parameters(belief, self._taking.seconds(int(time))) for time in times]
+            found = [how.parameters(self._now, self._taking.seconds(int(time))) for time in times]
         return self._course(times, found, np.full(len(times), self._widened))
+
+    @cached_property
+    def _now(self) -> Belief:
+        """What is known after all readings, jumps that are not told counted by their chances."""
+        return self._taking.how.blended(self._standing.belief)
 
     @cached_property
     def _widened(self) -> float:
@@ -420,10 +425,9 @@ class Operation:
         begin = self._begin()
         if len(times) and times.max() >= last.time:
             with one_blas_thread():
-                now = taking.how.blended(last.belief)
                 ahead = []
                 for second in (taking.seconds(int(time)) for time in times[times >= last.time]):
-                    there = taking.how.at(now, second)
+                    there = taking.how.at(self._now, second)
                     ahead.append(each(there.mean, there.covariance, second))
             past, ahead_of = iter(self._past(times[times < last.time], each)), iter(ahead)
             return [next(ahead_of if time >= last.time else past) for time in times]
@@ -437,8 +441,10 @@ class Operation:
             told = None if start is None else start.time
             steps = (*taking.how.steps, *self._steps(last, told))
             used, left = self._used(told)
-            entries = {int(one["id"]): one for together in self._moments(told) for one in together}
-            observed = [taking.observed(entries[number]) for number in used.tolist()]
+            wanted = set(used.tolist())
+            every = (one for together in self._moments(told) for one in together)
+            said = {one["id"]: taking.observed(one) for one in every if one["id"] in wanted}
+            observed = [said[number] for number in used.tolist()]
             belief = (taking.start(begin) if start is None else start).belief
             belief = replace(
                 belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
@@ -451,23 +457,22 @@ class Operation:
     def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
         """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""
         spans = self._spans(after_us)
-        if not spans:
-            return np.zeros(0, np.int64), np.zeros((0, len(self._taking.how.walking)))
         width = len(self._taking.how.walking)
         left = np.concatenate([one.left.reshape(len(one.used), width) for one in spans])
         return np.concatenate([one.used for one in spans]), left
 
     def _spans(self, after_us: int | None) -> list[Standing]:
         """Where the estimate was kept for good after a time and stands now; each knows what was used since the last."""
+        return [one for one in self._every_span if after_us is None or one.time > after_us]
+
+    @cached_property
+    def _every_span(self) -> list[Standing]:
+        last = self._standing  # what is new is taken and kept first
         kept = [one for one in self.history.checkpoints(self.key) if one.number > _HEAD]
-        spans = [Standing.from_bytes(one.content) for one in kept if after_us is None or one.time > after_us]
-        if after_us is None or self._standing.time > after_us:
-            spans.append(self._standing)
-        return spans
+        return [*(Standing.from_bytes(one.content) for one in kept), last]
 
     def _begin(self) -> int:
-        first = min(int(one["time_us"]) for kind in _USED if (one := self.history.first(kind)) is not None)
-        return first
+        return min(int(one["time_us"]) for kind in _USED if (one := self.history.first(kind)) is not None)
 
     def _before_all(self, time: int) -> Standing | None:
         """The newest that was kept for good before a time and before all jumps that were told since; None for none."""
