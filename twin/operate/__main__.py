@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from scenes.yaml.errors import InputError, Problem, nearest
+from scenes.yaml.errors import InputError, nearest
 from scenes.yaml.standard_output import FAILURE, print_error
 from twin.operate.estimate_commands import alarms, estimate_of, forecast, show_estimate
 from twin.operate.followed import PlanFile
@@ -152,10 +152,11 @@ def ingest(
     Exit codes: 0 success, 2 bad input or something was refused (all else is taken), 1 anything else.
     """
     from twin.operate.record.history import History
-    from twin.operate.record.sources import Sources
+    from twin.operate.record.sources import Sources, moment_said
 
     with told() as errors, durable.exit_on_terminate(), History(record) as history:
-        sources = Sources(files, _moment(moment), _is_stated(instrument, history), watch)
+        start = None if moment is None else moment_said("--time", moment)
+        sources = Sources(files, start, _is_stated(instrument, history), watch)
         totals, files_told, first = Counter({"new": 0, "known": 0, "refused": 0}), [], ""
         raised: list[str] = []
         try:
@@ -205,17 +206,6 @@ def _new_alarms(errors: Console, history: History, quiet: bool) -> list[str]:
         print_error(errors, f"what was taken is in the record, and the estimate cannot be worked out: {error}")
         return []
     return [] if found is None else [f"alarm: {one.text}" for one in found[1]]
-
-
-def _moment(text: str | None) -> int | None:
-    from twin.operate.record.entries import micros, one_line
-
-    if text is None:
-        return None
-    try:
-        return micros(text)
-    except Problem as problem:
-        raise InputErrorText(f"--time: {one_line(problem)}") from None
 
 
 def _is_stated(instrument: str | None, history: History) -> bool:

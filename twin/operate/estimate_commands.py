@@ -63,14 +63,12 @@ def forecast(
 
 def _end(until: str | None, start: int, horizon: float) -> int:
     """Microseconds of the end of a forecast. Raises InputErrorText: it is not after its beginning."""
-    from twin.operate.record.entries import MICRO, micros, one_line, utc_text
+    from twin.operate.record.entries import MICRO, utc_text
+    from twin.operate.record.sources import moment_said
 
     if until is None:
         return start + round(horizon * MICRO)
-    try:
-        end = micros(until)
-    except Problem as problem:
-        raise InputErrorText(f"--until: {one_line(problem)}") from None
+    end = moment_said("--until", until)
     if end <= start:
         raise InputErrorText(f"--until: {until} is not after the newest reading, {utc_text(start)}")
     return end

@@ -79,13 +79,14 @@ def products(
 def _time(moment: str | None, scene: ExportSource | None) -> int:
     """Of the estimate, microseconds of TAI since 2000. Raises InputErrorText."""
     from twin.operate.products import scene_time
-    from twin.operate.record.entries import micros, one_line
+    from twin.operate.record.entries import one_line
+    from twin.operate.record.sources import moment_said
 
+    if moment is not None:
+        return moment_said("--time", moment)
     try:
-        if moment is not None:
-            return micros(moment)
         if scene is not None:
             return scene_time(scene)
     except Problem as problem:
-        raise InputErrorText(f"{'--scene' if moment is None else '--time'}: {one_line(problem)}") from None
+        raise InputErrorText(f"--scene: {one_line(problem)}") from None
     raise InputErrorText("of which time? --time UTC, or --scene FILE, which has one")

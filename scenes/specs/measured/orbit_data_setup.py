@@ -83,7 +83,9 @@ Setup = TypeVar("Setup", MeasuredCalibrationSetup, MeasuredAngleSetup, MeasuredJ
 
 
 def is_measured(path: str | Path) -> bool:
-    """Whether a file, or a run's config.yaml, is a test on measurements. InputError if it cannot be read."""
+    """Whether a file, or a run's config.yaml, is a test on measurements; not of a block, whose simulation has a mapping
+    of passes, too (`adjust_setup.resolve_any_adjust`). InputError if it cannot be read.
+    """
     said = test_keys(path)
     # `passes` of a simulation is a number
     return "data" in said or "conventions" in said or isinstance(said.get("passes"), dict)

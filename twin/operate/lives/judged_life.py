@@ -110,15 +110,17 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
             ahead = np.searchsorted(times, times + round(horizon * MICRO))
             now: list[Course] = []
             later: list[Course] = []
+            operation: Operation | None = None
             advance(FOLLOW, 0, len(times))
             for k, moment in enumerate(times.tolist()):
                 steps.take(moment)
-                operation = Operation(history, plan)
+                operation = Operation(history, plan) if operation is None else operation.again()
                 following = operation.follow()
                 now.append(following.now)
                 target = times[ahead[k]] if ahead[k] < len(times) else moment + round(horizon * MICRO)
                 later.append(operation.forecast(np.array([target])))
                 advance(FOLLOW, k + 1, len(times))
+            assert operation is not None  # a life has a reading
             smoothed = operation.smoothed(times)
             ground = _prior(operation, times)
     # the record keeps no errors on the ground of a reading, the run that read it does

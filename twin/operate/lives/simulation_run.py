@@ -19,9 +19,10 @@ from scenes.yaml.yaml_file import read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.plans import keep_plan, read_plan
 from twin.operate.lives.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
-from twin.operate.record.entries import micros, one_line, utc_text
+from twin.operate.record.entries import one_line, utc_text
 from twin.operate.record.history import History, initialised
 from twin.operate.record.run_readings import CONFIG
+from twin.operate.record.sources import moment_said
 from twin.operate.record.taking import Taken
 from twin.operate.record.telemetry import read_table_file, read_telemetry, tables_of
 from twin.run.cli import InputErrorText
@@ -106,7 +107,7 @@ def simulation(options: Mapping[str, str], several: Mapping[str, Sequence[str]],
         raise InputErrorText(f"--coefficient-error: {options['--coefficient-error']} is below zero; write 30%, or 0%")
     if not sigma > 0.0:
         raise InputErrorText(f"--sensor-sigma: {options['--sensor-sigma']} is no standard deviation; write 0.05 K")
-    start = _moment("--from", options["--from"])
+    start = moment_said("--from", options["--from"])
     dates = tuple((moment, name) for name, moment in (_at("--event", text, EVENTS) for text in several["--event"]))
     return Simulation(
         start,
@@ -137,13 +138,6 @@ def _quantity(option: str, text: str, kind: Kind) -> float:
         raise InputErrorText(f"{option}: {one_line(problem)}") from None
 
 
-def _moment(option: str, text: str) -> int:
-    try:
-        return micros(text)
-    except Problem as problem:
-        raise InputErrorText(f"{option}: {one_line(problem)}") from None
-
-
 def _at(option: str, text: str, known: Collection[str] | None = None) -> tuple[str, int]:
     """Name and moment of ``NAME@UTC``."""
     name, sign, moment = text.partition("@")
@@ -151,7 +145,7 @@ def _at(option: str, text: str, known: Collection[str] | None = None) -> tuple[s
         raise InputErrorText(f"{option}: {text!r} does not say when; write {name or 'NAME'}@2027-06-01T00:00:00Z")
     if known is not None:
         _known(option, name, known)
-    return name, _moment(option, moment)
+    return name, moment_said(option, moment)
 
 
 def _known(option: str, name: str, names: Collection[str]) -> None:

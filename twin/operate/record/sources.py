@@ -11,7 +11,7 @@ from pathlib import Path
 from scenes.specs.measured.telemetry import RUNS, ReadingTableSpec
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Problem
-from twin.operate.record.entries import Given, Refused, digest_of_data, micros
+from twin.operate.record.entries import Given, Refused, digest_of_data, micros, one_line
 from twin.operate.record.history import History
 from twin.operate.record.run_readings import run_entries
 from twin.operate.record.telemetry import LARGEST, read_table_file, read_telemetry, tables_of
@@ -25,6 +25,22 @@ SETTLED = 2.0
 _TIME = re.compile(r"(\d{4})-?(\d{2})-?(\d{2})T(\d{2})[:-]?(\d{2})[:-]?(\d{2}(?:\.\d+)?)Z")
 _YAML = (".yaml", ".yml")
 State = tuple[int, ...]
+
+
+def moment_said(option: str, text: str) -> int:
+    """Microseconds of TAI since 2000 of a UTC that a command was given.
+
+    Args:
+        option: with its dashes.
+        text: after it.
+
+    Raises:
+        InputErrorText: not a date and time.
+    """
+    try:
+        return micros(text)
+    except Problem as problem:
+        raise InputErrorText(f"{option}: {one_line(problem)}") from None
 
 
 def time_of_name(name: str) -> int | None:
