@@ -93,7 +93,7 @@ def image(field: PupilField, x: Grid, y: Grid, single: bool = False) -> np.ndarr
         field: B pupils.
         x: detector x of the C columns.
         y: detector y of the R rows.
-        single: right to some 1e-7 of the peak, as in single precision, for half of the time; else to 1e-12.
+        single: right to some 1e-7 of the peak, as in single precision, for less time; else to 1e-12.
 
     Returns:
         Shape (B, R, C), 1/m^2 for unit power through the pupil.
