@@ -15,7 +15,7 @@ number has to be gathered but those of the table.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from optics.numerics.llvm import ensure_llvm
+from optics.numerics.threads import one_kernel_thread
 from twin.sensors.poisson_numbers import (
     CELLS_PER_UNIT,
     MOST_IN_TABLE,
@@ -40,8 +41,10 @@ __all__ = ["FEWEST", "Reading", "exposing_bytes", "kernels_there"]
 FEWEST = 50_000
 """Numbers of an exposure from which it is done by kernels: fewer take as long to hand over as to work out."""
 
-_TOGETHER = 1 << 21
-"""Numbers that are drawn and read out at once; their words and normal numbers take 32 MiB."""
+_TOGETHER = 1 << 20
+"""Numbers that are drawn and read out at once; their words and normal numbers take 16 MiB, and as much again while the
+next are drawn.
+"""
 
 _LANES = 16
 """Numbers of pixels are rounded up to a multiple of this, so that each frame begins at an aligned address."""
@@ -105,17 +108,25 @@ class Reading:
         images, frames, pixels = out.shape
         together = min(together, frames)
         size = min(images, max(1, _TOGETHER // (together * pixels)))
-        drawn = _Numbers.room(together, size * pixels, self.sigma_e > 0)
-        with ThreadPoolExecutor(threads) as pool:
+        pieces = (images > size) + (frames > together)
+        rooms = [_Numbers.room(together, size * pixels, self.sigma_e > 0) for _ in range(min(2, 1 + pieces))]
+        # the next numbers are drawn while kernels work on the last ones
+        drawn: _Drawn | None = None
+        with one_kernel_thread(), ThreadPoolExecutor(threads) as pool:
             for first in range(0, images, size):
-                last = min(first + size, images)
-                for number in range(first, last):
-                    own = slice((number - first) * pixels, (number - first + 1) * pixels)
-                    for row, values in zip((drawn.mean, drawn.shift), expected(number), strict=True):
-                        row[own] = values.reshape(-1)
-                group = _Group(self, drawn, streams[first:last], together, frames, pixels)
+                some = range(first, min(first + size, images))
+                group: _Group | None = None
                 for start in range(0, frames, together):
-                    group.expose(out[first:last, start : start + together], pool)
+                    numbers = rooms[(first // size * len(range(0, frames, together)) + start // together) % len(rooms)]
+                    numbers.expect(expected, some)
+                    if group is None:
+                        group = _Group(self, numbers, [streams[k] for k in some], together, frames, pixels)
+                    following = group.draw(numbers, out[some.start : some.stop, start : start + together], pool)
+                    if drawn is not None:
+                        drawn.read_out()
+                    drawn = following
+            if drawn is not None:
+                drawn.read_out()
 
 
 def exposing_bytes(frames: int, pixels: int) -> int:
@@ -125,7 +136,7 @@ def exposing_bytes(frames: int, pixels: int) -> int:
         frames: of an image that are done at once.
         pixels: of a frame.
     """
-    return max(_TOGETHER, frames * pixels) * 24 + pixels * 64
+    return max(_TOGETHER, frames * pixels) * 40 + pixels * 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +162,15 @@ class _Numbers:
         normals = _aligned(np.float64, frames, lanes) if noisy else None
         return cls(mean, shift, _aligned(np.uint64, frames, lanes), normals)
 
+    def expect(self, expected: Callable[[int], tuple[np.ndarray, np.ndarray]], images: range) -> None:
+        """Set what is expected of some images."""
+        for place, image in enumerate(images):
+            for row, values in zip((self.mean, self.shift), expected(image), strict=True):
+                row[place * values.size : (place + 1) * values.size] = values.reshape(-1)
+
 
 class _Group:
-    """Some images whose frames are drawn and read out together."""
+    """Some images whose frames are drawn together, and their streams."""
 
     def __init__(
         self,
@@ -164,48 +181,72 @@ class _Group:
         frames: int,
         pixels: int,
     ) -> None:
-        self.how, self.numbers, self.images, self.pixels = how, numbers, len(streams), pixels
+        self.how, self.pixels = how, pixels
         self.huge: list[np.ndarray] = []
         self.sources = []
         for image, own in enumerate(streams):
-            mean = numbers.mean[self._own(image)]
+            mean = numbers.mean[self.own(image)]
             self.huge.append(np.flatnonzero(mean >= SERIES_END))
             rng = np.random.Generator(np.random.SFC64(own))
             self.sources.append((*split_stream(rng, mean[self.huge[image]], frames, pixels, together), rng))
 
-    def _own(self, image: int) -> slice:
+    def own(self, image: int) -> slice:
+        """Lanes of an image."""
         return slice(image * self.pixels, (image + 1) * self.pixels)
 
-    def expose(self, out: np.ndarray, pool: ThreadPoolExecutor) -> None:
-        """The next frames (images, frames, pixels)."""
-        drawn = list(pool.map(lambda image: self._drawn(image, out.shape[1]), range(self.images)))
-        frame, lane = _kernels(self.how, self.numbers, out)
-        if frame.size:
-            self._put(out, frame, lane, poisson_quantile(self.numbers.mean[lane], self.numbers.words[frame, lane]))
-        for image, (huge, found) in enumerate(zip(self.huge, drawn, strict=True)):
-            if found is not None:
-                frame, lane = np.divmod(np.arange(found.size), huge.size)
-                self._put(out, frame, image * self.pixels + huge[lane], found.astype(np.float64).reshape(-1))
+    def draw(self, numbers: _Numbers, out: np.ndarray, pool: ThreadPoolExecutor) -> _Drawn:
+        """Begin to draw the numbers of the next frames (images, frames, pixels)."""
+        work = [pool.submit(self._drawn, numbers, image, out.shape[1]) for image in range(len(out))]
+        return _Drawn(self, numbers, out, work)
 
-    def _drawn(self, image: int, count: int) -> np.ndarray | None:
+    def _drawn(self, numbers: _Numbers, image: int, count: int) -> np.ndarray | None:
         """Draw the random numbers of an image; its Poisson numbers of huge means, (count, huge), None where no mean
         is.
         """
         words, huge, rng = self.sources[image]
-        own, which = self._own(image), self.huge[image]
-        self.numbers.words[:count, own] = words_of(words, count, self.pixels)
-        found = huge.poisson(self.numbers.mean[own][which], (count, which.size)) if which.size else None
-        if self.numbers.normals is not None:
-            for row in self.numbers.normals[:count]:
+        own, which = self.own(image), self.huge[image]
+        numbers.words[:count, own] = words_of(words, count, self.pixels)
+        found = huge.poisson(numbers.mean[own][which], (count, which.size)) if which.size else None
+        if numbers.normals is not None:
+            for row in numbers.normals[:count]:
                 rng.standard_normal(out=row[own])
         return found
 
-    def _put(self, out: np.ndarray, frame: np.ndarray, lane: np.ndarray, electrons: np.ndarray) -> None:
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Frames whose random numbers are being drawn.
+
+    Attributes:
+        group: their images.
+        numbers: where they are drawn to.
+        out: the frames, (images, frames, pixels).
+        work: draws each image.
+    """
+
+    group: _Group
+    numbers: _Numbers
+    out: np.ndarray
+    work: Sequence[Future[np.ndarray | None]]
+
+    def read_out(self) -> None:
+        """Fill the frames."""
+        huge = [one.result() for one in self.work]
+        numbers, group = self.numbers, self.group
+        frame, lane = _kernels(group.how, numbers, self.out)
+        if frame.size:
+            self._put(frame, lane, poisson_quantile(numbers.mean[lane], numbers.words[frame, lane]))
+        for image, (which, found) in enumerate(zip(group.huge, huge, strict=True)):
+            if found is not None:
+                frame, lane = np.divmod(np.arange(found.size), which.size)
+                self._put(frame, image * group.pixels + which[lane], found.astype(np.float64).reshape(-1))
+
+    def _put(self, frame: np.ndarray, lane: np.ndarray, electrons: np.ndarray) -> None:
         """Read numbers of electrons out into some pixels of some frames."""
-        normals = self.numbers.normals
-        noise = [] if normals is None else [normals[frame, lane] * self.how.sigma_e]
-        image, pixel = np.divmod(lane, self.pixels)
-        out[image, frame, pixel] = self.how.read_out(electrons, noise, self.numbers.shift[lane])
+        numbers, how = self.numbers, self.group.how
+        noise = [] if numbers.normals is None else [numbers.normals[frame, lane] * how.sigma_e]
+        image, pixel = np.divmod(lane, self.group.pixels)
+        self.out[image, frame, pixel] = how.read_out(electrons, noise, numbers.shift[lane])
 
 
 def _aligned(kind: type, rows: int, columns: int) -> np.ndarray:
