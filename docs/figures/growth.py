@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FILE = Path(__file__).with_name("growth.json")
 PICTURE = ROOT / "docs/growth.svg"
 TITLES = {
-    "states": ("states, one frame of 32 × 32 px", "states"),
+    "states": ("states, one frame of 48 × 48 px", "states"),
     "pixels": ("one state's images and a frame", "pixels on a side of each CCD"),
     "bodies": ("100 states placed", "bodies"),
     "frames": ("frames of 96 × 96 px", "frames"),
