@@ -23,7 +23,7 @@ from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesF
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.untold_jumps import added
 
-__all__ = ["Followed", "follow", "hinted", "smoothed"]
+__all__ = ["Followed", "follow", "hinted", "jointly", "smoothed"]
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
@@ -192,6 +192,66 @@ def smoothed(
             carried = moved(carried[:, None], before.time, now, back=True)[:, 0]
             known = how.space.moved_both(known, before.time, now, back=True)
     return [out[k] for k in range(len(times))]
+
+
+def jointly(
+    how: SeriesFilter, start: Belief, observed: Sequence[Observed], wanted: ArrayLike, left: Sequence[Array]
+) -> tuple[Array, Array]:
+    """What all readings say of times past together: values (T, P) of the parameters, and their covariance (T, P, T, P).
+
+    The states at the wanted times go along with the filter, as copies that move no more, up to the last of them; what
+    comes after that is what the smoother carries back to it.
+
+    Args:
+        how: a filter that looks for no jumps, since it knows of them.
+        start: what is known before the first reading.
+        observed: N readings in the order of time.
+        wanted: (T,) times, seconds, in order, none before ``start``.
+        left: as of `smoothed`.
+    """
+    times, space = np.asarray(wanted, np.float64), how.space
+    size, ahead = space.size, 0
+    behind = np.searchsorted(np.array([one.time for one in observed]), times, side="right")
+    last = int(behind[-1]) if len(times) else 0
+    means, own = np.empty((0, size)), np.empty((0, size, 0, size))
+    across, belief = np.empty((0, size, size)), start  # of each copy, the states now with it
+    for k in range(last + 1):
+        if k < len(observed):
+            belief = replace(belief, left=left[k])
+        while ahead < len(times) and behind[ahead] == k:
+            across = space.moved(across, belief.time, times[ahead])
+            belief = how.at(belief, times[ahead])
+            own = np.concatenate([own, across.transpose(0, 2, 1)[:, :, None]], axis=2)
+            row = np.concatenate([across.transpose(1, 0, 2), belief.covariance[:, None]], axis=1)
+            own, across = np.concatenate([own, row[None]]), np.concatenate([across, belief.covariance[None]])
+            means = np.concatenate([means, belief.mean[None]])
+            ahead += 1
+        if k == last:
+            break
+        across = space.moved(across, belief.time, observed[k].time)
+        there = how.at(belief, observed[k].time)
+        whitened = how.whitened(there.state, observed[k])
+        gain = whitened.rows @ across
+        means = means + np.einsum("kdn,d->kn", gain, whitened.white)
+        own = own - np.einsum("kdn,ldm->knlm", gain, gain)
+        across = across - whitened.gain.T @ gain
+        belief, _ = how.update(there, observed[k])
+    after: list[tuple[Array, Array]] = []
+
+    def note(number: int, carried: Array, known: Array) -> None:
+        if number == 0:
+            after.append((carried, known))
+
+    smoothed(how, belief, observed[last:], np.zeros(0), left[last:], how.parameters_of, note)
+    for carried, known in after:
+        until = observed[last].time
+        back = space.moved(carried[:, None], belief.time, until, back=True)[:, 0]
+        both = space.moved_both(known, belief.time, until, back=True)
+        means = means + np.einsum("kmn,m->kn", across, back)
+        own = own - np.einsum("kmn,mo,lop->knlp", across, both, across, optimize=True)
+    values, covariance = space.outputs_jointly(means, own, times)
+    width = space.width
+    return values[:, width:], covariance[:, width:, :, width:]
 
 
 def _again(

@@ -16,6 +16,7 @@ which what heat really does to light is larger than computed: the product of the
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -336,15 +337,44 @@ class StateSpace:
             return rows @ mean, rows, left
         rows = rows.copy()
         values = rows @ mean
+        plain = rows.copy()
         for factor, at in self._heated:
-            own = rows[:, at].copy()
-            product, cross = mean[factor] * mean[at], covariance[factor, at]
-            values += own @ (product + cross)
+            own = plain[:, at]
+            values += own @ (mean[factor] * mean[at] + covariance[factor, at])
             rows[:, at] = (1.0 + mean[factor]) * own
             rows[:, factor] = own @ mean[at]
-            second = covariance[factor, factor] * covariance[np.ix_(at, at)] + np.outer(cross, cross)
-            left += own @ second @ own.T
-        return values, rows, left
+        return values, rows, self._second(plain, plain, covariance)
+
+    def _second(self, rows: Array, others: Array, across: Array) -> Array:
+        """(R, R') covariance of the products of factors and temperatures beyond what rows make of them.
+
+        Args:
+            rows: (R, n), of temperatures as if heat did what was computed.
+            others: (R', n) likewise, of the states at another time or the same.
+            across: (n, n) covariance of the states with those.
+        """
+        out = np.zeros((len(rows), len(others)))
+        for factor, at in self._heated if self.heat is not None else ():
+            second = across[factor, factor] * across[np.ix_(at, at)] + np.outer(across[at, factor], across[factor, at])
+            out += rows[:, at] @ second @ others[:, at].T
+        return out
+
+    def outputs_jointly(self, means: Array, covariance: Array, times: Array) -> tuple[Array, Array]:
+        """What states at T times do together: values (T, D + P) and their covariance (T, D + P, T, D + P).
+
+        Args:
+            means: (T, n) of the states.
+            covariance: (T, n, T, n) of them.
+            times: (T,) seconds.
+        """
+        count, plain = len(times), [self._rows(float(time)).copy() for time in times]
+        own = [self.acting(plain[k], means[k], covariance[k, :, k]) for k in range(count)]
+        values = np.array([one for one, _, _ in own]).reshape(count, len(self.basis))
+        out = np.empty((count, len(self.basis), count, len(self.basis)))
+        for i, j in itertools.product(range(count), repeat=2):
+            across = covariance[i, :, j]
+            out[i, :, j] = own[i][1] @ across @ own[j][1].T + self._second(plain[i], plain[j], across)
+        return values, out
 
     def _rows(self, time: float) -> Array:
         if time not in self._rows_at:
