@@ -113,17 +113,19 @@ def hinted(
     """
     if not how.jumpers or not observed:
         return list(left)
-    levels = [how.space.level_of(one.motions) @ one.root for one in how.jumpers]
-    score = [np.empty((len(observed), level.shape[1])) for level in levels]
-    information = [np.empty((len(observed), level.shape[1], level.shape[1])) for level in levels]
+    at = how.space.level
+    levels = [how.space.level_of(one.motions)[at] @ one.root for one in how.jumpers]
+    scores = np.empty((len(observed), at.stop - at.start))
+    known_of = np.empty((*scores.shape, scores.shape[1]))
 
     def note(number: int, carried: Array, known: Array) -> None:
-        for level, own_score, own_information in zip(levels, score, information, strict=True):
-            own_score[number], own_information[number] = carried @ level, level.T @ known @ level
+        scores[number], known_of[number] = carried[at], known[at, at]
 
     plain = replace(knowing, unfound=False)
     none = np.zeros(0)
     smoothed(plain, replace(start, left=none), observed, none, [none] * len(observed), knowing.parameters_of, note)
+    score = [scores @ level for level in levels]
+    information = [level.T @ (known_of @ level) for level in levels]
     gap = np.diff([one.time for one in observed], prepend=observed[0].time)
     place = {k: i for i, k in enumerate(how.walking.tolist())}
     out = np.array(left)
@@ -160,7 +162,8 @@ def smoothed(
     for k, one in enumerate(observed):
         if k and k % _PIECE == 0:
             beliefs.append(belief)
-        belief, _ = how.update(replace(belief, left=left[k]), one)
+        there = how.at(replace(belief, left=left[k]), one.time)
+        belief = replace(there, state=how.taken(there.state, one)[0])
     out: dict[int, T] = {}
     size, moved = how.space.size, how.space.moved
     carried, known = np.zeros(size), np.zeros((size, size))
@@ -235,7 +238,7 @@ def jointly(
         means = means + np.einsum("kdn,d->kn", gain, whitened.white)
         own = own - np.einsum("kdn,ldm->knlm", gain, gain)
         across = across - whitened.gain.T @ gain
-        belief, _ = how.update(there, observed[k])
+        belief = replace(there, state=how.taken(there.state, observed[k], whitened)[0])
     after: list[tuple[Array, Array]] = []
 
     def note(number: int, carried: Array, known: Array) -> None:
@@ -261,5 +264,6 @@ def _again(
     for one, share in zip(observed, left, strict=True):
         before = replace(belief, left=share)
         there = how.at(before, one.time)
-        yield before, how.whitened(there.state, one)
-        belief, _ = how.update(there, one)
+        whitened = how.whitened(there.state, one)
+        yield before, whitened
+        belief = replace(there, state=how.taken(there.state, one, whitened)[0])
