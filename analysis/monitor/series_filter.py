@@ -248,6 +248,8 @@ class SeriesFilter:
 
     def _stepped(self, covariance: Array, then: float, now: float) -> Array:
         """With the steps that come after one time and not after another."""
+        if not self.steps:
+            return covariance
         ends = self._step_ends
         for k in np.flatnonzero((ends[:, 1] > then) & (ends[:, 0] <= now)).tolist():
             one = self.steps[k]

@@ -308,12 +308,18 @@ class StateSpace:
                 kept[block.at] = _kept(block.law, over)
                 if not block.law.event:
                     self._add(gained, block, (1.0 - _kept(block.law, over) ** 2) * block.covariance)
-                if block.law.period_s is not None:
-                    angle, one = 2.0 * math.pi * over / block.law.period_s, np.eye(block.rank)
-                    cosine, sine = math.cos(angle) * one, math.sin(angle) * one
-                    turned.append((block.at, np.block([[cosine, -sine], [sine, cosine]])))
+            for at, period, still, quarter in self._turning:
+                angle = 2.0 * math.pi * over / period
+                turned.append((at, math.cos(angle) * still + math.sin(angle) * quarter))
             self._transitions[over] = _Transition(kept, kept[:, None] * kept, tuple(turned), gained)
         return self._transitions[over]
+
+    @cached_property
+    def _turning(self) -> list[tuple[slice, float, Array, Array]]:
+        """Of each law with a period its states, the period, and the turns of them by nothing and by a quarter."""
+        own = [block for block in self._blocks if block.law.period_s is not None]
+        quarters = [np.kron([[0.0, -1.0], [1.0, 0.0]], np.eye(block.rank)) for block in own]
+        return [(b.at, float(b.law.period_s or 0.0), np.eye(len(q)), q) for b, q in zip(own, quarters, strict=True)]
 
     @cached_property
     def _transitions(self) -> dict[float, _Transition]:
