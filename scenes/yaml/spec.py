@@ -171,7 +171,7 @@ class Spec(BaseModel):
         old_keys: names that keys had until the last version -> names now; they are read with a note.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False, defer_build=True)
     old_keys: ClassVar[OldKeys] = {}
 
     _source: Source = PrivateAttr(default_factory=Source)
