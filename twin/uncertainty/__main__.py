@@ -8,14 +8,16 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scenes.specs.resolved import ResolvedJob, resolve_with
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
+
+if TYPE_CHECKING:
+    from scenes.specs.resolved import ResolvedJob
 
 PROGRAM, KIND = "twin.uncertainty", "uncertainty"
 _MOST_STATES = 100_000
@@ -73,6 +75,8 @@ def main(
     """
 
     def resolve() -> ResolvedJob:
+        from scenes.specs.resolved import resolve_with
+
         resolved = resolve_with(file, disturbances)
         chosen = resolved.job.render.seed if seed is None else seed
         return resolved.with_render(resolved.frames, chosen)
