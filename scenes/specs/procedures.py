@@ -100,6 +100,7 @@ class Procedure:
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
         report: run -> `twin.run.report.Report`.
         export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
+        cost: set-up -> `twin.run.cost.Cost`, what a run takes of memory and time; none for what never takes much.
         files: kinds of file that it reads; their command is known from the list.
         varied: whether a study can vary it.
         judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
@@ -115,6 +116,7 @@ class Procedure:
     numbers: Any
     report: Any
     export: Any = None
+    cost: Any = None
     files: tuple[FileKind, ...] = ()
     varied: bool = False
     judged: bool = True
@@ -124,7 +126,7 @@ class Procedure:
 
     def __post_init__(self) -> None:
         """Functions that are given by name are imported when they are called."""
-        for name in ("resolve", "run", "numbers", "report", "export"):
+        for name in ("resolve", "run", "numbers", "report", "export", "cost"):
             if isinstance(path := getattr(self, name), str):
                 object.__setattr__(self, name, Named(path))
 
@@ -245,6 +247,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.adjust_setup:resolve_any_adjust",
         run="twin.orbit.block.block_run:run_adjustment",
         numbers="twin.orbit.block.block_numbers:BLOCK",
+        cost="twin.orbit.block.block_cost:block_cost",
         report="twin.orbit.block.block_report:block_report",
         files=(
             FileKind(
@@ -475,6 +478,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.orbit.setup:resolve_simulate",
         run="twin.orbit.images.simulate_run:run_simulation",
         numbers="twin.orbit.images.simulate_numbers:SIMULATE",
+        cost="twin.orbit.images.simulate_cost:simulation_cost",
         report="twin.orbit.images.simulate_report:simulation_report",
         export="twin.orbit.calibration.calibration_export:simulation_exported",
         files=(

@@ -23,6 +23,7 @@ from twin.run import cli, durable
 from twin.run.procedure import Advance, Session, performed
 
 if TYPE_CHECKING:
+    from twin.run.cost import Cost
     from twin.run.report import Report
     from twin.run.run_folder import RunFolder
 
@@ -69,7 +70,11 @@ Given = TypeVar("Given")
 
 
 def run_command(
-    stem: str, options: cli.Options, resolve: Callable[[], Given], work: Callable[[Given, Session], Result]
+    stem: str,
+    options: cli.Options,
+    resolve: Callable[[], Given],
+    work: Callable[[Given, Session], Result],
+    cost: Callable[[Given], Cost] | None = None,
 ) -> None:
     """Read what is asked for, do it in a run folder and print what it gave.
 
@@ -78,6 +83,7 @@ def run_command(
         options: what the user chose.
         resolve: reads the files and checks what is asked for. Raises InputError, InputErrorText.
         work: computes and writes all files of the run folder, the manifest last. Raises InputError.
+        cost: what that takes of memory and time; None where it never takes much.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
@@ -86,6 +92,8 @@ def run_command(
     with cli.explained(errors):
         cli.check_backend(options.backend)
         given = resolve()
+        if cost is not None:
+            tell_cost(cost(given), errors, options.quiet)
         # a bad file is told before these are imported
         from optics.numerics.backend import load_backend
         from twin.run import provenance, run_folder
@@ -109,6 +117,25 @@ def run_command(
         raise typer.Exit(FAILURE)
     if result.code:
         raise typer.Exit(result.code)
+
+
+def tell_cost(cost: Cost, errors: Console, quiet: bool) -> None:
+    """Say what a command takes before it starts, where it is much.
+
+    Args:
+        cost: of the command.
+        errors: where it is said.
+        quiet: nothing is said.
+
+    Raises:
+        InputError: more memory than there is.
+    """
+    from twin.run.cost import require_memory, told
+
+    require_memory(cost)
+    text = "" if quiet else told(cost, cli.time_text)
+    if text:
+        errors.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
@@ -226,7 +253,9 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
         done = finished(session, procedure.kind, shown, numbers, program=program, **facts)
         return replace(done, problem=problem)
 
-    run_command(file.stem, options, lambda: read_for(f"{program} {command}", file, procedure.resolve), work)
+    run_command(
+        file.stem, options, lambda: read_for(f"{program} {command}", file, procedure.resolve), work, procedure.cost
+    )
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
