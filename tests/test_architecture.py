@@ -29,7 +29,8 @@ ONLY_IN_ANALYSIS = {"analysis", "numpy", "scipy", "cv2"} | sys.stdlib_module_nam
 # Modules of analysis that may use more: commands that draw, and fits that need a library. Name each module here.
 ANALYSIS_MAY: dict[str, set[str]] = {
     "turntable/angle_network.py": {"sklearn"},
-    "mtf/__main__.py": {"typer", "rich", "matplotlib"},
+    "mtf/__main__.py": {"typer"},
+    "mtf/mtf_command.py": {"typer", "rich", "matplotlib"},
     "images/tiff_image.py": {"tifffile"},
     "images/fits_image.py": {"astropy"},
     "wavefront_maps/zygo_files.py": {"h5py"},

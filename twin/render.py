@@ -22,6 +22,7 @@ from twin.run.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.resolved import ResolvedJob
+    from twin.run.cost import Cost
 
 RESOLVE = Named("scenes.specs.resolved:resolve")
 
@@ -109,11 +110,17 @@ def main(
 
         return run_render(resolved, session, frames, seed, picture)
 
+    def cost(resolved: ResolvedJob) -> Cost:
+        from twin.main_job.render_cost import render_cost
+
+        return render_cost(resolved, frames)
+
     run_command(
         job.stem,
         cli.Options(out, seed, backend, force, as_json, quiet),
         lambda: read_for("twin.render", job, RESOLVE),
         work,
+        cost,
     )
 
 

@@ -141,6 +141,8 @@ def _run(
     errors: Console,
 ) -> Validation:
     from optics.numerics.backend import load_backend
+    from twin.run.command import tell_cost
+    from twin.run.cost import Cost
     from twin.run.provenance import program_digest
     from twin.validation.runner import rough_seconds, run_checks
     from twin.validation.validation_report import write_validation
@@ -154,8 +156,9 @@ def _run(
     )
     tracer = load_backend(backend)
     program_digest()  # of the files that compute, which may be others when the checks end
+    total = rough_seconds(selections, fast)
+    tell_cost(Cost(0.0, total), errors, quiet=False)
     with Progress(*columns, console=errors, disable=not errors.is_terminal, transient=True) as bar:
-        total = rough_seconds(selections, fast)
         task = bar.add_task("start", total=total)
 
         begun, at = time.monotonic(), "start"

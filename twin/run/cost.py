@@ -24,7 +24,7 @@ MUCH_MEMORY, LONG = 2.0 * 2**30, 300.0
 """Bytes and seconds above which a command says beforehand what it takes."""
 ORDINARY = 600e6
 """A job that needs no more is never refused, bytes: what is free changes while other processes start."""
-PACE_SECONDS = 0.0105
+PACE_SECONDS = 0.0041
 """What the calculation of `pace` takes on the machine on which the rates were measured, seconds of one core."""
 
 
@@ -111,7 +111,7 @@ def beyond(need: float, free: float, lower: Lowered) -> InputError:
     return lower.owner.error(
         f"this needs about {amount_text(need)} of memory, and {amount_text(free)} may be taken",
         lower.key,
-        found=str(lower.number),
+        found=lower.number,
         allowed=f"at most {most} {lower.unit}, or {more}" if most >= lower.least else more,
     )
 

@@ -18,6 +18,7 @@ from twin.run.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.resolved import ResolvedJob
+    from twin.run.cost import Cost
 
 PROGRAM, KIND = "twin.uncertainty", "uncertainty"
 _MOST_STATES = 100_000
@@ -81,6 +82,11 @@ def main(
         chosen = resolved.job.render.seed if seed is None else seed
         return resolved.with_render(resolved.frames, chosen)
 
+    def cost(resolved: ResolvedJob) -> Cost:
+        from twin.uncertainty.coverage_cost import coverage_cost
+
+        return coverage_cost(resolved, states)
+
     def work(resolved: ResolvedJob, session: Session) -> Result:
         from twin.run.provenance import checks_in
         from twin.uncertainty.coverage import run_uncertainty
@@ -95,7 +101,7 @@ def main(
         facts |= {"seed": run.seed if states else None, "checks": (*run.images.told(), *checks_in(numbers))}
         return finished(session, KIND, uncertainty_report(run), numbers, program=PROGRAM, **facts)
 
-    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work)
+    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work, cost)
 
 
 if __name__ == "__main__":
