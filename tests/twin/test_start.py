@@ -66,6 +66,7 @@ BAD = {
     "twin.orbit.__main__": ("angle", "name: x\ncamera: tlc\norbit: {}\nstrips: []\nno_such_key: 1\n"),
     "twin.study.__main__": ("", "name: x\nbase: {}\nfactors: {}\nresponses: {}\nno_such_key: 1\n"),
     "twin.tolerance.__main__": ("", "instrument: gf7\ntolerances: {}\nmerits: {}\nno_such_key: 1\n"),
+    "twin.design.__main__": ("", "name: x\ncamera: gf7\nvary: {}\nno_such_key: 1\n"),
     "twin.recover.__main__": ("", "frames: {}\nno_such_key: 1\n"),
 }
 """Program -> its subcommand, and a file of its kind with a key that it does not know."""

@@ -9,15 +9,15 @@ from twin.run.cost import Cost
 if TYPE_CHECKING:
     from scenes.specs.resolved import ResolvedJob
 
-STARTED, STARTED_SECONDS = 600e6, 12.0
+STARTED, STARTED_SECONDS = 287e6, 8.5
 """Of a run without states: kernels, the limits, and what draws the report; bytes and seconds."""
-STATE_SECONDS = 0.06
+STATE_SECONDS = 0.1
 """Seconds of a state beside its frames: light, fits, estimators, truth."""
 EXPOSED_SECONDS = 1e-7
 """Seconds per pixel of a frame, noise of the light and of the detector with it."""
 AT_ONCE = 32
 """States that are rendered together (`twin.uncertainty.coverage.CHUNK`)."""
-PIXEL = 80.0
+PIXEL = 219.0
 """Bytes per pixel of the images of the states that are rendered together, before and after."""
 
 
