@@ -1,27 +1,95 @@
-"""What a command imports before it can say anything: help and completion nothing that computes, draws or reads files,
-a bad file only the models of its own kind.
+"""How commands start: their help, and what is wrong with a file, wait for nothing that computes or draws; Ctrl-C ends
+them without a traceback from the first moment on.
 
 Which modules are loaded is the same on every machine; how long it takes is in tests/benchmarks/start_speed.py.
 """
 
 import json
-import os
+import multiprocessing
+import re
+import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from scenes.kinds.file_kinds import FILE_KINDS
-from scenes.yaml.spec import Spec
-from tests.twin.study_bench import ROOT
-from twin.run.console import PROGRAMS
+import pytest
 
+from scenes.kinds.file_kinds import FILE_KINDS
+from tests.twin.study_bench import ROOT
+from twin.run.console import PROGRAMS as ALL_PROGRAMS
+from twin.run.durable import ending_later
+from twin.study.runs.cluster import _children_deaf_to_ctrl_c
+
+DRAWS = {"matplotlib", "mitsuba", "trimesh", "xarray"}
 HEAVY = {
-    *("cv2", "dask", "distributed", "drjit", "erfa", "h5netcdf", "h5py", "jinja2", "matplotlib", "mitsuba", "networkx"),
-    *("pandas", "pyproj", "scipy", "skfem", "sklearn", "sqlalchemy", "tifffile", "trimesh", "xarray"),
+    *(
+        "cv2",
+        "dask",
+        "distributed",
+        "drjit",
+        "erfa",
+        "h5netcdf",
+        "h5py",
+        "jinja2",
+        "networkx",
+        "pandas",
+        "pint",
+        "pyproj",
+    ),
+    *("scipy", "skfem", "sklearn", "sqlalchemy", "tifffile"),
+    *DRAWS,
 }
-"""Packages that take a tenth of a second or more to import."""
+"""What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""
+READ = (
+    ("twin.render",),
+    ("twin.live",),
+    ("twin.recover",),
+    ("twin.camera",),
+    ("twin.uncertainty",),
+    ("twin.study",),
+    ("twin.design",),
+    ("twin.lab", "focus"),
+    ("twin.orbit", "angle"),
+)
+"""Commands that read a YAML file; all tests of a program do it in the same way."""
+PROGRAMS = (
+    *("twin.render", "twin.camera", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate"),
+    *("twin.compare", "twin.doctor", "twin.uncertainty", "twin.live", "twin.recover"),
+    *("scenes.lens", "scenes.schema", "analysis.mtf"),
+)
+BAD = "seed: 1\nno_such_key: [2 arcsec, 3 um, 20 degC]\n"
+
+
+def run(*words: object, **options) -> subprocess.CompletedProcess:
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, **options)
+
+
+def heavy(words: tuple, of: set[str] = HEAVY) -> tuple[int, set[str]]:
+    """Exit code of a command, and what it imported of some packages."""
+    done = run("-X", "importtime", "-m", *words)
+    names = set(re.findall(r"^import time:.*\| +([\w.]+)$", done.stderr, re.M))
+    assert len(names) > 100
+    return done.returncode, {name.split(".")[0] for name in names} & of
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_help_imports_nothing_that_computes(program: str) -> None:
+    assert heavy((program, "--help")) == (0, set())
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("words", READ, ids=" ".join)
+def test_a_bad_file_is_told_before_anything_that_computes_is_imported(words: tuple, tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(BAD, "utf-8")
+    assert heavy((*words, path)) == (2, set())
+
+
 TOLD = """
 import json, sys
 from contextlib import redirect_stderr, redirect_stdout
@@ -38,20 +106,20 @@ def loaded(before: str, *words: object) -> dict[str, Any]:
         before: the lines.
         words: its arguments.
     """
-    command = [sys.executable, "-c", TOLD.format(before=before), *map(str, words)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120, env=os.environ)
+    done = run("-c", TOLD.format(before=before), *words)
+    assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
     return found
 
 
-def packages(modules: Sequence[str]) -> set[str]:
+def packages(modules: Iterable[str]) -> set[str]:
     return {module.partition(".")[0] for module in modules}
 
 
 def test_help_waits_for_nothing_that_computes_or_reads() -> None:
     """The parsers of all programs: what --help and a shell's completion need."""
     # last the schemas, whose generator is pydantic's
-    names = sorted((module for module, _ in PROGRAMS.values()), key=lambda name: name == "scenes.schema")
+    names = sorted((module for module, _ in ALL_PROGRAMS.values()), key=lambda name: name == "scenes.schema")
     found = loaded(
         f"from twin.run.console import parser\nfor name in {names}:\n"
         " more = {'pydantic': 'pydantic' in sys.modules}\n parser(name)"
@@ -60,7 +128,7 @@ def test_help_waits_for_nothing_that_computes_or_reads() -> None:
     assert (packages(found["modules"]) & HEAVY, found["pydantic"]) == (set(), False)
 
 
-BAD = {
+OWN = {
     "twin.render": ("", "instrument: gf7_pair\nno_such_key: 1\n"),
     "twin.lab": ("focus", "name: x\nmisset: {}\nscan: {}\nno_such_key: 1\n"),
     "twin.orbit.__main__": ("angle", "name: x\ncamera: tlc\norbit: {}\nstrips: []\nno_such_key: 1\n"),
@@ -81,14 +149,15 @@ for program, words in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.second
 def test_a_bad_file_waits_for_nothing_that_computes(tmp_path: Path) -> None:
     runs = []
-    for program, (sub, text) in BAD.items():
+    for program, (sub, text) in OWN.items():
         file = tmp_path / f"{program}.yaml"
         file.write_text(text, "utf-8")
         runs.append((program, [*sub.split(), str(file)]))
     found = loaded(REFUSED, json.dumps(runs))
-    for program, (_, text) in BAD.items():
+    for program, (_, text) in OWN.items():
         code, told, there = found[program]
         line = text.count("\n")
         assert (code, set(there) & HEAVY) == (2, set()), (program, told)
@@ -98,7 +167,7 @@ def test_a_bad_file_waits_for_nothing_that_computes(tmp_path: Path) -> None:
 def test_a_bad_job_waits_for_no_other_kind_of_file(tmp_path: Path) -> None:
     """Nor is a model built that it does not need."""
     file = tmp_path / "job.yaml"
-    file.write_text(BAD["twin.render"][1], "utf-8")
+    file.write_text(OWN["twin.render"][1], "utf-8")
     found = loaded(
         REFUSED + "from scenes.yaml.spec import Spec\n"
         "def below(model):\n return [model, *(one for part in model.__subclasses__() for one in below(part))]\n"
@@ -122,7 +191,65 @@ def test_import_twin_imports_nothing() -> None:
 def test_a_kind_is_told_by_keys_that_its_model_requires() -> None:
     """`FileKind.needs` is looked at before the model is imported, so it must say no more than the model does."""
     for kind in FILE_KINDS:
-        assert issubclass(kind.model, Spec)
         required = {name for name, item in kind.model.model_fields.items() if item.is_required()}
         assert kind.needs, kind.name
         assert set(kind.needs) <= required, kind.name
+
+
+@pytest.mark.second
+def test_a_wrong_option_of_the_mtf_is_told_before_anything_is_drawn() -> None:
+    assert heavy(("analysis.mtf", "none.png", "--roi", "0,0,64,64", "--pitch", "7 um"), DRAWS) == (2, set())
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_ctrl_c_during_imports_leaves_no_traceback(program: str, tmp_path: Path) -> None:
+    """One module stands for all: while it is imported, the signal comes."""
+    (tmp_path / "typer.py").write_text(
+        "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n", "utf-8"
+    )
+    done = run("-m", program, "--help", env={"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin:/bin"})
+    assert done.returncode in (130, -2)  # by the signal, which a shell shows as 130
+    assert done.stderr == "interrupted\n"
+
+
+def hears() -> None:
+    """In a process of its own: exit code 1 where SIGINT reaches it, else 0."""
+    sys.exit(signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+
+def exit_code_of_a_worker() -> int:
+    """Started by a thread, as Dask starts its workers."""
+    codes = []
+
+    def start() -> None:
+        process = multiprocessing.get_context("spawn").Process(target=hears)
+        process.start()
+        process.join(60)
+        codes.append(process.exitcode)
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    return codes[0]
+
+
+@pytest.mark.second
+def test_workers_leave_ctrl_c_to_their_command() -> None:
+    with _children_deaf_to_ctrl_c():
+        assert exit_code_of_a_worker() == 0
+    assert exit_code_of_a_worker() == 1
+
+
+def test_a_signal_waits_for_the_end_of_what_cannot_be_broken_off() -> None:
+    done = []
+
+    def work() -> None:
+        with ending_later():
+            signal.raise_signal(signal.SIGINT)
+            done.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert done
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
