@@ -115,7 +115,7 @@ class MonitorSize:
         threads = min(cores(), 8, self.spots * states)  # that expose images
         return {
             "ccd": every * (_PIXEL + (states - 1) * _OF_STATE) + self.rays * _RAY,
-            "frames": (1 + states) * every * frames * GREY + threads * detector.exposing_bytes(frames, image),
+            "frames": (1 + states) * every * frames * GREY + detector.exposing_bytes(frames, image, threads),
             "times": self.times * every * _OF_COURSE,
             "pictures": self.pictures * GREY,
         }

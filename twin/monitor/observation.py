@@ -7,6 +7,7 @@ states. What differs from use to use is said by an `Observing`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
@@ -18,7 +19,7 @@ from analysis.short_repr import shows
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.threads import cores, one_blas_thread, one_kernel_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -167,7 +168,7 @@ def light_of(
     Raises:
         BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD.
     """
-    with one_blas_thread():
+    with one_blas_thread(), one_kernel_thread() if len(states) > 1 else nullcontext():
         placed = experiment.instrument.assembly.place(states)
         truth = experiment.sight.truth(states, placed)
         if photons is None and len(states) == 1:
