@@ -275,7 +275,9 @@ def _shares(
     tables, glass = prepared.tables, features.glass
     reflected, transmitted, diffused, scattered = tables.finish(row, met)
     incidence = dr.abs(place.cosine)
-    after = ratio = bent = None
+    after: Any = None
+    ratio: Any = None
+    bent: Any = None
     if glass:
         after = dr.select(inside, 1.0, place.row[layout.INDEX])
         ratio = dr.select(inside, place.row[layout.INDEX], place.row[layout.INVERSE])

@@ -24,6 +24,7 @@ import numpy as np
 
 from optics.numerics.llvm import ensure_llvm
 from optics.numerics.threads import one_kernel_thread
+from twin.run.frame_store import let_go
 from twin.sensors.poisson_numbers import (
     CELLS_PER_UNIT,
     MOST_IN_TABLE,
@@ -124,6 +125,7 @@ class Reading:
                     following = group.draw(numbers, out[some.start : some.stop, start : start + together], pool)
                     if drawn is not None:
                         drawn.read_out()
+                        let_go(out)
                     drawn = following
             if drawn is not None:
                 drawn.read_out()
