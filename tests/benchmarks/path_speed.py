@@ -27,7 +27,7 @@ INSTRUMENTS = ("gf7_pair", "monitor_pair")
 PATHS, PATHS_BACK, QUICK_PATHS = 1 << 19, 1 << 18, 1 << 15
 CORES = 2
 ROUNDS, MOST_ROUNDS = 3, 15
-LEAST_IMAGING, LEAST_OUT_AND_BACK = 3.0e6, 1.5e6
+LEAST_IMAGING, LEAST_OUT_AND_BACK = 4.7e6, 1.5e6
 STRAY_PATHS, STRAY_SIGMA, MOST_STRAY_S = 1 << 19, 1e-7, 8.5
 """Paths of one source, and the standard deviation, in spots, that its stray light on its area CCD is to have."""
 

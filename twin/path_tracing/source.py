@@ -162,18 +162,25 @@ def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed:
     vectors = [backend.Vector3(s[3 * k], s[3 * k + 1], s[3 * k + 2]) for k in range(4)]
     centre, axis, first, second = vectors
     radius, cone, x, y, narrow, share, gain = s[12:19]
-    r, turn = radius * dr.sqrt(rng.next_float64()), 2.0 * dr.pi * rng.next_float64()
-    sine, cosine = dr.sincos(turn)
-    position = centre + (r * cosine) * first + (r * sine) * second
     block = backend.Float(numbers // BLOCK)
     shift = [dr.opaque(backend.Float, float(u)) for u in np.random.default_rng(seed).random(3)]
 
     def fraction(value: Any) -> Any:
         return value - dr.floor(value)
 
-    aimed = fraction(dr.fma(block, share, shift[0])) < share
-    r = dr.sqrt(fraction(dr.fma(block, _STEPS[0], shift[1]) + _CELL[0] * rng.next_float64()))
-    turn = 2.0 * dr.pi * fraction(dr.fma(block, _STEPS[1], shift[2]) + _CELL[1] * rng.next_float64())
+    def apart() -> tuple[Any, Any]:
+        return rng.next_float64(), rng.next_float64()
+
+    def alike() -> tuple[Any, Any]:
+        return tuple(fraction(dr.fma(block, _STEPS[k], shift[k]) + _CELL[k] * rng.next_float64()) for k in range(2))
+
+    # the directions of neighbours are alike; of a collimated beam their places
+    first_two, last_two = (apart(), alike()) if source.cone > 0.0 else (alike(), apart())
+    r, turn = radius * dr.sqrt(first_two[0]), 2.0 * dr.pi * first_two[1]
+    sine, cosine = dr.sincos(turn)
+    position = centre + (r * cosine) * first + (r * sine) * second
+    aimed = fraction(dr.fma(block, share, shift[2])) < share
+    r, turn = dr.sqrt(last_two[0]), 2.0 * dr.pi * last_two[1]
     sine, cosine = dr.sincos(turn)
     r = r * dr.select(aimed, narrow, cone)
     u, v = r * cosine + dr.select(aimed, x, 0.0), r * sine + dr.select(aimed, y, 0.0)

@@ -28,8 +28,10 @@ PART = 1 << 26
 
 
 def kept_bytes(size: float) -> float:
-    """Memory that frames of so many bytes take: all of them, or a part of a file and what is made of it."""
-    return size if size <= IN_MEMORY else 2.0 * PART
+    """Memory that frames of so many bytes take: all of them, or half of a part, since of the frames before and after
+    only one is worked on at a time.
+    """
+    return size if size <= IN_MEMORY else 0.5 * PART
 
 
 def frame_room(shape: tuple[int, ...]) -> NDArray[np.uint16]:
