@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-import time
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -28,8 +22,6 @@ from tests.analysis.drawn_blocks import (
     drawn_process,
     project,
 )
-from tests.benchmarks.number import Limit, Number, Speed
-from tests.benchmarks.workbench import Workbench
 
 TIES, QUICK_TIES = 1_000_000, 20_000
 """Of the largest of three sizes; the others have a quarter and a half."""
@@ -70,7 +62,9 @@ def large_block(ties: int, seed: int = 1) -> tuple[Block, np.ndarray]:
     for k in range(ROWS * COLUMNS):
         column, row = divmod(k, ROWS)
         place = np.array([(column + 0.5) * ACROSS + 0.5 * (SWATH - ACROSS), row * ALONG + 0.5 * LENGTH]) - half
-        turned = body @ Rotation.from_euler("ZX", [random.uniform(-0.02, 0.02), random.uniform(-0.02, 0.02)]).as_matrix()
+        turned = (
+            body @ Rotation.from_euler("ZX", [random.uniform(-0.02, 0.02), random.uniform(-0.02, 0.02)]).as_matrix()
+        )
         along = turned[:, 0] - UP * (turned[:, 0] @ UP)
         along = along / np.linalg.norm(along)
         # where body Z looks at the middle of the pass
