@@ -19,9 +19,9 @@ import pytest
 
 from scenes.kinds.file_kinds import FILE_KINDS
 from tests.twin.study_bench import ROOT
+from twin.run.cluster import _children_deaf_to_ctrl_c
 from twin.run.console import PROGRAMS as ALL_PROGRAMS
 from twin.run.durable import ending_later
-from twin.study.runs.cluster import _children_deaf_to_ctrl_c
 
 DRAWS = {"matplotlib", "mitsuba", "trimesh", "xarray"}
 HEAVY = {

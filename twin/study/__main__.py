@@ -79,8 +79,8 @@ def main(
     Exit codes: 0 success, 2 bad input (nothing is lost), 129, 130 or 143 interrupted, 1 anything else: all runs failed,
     the program did, or a figure could not be drawn.
     """
+    from twin.run.cluster import ClusterError
     from twin.study import study_command
-    from twin.study.runs.cluster import ClusterError
     from twin.study.runs.engine import IncompleteError, ProgramFault
 
     errors = Console(stderr=True)
