@@ -18,7 +18,7 @@ from analysis.block.assembly import assembled
 from analysis.block.block import Block, Term
 from analysis.block.block_adjustment import BlockAdjustment
 from analysis.block.processes import Law
-from analysis.orbit.calibration_parameters import vertical
+from analysis.orbit.ground_errors import level_axes
 from analysis.units import ARCSEC
 
 __all__ = ["Network", "Open", "datum_test", "network_of", "open_combinations", "simplified"]
@@ -179,16 +179,8 @@ def datum_test(found: BlockAdjustment) -> DatumTest | None:
     value, covariance = shift
     points = found.assembly.block.points
     middle = np.mean(points.start[points.role == "control"], axis=0)
-    axes = _level(middle)
+    axes = level_axes(middle[None])[0]
     level, spread = axes @ value, axes @ covariance @ axes.T
     a, b, c = np.sqrt(np.diag(spread)).tolist()
     east, north, up = level.tolist()
     return DatumTest(east, north, up, (a, b, c), float(level @ np.linalg.solve(spread, level)))
-
-
-def _level(place: Array) -> Array:
-    """(3, 3) east, north and up as rows."""
-    up = vertical(place[None])[0]
-    east = np.cross([0.0, 0.0, 1.0], up)
-    east = east / np.linalg.norm(east)
-    return np.stack([east, np.cross(up, east), up])
