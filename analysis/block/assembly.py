@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from analysis.block.block import Block, CameraKnowledge, Term
-from analysis.block.packets import Corrections, FixedPoints, Heights, LineImage, Packets, Part, Pointings
+from analysis.block.corrections import Corrections, Part
+from analysis.block.packets import FixedPoints, Heights, LineImage, Packets, Pointings
 from analysis.block.point_reduction import PriorGroup, Reduction
 from analysis.block.processes import BlockError, Support
 from analysis.orbit.three_line_model import BIAS, DRIFT
@@ -90,10 +91,8 @@ class Assembly:
         parts = []
         for kind in ("attitude", "station"):
             for one in self.processes[kind, of]:
-                number, blend = one.support.blend(times)
-                sigma = np.array(one.support.law.sigma)
-                parts.append(Part(kind == "attitude", one.column, sigma, number.astype(np.int32), blend))
-        return Corrections(tuple(parts), self.axes[of], len(times))
+                parts.append(Part(kind == "attitude", one.column, one.support))
+        return Corrections(tuple(parts), self.axes[of], times)
 
 
 def assembled(block: Block, datum: bool = False) -> Assembly:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse.linalg import splu
 from scipy.stats import chi2
 
@@ -35,6 +36,7 @@ _DENSE = 2500
 _MOST = 20_000
 """Unknowns whose covariance is kept whole: 3.2 GB."""
 _COLUMNS = 256
+_SINGULAR = "block: the equations are singular; a sigma is too large for what observes it"
 _ROUNDS = 40
 _HUBER_ROUNDS = 4
 _FREE_ROUNDS = 8
@@ -192,18 +194,18 @@ class _Factor:
         if not np.all(diagonal > 0):
             raise BlockError("block: an unknown that nothing determines")
         self.size = 1.0 / np.sqrt(diagonal)
-        scaled = sparse.diags(self.size) @ matrix @ sparse.diags(self.size)
+        self.scaled = (sparse.diags(self.size) @ matrix @ sparse.diags(self.size)).tocsc()
         self.count = matrix.shape[0]
         try:
             if self.count <= _DENSE:
-                factor = cho_factor(scaled.toarray())
+                factor = cho_factor(self.scaled.toarray())
                 self._solve = lambda right: cho_solve(factor, right)
             else:
                 options = {"SymmetricMode": True}
-                lu = splu(scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+                lu = splu(self.scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
                 self._solve = lu.solve
         except (np.linalg.LinAlgError, RuntimeError) as error:
-            raise BlockError("block: the equations are singular; a sigma is too large for what observes it") from error
+            raise BlockError(_SINGULAR) from error
 
     def solve(self, right: Array) -> Array:
         """Solution for right sides (P,) or (P, k)."""
@@ -211,16 +213,21 @@ class _Factor:
         return np.asarray(size * self._solve(size * right))
 
     def inverse(self) -> Array:
-        """(P, P)."""
+        """(P, P), whole: several times faster from a whole factor than column by column from a sparse one."""
         if self.count > _MOST:
             raise BlockError(f"block: {self.count} unknowns beside the points; at most {_MOST} are adjusted at once")
-        found = np.empty((self.count, self.count))
+        found, failed = dpotrf(self.scaled.toarray(order="F"), lower=1, clean=0, overwrite_a=1)
+        if failed:
+            raise BlockError(_SINGULAR)
+        found, _ = dpotri(found, lower=1, overwrite_c=1)
         for a in range(0, self.count, _COLUMNS):
-            some = np.arange(a, min(a + _COLUMNS, self.count))
-            right = np.zeros((self.count, len(some)))
-            right[some, some - a] = 1.0
-            found[:, some] = self.solve(right)
-        return 0.5 * (found + found.T)
+            b = min(a + _COLUMNS, self.count)
+            own = np.tril(found[a:b, a:b])
+            found[a:b, a:b] = own + np.tril(own, -1).T
+            found[a:b, b:] = found[b:, a:b].T
+        found *= self.size
+        found *= self.size[:, None]
+        return np.ascontiguousarray(found.T)
 
 
 @dataclass(frozen=True, eq=False)

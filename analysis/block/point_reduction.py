@@ -28,6 +28,8 @@ _PIECE = 4_000
 """Points that are linearised at once."""
 _FLUSH = 4_000_000
 """Entries of the reduced matrix that are collected before they are added up."""
+_WHOLE = 10_000
+"""Unknowns up to which they are added up in a whole matrix, of 0.8 GB."""
 _LOOSE = 1e-10
 """1/m^2: a point's own weight where nothing else holds it; 100 km in each coordinate."""
 
@@ -56,12 +58,14 @@ class Bundle:
     Attributes:
         points: (n,).
         members: set and its packets (n,), in order.
-        columns: (W,) unknowns of all packets of a point one after the other; some may stand twice.
+        columns: (W,) unknowns of all packets of a point, each once.
+        places: of each member, where its unknowns stand among the columns.
     """
 
     points: Indices
     members: tuple[tuple[int, Indices], ...]
     columns: Indices
+    places: tuple[Indices, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,17 +122,13 @@ class Reduction:
             columns = one.columns
             if not len(columns):
                 continue
-            table, code = (
-                np.unique(columns, axis=0, return_inverse=True)
-                if columns.shape[1]
-                else (np.zeros((1, 0), np.intp), np.zeros(len(columns), np.intp))
-            )
+            where, code = _distinct(columns)
             points.append(one.point)
-            codes.append(first + code.ravel())
-            owners.append(np.full(len(columns), k))
+            codes.append(first + code)
+            owners.append(np.full(len(columns), k, np.int32))
             places.append(np.arange(len(columns)))
-            tables += list(table)
-            first += len(table)
+            tables += list(columns[where])
+            first += len(where)
         if not points:
             raise BlockError("block: no observations")
         point, code, owner, place = (np.concatenate(v) for v in (points, codes, owners, places))
@@ -139,16 +139,18 @@ class Reduction:
         found = []
         for count in np.unique(counts).tolist():
             at = starts[counts == count][:, None] + np.arange(count)
-            kinds, kind = np.unique(code[at], axis=0, return_inverse=True)
-            sort = np.argsort(kind.ravel(), kind="stable")
-            for piece in np.split(sort, np.cumsum(np.bincount(kind.ravel(), minlength=len(kinds)))[:-1]):
+            kinds, kind = _distinct(code[at])
+            sort = np.argsort(kind, kind="stable")
+            for piece in np.split(sort, np.cumsum(np.bincount(kind, minlength=len(kinds)))[:-1]):
                 rows = at[piece]
-                members = tuple((int(owner[rows[0, j]]), place[rows[:, j]]) for j in range(count))
-                columns = np.concatenate([tables[c] for c in code[rows[0]].tolist()])
+                met = [tables[c] for c in code[rows[0]].tolist()]
+                columns = np.unique(np.concatenate(met))
+                where = tuple(np.searchsorted(columns, one) for one in met)
                 # a long bundle is cut, so that its rows have bounded memory
                 for a in range(0, len(rows), _PIECE):
-                    part = tuple((k, w[a : a + _PIECE]) for k, w in members)
-                    found.append(Bundle(point[rows[a : a + _PIECE, 0]], part, columns))
+                    part = rows[a : a + _PIECE]
+                    members = tuple((int(owner[part[0, j]]), place[part[:, j]]) for j in range(count))
+                    found.append(Bundle(point[part[:, 0]], members, columns, where))
         return tuple(found)
 
     @cached_property
@@ -206,15 +208,15 @@ class Reduction:
                 n, width = len(one.points), len(one.columns)
                 depth = sum(self.sets[k].rows for k, _ in one.members)
                 rows = Rows(one, np.zeros((n, depth, width)), np.empty((n, depth, 3)), np.empty((n, depth)))
-                d = c = 0
-                for k, which in one.members:
+                d = 0
+                for (k, which), place in zip(one.members, one.places, strict=True):
                     a = used[k]
                     used[k] = b = a + len(which)
                     miss, by_x, by_point = (v[a:b] for v in parts[k])
                     rows.miss[:, d : d + miss.shape[1]] = miss
                     rows.by_point[:, d : d + miss.shape[1]] = by_point
-                    rows.by_x[:, d : d + miss.shape[1], c : c + by_x.shape[2]] = by_x
-                    d, c = d + miss.shape[1], c + by_x.shape[2]
+                    rows.by_x[:, d : d + miss.shape[1], place] = by_x
+                    d += miss.shape[1]
                 yield rows
 
     def reduced(self, x: Array, ground: Array, weight: Sequence[Array], factor: Mapping[str, float]) -> Reduced:
@@ -243,7 +245,7 @@ class Reduction:
             half = (np.swapaxes(root, 1, 2) @ cross).reshape(3 * n, width)
             step = np.einsum("nij,nj->ni", inverse, pull)
             data.add(rows.bundle.columns, flat.T @ flat - half.T @ half)
-            np.add.at(right, rows.bundle.columns, flat.T @ m.ravel() - cross.reshape(3 * n, width).T @ step.ravel())
+            right[rows.bundle.columns] += flat.T @ m.ravel() - cross.reshape(3 * n, width).T @ step.ravel()
             spread[rows.bundle.points], start[rows.bundle.points] = inverse, -step
             d = 0
             for k, _ in rows.bundle.members:
@@ -298,16 +300,36 @@ class Reduction:
         return found
 
 
+def _distinct(rows: Indices) -> tuple[Indices, Indices]:
+    """Where each distinct row (n, w) of whole numbers stands first (k,), and which of them each row is (n,)."""
+    if not rows.shape[1]:
+        return np.zeros(1, np.intp), np.zeros(len(rows), np.intp)
+    # a product of odd numbers wraps around and tells rows apart all but surely; whether it did is looked at
+    factors = np.random.default_rng(0).integers(1, 2**62, rows.shape[1]) * 2 + 1
+    with np.errstate(over="ignore"):
+        key = rows.astype(np.int64) @ factors
+    _, where, code = np.unique(key, return_index=True, return_inverse=True)
+    code = code.ravel()
+    if not np.array_equal(rows[where][code], rows):
+        _, where, code = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return np.asarray(where, np.intp), np.asarray(code, np.intp).ravel()
+
+
 class _Collected:
-    """A sum of dense blocks at indices, in a sparse matrix."""
+    """A sum of dense blocks at indices, whole where the unknowns are few and else in a sparse matrix."""
 
     def __init__(self, size: int) -> None:
         self.size = size
+        self.whole = np.zeros((size, size)) if size <= _WHOLE else None
         self.sum = sparse.csc_matrix((size, size))
         self.parts: list[tuple[Indices, Indices, Array]] = []
         self.entries = 0
 
     def add(self, columns: Indices, block: Array) -> None:
+        """Add a block (w, w) at its columns, of which none stands twice."""
+        if self.whole is not None:
+            self.whole[columns[:, None], columns] += block
+            return
         width = len(columns)
         self.parts.append((np.repeat(columns, width), np.tile(columns, width), block.ravel()))
         self.entries += width**2
@@ -315,11 +337,14 @@ class _Collected:
             self.flush()
 
     def flush(self) -> None:
+        """Add up what was collected."""
         if self.parts:
             row, column, value = (np.concatenate(v) for v in zip(*self.parts, strict=True))
             self.sum = self.sum + sparse.csc_matrix((value, (row, column)), shape=(self.size, self.size))
         self.parts, self.entries = [], 0
 
     def total(self) -> sparse.csc_matrix:
+        """The sum, made symmetric."""
         self.flush()
-        return 0.5 * (self.sum + self.sum.T)
+        found = self.sum if self.whole is None else sparse.csc_matrix(self.whole)
+        return 0.5 * (found + found.T)
