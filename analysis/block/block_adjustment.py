@@ -1,6 +1,6 @@
 """Adjustment of a block: Gauss-Newton on all packets and priors, robust weights, variance components, covariances.
 
-The weights and factors follow the rules of the campaign's adjustment (`analysis.orbit.residual_tests`).
+The weights and factors follow the rules of `reweighting`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from analysis.block.block import Block
 from analysis.block.plausible_block import check_places, pruned
 from analysis.block.point_reduction import Reduced
 from analysis.block.processes import BlockError
-from analysis.orbit.residual_tests import bounded, extrapolated, robust_weights, standardised_packets
+from analysis.block.reweighting import GroupTest, extrapolated, robust_weights, standardised_packets
 
-__all__ = ["BlockAdjustment", "GroupTest", "adjust_block", "kept_block"]
+__all__ = ["BlockAdjustment", "adjust_block", "kept_block"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -41,37 +41,6 @@ _ROUNDS = 40
 _HUBER_ROUNDS = 4
 _FREE_ROUNDS = 8
 _SETTLED = 1e-3
-_LEAST_REDUNDANCY = 10.0
-"""A variance from fewer redundant observations is uncertain by 45% or more: the group keeps its factor."""
-
-
-@dataclass(frozen=True)
-class GroupTest:
-    """A variance group after the adjustment.
-
-    Attributes:
-        count: observations. redundancy: how many of them the others check.
-        square: their weighted squares, whose expectation is the redundancy.
-        factor: on the variances; 1 where not estimated.
-    """
-
-    count: int
-    redundancy: float
-    square: float
-    factor: float
-
-    @property
-    def ratio(self) -> float:
-        """Variance of the residuals over that which the sigmas predict; NaN where nothing checks the group."""
-        return self.square / self.redundancy if self.redundancy > 1e-6 else float("nan")
-
-    @property
-    def p_value(self) -> float:
-        """Two-sided chance of such squares, as of a chi-square with the redundancy for its freedom."""
-        if self.redundancy < 1.0:
-            return 1.0
-        high = float(chi2.sf(self.square, self.redundancy))
-        return 2.0 * min(high, 1.0 - high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,9 +260,7 @@ def adjust_block(
             new_weight = _without_lost(assembly, new_weight)
         if estimated and not screening:
             for name in estimated & set(tests):
-                one = tests[name]
-                if one.redundancy >= _LEAST_REDUNDANCY:
-                    new_factor[name] = bounded(at.factor[name] * one.square / one.redundancy)
+                new_factor[name] = tests[name].estimated
             factors.append(new_factor)
         change = max(
             max(

@@ -8,11 +8,12 @@ import pytest
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
-from analysis.orbit.adjustment import adjust
+from analysis.calibration.adjustment import adjust
+from analysis.calibration.normal_equations import State, Weights, assemble
+from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters
 from analysis.orbit.forward_intersection import intersect
-from analysis.orbit.normal_equations import State, Weights, assemble
-from analysis.orbit.shared_noise import SharedNoise, reading_variance
+from analysis.orbit.ray_noise import reading_variance
 from analysis.orbit.three_line_model import Partials, Rays, misclosure, partials
 from tests.analysis.test_adjustment import (
     BIAS,

@@ -14,9 +14,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from analysis.calibration.adjustment import Adjustment
 from analysis.orbit import forward_intersection, normal_equations, null_space, three_line_model
 from analysis.orbit import stepwise as stepwise_module
-from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.third_difference import third_difference
 from optics.numerics.backend import load_backend
 from tests.validation.undrawn import undrawn

@@ -16,6 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from analysis.block.reweighting import (
+    HUBER,
+    Robust,
+    bounded,
+    extrapolated,
+    median_factor,
+    robust_weights,
+    standardised_packets,
+)
+from analysis.calibration.hidden_terms import Courses, HiddenTerms, Rates, Unseen
+from analysis.calibration.normal_equations import Equations, State, Weights, assemble
+from analysis.calibration.plausibility import FarPointsError, NoiseError, check_places, single_ray
+from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit import null_space
 from analysis.orbit.calibration_parameters import (
     CalibrationError,
@@ -26,23 +39,6 @@ from analysis.orbit.calibration_parameters import (
     Unknowns,
     index,
 )
-from analysis.orbit.normal_equations import Equations, State, Weights, assemble
-from analysis.orbit.plausibility import FarPointsError, NoiseError, check_places, single_ray
-from analysis.orbit.residual_tests import (
-    HUBER,
-    Courses,
-    HiddenTerms,
-    Rates,
-    Robust,
-    Unseen,
-    bounded,
-    extrapolated,
-    median_factor,
-    robust_weights,
-    standardised,
-)
-from analysis.orbit.residual_tests import variance_components as components
-from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import BIAS, DRIFT, LineModel
 
 Array = NDArray[np.float64]
@@ -279,13 +275,14 @@ def _settled(problem: _Problem, state: _Iteration, rule: _Rule) -> _Settled:
         if rule.image is None and rule.factor is None:
             return _Settled(problem, state, equations, covariance)
         cofactors = equations.image_cofactors(covariance)
-        standard = standardised(equations, cofactors, old)
+        standard = _standardised(equations, cofactors, old)
         factor = dict(old.factor)
         if rule.factor == "median":
             factor["image"] = bounded(factor["image"] * median_factor(standard))
         elif rule.factor == "components":
-            found, _ = components(equations, covariance, cofactors, old, problem.priors)
-            factor |= {g: v for g, v in found.items() if problem.estimated is None or g in problem.estimated}
+            tests = equations.tests(covariance, cofactors, old, problem.priors)
+            some = problem.estimated
+            factor |= {g: one.estimated for g, one in tests.items() if some is None or g in some}
             factors.append(factor)
         image = old.image
         if rule.image is not None:
@@ -446,8 +443,8 @@ class _Problem:
             equations.reduced + rows.T @ rows, equations.length, scale, np.eye(len(names))[:, freedom.kept]
         )
         cofactors = equations.image_cofactors(covariance)
-        standard = standardised(equations, cofactors, state.weights)
-        _, redundancy = components(equations, covariance, cofactors, state.weights, self.priors)
+        standard = _standardised(equations, cofactors, state.weights)
+        tests = equations.tests(covariance, cofactors, state.weights, self.priors)
         held = np.eye(len(names))[:, [index(names, n) for n in self.gauge.held]]
         follow = self.followed(equations, covariance, held)
         pulled = rows @ covariance
@@ -469,14 +466,7 @@ class _Problem:
         used = int(np.sum(state.weights.image > 0))
         controls = sum(int(np.sum(f.control & np.any(f.covariance, axis=(1, 2)))) for f in self.fields)
         known = 2 * used + 3 * controls + len(self.priors) + len(rows)
-        r = equations.residuals
-        square = float(
-            np.sum(state.weights.image * np.sum(r.image**2, axis=1)) / state.weights.factor["image"]
-            + np.sum(r.control**2) / state.weights.factor["control"]
-            + np.sum(equations.prior_weight * r.prior**2)
-            + sum(v / state.weights.factor[g] for g, v in r.shared.items())
-            + np.sum((rows @ (state.state.values - self.parameters.start)) ** 2)
-        )
+        pulled_square = float(np.sum((rows @ (state.state.values - self.parameters.start)) ** 2))
         parts = self.parameters.parts
 
         def unseen(terms: HiddenTerms) -> Unseen:
@@ -504,10 +494,10 @@ class _Problem:
             ground_covariance={f.name: s for f, s in zip(self.fields, spreads, strict=True)},
             residual=self._by_line(standard),
             weight=self._by_line(state.weights.image),
-            chi_square=square,
+            chi_square=sum(one.square for one in tests.values()) + pulled_square,
             degrees_of_freedom=known - 3 * int(equations.movable.sum()) - len(freedom.kept),
             factors=state.weights.factor,
-            redundancy=redundancy,
+            redundancy={g: one.redundancy for g, one in tests.items()},
             iterations=state.steps,
             fields=self.fields,
             unseen=unseen,
@@ -517,6 +507,10 @@ class _Problem:
         sizes = [len(r.point) for f in self.fields for r in f.rays.values()]
         pieces = iter(np.split(rows, np.cumsum(sizes)[:-1]))
         return {f.name: {line: next(pieces) for line in f.rays} for f in self.fields}
+
+
+def _standardised(equations: Equations, cofactors: Array, weights: Weights) -> Array:
+    return standardised_packets(equations.residuals.image, cofactors, weights.image, weights.factor["image"])
 
 
 def _scores(equations: Equations, standard: Array, weights: Weights) -> Array:
