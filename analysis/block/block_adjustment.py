@@ -5,7 +5,7 @@ The weights and factors follow the rules of `reweighting`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -21,9 +21,10 @@ from scipy.stats import chi2
 from analysis.block.assembly import Assembly, assembled, group_ranks
 from analysis.block.block import Block
 from analysis.block.plausible_block import check_places, pruned
-from analysis.block.point_reduction import Reduced
+from analysis.block.point_reduction import Reduced, Reduction, State
 from analysis.block.processes import BlockError
-from analysis.block.reweighting import GroupTest, extrapolated, robust_weights, standardised_packets
+from analysis.block.reweighting import GroupTest, extrapolated, robust_weights
+from analysis.block.shares import Pool, SharedReduction
 
 __all__ = ["BlockAdjustment", "adjust_block", "kept_block"]
 
@@ -86,22 +87,22 @@ class BlockAdjustment:
     def _filled(self) -> Array:
         return np.where(np.isfinite(self.ground), self.ground, self.assembly.block.points.start)
 
+    @property
+    def state(self) -> State:
+        """Where the adjustment ended."""
+        return State(self.x, self._filled, self.weight, self.factors)
+
     def point_covariance(self, points: Indices) -> Array:
         """(k, 3, 3) covariance of any of the block's points, ITRS, m^2; NaN where nothing determines one."""
-        found = np.full((len(self.ground), 3, 3), np.nan)
-        wanted = np.zeros(len(self.ground), bool)
-        wanted[points] = True
-        for rows in self.assembly.reduction.rows(self.x, self._filled, self.weight, self.factors):
-            where = rows.bundle.points
-            use = wanted[where]
-            if not np.any(use):
-                continue
-            inner = self.spread[where[use]]
-            moved = inner @ np.swapaxes(rows.by_point[use], 1, 2) @ rows.by_x[use]
-            columns = rows.bundle.columns
-            found[where[use]] = inner + moved @ self.covariance[np.ix_(columns, columns)] @ np.swapaxes(moved, 1, 2)
-        found[~np.isfinite(self.ground).all(axis=1)] = np.nan
-        return np.asarray(found[points])
+        reduction = self.assembly.reduction
+        found = np.full((len(points), 3, 3), np.nan)
+        for rows in reduction.restricted(points).rows(reduction.state_of(points, self.state)):
+            where, columns = rows.bundle.points, rows.bundle.columns
+            inner = self.spread[points[where]]
+            moved = inner @ np.swapaxes(rows.by_point, 1, 2) @ rows.by_x
+            found[where] = inner + moved @ self.covariance[np.ix_(columns, columns)] @ np.swapaxes(moved, 1, 2)
+        found[~np.isfinite(self.ground[points]).all(axis=1)] = np.nan
+        return found
 
     def attitude_at(self, of: str, times: Array) -> tuple[Array, Array]:
         """Correction of the attitude of a pass about the body's axes, (n, 3), radians, with covariances (n, 3, 3)."""
@@ -199,17 +200,6 @@ class _Factor:
         return np.ascontiguousarray(found.T)
 
 
-@dataclass(frozen=True, eq=False)
-class _At:
-    """Where an iteration stands."""
-
-    x: Array
-    ground: Array
-    weight: tuple[Array, ...]
-    factor: Mapping[str, float]
-    steps: int
-
-
 def adjust_block(
     block: Block,
     *,
@@ -217,6 +207,7 @@ def adjust_block(
     variance_components: bool | Collection[str] = False,
     datum: bool = False,
     iterations: int = 20,
+    pool: Pool | None = None,
 ) -> BlockAdjustment:
     """Adjust a block.
 
@@ -227,6 +218,7 @@ def adjust_block(
         variance_components: estimate a factor on the variances of every group, or of those named.
         datum: look for a shift that all control points have in common.
         iterations: most Gauss-Newton steps of one round.
+        pool: processes that reduce the points; None for this one alone.
 
     Raises:
         BlockError: input that cannot be used, points that are not what was photographed, no convergence.
@@ -235,20 +227,24 @@ def adjust_block(
     check_places(block)
     assembly = assembled(block, datum)
     reduction = assembly.reduction
+    points: Reduction | SharedReduction = reduction if pool is None else SharedReduction.of(reduction, pool)
     groups = [*(one.group for one in reduction.sets), *(one.group for one in reduction.priors)]
     weight = tuple(np.ones(len(one.point)) for one in reduction.sets)
-    at = _At(np.zeros(reduction.size), block.points.start.copy(), weight, dict.fromkeys(groups, 1.0), 0)
+    at = State(np.zeros(reduction.size), block.points.start.copy(), weight, dict.fromkeys(groups, 1.0))
+    steps = 0
     estimated = set(groups) if variance_components is True else set(variance_components or ())
     factors: list[Mapping[str, float]] = []
     for turn in range(_ROUNDS):
         screening = robust is not None and turn < _HUBER_ROUNDS
         # weights that will change are not worth more than a step or two
-        at, reduced, factor = _solved(assembly, at, iterations, 1e-2 if screening else _CONVERGED)
+        at, reduced, factor, more = _solved(reduction, points, at, iterations, 1e-2 if screening else _CONVERGED)
+        steps += more
         covariance = factor.inverse()
-        standard, taken = _checked(assembly, at, covariance, reduced)
-        tests = _tests(assembly, at, covariance, reduced, taken)
+        checked = points.checked(at, reduced.spread, _part_of(covariance))
+        standard = checked.standard
+        tests = _tests(reduction, at, covariance, reduced, checked.taken)
         if robust is None and not estimated:
-            return _result(assembly, at, covariance, standard, tests, reduced)
+            return _result(assembly, at, covariance, standard, tests, reduced, steps)
         new_weight, new_factor = at.weight, dict(at.factor)
         if robust is not None:
             kind: Literal["huber", "accept"] = "accept"
@@ -269,42 +265,48 @@ def adjust_block(
             max(abs(new_factor[g] / at.factor[g] - 1.0) for g in new_factor),
         )
         if change < _SETTLED and not screening:
-            return _result(assembly, at, covariance, standard, tests, reduced)
+            return _result(assembly, at, covariance, standard, tests, reduced, steps)
         if len(factors) == 3:
             new_factor, factors = extrapolated(factors), []
         at = replace(at, weight=new_weight, factor=new_factor)
     raise BlockError(f"block: weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}")
 
 
-def _solved(assembly: Assembly, at: _At, iterations: int, tolerance: float) -> tuple[_At, Reduced, _Factor]:
-    """Gauss-Newton with the weights as they stand, until a step is below so many sigmas."""
-    reduction = assembly.reduction
+def _solved(
+    reduction: Reduction, points: Reduction | SharedReduction, at: State, iterations: int, tolerance: float
+) -> tuple[State, Reduced, _Factor, int]:
+    """Gauss-Newton with the weights as they stand, until a step is below so many sigmas; and how many there were."""
     last = np.inf
-    for _ in range(iterations):
-        reduced = reduction.reduced(at.x, at.ground, at.weight, at.factor)
+    for steps in range(1, iterations + 1):
+        reduced = reduction.with_priors(points.eliminated(at), at)
         total = reduced.data + reduced.prior
         factor = _Factor(total)
         step = -factor.solve(reduced.right)
-        moved = reduction.point_steps(at.x, at.ground, at.weight, at.factor, reduced, step)
         size = float(np.sqrt(max(float(step @ (total @ step)), 0.0)))
         # points that stay too far from where x puts them count, too
-        apart = float(np.sqrt(np.max(np.einsum("ni,nij,nj->n", moved, _inverses(reduced.spread), moved), initial=0.0)))
-        at = replace(at, x=at.x + step, ground=at.ground + moved, steps=at.steps + 1)
-        size = max(size, apart)
+        if size + _largest(reduced.start, reduced.spread) < _CONVERGED:
+            # what x moves them by is less than its own step
+            return replace(at, x=at.x + step, ground=at.ground + reduced.start), reduced, factor, steps
+        moved = points.point_steps(at, reduced, step)
+        at = replace(at, x=at.x + step, ground=at.ground + moved)
+        size = max(size, _largest(moved, reduced.spread))
         if size < tolerance or (size < 1e3 * tolerance and size > 0.5 * last):
-            return at, reduction.reduced(at.x, at.ground, at.weight, at.factor), factor
+            return at, reduction.with_priors(points.eliminated(at), at), factor, steps
         if not np.isfinite(size):
             break
         last = size
     raise BlockError(f"block: no convergence in {iterations} steps, the last of {last:.3g} sigmas")
 
 
-def _inverses(spread: Array) -> Array:
-    """(m, 3, 3) inverses; zero where there is none."""
+def _part_of(covariance: Array) -> Callable[[Indices], Array]:
+    return lambda some: np.asarray(covariance[np.ix_(some, some)])
+
+
+def _largest(moved: Array, spread: Array) -> float:
+    """Largest of steps (m, 3) of points with covariances (m, 3, 3), in sigmas; points without one do not count."""
     used = spread[:, 0, 0] > 0
-    found = np.zeros_like(spread)
-    found[used] = np.linalg.inv(spread[used])
-    return found
+    solved = np.linalg.solve(spread[used], moved[used][:, :, None])[:, :, 0]
+    return float(np.sqrt(np.max(np.sum(moved[used] * solved, axis=1), initial=0.0)))
 
 
 def _without_lost(assembly: Assembly, weight: Sequence[Array]) -> tuple[Array, ...]:
@@ -322,44 +324,9 @@ def _rows_left(assembly: Assembly, weight: Sequence[Array]) -> NDArray[np.intp]:
     return rows
 
 
-def _checked(
-    assembly: Assembly, at: _At, covariance: Array, reduced: Reduced
-) -> tuple[tuple[Array, ...], dict[str, float]]:
-    """Standardised residuals of all sets, and group -> what the adjustment took of its observations (count less
-    redundancy).
-    """
-    sets = assembly.reduction.sets
-    standard = [np.zeros((len(one.point), one.rows)) for one in sets]
-    taken = dict.fromkeys((one.group for one in sets), 0.0)
-    for rows in assembly.reduction.rows(at.x, at.ground, at.weight, at.factor, weighted=False):
-        columns, where = rows.bundle.columns, rows.bundle.points
-        weights = np.concatenate(
-            [
-                np.repeat((at.weight[k][w] / at.factor[sets[k].group])[:, None], sets[k].rows, axis=1)
-                for k, w in rows.bundle.members
-            ],
-            axis=1,
-        )
-        inner = reduced.spread[where]
-        moved = inner @ np.swapaxes(rows.by_point * weights[:, :, None], 1, 2) @ rows.by_x
-        through = rows.by_x - rows.by_point @ moved
-        shared = covariance[np.ix_(columns, columns)]
-        d = 0
-        for k, which in rows.bundle.members:
-            depth = sets[k].rows
-            part, by_point = through[:, d : d + depth], rows.by_point[:, d : d + depth]
-            cofactor = part @ shared @ np.swapaxes(part, 1, 2) + by_point @ inner @ np.swapaxes(by_point, 1, 2)
-            weight, unit = at.weight[k][which], at.factor[sets[k].group]
-            standard[k][which] = standardised_packets(rows.miss[:, d : d + depth], cofactor, weight, unit)
-            taken[sets[k].group] += float(np.sum(weight * np.trace(cofactor, axis1=1, axis2=2)) / unit)
-            d += depth
-    return tuple(standard), taken
-
-
 def _tests(
-    assembly: Assembly, at: _At, covariance: Array, reduced: Reduced, taken: Mapping[str, float]
+    reduction: Reduction, at: State, covariance: Array, reduced: Reduced, taken: Mapping[str, float]
 ) -> dict[str, GroupTest]:
-    reduction = assembly.reduction
     counts: dict[str, int] = {}
     for one, weight in zip(reduction.sets, at.weight, strict=True):
         counts[one.group] = counts.get(one.group, 0) + one.rows * int(np.sum(weight > _SETTLED))
@@ -380,11 +347,12 @@ def _tests(
 
 def _result(
     assembly: Assembly,
-    at: _At,
+    at: State,
     covariance: Array,
     standard: tuple[Array, ...],
     tests: Mapping[str, GroupTest],
     reduced: Reduced,
+    steps: int,
 ) -> BlockAdjustment:
     rows = _rows_left(assembly, at.weight)
     known = rows >= 3
@@ -402,5 +370,5 @@ def _result(
         chi_square=sum(one.square for one in tests.values()),
         degrees_of_freedom=freedom,
         reduced=reduced,
-        iterations=at.steps,
+        iterations=steps,
     )

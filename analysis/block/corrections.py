@@ -67,7 +67,8 @@ class Corrections:
         """(n, w) unknowns of all parts."""
         every = [np.zeros((len(self.time), 0), np.intp)]
         for one, (number, _) in zip(self.parts, self._blends, strict=True):
-            every.append((one.first + 3 * number[:, :, None] + np.arange(3)).reshape(len(number), -1))
+            columns = one.first + 3 * number[:, :, None] + np.arange(3)
+            every.append(columns.reshape(len(number), 3 * number.shape[1]))
         return np.concatenate(every, axis=1)
 
     def factors(self, turns: bool) -> tuple[Indices, Array]:

@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from analysis.block.assembly import assembled
 from analysis.block.block import Block, Term
 from analysis.block.block_adjustment import BlockAdjustment
+from analysis.block.point_reduction import State
 from analysis.block.processes import Law
 from analysis.orbit.ground_errors import level_axes
 from analysis.units import ARCSEC
@@ -115,7 +116,7 @@ def open_combinations(found: BlockAdjustment) -> tuple[Open, ...]:
     plain = assembled(simplified(found.assembly.block))
     ground = np.where(np.isfinite(found.ground), found.ground, found.assembly.block.points.start)
     weight = tuple(np.ones(len(one.point)) for one in plain.reduction.sets)
-    data = plain.reduction.reduced(np.zeros(plain.reduction.size), ground, weight, {}).data.toarray()
+    data = plain.reduction.eliminated(State(np.zeros(plain.reduction.size), ground, weight, {})).data.toarray()
     prior = plain.reduction.prior({}).toarray()
     # eigenvalues of the observations' information in units of the priors'
     values, vectors = eigh(data, prior)

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.twin.study_bench import ROOT
+from twin.run.cluster import _children_deaf_to_ctrl_c
 from twin.run.durable import ending_later
-from twin.study.runs.cluster import _children_deaf_to_ctrl_c
 
 HEAVY = {"mitsuba", "drjit", "matplotlib", "dask", "distributed", "sklearn", "trimesh", "xarray", "pandas", "pint"}
 """What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""

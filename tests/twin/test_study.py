@@ -27,8 +27,8 @@ import twin.study.__main__ as command
 from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import ROOT, children, chunks, same_bytes, start, wait_for, write_study
+from twin.run.cluster import local_workers
 from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.cluster import local_workers
 from twin.study.runs.engine import Engine
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK

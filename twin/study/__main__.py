@@ -17,8 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run import cli
+from twin.run.cluster import ClusterError
 from twin.study.progress_bar import Told, tell_through
-from twin.study.runs.cluster import ClusterError
 from twin.study.runs.engine import Estimate, IncompleteError, ProgramFault
 from twin.study.runs.engine import Progress as EngineProgress
 from twin.study.runs.study_folder import StudyFolder

@@ -14,6 +14,7 @@ from analysis.block.block_adjustment import BlockAdjustment, adjust_block, kept_
 from analysis.block.law_tests import LawTest, law_tests
 from analysis.block.network import DatumTest, Network, Open, datum_test, network_of, open_combinations
 from analysis.block.processes import BlockError
+from analysis.block.shares import Pool
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.ground_errors import Accuracy, level_axes, predicted, realised
 from optics.numerics.frozen_map import FrozenMap
@@ -121,8 +122,17 @@ class BlockRun:
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
-def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance: Advance = silent) -> BlockRun:
+def run_adjustment(
+    setup: AnyAdjust, backend: Backend | None, seed: int, advance: Advance = silent, pool: Pool | None = None
+) -> BlockRun:
     """Draw or read a block and adjust it. Nothing is traced: the backend is not used.
+
+    Args:
+        setup: what the file says.
+        backend: not used.
+        seed: of all that is drawn.
+        advance: told of the progress.
+        pool: processes that reduce the points; None for this one alone.
 
     Raises:
         InputError: tables that cannot be used.
@@ -143,13 +153,13 @@ def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance
     advance("block", 1, 2)
     try:
         network = network_of(block)
-        datum, block, rejected = _datum(block, spec.robust)
+        datum, block, rejected = _datum(block, spec.robust, pool)
         robust = spec.robust and rejected is None
         found = adjust_block(
-            block, robust="reject" if robust else None, variance_components=_components(spec.components)
+            block, robust="reject" if robust else None, variance_components=_components(spec.components), pool=pool
         )
         advance("block", 2, 2)
-        worth = _worth(kept_block(found), found, known, advance)
+        worth = _worth(kept_block(found), found, known, advance, pool)
     except (MeasurementError, np.linalg.LinAlgError) as error:
         key = "data" if drawn is None else "points"
         raise BenchError(str(error), (key,), "more points, or scenes that see the same ground") from error
@@ -173,7 +183,7 @@ def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance
     )
 
 
-def _datum(block: Block, robust: bool) -> tuple[DatumTest | None, Block, Rejected | None]:
+def _datum(block: Block, robust: bool, pool: Pool | None) -> tuple[DatumTest | None, Block, Rejected | None]:
     """A common shift of the control points, the block to be adjusted, and what was left out of it already.
 
     It is looked for first: control points of another datum would else all be taken for gross errors. Where there is
@@ -181,7 +191,7 @@ def _datum(block: Block, robust: bool) -> tuple[DatumTest | None, Block, Rejecte
     """
     if not np.any(block.points.role == "control"):
         return None, block, None
-    shifted = adjust_block(block, robust="reject" if robust else None, datum=True)
+    shifted = adjust_block(block, robust="reject" if robust else None, datum=True, pool=pool)
     test = datum_test(shifted)
     assert test is not None
     if robust and chi2.sf(test.chi_square, 3) < DATUM_ALARM:
@@ -201,7 +211,9 @@ def _check(found: BlockAdjustment, known: _Known) -> tuple[np.ndarray, np.ndarra
     return where, found.ground[where] - known.places[where], spread
 
 
-def _worth(kept: Block, found: BlockAdjustment, known: _Known, advance: Advance) -> FrozenMap[str, Worth]:
+def _worth(
+    kept: Block, found: BlockAdjustment, known: _Known, advance: Advance, pool: Pool | None
+) -> FrozenMap[str, Worth]:
     """Check points by all sensors, without each, and by none but ties."""
     sensors = [name for name in kept.sensors if name != "ties"]
     cases: dict[str, tuple[str, ...]] = {ALL: ()}
@@ -216,7 +228,7 @@ def _worth(kept: Block, found: BlockAdjustment, known: _Known, advance: Advance)
             block = block.without(name)
         one = found
         if left_out:
-            one = adjust_block(block, variance_components=False)
+            one = adjust_block(block, pool=pool)
         rows[case] = _accuracy(left_out, one, known)
     advance("sensors", len(cases), len(cases))
     return FrozenMap(rows)
