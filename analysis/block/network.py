@@ -113,8 +113,8 @@ class Open:
 def open_combinations(found: BlockAdjustment) -> tuple[Open, ...]:
     """What of the block's unknowns the observations leave to the priors, by name, the widest open first.
 
-    What is told to less than a thousandth, and the rest, are a space each, and a combination has an unknown that is in no
-    other one of its space (`null_space.echelon`): the eigenvectors of a space whose eigenvalues are alike are any.
+    What is told to less than a thousandth, and the rest, are a space each, and a combination has an unknown that is in
+    no other one of its space (`null_space.echelon`): the eigenvectors of a space whose eigenvalues are alike are any.
     """
     plain = assembled(simplified(found.assembly.block))
     ground = np.where(np.isfinite(found.ground), found.ground, found.assembly.block.points.start)

@@ -5,29 +5,42 @@ Of an adjustment of any kind: a campaign's (`analysis.calibration`) and a block'
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from analysis.measurement_error import MeasurementError
+
 __all__ = [
     "HUBER",
     "LARGEST_FACTOR",
     "REJECT",
+    "SETTLED",
     "GroupTest",
     "Robust",
+    "Rule",
+    "UnsettledError",
     "bounded",
     "extrapolated",
     "limits",
     "median_factor",
     "robust_weights",
+    "settled",
     "standardised_packets",
 ]
 
 Array = NDArray[np.float64]
+S = TypeVar("S", bound="Weighted")
+T = TypeVar("T")
+SETTLED = 1e-3
+"""Largest change of weights at rest, and the largest weight of a packet that counts as given up."""
+_ROUNDS = 50
+_FREE_ROUNDS = 12
+"""From then on weights that leave packets out only fall: two of a point that are doubted in turns would never rest."""
 Robust = Literal["huber", "igg"]
 # Lengths of standardised residuals of image points, Rayleigh for good ones. Beyond HUBER lie 5 in 100 good points, they
 # lose weight; beyond REJECT 1 in 10 000, they are left out (IGG III: Yang, Song and Xu, J. Geodesy 76 (2002) 353).
@@ -79,6 +92,10 @@ class GroupTest:
             return 1.0
         high = float(chi2.sf(self.square, self.redundancy))
         return 2.0 * min(high, 1.0 - high)
+
+
+class UnsettledError(MeasurementError, ValueError):
+    """Weights that do not come to rest."""
 
 
 def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit: float) -> Array:
@@ -152,3 +169,87 @@ def extrapolated(factors: Sequence[Mapping[str, float]]) -> dict[str, float]:
         ratio = min(max(ratio, 0.0), _LARGEST_RATIO)
         found[group] = bounded(float(np.exp(last + (last - middle) * ratio / (1.0 - ratio))))
     return found
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How weights of packets and factors of groups follow from residuals.
+
+    Attributes:
+        packets: Huber's weights, IGG III, or "accept": 1 up to where IGG III ends and zero beyond; None leaves them.
+        factor: of the image points by the median of their residuals, or of groups by variance components; None leaves
+            them.
+        groups: whose components are estimated; None for all.
+        screening: rounds with Huber's weights that come first, in which no factor is estimated.
+        tolerance: largest change of a weight, or relative one of a factor, at rest.
+    """
+
+    packets: Robust | Literal["accept"] | None = None
+    factor: Literal["median", "components"] | None = None
+    groups: Collection[str] | None = None
+    screening: int = 0
+    tolerance: float = SETTLED
+
+
+class Weighted(Protocol):
+    """A state with weights."""
+
+    @property
+    def weight(self) -> tuple[Array, ...]:
+        """Robust weights of each set of packets, 0 to 1."""
+
+    @property
+    def factor(self) -> Mapping[str, float]:
+        """Group -> factor on its variances."""
+
+
+class Reweighted(Protocol[S, T]):
+    """An adjustment, as far as its weights are concerned: states S, solutions T."""
+
+    def solve(self, at: S, screening: bool) -> tuple[S, T]:
+        """State and solution with the weights of a state; a rough one will do while gross errors are looked for."""
+
+    def judged(self, at: S, found: T) -> tuple[Array, ...]:
+        """Standardised residuals of each set of packets."""
+
+    def tests(self, at: S, found: T) -> Mapping[str, GroupTest]:
+        """Variance groups."""
+
+    def weighed(self, at: S, weight: tuple[Array, ...], factor: Mapping[str, float]) -> S:
+        """The state with other weights, and with none at points that too little is left of."""
+
+
+def settled(problem: Reweighted[S, T], at: S, rule: Rule) -> tuple[S, T]:
+    """Solve until weights and factors rest.
+
+    Raises:
+        UnsettledError: they do not.
+    """
+    factors: list[Mapping[str, float]] = []
+    for turn in range(_ROUNDS):
+        screening = turn < rule.screening
+        at, found = problem.solve(at, screening)
+        if rule.packets is None and rule.factor is None:
+            return at, found
+        weight, factor = at.weight, dict(at.factor)
+        standard = () if rule.packets is None and rule.factor == "components" else problem.judged(at, found)
+        if rule.factor == "median":
+            factor["image"] = bounded(factor["image"] * median_factor(np.concatenate(standard)))
+        elif rule.factor == "components" and not screening:
+            tests = problem.tests(at, found)
+            factor |= {g: one.estimated for g, one in tests.items() if rule.groups is None or g in rule.groups}
+            factors.append(factor)
+        if rule.packets is not None:
+            kind = "huber" if screening else rule.packets
+            weight = tuple(robust_weights(one, kind) for one in standard)
+            if kind != "huber" and turn >= _FREE_ROUNDS:
+                weight = tuple(np.minimum(new, old) for new, old in zip(weight, at.weight, strict=True))
+        new = problem.weighed(at, weight, factor)
+        changes = [float(np.abs(a - b).max(initial=0.0)) for a, b in zip(new.weight, at.weight, strict=True)]
+        change = max(*changes, *(abs(factor[g] / at.factor[g] - 1.0) for g in factor))
+        if change < rule.tolerance and not screening:
+            return at, found
+        if len(factors) == 3:
+            new, factors = problem.weighed(new, new.weight, extrapolated(factors)), []
+        at = new
+    raise UnsettledError(f"weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}")

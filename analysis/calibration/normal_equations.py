@@ -328,7 +328,8 @@ def _reduce(
     weighted = (sparse.diags(row_weight) @ every).tocsr()
     cross = (design_point.T @ weighted).tocsr()
     own_blocks = _point_blocks(point, rows.place, weights.image / weights.factor.get("image", 1.0), total) + held.data
-    own_blocks[exact] = np.eye(3)
+    # of what was given up no ray has any weight
+    own_blocks[exact | ~np.any(own_blocks, axis=(1, 2))] = np.eye(3)
     try:
         point_inverse = _blocks(np.asarray(np.linalg.inv(own_blocks), np.float64))
     except np.linalg.LinAlgError:
