@@ -12,8 +12,12 @@ with unknowns z whose prior is that of the process at unit size, the same about 
 - `walk`: a random walk that is zero at the middle of the scope; sigma is what it gains in a second.
 - `slow`: a first-order Gauss-Markov process of standard deviation sigma and correlation time `time`.
 - `orbital`: amplitudes of cosine and sine of 2 pi t / `time`, of standard deviation sigma each.
+- `jitter`: the same at `frequency`, each amplitude a slow process of standard deviation sigma and correlation time
+  `time`, so that sigma is the root mean square of the oscillation. It is a line of the spectrum of width 1 / (pi time):
+  a frequency that is known to s keeps its phase for 1 / (2 pi s).
 
-A walk and a slow process have unknowns at whole multiples of `interval` and are straight lines between them.
+A walk, a slow process and amplitudes of jitter have unknowns at whole multiples of `interval` and are straight lines
+between them.
 """
 
 from __future__ import annotations
@@ -32,8 +36,9 @@ __all__ = ["BlockError", "Kind", "Law", "Support"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital"]
-KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital")
+Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
+KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital", "jitter")
+_STEPPED = ("white", "walk", "slow", "jitter")
 _GAP = 18
 """Stretches of a spline's unknowns this far apart correlate by 1e-9 and are kept apart."""
 _MOST = 1e5
@@ -54,8 +59,9 @@ class Law:
         group: its name, and that of its variance component.
         kind: of process, see the module.
         sigma: about or along three axes, radians or metres; of a rate per second, of a walk in a second.
-        interval: between the unknowns of `white`, `walk` and `slow`, seconds.
-        time: correlation time of `slow`, period of `orbital`, seconds.
+        interval: between the unknowns of `white`, `walk`, `slow` and `jitter`, seconds.
+        time: correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
+        frequency: of `jitter`, hertz.
     """
 
     group: str
@@ -63,6 +69,7 @@ class Law:
     sigma: tuple[float, float, float]
     interval: float = 1.0
     time: float = 0.0
+    frequency: float = 0.0
 
     def check(self) -> None:
         """Raises BlockError for numbers that cannot be used."""
@@ -70,9 +77,11 @@ class Law:
             raise BlockError(f"block: {self.group}: a law is one of {', '.join(KINDS)}, found {self.kind!r}")
         if len(self.sigma) != 3 or not np.all(np.isfinite(self.sigma)) or min(self.sigma) < 0:
             raise BlockError(f"block: {self.group}: three sigmas that are finite and not negative, found {self.sigma}")
-        if self.kind in ("white", "walk", "slow") and not (np.isfinite(self.interval) and self.interval > 0):
+        if self.kind in _STEPPED and not (np.isfinite(self.interval) and self.interval > 0):
             raise BlockError(f"block: {self.group}: the interval must be positive, found {self.interval}")
-        if self.kind in ("slow", "orbital") and not (np.isfinite(self.time) and self.time > 0):
+        if self.kind == "jitter" and not (np.isfinite(self.frequency) and self.frequency > 0):
+            raise BlockError(f"block: {self.group}: the frequency must be positive, found {self.frequency}")
+        if self.kind in ("slow", "orbital", "jitter") and not (np.isfinite(self.time) and self.time > 0):
             raise BlockError(f"block: {self.group}: correlation time or period must be positive, found {self.time}")
 
     def spread(self, seconds: float) -> tuple[float, float, float]:
@@ -88,7 +97,8 @@ class Support:
 
     Attributes:
         law: which.
-        numbers: (k,) of the unknowns of one axis: multiples of the interval where there is one, else 0, 1.
+        numbers: (k,) of the unknowns of one axis: multiples of the interval where there is one, else 0, 1; of jitter
+            twice the multiple for the cosine, and one more for the sine.
         middle: time at which a rate vanishes, seconds.
         precision: (k, k) sparse, of the unknowns of one axis.
     """
@@ -142,6 +152,9 @@ class Support:
         kept = np.exp(-step / law.time)
         precision = _chain(kept, 1.0 - kept**2).tolil()
         precision[0, 0] += 1.0
+        if law.kind == "jitter":
+            both = (2 * numbers[:, None] + np.arange(2)).ravel()
+            return cls(law, both, middle, sparse.csr_matrix(sparse.kron(precision, sparse.eye(2))))
         return cls(law, numbers, middle, sparse.csr_matrix(precision))
 
     @property
@@ -169,6 +182,10 @@ class Support:
             first = np.asarray(np.floor(times / law.interval), np.intp)
             share = times / law.interval - first
             wanted, values = np.stack([first, first + 1], axis=1), np.stack([1.0 - share, share], axis=1)
+            if law.kind == "jitter":
+                phase = 2.0 * np.pi * law.frequency * times
+                wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+                wanted, values = 2 * first[:, None] + np.arange(4), np.repeat(values, 2, axis=1) * np.tile(wave, 2)
         where = np.minimum(np.searchsorted(self.numbers, wanted), len(self.numbers) - 1)
         return where, np.where(self.numbers[where] == wanted, values, 0.0)
 

@@ -89,6 +89,36 @@ def test_a_wrong_law_is_told_and_a_right_one_is_not(stated, true):
             assert "not that of the readings" in str(test)
 
 
+SLOW = Law("attitude", "slow", (0.4 * ARCSEC,) * 3, 2.0, 60.0)
+JITTER = Term(Law("jitter", "jitter", (0.6 * ARCSEC,) * 3, 2.0, 40.0, 0.65))
+
+
+@pytest.mark.second
+@one_blas_thread()
+def test_jitter_as_an_unknown_makes_the_sigmas_right_and_without_it_the_block_is_refused():
+    """0.65 Hz, 0.6 arcsec rms: 0.5 px. Without it chi-square and check points contradict the sigmas."""
+    bias = Term(Law("tracker bias", "constant", (3 * ARCSEC,) * 3), "tracker")
+    true = plan(SLOW, ties=60, half=6e3, image=0.2 * PITCH, attitude=(bias, Term(SLOW), JITTER))
+    said = replace(true, attitude=(bias, Term(SLOW)))
+    square = freedom = check = without = count = 0
+    for seed in range(20):
+        drawn = draw(true, np.random.default_rng([6, seed]))
+        found = adjust_block(drawn.block)
+        square, freedom = square + found.chi_square, freedom + found.degrees_of_freedom
+        where = np.flatnonzero(drawn.block.points.role == "check")[:1]
+        wrong = adjust_block(replace(drawn.block, attitude=said.attitude))
+        assert wrong.p_value < 1e-6
+        for one in (found, wrong):
+            error = one.ground[where] - drawn.ground[where]
+            value = float(np.einsum("ni,nij,nj->", error, np.linalg.inv(one.point_covariance(where)), error))
+            check, without = (check + value, without) if one is found else (check, without + value)
+        count += 3
+    assert _two_sided(square, freedom) > _ALARM
+    assert _two_sided(check, count) > _ALARM
+    # check points of a pass whose jitter nobody told lie farther off than their sigmas
+    assert chi2.sf(without, count) < 1e-4
+
+
 @pytest.mark.second
 @one_blas_thread()
 def test_serial_correlation_has_unit_variance_under_the_right_law():

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from scenes.specs.orbit.angle import Relief, TerrainHeight
 from scenes.specs.orbit.calibration import CameraDriftSpec, FieldLength, LineTime, MonitorReadingSpec
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, Interval, Latitude, Longitude, UtcTime
+from scenes.specs.orbit.jitter import Frequency
 from scenes.specs.orbit.sensors import SENSORS
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
@@ -20,7 +21,7 @@ from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, T
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 
 Sensor = Literal["ties", "control", "monitor", "laser", "terrain", "tracker_angles"]
-LawKind = Literal["constant", "rate", "white", "walk", "slow", "orbital"]
+LawKind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 Period = Annotated[float, Quantity(MOMENT, above_zero=True, largest="100000 h")]
 Sigmas = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, smallest="0 m", largest="10 km"))]
 Positive = Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")]
@@ -33,23 +34,30 @@ class LawSpec(Spec):
     Attributes:
         law: constant; rate, of even growth from the middle of what shares it; white, readings independent of one
             another that a cubic spline joins; walk, a random walk that is zero in the middle; slow, a stationary
-            process that forgets itself over `time`; orbital, cosine and sine of the period `time`.
+            process that forgets itself over `time`; orbital, cosine and sine of the period `time`; jitter, an
+            oscillation of `frequency` whose amplitude and phase forget themselves over `time`.
         shared_by: what has one draw of it: each pass, all passes of a star tracker, or the block.
-        interval: between independent readings of `white`; between the values of `walk` and `slow` that are solved for,
-            seconds.
-        time: correlation time of `slow`, period of `orbital`, seconds.
+        interval: between independent readings of `white`; between the values of `walk`, of `slow` and of the amplitudes
+            of `jitter` that are solved for, seconds.
+        time: correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
+        frequency: of `jitter`, hertz.
     """
 
     law: LawKind
     shared_by: Literal["pass", "tracker", "block"] = "pass"
     interval: Interval = 1.0
     time: Period | None = None
+    frequency: Frequency | None = None
 
     @model_validator(mode="after")
     def _has_its_time(self) -> LawSpec:
-        if (self.time is None) == (self.law in ("slow", "orbital")):
-            what = {"slow": "a correlation time", "orbital": "a period"}.get(self.law, "no `time:`")
+        if (self.time is None) == (self.law in ("slow", "orbital", "jitter")):
+            named = {"slow": "a correlation time", "orbital": "a period", "jitter": "a correlation time"}
+            what = named.get(self.law, "no `time:`")
             raise Problem(f"a {self.law} law has {what}", None, what, within=("time",))
+        if (self.frequency is None) == (self.law == "jitter"):
+            what = "a frequency" if self.law == "jitter" else "no `frequency:`"
+            raise Problem(f"a {self.law} law has {what}", None, what, within=("frequency",))
         return self
 
 
@@ -61,8 +69,9 @@ class AttitudeLawSpec(LawSpec):
         shared_by: what has one draw of it.
         interval: between independent readings, or between values that are solved for, seconds.
         time: correlation time or period, seconds.
-        sigma: standard deviation about body X, Y and Z, radians: of a constant, a reading, an amplitude; of a rate in
-            each second; of what a walk gains in a second.
+        frequency: of `jitter`, hertz.
+        sigma: standard deviation about body X, Y and Z, radians: of a constant, a reading, an amplitude, of jitter as a
+            root mean square; of a rate in each second; of what a walk gains in a second.
     """
 
     sigma: AngleSigmas
@@ -76,6 +85,7 @@ class OrbitLawSpec(LawSpec):
         shared_by: what has one draw of it.
         interval: between independent readings, or between values that are solved for, seconds.
         time: correlation time or period, seconds.
+        frequency: of `jitter`, hertz.
         sigma: standard deviation along body X, Y and Z of the middle of the pass, metres, as for the attitude.
     """
 

@@ -119,12 +119,25 @@ def drawn_course(law: Law, first: float, last: float, random: np.random.Generato
         values = np.cumsum(steps, axis=0) * np.sqrt(law.interval)
         values = values - values[np.flatnonzero(number == np.round(middle / law.interval))[0]]
     else:
-        kept = np.exp(-law.interval / law.time)
-        values = steps.copy()
-        for k in range(1, len(number)):
-            values[k] = kept * values[k - 1] + np.sqrt(1.0 - kept**2) * steps[k]
+        values = _slow(steps, law)
+    if law.kind == "jitter":
+        both = np.concatenate([values, _slow(random.standard_normal(steps.shape), law)], axis=1)
+        amplitude: Course = make_interp_spline(law.interval * number, np.tile(sigma, 2) * both, k=1)
+        turn = 2.0 * np.pi * law.frequency
+        return lambda t: (
+            np.cos(turn * t)[:, None] * amplitude(t)[:, :3] + np.sin(turn * t)[:, None] * amplitude(t)[:, 3:]
+        )
     line: Course = make_interp_spline(law.interval * number, sigma * values, k=1)
     return line
+
+
+def _slow(steps: np.ndarray, law: Law) -> np.ndarray:
+    """(k, 3) values of a stationary process of unit size from independent normals (k, 3)."""
+    kept = np.exp(-law.interval / law.time)
+    values = steps.copy()
+    for k in range(1, len(steps)):
+        values[k] = kept * values[k - 1] + np.sqrt(1.0 - kept**2) * steps[k]
+    return values
 
 
 def _courses(
@@ -147,7 +160,7 @@ def _courses(
                 last = max(begin[m] for m in members) + spec.span
                 random = np.random.default_rng(stream(seed, number))
                 number += 1
-                if (last - first) / term.law.interval > _MOST_STEPS and term.law.kind in ("white", "walk", "slow"):
+                if (last - first) / term.law.interval > _MOST_STEPS and term.law.kind in ("white", "walk", "slow", "jitter"):
                     problem = (
                         f"{name}: more than {_MOST_STEPS:.0e} values of a course; are passes too far apart to share it?"
                     )

@@ -13,7 +13,9 @@ from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
 def law_of(name: str, spec: LawSpec) -> Term:
     """A stated law as the analysis has it."""
     sigma: tuple[float, float, float] = spec.sigma  # type: ignore[attr-defined]
-    return Term(Law(name, spec.law, sigma, spec.interval, spec.time or 0.0), spec.shared_by)
+    return Term(
+        Law(name, spec.law, sigma, spec.interval, spec.time or 0.0, spec.frequency or 0.0), spec.shared_by
+    )
 
 
 def camera_sigmas(spec: CameraDriftSpec | MonitorReadingSpec) -> np.ndarray:
