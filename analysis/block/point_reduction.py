@@ -172,7 +172,8 @@ class Reduction:
         if not points:
             raise BlockError("block: no observations")
         order = np.lexsort((np.concatenate(codes), np.concatenate(points)))
-        point, code, owner, place = (np.concatenate(v)[order] for v in (points, codes, owners, places))
+        every: list[Indices] = [np.concatenate(v).astype(np.intp)[order] for v in (points, codes, owners, places)]
+        point, code, owner, place = every
         starts: Indices = np.flatnonzero(np.diff(point, prepend=-1))
         counts = np.diff(np.append(starts, len(point)))
         found = []

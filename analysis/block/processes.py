@@ -32,13 +32,14 @@ from scipy import sparse
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.ray_noise import spline_blend, spline_precision
 
-__all__ = ["BlockError", "Kind", "Law", "Support"]
+__all__ = ["STEPPED", "BlockError", "Kind", "Law", "Support"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital", "jitter")
-_STEPPED = ("white", "walk", "slow", "jitter")
+STEPPED = ("white", "walk", "slow", "jitter")
+"""Laws with unknowns at multiples of an interval."""
 _GAP = 18
 """Stretches of a spline's unknowns this far apart correlate by 1e-9 and are kept apart."""
 _MOST = 1e5
@@ -77,7 +78,7 @@ class Law:
             raise BlockError(f"block: {self.group}: a law is one of {', '.join(KINDS)}, found {self.kind!r}")
         if len(self.sigma) != 3 or not np.all(np.isfinite(self.sigma)) or min(self.sigma) < 0:
             raise BlockError(f"block: {self.group}: three sigmas that are finite and not negative, found {self.sigma}")
-        if self.kind in _STEPPED and not (np.isfinite(self.interval) and self.interval > 0):
+        if self.kind in STEPPED and not (np.isfinite(self.interval) and self.interval > 0):
             raise BlockError(f"block: {self.group}: the interval must be positive, found {self.interval}")
         if self.kind == "jitter" and not (np.isfinite(self.frequency) and self.frequency > 0):
             raise BlockError(f"block: {self.group}: the frequency must be positive, found {self.frequency}")

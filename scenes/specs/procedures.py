@@ -216,7 +216,7 @@ PROCEDURES: dict[str, Procedure] = {
         "block",
         setup="scenes.specs.measured.adjust_setup:AdjustSetup",
         resolve="scenes.specs.measured.adjust_setup:resolve_any_adjust",
-        run="twin.orbit.block.block_run:run_adjustment",
+        run="twin.operate.operated_block:run_operated_block",
         numbers="twin.orbit.block.block_numbers:BLOCK",
         report="twin.orbit.block.block_report:block_report",
         files=(

@@ -238,6 +238,24 @@ class CameraChangeSpec(Spec):
         return self
 
 
+class MonitorRecordSpec(Spec):
+    """A record of `twin.operate`, whose estimate says how the cameras stand in every pass.
+
+    Attributes:
+        record: its folder, or the URL of its database.
+        plan: file of the plan of operation under which it is followed; None for the plan that the record keeps.
+    """
+
+    record: Reference
+    plan: Reference | None = None
+
+
+def one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None:
+    """Refuse two monitors."""
+    if monitor is not None and record is not None:
+        raise Problem("`monitor` and `monitor_record` are both given", None, "one of them", within=("monitor_record",))
+
+
 class OrbitAdjustSpec(TitledSpec):
     """A block of scenes, adjusted at once.
 
@@ -259,6 +277,8 @@ class OrbitAdjustSpec(TitledSpec):
         angles: between star trackers.
         changes: line -> how its camera may have changed.
         monitor: how well an on-board monitor reads these changes in each pass; None for no monitor.
+        monitor_record: what a record of `twin.operate` says of them, in place of `monitor`; the true cameras are drawn
+            from that.
         laser: an altimeter; None for none.
         terrain: a terrain model; None for none.
         without: sensors that are there and are not used.
@@ -283,6 +303,7 @@ class OrbitAdjustSpec(TitledSpec):
     angles: tuple[TrackerAngleSpec, ...] = ()
     changes: Annotated[Named[CameraChangeSpec], not_empty("no changes", "how each line may have changed")]
     monitor: MonitorReadingSpec | None = None
+    monitor_record: MonitorRecordSpec | None = None
     laser: LaserSpec | None = None
     terrain: TerrainModelSpec | None = None
     without: tuple[Sensor, ...] = ()
@@ -301,6 +322,7 @@ class OrbitAdjustSpec(TitledSpec):
         for name in self.changes:
             if name not in self.lines:
                 raise unknown("no such line among `lines`", name, self.lines, ("changes", name))
+        one_monitor(self.monitor, self.monitor_record)
         trackers = tuple(dict.fromkeys(one.tracker for one in self.passes.values()))
         for k, angle in enumerate(self.angles):
             for j, name in enumerate(angle.between):
@@ -327,7 +349,7 @@ class OrbitAdjustSpec(TitledSpec):
         has = {
             "ties": self.points.tie > 0,
             "control": self.points.control > 0,
-            "monitor": self.monitor is not None,
+            "monitor": self.monitor is not None or self.monitor_record is not None,
             "laser": self.laser is not None,
             "terrain": self.terrain is not None,
             "tracker_angles": bool(self.angles),

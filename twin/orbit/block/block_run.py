@@ -22,6 +22,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import measured_block
+from twin.orbit.block.pass_knowledge import MonitorSource
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
@@ -123,7 +124,12 @@ class BlockRun:
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
 def run_adjustment(
-    setup: AnyAdjust, backend: Backend | None, seed: int, advance: Advance = silent, pool: Pool | None = None
+    setup: AnyAdjust,
+    backend: Backend | None,
+    seed: int,
+    advance: Advance = silent,
+    pool: Pool | None = None,
+    monitor: MonitorSource | None = None,
 ) -> BlockRun:
     """Draw or read a block and adjust it. Nothing is traced: the backend is not used.
 
@@ -133,6 +139,7 @@ def run_adjustment(
         seed: of all that is drawn.
         advance: told of the progress.
         pool: processes that reduce the points; None for this one alone.
+        monitor: what a record says of the cameras, where the file names one.
 
     Raises:
         InputError: tables that cannot be used.
@@ -142,10 +149,10 @@ def run_adjustment(
     advance("block", 0, 2)
     drawn = None
     if isinstance(setup, MeasuredAdjustSetup):
-        block, places = measured_block(setup, advance)
+        block, places = measured_block(setup, advance, monitor)
         known = _Known(places, block.points.covariance, {})
     else:
-        drawn = draw_block(setup, np.random.SeedSequence(seed))
+        drawn = draw_block(setup, np.random.SeedSequence(seed), monitor)
         block = drawn.block
         known = _Known(drawn.ground, np.zeros((len(drawn.ground), 3, 3)), drawn.change)
     for sensor in spec.without:

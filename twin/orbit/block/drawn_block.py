@@ -15,14 +15,14 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from analysis.block import block as known
-from analysis.block.processes import Law
+from analysis.block.processes import STEPPED, Law
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.measured.adjust_setup import AdjustSetup
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
-from twin.orbit.block.pass_knowledge import camera_sigmas, change_covariance, law_of, monitored_camera
+from twin.orbit.block.pass_knowledge import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.observations import PassData
 from twin.orbit.flight.earth import Earth, east_north_up, tai_of
@@ -36,6 +36,7 @@ from twin.run.procedure import BenchError
 from twin.run.random_streams import stream
 
 Course = Callable[[np.ndarray], np.ndarray]
+Monitored = dict[str, known.CameraKnowledge] | known.CamerasKnowledge
 _BEYOND = 30
 """Readings beyond the ends of a course: a cubic spline forgets its ends by a factor of 0.27 a reading."""
 _SPARE = 4.0
@@ -160,7 +161,7 @@ def _courses(
                 last = max(begin[m] for m in members) + spec.span
                 random = np.random.default_rng(stream(seed, number))
                 number += 1
-                if (last - first) / term.law.interval > _MOST_STEPS and term.law.kind in ("white", "walk", "slow", "jitter"):
+                if (last - first) / term.law.interval > _MOST_STEPS and term.law.kind in STEPPED:
                     problem = (
                         f"{name}: more than {_MOST_STEPS:.0e} values of a course; are passes too far apart to share it?"
                     )
@@ -178,9 +179,20 @@ def _summed(parts: list[Course]) -> Course:
 
 
 def _cameras(
-    spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator
-) -> tuple[dict[str, np.ndarray], dict[str, known.CameraKnowledge], dict[str, known.CameraKnowledge] | None]:
+    spec: OrbitAdjustSpec,
+    days: np.ndarray,
+    random: np.random.Generator,
+    recorded: known.CamerasKnowledge | None,
+) -> tuple[dict[str, np.ndarray], dict[str, known.CameraKnowledge], Monitored | None]:
     """Line -> true changes (T, 4), what is expected of them, and what is known after the monitor's readings."""
+    if recorded is not None:
+        values, vectors = np.linalg.eigh(recorded.covariance)
+        drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
+        changes = recorded.mean + drawn.reshape(recorded.mean.shape)
+        laws = {line: change_covariance(spec.changes[line], days) for line in spec.lines}
+        nothing = np.zeros((len(days), 4))
+        before = {line: known.CameraKnowledge(nothing, law) for line, law in laws.items()}
+        return dict(zip(recorded.cameras, changes, strict=True)), before, recorded
     true, expected, monitored = {}, {}, {}
     for line in spec.lines:
         law = change_covariance(spec.changes[line], days)
@@ -215,8 +227,13 @@ def _trajectory(spec: OrbitAdjustSpec, name: str, one: BlockPassSpec, earth: Ear
         raise BenchError(str(error), ("passes", name), "a place that a sun-synchronous orbit passes") from error
 
 
-def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence) -> DrawnBlock:
+def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence, monitor: MonitorSource | None = None) -> DrawnBlock:
     """Fly all passes and measure.
+
+    Args:
+        setup: what the file says.
+        seed: of all that is drawn.
+        monitor: what a record says of the cameras, from which the true ones are drawn.
 
     Raises:
         BenchError: no such orbit, or too few places that two scenes see.
@@ -231,7 +248,8 @@ def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence) -> DrawnBlock:
     }
     turns, shifts, constants = _courses(spec, spec.truth or spec.errors, begin, stream(seed, _COURSES))
     days = np.array(list(begin.values())) / _DAY
-    true, expected, monitored = _cameras(spec, days, np.random.default_rng(stream(seed, _CAMERAS)))
+    recorded = monitor({name: one.epoch for name, one in spec.passes.items()}, spec.lines) if monitor else None
+    true, expected, monitored = _cameras(spec, days, np.random.default_rng(stream(seed, _CAMERAS)), recorded)
     platforms = {
         name: TruePlatform(
             path, path.body_to_itrs(np.zeros(1))[0], _summed(turns[name]), _summed(shifts[name]), begin[name]

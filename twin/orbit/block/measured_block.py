@@ -14,6 +14,7 @@ from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.measured.adjust_setup import MeasuredAdjustSetup
 from twin.orbit.block.pass_knowledge import (
+    MonitorSource,
     camera_sigmas,
     change_covariance,
     law_of,
@@ -33,7 +34,9 @@ from twin.run.procedure import Advance, BenchError, silent
 _DAY = 86400.0
 
 
-def measured_block(setup: MeasuredAdjustSetup, advance: Advance = silent) -> tuple[known.Block, np.ndarray]:
+def measured_block(
+    setup: MeasuredAdjustSetup, advance: Advance = silent, monitor: MonitorSource | None = None
+) -> tuple[known.Block, np.ndarray]:
     """The block of the tables of all passes, and the given coordinates of its points (m, 3), ITRS, metres, NaN of ties.
 
     Raises:
@@ -46,6 +49,7 @@ def measured_block(setup: MeasuredAdjustSetup, advance: Advance = silent) -> tup
     for line in lines:
         if line not in spec.changes:
             raise BenchError(f"it is not said how {line} may have changed", ("changes",), f"`{line}:`")
+    epochs = {one.name: one.platform.epoch for one in passes}
     moments = {one.name: tai_of(one.platform.epoch) for one in passes}
     zero = min(moments.values())
     begin = {name: round((day - zero[0]) * _DAY + (part - zero[1]) * _DAY, 6) for name, (day, part) in moments.items()}
@@ -83,7 +87,7 @@ def measured_block(setup: MeasuredAdjustSetup, advance: Advance = silent) -> tup
         station=tuple(law_of(name, law) for name, law in spec.errors.orbit.items()),
         image=1.0,
         points=points,
-        monitored=_monitored(setup, lines, expected, tuple(begin)),
+        monitored=_monitored(setup, lines, expected, epochs, monitor),
     )
     return block, given
 
@@ -164,8 +168,12 @@ def _monitored(
     setup: MeasuredAdjustSetup,
     lines: Sequence[str],
     expected: Mapping[str, known.CameraKnowledge],
-    passes: Sequence[str],
-) -> dict[str, known.CameraKnowledge] | None:
+    epochs: Mapping[str, str],
+    source: MonitorSource | None,
+) -> dict[str, known.CameraKnowledge] | known.CamerasKnowledge | None:
+    passes = tuple(epochs)
+    if source is not None:
+        return source(epochs, lines)
     monitor = setup.test.monitor
     if monitor is None:
         return None

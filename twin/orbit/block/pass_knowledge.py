@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+
 import numpy as np
 
-from analysis.block.block import CameraKnowledge, Term
+from analysis.block.block import CameraKnowledge, CamerasKnowledge, Term
 from analysis.block.processes import Law
 from scenes.specs.orbit.adjust import CameraChangeSpec, LawSpec
 from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
+
+MonitorSource = Callable[[Mapping[str, str], Sequence[str]], CamerasKnowledge]
+"""Epochs of passes, UTC, and lines -> what a record of the monitor says of the lines' cameras in these passes."""
 
 
 def law_of(name: str, spec: LawSpec) -> Term:
     """A stated law as the analysis has it."""
     sigma: tuple[float, float, float] = spec.sigma  # type: ignore[attr-defined]
-    return Term(
-        Law(name, spec.law, sigma, spec.interval, spec.time or 0.0, spec.frequency or 0.0), spec.shared_by
-    )
+    return Term(Law(name, spec.law, sigma, spec.interval, spec.time or 0.0, spec.frequency or 0.0), spec.shared_by)
 
 
 def camera_sigmas(spec: CameraDriftSpec | MonitorReadingSpec) -> np.ndarray:
