@@ -216,7 +216,13 @@ class Reweighted(Protocol[S, T]):
         """Variance groups."""
 
     def weighed(self, at: S, weight: tuple[Array, ...], factor: Mapping[str, float]) -> S:
-        """The state with other weights, and with none at points that too little is left of."""
+        """The state with other weights, and with none at points that too little is left of.
+
+        Args:
+            at: state.
+            weight: robust weights of each set of packets, (n,), 0 to 1.
+            factor: group -> factor on its variances.
+        """
 
 
 def settled(problem: Reweighted[S, T], at: S, rule: Rule) -> tuple[S, T]:
