@@ -358,7 +358,7 @@ class Reduction:
             for k, which in rows.bundle.members:
                 depth = sets[k].rows
                 part, by_point = through[:, d : d + depth], rows.by_point[:, d : d + depth]
-                told = (part.reshape(-1, len(shared)) @ shared).reshape(part.shape)
+                told = np.tensordot(part, shared, 1)
                 cofactor = told @ np.swapaxes(part, 1, 2) + by_point @ inner @ np.swapaxes(by_point, 1, 2)
                 weight, unit = at.weight[k][which], at.factor[sets[k].group]
                 standard[k][which] = standardised_packets(rows.miss[:, d : d + depth], cofactor, weight, unit)

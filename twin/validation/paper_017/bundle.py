@@ -125,7 +125,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     )
     inputs: list[Chosen | Supposed] = [
         Chosen.power("error of an image point", IMAGE, "px", measured, float(power)),
-        Supposed("errors of the attitude are independent twice a second", "every 4 s likewise, to 3%"),
+        Supposed("errors of the attitude are independent twice a second", "every 4 s likewise"),
         Supposed("orbit and cameras are without errors", "they are the same in both"),
     ]
     yield context.check("017.bundle").evaluate(measured, sigma, how, explained=[measured], inputs=inputs, facts=facts)
