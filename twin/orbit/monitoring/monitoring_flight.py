@@ -37,6 +37,7 @@ from twin.orbit.monitoring.monitor_series import TOO_FAR, MonitorSeries, Reading
 from twin.run.procedure import Advance, BenchError
 
 if TYPE_CHECKING:
+    from scenes.specs.orbit.loop import OrbitLoopSpec
     from scenes.specs.orbit.monitor import OrbitMonitorSpec
     from scenes.specs.orbit.setup import MonitorSetup
 
@@ -204,7 +205,7 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
         angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
         worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
         # before the images, which take longer
-        views = _look_down(spec, pair, lines, ground_seed, advance)
+        views = look_down(spec, spec.course.times, pair, lines, ground_seed, advance)
         monitor = MonitorSeries(experiment, spec, reference, pair)
         noisy, clean = monitor.measured(states, number)
         truth, distance = _changes(clean.truth, spec.referred)
@@ -293,14 +294,23 @@ def _turned(experiment: MonitorExperiment, state: State, camera: str) -> State:
     return compose(state, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
 
 
-def _look_down(
-    spec: OrbitMonitorSpec,
+def look_down(
+    spec: OrbitMonitorSpec | OrbitLoopSpec,
+    times: Sequence[float],
     pair: tuple[str, str],
     lines: Sequence[Mapping[str, LineCamera]],
     seed: np.random.SeedSequence,
     advance: Advance,
 ) -> tuple[View, ...]:
     """Check points at every time, as both lines see them.
+
+    Args:
+        spec: of orbit, attitude, ground and errors.
+        times: T of them, seconds from the orbit's epoch.
+        pair: the two cameras.
+        lines: of each time: camera -> its line as it truly is.
+        seed: of places and errors.
+        advance: told of the progress.
 
     Raises:
         BenchError: no such orbit, or not enough points that both lines see.
@@ -316,30 +326,30 @@ def _look_down(
         measured = true.with_errors(spec.errors, int(np.random.default_rng(data).integers(2**31)))
     out = []
     for k, (line, stream) in enumerate(zip(lines, streams, strict=True)):
-        out.append(_view(spec, k, [line[name] for name in pair], true, measured, earth, stream))
+        out.append(_view(spec, times[k], [line[name] for name in pair], true, measured, earth, stream))
         advance("ground", k + 1, len(lines))
     return tuple(out)
 
 
 def _view(
-    spec: OrbitMonitorSpec,
-    number: int,
+    spec: OrbitMonitorSpec | OrbitLoopSpec,
+    time: float,
     cameras: Sequence[LineCamera],
     true: Trajectory,
     measured: Trajectory,
     earth: Earth,
     seed: np.random.SeedSequence,
 ) -> View:
-    """Points at time number ``number``."""
+    """Points at a time."""
     place, image = (np.random.default_rng(s) for s in seed.spawn(2))
-    ground, time = spec.ground, spec.course.times[number]
+    ground = spec.ground
     begin, lines = time - HALF_SPAN, int(2.0 * HALF_SPAN / spec.line_time)
     try:
         sensors = [Sensor(c, true, earth, spec.line_time, begin, lines, NO_EFFECTS) for c in cameras]
     except ValueError as error:
         remedy = "an orbit that goes on for a minute before the first and after the last time of the course"
         raise BenchError(f"{error} around {moment(time)}", ("orbit", "after"), remedy) from error
-    at = _second_view(sensors, time, 0.5 * (ground.first + ground.last), ground.height, number)
+    at = _second_view(sensors, time, 0.5 * (ground.first + ground.last), ground.height)
     wanted = ground.points
     height = ground.height + ground.relief * place.uniform(-1.0, 1.0, _SPARE * wanted)
     pixel = place.uniform(ground.first, ground.last, len(height))
@@ -365,7 +375,7 @@ def _view(
     return View(points[good], (exact[0], exact[1]), (noisy[0], noisy[1]))
 
 
-def _second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: float, number: int) -> float:
+def _second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: float) -> float:
     """When the second line sees a point that the first sees as long before ``time`` (or after it), seconds."""
     at = time
     for _ in range(20):
