@@ -10,8 +10,8 @@ and the mechanism stands at it d readings later, so that the reading after the n
     L(z) = g z^-(d + 1) / (1 - 1/z),
 
 as of every integrator with a delay (Astrom, Wittenmark, Computer-Controlled Systems, 1997, ch. 3; in adaptive optics:
-Gendron, Lena, Astron. Astrophys. 291, 1994, 337). Its phase is -180 degrees at w = pi / (2 d + 1) per reading, where its
-size is g / (2 sin(w / 2)): the loop is stable below
+Gendron, Lena, Astron. Astrophys. 291, 1994, 337). Its phase is -180 degrees at w = pi / (2 d + 1) per reading, where
+its size is g / (2 sin(w / 2)): the loop is stable below
 
     g = 2 sin(pi / (4 d + 2)).
 
@@ -28,7 +28,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["LimitCycle", "Margins", "common_margin", "limit_cycle", "margins", "open_loop", "rejection", "spectral_radius"]
+__all__ = [
+    "LimitCycle",
+    "Margins",
+    "common_margin",
+    "limit_cycle",
+    "margins",
+    "open_loop",
+    "rejection",
+    "spectral_radius",
+]
 
 Array = NDArray[np.float64]
 _MOST = 1e6
@@ -194,9 +203,7 @@ def limit_cycle(gain: float, delay: int, dead_band: float = 0.0) -> LimitCycle:
     places = np.array(seen)
     steps = np.ptp(places, axis=0)
     periods = [_period(column) for column in places.T[steps > 0.0]]
-    return LimitCycle(
-        int(steps.max()), float(np.abs(offset + places).max()), float(max(periods)) if periods else 0.0
-    )
+    return LimitCycle(int(steps.max()), float(np.abs(offset + places).max()), float(max(periods)) if periods else 0.0)
 
 
 def _period(places: Array) -> float:

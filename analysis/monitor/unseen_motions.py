@@ -6,8 +6,8 @@ covariance
     C - C A' (A C A')^+ A C,
 
 and what it does to the quantities is known by nobody who has the spots alone. Motions of different laws may be told
-apart by how they go on in time; with each law's share of the spots known apart, the sum over laws of what is left is the
-floor that every estimate from the spots has, of every time (`floor`). An eigenvector of the floor is a mode of
+apart by how they go on in time; with each law's share of the spots known apart, the sum over laws of what is left is
+the floor that every estimate from the spots has, of every time (`floor`). An eigenvector of the floor is a mode of
 quantities, and the likeliest motions that make it are a combination that leaves the spots where they are.
 """
 

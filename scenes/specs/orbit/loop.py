@@ -1,4 +1,4 @@
-"""The monitor in a loop with mechanisms, along one orbit, as a file in scenes/orbit gives it: what moves, when the spots
+"""The monitor in a loop with mechanisms along one orbit, as a file in scenes/orbit gives it: what moves, when the spots
 are read, and what acts on what they say.
 """
 
@@ -29,8 +29,8 @@ _QUANTITIES: dict[str, Kind] = {"d_alpha": ANGLE, "d_beta": ANGLE, "d_gamma": AN
 class CorrectionSpec(Spec):
     """What acts on one quantity of the posterior.
 
-    With every reading the command changes by `gain` times what the posterior says is left of the quantity, over what the
-    mechanism does to it.
+    With every reading the command changes by `gain` times what the posterior says is left of the quantity, over what
+    the mechanism does to it.
 
     Attributes:
         camera: whose quantity it is.
@@ -62,7 +62,9 @@ class CorrectionSpec(Spec):
             raise Problem("no processing corrects the focus", None, allowed, within=("mechanism",))
         if self.mechanism is None and self.response != 1.0:
             allowed = "no response, or a mechanism"
-            raise Problem("a correction by processing does what it says", str(self.response), allowed, None, ("response",))
+            raise Problem(
+                "a correction by processing does what it says", str(self.response), allowed, None, ("response",)
+            )
         try:
             kind = self.motion[1]
         except Problem as problem:

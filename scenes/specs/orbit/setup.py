@@ -32,7 +32,6 @@ from scenes.yaml.spec import Paths, Spec
 from scenes.yaml.units import ANGLE, format_quantity
 from scenes.yaml.yaml_file import read_yaml
 
-
 PairTest = TypeVar("PairTest", OrbitMonitorSpec, OrbitLoopSpec)
 
 
@@ -298,7 +297,9 @@ def _parts_of(job: JobSpec) -> dict[str, Any]:
     return {key: held[key] for key in ("instrument", "cameras", "detector", "disturbances")}
 
 
-def _require_pair(test: OrbitMonitorSpec | OrbitLoopSpec, instrument: InstrumentSpec, cameras: Paths[CameraSpec]) -> None:
+def _require_pair(
+    test: OrbitMonitorSpec | OrbitLoopSpec, instrument: InstrumentSpec, cameras: Paths[CameraSpec]
+) -> None:
     """InputError unless the pair has monitors and looks two ways, and the points lie on the second line."""
     names = tuple(instrument.cameras)
     for name in names:

@@ -6,7 +6,6 @@ dates of events. Nothing here uses the filter or the smoother that such lives te
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,8 +1,8 @@
 """The course of a loop: at every moment the mechanisms stand where they are, the spots are rendered and recovered, the
 filter takes them, commands go out, mechanisms move, and images are taken.
 
-The filter is told what moves and by which laws, the readings, and where mechanisms are known to stand; it never sees the
-state. The truth comes from the exact trace of the state that the mechanisms have left.
+The filter is told what moves and by which laws, the readings, and where mechanisms are known to stand; it never sees
+the state. The truth comes from the exact trace of the state that the mechanisms have left.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.recovery import judged_spots
 from analysis.monitor.series_filter import Observed, SeriesFilter
+from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import Motion, State, compose
@@ -35,7 +36,6 @@ from twin.orbit.monitoring.monitor_series import TOO_FAR
 from twin.run.procedure import BenchError
 from twin.run.random_streams import stream
 
-Read: TypeAlias = Callable[[State, int], tuple[Observed, np.ndarray]]
 _DRAWN = 20
 """Random stream of the motions; detectors have the first ones."""
 
@@ -55,6 +55,7 @@ class LoopCourse:
         chi_square: (T,) of the readings against what was expected of them before they came.
         jumps: that the filter told.
         states: of the moments, when images are taken.
+        evidence: what the fits of the spots say of their sigmas; None where nobody judged them.
     """
 
     model: LoopModel
@@ -67,6 +68,7 @@ class LoopCourse:
     chi_square: np.ndarray
     jumps: tuple[Jump, ...]
     states: tuple[State, ...]
+    evidence: SpotEvidence | None = None
 
     @property
     def sigma(self) -> np.ndarray:
@@ -128,6 +130,24 @@ def drifting_states(spec: OrbitLoopSpec, experiment: MonitorExperiment, seed: in
 
 
 @dataclass(frozen=True, eq=False)
+class Reading:
+    """What is read of one state.
+
+    Attributes:
+        observed: shifts of the spots, px, since the images of the nominal instrument.
+        reference: (D, D) px^2 of the spots in those, from which all shifts are counted.
+        evidence: what the fits of the spots say of their sigmas; None where nobody judged them.
+    """
+
+    observed: Observed
+    reference: np.ndarray
+    evidence: SpotEvidence | None = None
+
+
+Read: TypeAlias = Callable[[State, int], Reading]
+
+
+@dataclass(frozen=True, eq=False)
 class Reader:
     """Renders and recovers one state after the other.
 
@@ -142,8 +162,7 @@ class Reader:
     seed: int
 
     def reading(self) -> Read:
-        """Function of a state and the number of its moment -> the reading of its spots, and the covariance (D, D) px^2 of
-        the spots that all its shifts are counted from.
+        """Function of a state and the number of its moment -> what is read of it.
 
         Raises (the function):
             BenchError: light is lost, or a spot cannot be measured.
@@ -166,7 +185,7 @@ class Reader:
 
         how = Observing(record, centroid, stated=False, frames=frames)  # type: ignore[arg-type]
 
-        def read(state: State, number: int) -> tuple[Observed, np.ndarray]:
+        def read(state: State, number: int) -> Reading:
             when = spec.readings.times[number]
             try:
                 found = next(iter(observe(experiment, [state], how, [number]))).recovery
@@ -174,7 +193,7 @@ class Reader:
                 text = f"the spots cannot be read at {moment(when)}: {error}"
                 raise BenchError(text, ("readings",), f"{TOO_FAR}; a smaller range of the mechanisms") from error
             before, after = (np.diag(sigma[0].ravel() ** 2) for sigma in (found.sigma_before, found.sigma_after))
-            return Observed(when - spec.readings.times[0], found.shift[0], after), before
+            return Reading(Observed(when - spec.readings.times[0], found.shift[0], after), before, found.evidence)
 
         return read
 
@@ -197,14 +216,17 @@ def gone_through(
         open_loop: leave all mechanisms where they are.
         advance: told of the number of moments that are done.
     """
-    commands = Commands(model, open_loop)
+    commands = Commands.none(model, open_loop)
     rows: list[tuple[np.ndarray, ...]] = []
     chi_square, jumps, out = [], [], []
+    evidence: tuple[SpotEvidence, ...] = ()
     for k, state in enumerate(states):
         standing = commands.standing
-        reading, reference = read(model.moved(state, standing), k)
+        found = read(model.moved(state, standing), k)
+        reading = found.observed
+        evidence += () if found.evidence is None else (found.evidence,)
         if not k:
-            how = SeriesFilter(model.stated, reference)
+            how = SeriesFilter(model.stated, found.reference)
             belief = how.start(reading.time)
         known = replace(reading, value=reading.value - model.spots @ standing)
         belief, innovation = how.update(belief, known)
@@ -220,7 +242,17 @@ def gone_through(
     read_at, positions, held, expected, spread = (np.array(column) for column in zip(*rows, strict=True))
     times = np.array(spec.readings.times)
     return LoopCourse(
-        model, times, read_at, positions, held, expected, spread, np.array(chi_square), tuple(jumps), tuple(out)
+        model,
+        times,
+        read_at,
+        positions,
+        held,
+        expected,
+        spread,
+        np.array(chi_square),
+        tuple(jumps),
+        tuple(out),
+        SpotEvidence.joined(evidence) if evidence else None,
     )
 
 
@@ -237,8 +269,13 @@ class Commands:
 
     model: LoopModel
     idle: bool
-    given_before: tuple[np.ndarray, ...] = ()
-    held: np.ndarray | None = None
+    given_before: tuple[np.ndarray, ...]
+    held: np.ndarray
+
+    @classmethod
+    def none(cls, model: LoopModel, idle: bool) -> Commands:
+        """Before any reading."""
+        return cls(model, idle, (), np.zeros(len(model.correctors), bool))
 
     @property
     def standing(self) -> np.ndarray:
@@ -257,8 +294,9 @@ class Commands:
             mean: (P,) what the posterior says would be there without mechanisms.
         """
         left = mean + self.model.effects @ self.standing
-        last = self.given_before[0] if self.given_before else np.zeros(len(left[: len(self.model.correctors)]))
-        now, held = np.array(last, np.float64), np.zeros(len(last), bool)
+        count = len(self.model.correctors)
+        now = self.given_before[0].copy() if self.given_before else np.zeros(count)
+        held = np.zeros(count, bool)
         for k, one in enumerate(self.model.correctors):
             own = float(left[one.row])
             if self.idle or one.spec.gain == 0.0 or abs(own) <= one.spec.band:

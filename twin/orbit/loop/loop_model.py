@@ -107,7 +107,7 @@ class LoopModel:
         change = np.zeros(4)
         for one, position in zip(self.correctors, positions.tolist(), strict=True):
             if one.motion is None and one.spec.camera == camera:
-                change[PARAMETERS.index(one.spec.quantity)] -= position  # type: ignore[arg-type]
+                change[PARAMETERS.index(one.spec.quantity)] -= position
         return change
 
     @cached_property
@@ -136,7 +136,7 @@ class LoopModel:
 
 def _row(cameras: Sequence[str], camera: str, quantity: str) -> int:
     at = cameras.index(camera)
-    return 4 * len(cameras) + at if quantity == "defocus" else 4 * at + PARAMETERS.index(quantity)  # type: ignore[arg-type]
+    return 4 * len(cameras) + at if quantity == "defocus" else 4 * at + PARAMETERS.index(quantity)
 
 
 def loop_model(setup: LoopSetup, experiment: MonitorExperiment) -> LoopModel:

@@ -1,4 +1,4 @@
-"""A loop closed and open along one orbit: what is left of pointing and focus, and heights from points that both lines see.
+"""A loop closed and open along one orbit: what is left of pointing and focus, and heights of points that both lines see.
 
 Heights are those of forward intersection of exact lines of sight with the stated errors of image points, orbit and
 attitude: the lines are traced through the state that the mechanisms have left, and the intersection knows the lines as
@@ -7,14 +7,16 @@ calibrated, with the corrections that the processing makes. Truth enters where e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import norm
 
 from analysis.monitor.control_loop import LimitCycle, Margins, common_margin, limit_cycle, margins, spectral_radius
+from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.unseen_motions import UnseenMode, floor, unseen_modes
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
 from optics.numerics.frozen_map import FrozenMap
@@ -37,8 +39,6 @@ if TYPE_CHECKING:
 
 FOCUS_SCALE = 10e-6
 """Metres of defocus that count as much as a metre of height where modes are sought: a tenth of what blurs an image."""
-UNSEEN = 1.0
-"""Standard deviations of a reading's noise: what moves every spot by less is a motion that no spot shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +75,12 @@ class LoopPass:
     def true(self, rows: np.ndarray) -> np.ndarray:
         """(T,) of a quantity, by the traced states; arguments as of `told`."""
         return np.einsum("tp,tp->t", np.broadcast_to(rows, self.truth.shape), self.truth)
+
+    def ratio(self, rows: np.ndarray) -> float:
+        """Largest error of what the posterior says of a quantity over its sigma; arguments as of `told`."""
+        value, sigma = self.told(rows)
+        known = sigma > 0.0
+        return float(np.max(np.abs(value - self.true(rows))[known] / sigma[known], initial=0.0))
 
     def unit(self, row: int) -> np.ndarray:
         """(P,) of one of the quantities."""
@@ -114,8 +120,7 @@ class LoopRun:
         radius: largest size of the eigenvalues of all loops together.
         margin: by how much all gains together may be larger.
         modes: what no spot shows; quantities are height (m) and the defocus (m) of the pair.
-        floor: (3,) standard deviations of the same that no estimate from the spots can have less of.
-        noise: sigma of a spot's coordinate in one reading, px.
+        unseen: (3, T) standard deviations of the same that no estimate from the spots can have less of.
     """
 
     setup: LoopSetup
@@ -128,8 +133,7 @@ class LoopRun:
     radius: float
     margin: float
     modes: tuple[UnseenMode, ...]
-    floor: np.ndarray
-    noise: float
+    unseen: np.ndarray
 
     @property
     def stable(self) -> bool:
@@ -141,20 +145,27 @@ class LoopRun:
         """The two cameras."""
         return self.setup.pair
 
-    @cached_property
-    def silent(self) -> tuple[int, ...]:
-        """Numbers of the stated motions that by themselves move no spot by a reading's noise, and a quantity."""
-        stated = self.model.stated
-        still = np.abs(stated.spots).max(axis=0) < UNSEEN * self.noise
-        rows = _mode_rows(self.model, self.pair, self.open.slopes.mean(axis=0))
-        effect = np.abs(rows @ stated.parameters) / _SCALE[:, None]
-        size = np.where(still, effect.max(axis=0), 0.0)
-        return tuple(int(k) for k in np.argsort(-size, kind="stable") if size[k] > _TOLD)
+    @property
+    def ratios(self) -> dict[str, float]:
+        """Quantity -> largest error of what the posterior says of it over its sigma, both courses together."""
+        rows = {f"defocus of {name}": self.open.unit(self.model.row(name, "defocus")) for name in self.pair}
+        every = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
+        every |= {name: (row, row) for name, row in rows.items()}
+        return {name: max(self.closed.ratio(one), self.open.ratio(two)) for name, (one, two) in every.items()}
+
+    @property
+    def ratio_limit(self) -> float:
+        """Of `ratios`, exceeded with a chance of `FALSE_ALARM` at most whatever the correlations."""
+        return float(norm.isf(0.5 * FALSE_ALARM / (2 * len(self.closed.course.times) * len(self.ratios))))
+
+    @property
+    def phase_deg(self) -> float:
+        """Smallest phase margin of the loops; NaN where none has one."""
+        known = [one.margins.phase_deg for one in self.loops.values() if math.isfinite(one.margins.phase_deg)]
+        return min(known, default=math.nan)
 
 
 _SCALE = np.array([1.0, FOCUS_SCALE, FOCUS_SCALE])
-_TOLD = 1e-3
-"""Metres of height, or as much of defocus, from which a silent motion is told."""
 
 
 def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = silent) -> LoopRun:
@@ -174,14 +185,13 @@ def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = s
         states = drifting_states(spec, experiment, number)
         advance("trace", 1, 1)
         read = Reader(model, spec, number).reading()
-        every, noise = 2 * len(states), read(states[0], 0)[0].noise
         courses = []
-        for first, still in ((0, False), (len(states), True)):
-            courses.append(
-                gone_through(
-                    model, spec, states, read, still, lambda done, first=first: advance("readings", first + done, every)
-                )
-            )
+        for part, still in (("readings, loop closed", False), ("readings, loop open", True)):
+
+            def told(done: int, part: str = part) -> None:
+                advance(part, done, len(states))
+
+            courses.append(gone_through(model, spec, states, read, still, told))
         nominal = traced_line_cameras(experiment.instrument, backend)
         calibrated = {
             name: calibrated_line(
@@ -209,8 +219,9 @@ def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = s
         spectral_radius(model.coupling, gains, delays),
         common_margin(model.coupling, gains, delays),
         unseen_modes(model.stated, rows, _SCALE),
-        np.sqrt(np.maximum(np.diag(floor(model.stated, rows)), 0.0)),
-        float(np.sqrt(np.diag(noise).max())),
+        np.stack(
+            [_floor(model, free.slopes), *(np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])]
+        ),
     )
 
 
@@ -222,6 +233,10 @@ def _facts(model: LoopModel, k: int, course: LoopCourse) -> LoopFacts:
     if step is not None and spec.gain:
         cycle = limit_cycle(spec.gain, spec.delay, spec.band / abs(step * one.own))
     return LoopFacts(one, gain, margins(gain, spec.delay), cycle, tuple(np.flatnonzero(course.held[:, k]).tolist()))
+
+
+def _floor(model: LoopModel, rows: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.maximum(np.diag(floor(model.stated, rows)), 0.0))
 
 
 def _mode_rows(model: LoopModel, pair: tuple[str, str], slopes: np.ndarray) -> np.ndarray:
