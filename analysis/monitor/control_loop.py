@@ -40,8 +40,10 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-_MOST = 1e6
-"""Gain margin that is as good as any."""
+_LEAST, _MOST = 1e-6, 1e6
+"""Gain margins that are as bad and as good as any."""
+_CLOSE = 1e-12
+"""Relative, to which a gain margin is found."""
 _SETTLING, _WATCHED = 400, 400
 """Readings before a limit cycle is looked at, and for which it is."""
 _OFFSETS = 41
@@ -113,58 +115,69 @@ def margins(gain: float, delay: int) -> Margins:
     return Margins(limit, limit / gain, phase, w / (2.0 * math.pi))
 
 
-def spectral_radius(coupling: ArrayLike, gains: Sequence[float], delays: Sequence[int]) -> float:
+def spectral_radius(
+    coupling: ArrayLike, gains: Sequence[float], delays: Sequence[int], quantities: Sequence[int] | None = None
+) -> float:
     """Largest size of the eigenvalues of n loops together: below 1 all errors decay.
 
-    A loop of gain 0, which does nothing, does not count.
+    A loop of gain 0, which does nothing, does not count. Loops on one quantity add up the same numbers, so that what
+    their mechanisms do against each other is not a state of its own.
 
     Args:
         coupling: (n, n) what the mechanism of a column does to the quantity of a row, over what the row's own mechanism
             does to it; 1 on the diagonal.
         gains: (n,) of the loops.
         delays: (n,) of them, readings.
+        quantities: (n,) which quantity each acts on, by number; by default each on its own.
     """
-    own = np.flatnonzero(np.asarray(gains, np.float64) != 0.0)
-    if not len(own):
+    every, g = np.asarray(coupling, np.float64), np.asarray(gains, np.float64)
+    acting = np.flatnonzero(g != 0.0).tolist()
+    if not acting:
         return 0.0
-    matrix = np.asarray(coupling, np.float64)[np.ix_(own, own)]
-    g, d = np.asarray(gains, np.float64)[own], np.asarray(delays, int)[own]
-    n, longest = len(own), int(d.max())
+    named = list(range(len(g)) if quantities is None else quantities)
+    first: dict[int, int] = {}
+    for k in acting:
+        first.setdefault(named[k], k)
+    rows, place = list(first.values()), {name: at for at, name in enumerate(first)}
+    n, longest = len(rows), max(int(delays[k]) for k in acting)
+    # states are sums of what was left, of each quantity over what its first mechanism does, the newest first
     step = np.zeros((n * (longest + 1),) * 2)
     step[:n, :n] = np.eye(n)
-    for column, delay in enumerate(d.tolist()):
-        step[:n, n * delay + column] -= g * matrix[:, column]
-    step[n:, :-n] = np.eye(n * longest) if longest else step[n:, :-n]
+    for k in acting:
+        at = place[named[k]]
+        step[:n, n * int(delays[k]) + at] -= g[k] * every[rows, k] / every[rows[at], k]
+    step[n:, : n * longest] = np.eye(n * longest)
     return float(np.abs(np.linalg.eigvals(step)).max())
 
 
-def common_margin(coupling: ArrayLike, gains: Sequence[float], delays: Sequence[int]) -> float:
+def common_margin(
+    coupling: ArrayLike, gains: Sequence[float], delays: Sequence[int], quantities: Sequence[int] | None = None
+) -> float:
     """By how much all gains together may be larger (or must be smaller) for the loops to be at the limit of stability.
 
     Args:
         coupling: (n, n) as of `spectral_radius`.
         gains: (n,) likewise.
         delays: (n,) likewise.
+        quantities: (n,) likewise.
     """
     g = np.asarray(gains, np.float64)
     if not np.any(g):
         return math.inf
 
     def stable(factor: float) -> bool:
-        return spectral_radius(coupling, (factor * g).tolist(), delays) < 1.0
+        return spectral_radius(coupling, (factor * g).tolist(), delays, quantities) < 1.0
 
-    low, high = 1e-6, 1.0
+    low, high = _LEAST, 1.0
+    if not stable(low):
+        return 0.0
     while stable(high):
         low, high = high, 2.0 * high
         if high > _MOST:
             return math.inf
-    if not stable(low):
-        return 0.0
-    while high > low * (1.0 + 1e-12):
+    while high > low * (1.0 + _CLOSE):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if stable(middle) else (low, middle)
-        if middle in (low, high) and high - low <= np.spacing(high):
-            break
     return 0.5 * (low + high)
 
 

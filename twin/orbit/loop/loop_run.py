@@ -207,7 +207,11 @@ def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = s
     closed, free = (one for one, _ in passes)
     rows = _mode_rows(model, pair, free.slopes.mean(axis=0))
     facts = {one.name: _facts(model, k, closed.course) for k, one in enumerate(model.correctors)}
-    gains, delays = [one.loop_gain for one in facts.values()], [one.spec.delay for one in model.correctors]
+    loops = (
+        [one.loop_gain for one in facts.values()],
+        [one.spec.delay for one in model.correctors],
+        [one.row for one in model.correctors],
+    )
     return LoopRun(
         setup,
         seed,
@@ -216,8 +220,8 @@ def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = s
         free,
         passes[0][1],
         FrozenMap(facts),
-        spectral_radius(model.coupling, gains, delays),
-        common_margin(model.coupling, gains, delays),
+        spectral_radius(model.coupling, *loops),
+        common_margin(model.coupling, *loops),
         unseen_modes(model.stated, rows, _SCALE),
         np.stack(
             [_floor(model, free.slopes), *(np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])]
