@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "DECAYING",
     "LimitCycle",
     "Margins",
     "common_margin",
@@ -40,6 +41,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+DECAYING = 1.0 - 1e-12
+"""Largest eigenvalue of loops that are stable: of one that only comes to rest somewhere else rounding makes either."""
 _LEAST, _MOST = 1e-6, 1e6
 """Gain margins that are as bad and as good as any."""
 _CLOSE = 1e-12
@@ -166,7 +169,7 @@ def common_margin(
         return math.inf
 
     def stable(factor: float) -> bool:
-        return spectral_radius(coupling, (factor * g).tolist(), delays, quantities) < 1.0
+        return spectral_radius(coupling, (factor * g).tolist(), delays, quantities) < DECAYING
 
     low, high = _LEAST, 1.0
     if not stable(low):

@@ -59,7 +59,7 @@ class CorrectionSpec(Spec):
     def _can_be(self) -> "CorrectionSpec":
         if self.mechanism is None and self.quantity == "defocus":
             allowed = "mechanism: the motion of a body, as forward/focal_plane shift z"
-            raise Problem("no processing corrects the focus", None, allowed, within=("mechanism",))
+            raise Problem("no processing corrects the focus", "no mechanism", allowed, within=("quantity",))
         if self.mechanism is None and self.response != 1.0:
             allowed = "no response, or a mechanism"
             raise Problem(

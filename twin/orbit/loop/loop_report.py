@@ -42,8 +42,8 @@ def _verdict(run: LoopRun) -> tuple[str, tuple[str, ...]]:
     stands = "" if run.stable else "the loop is unstable; "
     angle = rms(run.closed.true(run.closed.angle)) / ARCSEC, rms(run.open.true(run.open.angle)) / ARCSEC
     return answer(
-        f"{stands}with the loop closed the cameras make height errors of {significant(left, 2)} m RMS over the orbit, with "
-        f"the loop open {significant(free, 2)} m; the posterior's sigma is {significant(sigma, 2)} m",
+        f"{stands}with the loop closed the cameras make height errors of {significant(left, 2)} m RMS over the orbit, "
+        f"with the loop open {significant(free, 2)} m; the posterior's sigma is {significant(sigma, 2)} m",
         f"what no spot shows costs {significant(hidden, 2)} m, which no gain takes away, and {_margin(run)}",
         f"the angle between the lines of sight is {significant(angle[0], 2)} arcsec RMS off, with the loop open "
         f"{significant(angle[1], 2)} arcsec",
@@ -96,8 +96,8 @@ def _summary(run: LoopRun) -> Table:
     return PASS.table(
         "loop",
         "What the loop leaves",
-        "RMS over the moments. Height: mean over the points, by the cameras alone; all errors: of each point, with those "
-        "of image points, orbit and attitude; σ: as the posterior says it; MTF at Nyquist, the least of all.",
+        "RMS over the moments. Height: mean over the points, by the cameras alone; all errors: of each point, with "
+        "those of image points, orbit and attitude; σ: as the posterior says it; MTF at Nyquist, the least of all.",
         {"loop open": PASS((run, run.open)), "loop closed": PASS((run, run.closed))},
         [one.key for one in PASS if one.head],
         "course",
@@ -125,8 +125,8 @@ def _orbit(run: LoopRun) -> Section:
         columns.append(positions(run, corrector.name))
     rows = csv_table([heads, *np.stack(columns, axis=-1).tolist()]).decode()
     text = (
-        "At every moment the spots are rendered where the mechanisms stand and recovered, the filter of the stated laws "
-        "takes them less what the known positions do to the spots, commands go out, mechanisms move, and images are "
+        "At every moment the spots are rendered where the mechanisms stand and recovered, the filter of the stated "
+        "laws takes them less what the known positions do to the spots, commands go out, mechanisms move, and images are "
         "taken. The estimate never sees the state.",
         f"True cameras leave {significant(run.bare.height_rms, 2)} m RMS in height by image points, orbit and "
         "attitude.",
@@ -157,8 +157,8 @@ def _loops(run: LoopRun) -> Section:
     table = Table(
         "corrections",
         "Each correction as a loop",
-        "Limit: gain below which a loop of this delay is stable. Cycle: steps by which a mechanism of whole steps goes to "
-        "and fro at worst although nothing changes. Told: share of what a mechanism does beyond what is known that the "
+        "Limit: gain below which a loop of this delay is stable. Cycle: steps by which a mechanism of whole steps goes "
+        "to and fro at worst although nothing changes. Told: share of what a mechanism does beyond what is known that the "
         "spots tell.",
         (
             "name",
@@ -214,8 +214,8 @@ def _unseen(run: LoopRun) -> Section:
     foci = " and ".join(significant(1e6 * float(one.max()), 2) for one in run.unseen[1:])
     text = (
         f"{run.model.stated.spots.shape[0]} spot coordinates stand against {len(run.model.stated.labels)} stated "
-        f"motions. What they do to heights and no spot shows is {significant(hidden, 2)} m, to the focus {foci} µm, one "
-        "standard deviation; no gain, no rate of readings and no filter goes below, unless something else than the "
+        f"motions. What they do to heights and no spot shows is {significant(hidden, 2)} m, to the focus {foci} µm, "
+        "one standard deviation; no gain, no rate of readings and no filter goes below, unless something else than the "
         "spots is measured.",
     )
     return Section("What the loop cannot see", text, (table,))

@@ -1,4 +1,4 @@
-"""A loop closed and open along one orbit: what is left of pointing and focus, and heights of points that both lines see.
+"""A loop closed and open along one orbit: what is left of pointing and focus, and heights of points both lines see.
 
 Heights are those of forward intersection of exact lines of sight with the stated errors of image points, orbit and
 attitude: the lines are traced through the state that the mechanisms have left, and the intersection knows the lines as
@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import norm
 
-from analysis.monitor.control_loop import LimitCycle, Margins, common_margin, limit_cycle, margins, spectral_radius
+from analysis.monitor.control_loop import (
+    DECAYING,
+    LimitCycle,
+    Margins,
+    common_margin,
+    limit_cycle,
+    margins,
+    spectral_radius,
+)
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.unseen_motions import UnseenMode, floor, unseen_modes
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
@@ -138,7 +146,7 @@ class LoopRun:
     @property
     def stable(self) -> bool:
         """Whether all loops together are."""
-        return self.radius < 1.0
+        return self.radius < DECAYING
 
     @property
     def pair(self) -> tuple[str, str]:
