@@ -16,12 +16,14 @@ instrument: gf7_pair
 readings: {every: 10 min, count: 3}
 corrections:
   pointing:
-    {camera: forward, quantity: d_alpha, mechanism: base/forward rotate y, gain: 0.8, step: 0.05 arcsec, range: 2.03 arcsec}
+    {camera: forward, quantity: d_alpha, mechanism: base/forward rotate y, gain: 0.8, step: 0.05 arcsec,
+     range: 2.03 arcsec}
   roll: {camera: backward, quantity: d_beta, gain: 1}
   focus:
     {camera: forward, quantity: defocus, mechanism: forward/focal_plane shift z, gain: 0.5, delay: 1, dead_band: 2 um}
 orbit: {epoch: 2021-06-21T02:40:00Z, before: 2 min, after: 22 min, passing: {longitude: 116 deg, latitude: 60 deg}}
 ground: {points: 4, first: 3000, last: 29000}
+seed: 2
 """
 
 
@@ -77,6 +79,8 @@ def test_units_and_defaults(tmp_path: Path) -> None:
         ("gain: 0.8", "gain: -0.8", "corrections.pointing.gain", ("0",)),
         ("delay: 1", "delay: 1.5", "corrections.focus.delay", ()),
         ("quantity: d_beta", "quantity: d_delta", "corrections.roll.quantity", ("d_alpha", "defocus")),
+        ("seed: 2", "images: {times: [7 min]}", "images.times", ("the time of a reading",)),
+        ("seed: 2", "images: {times: [10 min], points: {tie: 0}}", "images.points", ("no points",)),
         ("count: 3", "count: 4", "readings", ("outside the orbit data",)),
     ],
 )

@@ -12,13 +12,15 @@ import twin.orbit.__main__ as command
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.unseen_motions import unseen_modes
 from scenes.models.disturbances import state_of
-from scenes.specs.orbit.loop import CorrectionSpec
+from scenes.specs.orbit.loop import CorrectionSpec, LoopImagesSpec
 from scenes.specs.orbit.setup import LoopSetup, resolve_loop
+from scenes.specs.resolved import line_detector
 from tests.twin.commands import invoke, refused
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.loop.loop_course import Commands, LoopCourse, Reader, drifting_states, gone_through
 from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model
+from twin.orbit.loop.loop_run import LoopRun, run_loop
 
 run = partial(invoke, command.app)
 ARCSEC = np.pi / 648000.0
@@ -149,13 +151,44 @@ def perfect(setup: LoopSetup, model: LoopModel) -> LoopCourse:
     return course_of(setup, model)
 
 
+@pytest.fixture(scope="module")
+def idle(setup: LoopSetup, backend) -> LoopRun:
+    """A whole run, with images, whose corrections all have gain 0."""
+    test = setup.test
+    still = {name: one.model_copy(update={"gain": 0.0}) for name, one in test.corrections.items()}
+    images = LoopImagesSpec.model_validate(
+        {"times": ["10 min"], "side": 200, "points": {"control": 0, "tie": 20, "reach": 10}}
+    )
+    readings = test.readings.model_copy(update={"count": 2})
+    parts = {"test": test.model_copy(update={"corrections": still, "images": images, "readings": readings})}
+    sheets = {name: line_detector(one) for name, one in setup.cameras.items()}
+    return run_loop(setup.model_copy(update={**parts, "line_detectors": sheets}), backend, 3)
+
+
 @pytest.mark.second
-def test_gain_nothing_is_the_open_loop_to_the_bit(setup, model, left_alone) -> None:
-    nothing = {name: {"gain": 0.0} for name in ("tilt", "roll", "focus")}
-    closed = course_of(setup, model, **nothing)
+def test_gain_nothing_is_the_open_loop_to_the_bit(idle: LoopRun) -> None:
+    one, two = idle.closed, idle.open
     for name in ("positions", "read_at", "expected", "covariance", "chi_square"):
-        assert np.array_equal(getattr(closed, name), getattr(left_alone, name)), name
-    assert closed.states == left_alone.states
+        assert np.array_equal(getattr(one.course, name), getattr(two.course, name)), name
+    assert one.course.states == two.course.states
+    assert np.array_equal(one.truth, two.truth)
+    for name, errors in vars(one.heights).items():
+        assert np.array_equal(errors, getattr(two.heights, name)), name
+    assert np.array_equal(one.images[0].errors, two.images[0].errors)
+    assert idle.margin == np.inf
+
+
+@pytest.mark.second
+def test_heights_of_rendered_line_images_are_those_of_the_cameras(idle: LoopRun) -> None:
+    """Orbit and attitude are exact here, so that what is left is the cameras, and the noise of matching."""
+    pair, passed = idle.open.images[0], idle.open
+    mean, sigma = pair.height
+    # the cameras alone move heights by metres; over the swath what they do differs by a few centimetres
+    by_cameras = float(passed.heights.camera[pair.moment])
+    assert abs(by_cameras) > 0.3
+    assert mean == pytest.approx(by_cameras, abs=0.1 + 5.0 * sigma)
+    assert np.all(pair.matching < 0.1)
+    assert pair.matching == pytest.approx(pair.sigma, rel=0.8)
 
 
 @pytest.mark.second

@@ -8,12 +8,14 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.course import Moment
+from scenes.specs.course import Moment, no_such_time
 from scenes.specs.disturbances import JobDisturbances, component_named
 from scenes.specs.job import AnalysisSpec, JobSpec, RenderSpec
-from scenes.specs.orbit.calibration import LineTime
+from scenes.specs.orbit.calibration import LineTime, Side
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.specs.orbit.monitor import Frames, GroundSpec, Interval, MonitorErrorsSpec, MotionSpec
+from scenes.specs.orbit.scene import GroundSpec as SceneGroundSpec
+from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, Paths, Reference, Seed, Spec, Text, TitledSpec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, Kind, parse_quantity
@@ -136,6 +138,28 @@ class ReadingsSpec(Spec):
         return tuple(self.begin + self.every * k for k in range(self.count))
 
 
+class LoopImagesSpec(Spec):
+    """Pairs of line images, rendered after some of the readings with the loop open and closed.
+
+    Attributes:
+        times: of these readings, seconds from the orbit's epoch.
+        side: lines and pixels of every image.
+        ground: what is there.
+        points: how points of the second camera's image are sought in the first one's; `tie` says how many.
+    """
+
+    times: Annotated[tuple[Moment, ...], Field(min_length=1, max_length=20)]
+    side: Annotated[Side, Field(le=2000)] = 400
+    ground: SceneGroundSpec = SceneGroundSpec()
+    points: ImagePointsSpec = ImagePointsSpec.model_validate({"control": 0, "tie": 60, "reach": 16})
+
+    @model_validator(mode="after")
+    def _has_ties(self) -> "LoopImagesSpec":
+        if not self.points.tie:
+            raise Problem("no points of one image are sought in the other", "tie: 0", "some", None, ("points", "tie"))
+        return self
+
+
 class OrbitLoopSpec(TitledSpec):
     """A stereo pair whose monitor's readings are acted upon along an orbit, beside the same pair left alone.
 
@@ -156,6 +180,7 @@ class OrbitLoopSpec(TitledSpec):
         attitude: true attitude.
         line_time: from one image line to the next, seconds.
         ground: check points.
+        images: pairs of line images; none without this section.
         errors: of what is measured.
         seed: of every random number.
     """
@@ -173,6 +198,7 @@ class OrbitLoopSpec(TitledSpec):
     attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
     line_time: LineTime = 0.09e-3
     ground: GroundSpec
+    images: LoopImagesSpec | None = None
     errors: MonitorErrorsSpec = MonitorErrorsSpec()
     seed: Seed = 0
 
@@ -184,6 +210,9 @@ class OrbitLoopSpec(TitledSpec):
         for time in (self.readings.times[0], self.readings.times[-1]):
             if wrong := self.orbit.misses(time):
                 raise wrong.below("readings")
+        for k, time in enumerate(self.images.times if self.images is not None else ()):
+            if time not in self.readings.times:
+                raise no_such_time(time, self.readings.times, "the time of a reading").below("images", "times", k)
         return self
 
     @property

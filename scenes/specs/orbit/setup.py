@@ -25,7 +25,7 @@ from scenes.specs.orbit.monitor import OrbitMonitorSpec
 from scenes.specs.orbit.scene import LineImageSpec
 from scenes.specs.orbit.simulate import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
-from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
+from scenes.specs.resolved import ExperimentSetup, ResolvedJob, line_detector, read_setup, resolve_job
 from scenes.yaml.errors import KeyPath, names_text, unknown
 from scenes.yaml.old_keys import tell
 from scenes.yaml.spec import Paths, Spec
@@ -253,7 +253,14 @@ class MonitorSetup(PairSetup[OrbitMonitorSpec]):
 
 
 class LoopSetup(PairSetup[OrbitLoopSpec]):
-    """A monitor in a loop with mechanisms, with its instrument."""
+    """A monitor in a loop with mechanisms, with its instrument.
+
+    Attributes:
+        line_detectors: what the instrument's cameras are called -> data sheet of the line CCD that images; empty where
+            none are rendered.
+    """
+
+    line_detectors: Paths[DetectorSpec] = Field(default_factory=FrozenMap)
 
 
 def resolve_monitor(path: str | Path) -> MonitorSetup:
@@ -279,12 +286,17 @@ def resolve_loop(path: str | Path) -> LoopSetup:
     setup = read_setup(LoopSetup, path)
     if setup is None:
         test = load.load_named(OrbitLoopSpec, load.ORBIT, path)
-        setup = LoopSetup.model_construct(test=test, **_parts_of(test.job))
+        parts = _parts_of(test.job)
+        sheets = {} if test.images is None else {name: line_detector(one) for name, one in parts["cameras"].items()}
+        setup = LoopSetup.model_construct(test=test, line_detectors=FrozenMap(sheets), **parts)
     test = setup.test
     _require_pair(test, setup.instrument, setup.cameras)
     if setup.disturbances is None:
         problem = "nothing is stated to move, so that spots say nothing of what to correct"
         raise test.error(problem, ("disturbances",), allowed="the name of a file in scenes/library/disturbances")
+    if test.images is not None and (missing := [name for name in setup.cameras if name not in setup.line_detectors]):
+        problem = f"images need the data sheet of the line CCD of camera {missing[0]!r}"
+        raise test.error(problem, ("images",), allowed="line_detectors with one for each camera")
     for name, correction in test.corrections.items():
         if correction.camera not in setup.pair:
             wrong = unknown("no camera of the pair", correction.camera, setup.pair)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.monitor.unseen_motions import UnseenMode
+from twin.orbit.loop.line_images import ImagedPair
 from twin.orbit.loop.loop_run import LoopFacts, LoopPass, LoopRun, height_rms
 from twin.orbit.monitoring.monitoring_numbers import SUMMARY
 from twin.orbit.monitoring.monitoring_run import rms
@@ -56,6 +57,30 @@ SERIES: Record[LoopPass] = Record(
 )
 
 
+IMAGES: Record[tuple[LoopPass, ImagedPair]] = Record(
+    "A pair of rendered line images, its points matched and intersected.",
+    Quantity("time_s", lambda of: float(of[0].course.times[of[1].moment]), "of the reading before them", "time", 0),
+    Quantity("points", lambda of: len(of[1].errors), "that were matched", "points"),
+    Quantity("sought", lambda of: of[1].sought, "points that were sought"),
+    Quantity("height_m", lambda of: of[1].height[0], "mean height error of the points", "height", 3),
+    Quantity("height_m_sigma", lambda of: of[1].height[1], "of it by the scatter of the points", "σ", 3),
+    Quantity(
+        "drawn_height_m", lambda of: float(of[0].heights.bias[of[1].moment]), "by drawn points", "drawn points", 3
+    ),
+    Quantity(
+        "camera_height_m",
+        lambda of: float(of[0].heights.camera[of[1].moment]),
+        "by the cameras alone",
+        "by the cameras",
+        3,
+    ),
+    Quantity("matching_lines_px", lambda of: float(of[1].matching[0]), "RMS across the line", "matching across", 3),
+    Quantity("matching_pixels_px", lambda of: float(of[1].matching[1]), "RMS along the line", "along", 3),
+    Quantity("stated_lines_px", lambda of: float(of[1].sigma[0]), "sigma that matching states", "stated across", 3),
+    Quantity("stated_pixels_px", lambda of: float(of[1].sigma[1]), "likewise", "along", 3),
+)
+
+
 def _foci(of: tuple[LoopRun, LoopPass]) -> float:
     return rms(np.concatenate([focus_true(*of, name) for name in of[0].pair]))
 
@@ -76,6 +101,7 @@ PASS: Record[tuple[LoopRun, LoopPass]] = Record(
     Quantity("heights", lambda of: SUMMARY(of[1].heights), "errors at the check points", converted=False),
     Quantity("focus", lambda of: {name: (*of, name) for name in of[0].model.cameras}, "by camera", record=FOCUS),
     Quantity("series", lambda of: of[1], "over the moments", record=SERIES),
+    Quantity("images", lambda of: [(of[1], one) for one in of[1].images] or None, record=IMAGES, where_known=True),
     Quantity("chi_square", lambda of: float(of[1].course.chi_square.sum()), "of all readings"),
     Quantity("degrees_of_freedom", lambda of: of[1].course.degrees, "of chi-square"),
     Quantity("chi_square_limit", lambda of: of[1].course.limit, "of chi-square"),

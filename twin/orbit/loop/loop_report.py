@@ -11,7 +11,7 @@ from analysis.monitor.unseen_motions import UnseenMode
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from twin.monitor.time_series import jump_text
-from twin.orbit.loop.loop_numbers import PASS, angle_of, motions_of, positions
+from twin.orbit.loop.loop_numbers import IMAGES, PASS, angle_of, motions_of, positions
 from twin.orbit.loop.loop_plots import figure_svg
 from twin.orbit.loop.loop_run import LoopFacts, LoopRun, height_rms
 from twin.orbit.monitoring.monitoring_run import rms
@@ -31,7 +31,7 @@ def loop_report(run: LoopRun) -> Report:
         *_verdict(run),
         _facts(run),
         _summary(run),
-        (_orbit(run), _loops(run), _unseen(run)),
+        (_orbit(run), *_images(run), _loops(run), _unseen(run)),
         warnings=_warnings(run),
     )
 
@@ -85,7 +85,7 @@ def _facts(run: LoopRun) -> tuple[tuple[str, str], ...]:
         ("Readings", f"{test.readings.count}, every {moment(test.readings.every)}, rendered and recovered"),
         ("Disturbances", f"{run.setup.disturbances.name}, drawn by its laws in time, which the estimate knows"),
         ("Check points", f"{test.ground.points} at each moment, both views from the state at that moment"),
-        ("Lines of sight", "exact, traced; image points are drawn about them, not matched in images"),
+        ("Lines of sight", "exact, traced; points are drawn about them; matched where line images are rendered"),
         ("Image points", f"σ {errors.image:g} px" if on else "exact"),
         ("Monitor's frames", "with noise" if on and errors.monitor else "without noise"),
         ("Description", test.description),
@@ -126,14 +126,39 @@ def _orbit(run: LoopRun) -> Section:
     rows = csv_table([heads, *np.stack(columns, axis=-1).tolist()]).decode()
     text = (
         "At every moment the spots are rendered where the mechanisms stand and recovered, the filter of the stated "
-        "laws takes them less what the known positions do to the spots, commands go out, mechanisms move, and images are "
-        "taken. The estimate never sees the state.",
+        "laws takes them less what the known positions do to the spots, commands go out, mechanisms move, and images "
+        "are taken. The estimate never sees the state.",
         f"True cameras leave {significant(run.bare.height_rms, 2)} m RMS in height by image points, orbit and "
         "attitude.",
         "Turns that both cameras share with the base turn the body and not the angle: no monitor sees them, the star "
         "trackers do.",
     )
     return Section("Over the orbit", text, (course, places, CsvFile("moments", "All numbers", "", rows)))
+
+
+def _images(run: LoopRun) -> tuple[Section, ...]:
+    if not run.closed.images:
+        return ()
+    rows = {
+        f"{label}, {moment(float(one.course.times[pair.moment]))}": IMAGES((one, pair))
+        for label, one in (("open", run.open), ("closed", run.closed))
+        for pair in one.images
+    }
+    table = IMAGES.table(
+        "images",
+        "Heights from rendered line images",
+        "Points of the second camera's image, matched in the first one's: mean height error with σ by their scatter; "
+        "the same of drawn points over the whole swath, and by the cameras alone; matching, found minus true place, "
+        "and the σ that it states.",
+        rows,
+        [one.key for one in IMAGES if one.head and one.key != "time_s"],
+        "loop, after",
+    )
+    text = (
+        "At these moments both lines are rendered over the same ground through the states that the mechanisms have "
+        "left, their points matched, and intersected by the lines that the user knows.",
+    )
+    return (Section("Line images", text, (table,)),)
 
 
 def _loops(run: LoopRun) -> Section:
@@ -158,8 +183,8 @@ def _loops(run: LoopRun) -> Section:
         "corrections",
         "Each correction as a loop",
         "Limit: gain below which a loop of this delay is stable. Cycle: steps by which a mechanism of whole steps goes "
-        "to and fro at worst although nothing changes. Told: share of what a mechanism does beyond what is known that the "
-        "spots tell.",
+        "to and fro at worst although nothing changes. Told: share of what a mechanism does beyond what is known that "
+        "the spots tell.",
         (
             "name",
             "quantity",

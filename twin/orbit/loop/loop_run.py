@@ -33,18 +33,22 @@ from optics.raytrace.trace import BeamMissedError
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.corrected_lines import calibrated_line
-from twin.orbit.flight.line_camera import traced_line_cameras
+from twin.orbit.flight.line_camera import LineCamera, traced_line_cameras
+from twin.orbit.loop.line_images import ImagedPair, imaged_pair
 from twin.orbit.loop.loop_course import LoopCourse, Reader, drifting_states, gone_through
 from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model
 from twin.orbit.monitoring.monitor_series import TOO_FAR
-from twin.orbit.monitoring.monitoring_flight import in_analysis, look_down
+from twin.orbit.monitoring.monitoring_flight import fly, in_analysis, look_down
 from twin.orbit.monitoring.monitoring_run import CaseErrors, case_errors, height_slopes, point_errors, rms
 from twin.run.procedure import Advance, BenchError, silent
+from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.orbit.setup import LoopSetup
 
+_IMAGES = 100_000
+"""Random stream of line images; moments of the check points have those up to the number of readings."""
 FOCUS_SCALE = 10e-6
 """Metres of defocus that count as much as a metre of height where modes are sought: a tenth of what blurs an image."""
 
@@ -60,6 +64,7 @@ class LoopPass:
         slopes: (T, P) of the mean height error by the quantities, m/rad and m/m.
         angle: (P,) row of the angle between the pair's lines of sight, opening positive.
         mtf: camera -> (T, 2) at Nyquist along the line and along the track, mean over the fields.
+        images: pairs of line images, at the moments that the file names.
     """
 
     course: LoopCourse
@@ -68,6 +73,7 @@ class LoopPass:
     slopes: np.ndarray
     angle: np.ndarray
     mtf: Mapping[str, np.ndarray]
+    images: tuple[ImagedPair, ...] = ()
 
     def told(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(T,) what the posterior says of a quantity, and its sigma.
@@ -207,7 +213,7 @@ def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = s
             )
             for name in pair
         }
-        passes = [_passed(setup, course, calibrated, ground_seed, advance) for course in courses]
+        passes = [_passed(setup, course, nominal, calibrated, ground_seed, advance) for course in courses]
     except (AimError, BeamMissedError) as error:
         raise BenchError(f"the instrument cannot be traced: {error}", ("readings",), TOO_FAR) from error
     except IntersectionError as error:
@@ -260,6 +266,7 @@ def _mode_rows(model: LoopModel, pair: tuple[str, str], slopes: np.ndarray) -> n
 def _passed(
     setup: LoopSetup,
     course: LoopCourse,
+    nominal: Mapping[str, LineCamera],
     calibrated: Mapping[str, CalibratedLine],
     seed: np.random.SeedSequence,
     advance: Advance,
@@ -298,7 +305,15 @@ def _passed(
         name: np.stack([one.mtf_along_line.mean(axis=1), one.mtf_along_track.mean(axis=1)], axis=1)
         for name, one in quality.cameras.items()
     }
-    passed = LoopPass(course, traced_quantities, case_errors(found, best), rows, angle, FrozenMap(mtf))
+    images = []
+    for time in setup.test.images.times if setup.test.images is not None else ():
+        k = setup.test.readings.times.index(time)
+        changes = {name: model.on_ground(name, course.positions[k]) for name in pair}
+        foci = {name: float(traced_quantities[k, model.row(name, "defocus")]) for name in pair}
+        given = nominal, calibrated, changes, foci, fly(setup.test, seed), stream(seed, _IMAGES, k)
+        images.append(imaged_pair(setup, k, lines[k], *given))
+    heights = case_errors(found, best)
+    passed = LoopPass(course, traced_quantities, heights, rows, angle, FrozenMap(mtf), tuple(images))
     return passed, case_errors(best, best)
 
 
