@@ -5,6 +5,7 @@ spider, annular Zernike terms of batoid.
 import warnings
 from dataclasses import replace
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from scenes.lens.camera_writer import prescription_of
 from scenes.models.camera_model import derive_camera, field_direction
 from scenes.specs.load import load_camera
 from tests.oracles.pupil_raster import PupilRaster, raster
+from tests.tiers import one_of_each
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.colour import spectral_psfs
 
@@ -92,9 +94,7 @@ def as_its_raster(optics: CameraOptics, field: tuple[float, float], grid: PupilR
     assert 0.0 < mtf.accuracy < TOLD
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("field", FIELDS, ids=str)
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize(("name", "field"), one_of_each(itemgetter(0), [(n, f) for n in OWN for f in FIELDS[::-1]]))
 def test_mtf_as_by_an_fft_of_batoids_pupil(backend, folder, name, field) -> None:
     optics, peer = own_telescope(backend, name, folder)
     as_its_raster(optics, field, its_raster(optics, peer, field))
