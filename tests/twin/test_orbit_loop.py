@@ -18,7 +18,7 @@ from scenes.specs.resolved import line_detector
 from tests.twin.commands import invoke, refused
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.loop.loop_course import Commands, LoopCourse, Reader, drifting_states, gone_through
+from twin.orbit.loop.loop_course import Commands, LoopCourse, drifting_states, gone_through, reader
 from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model
 from twin.orbit.loop.loop_run import LoopRun, run_loop
 
@@ -138,7 +138,7 @@ def course_of(setup: LoopSetup, model: LoopModel, still: bool = False, **changed
     own = tuple(replace(one, spec=one.spec.model_copy(update=changed.get(one.name, {}))) for one in model.correctors)
     loop = LoopModel(model.experiment, model.stated, own)
     states = drifting_states(setup.test, model.experiment, 3)
-    return gone_through(loop, setup.test, states, Reader(loop, setup.test, 7).reading(), still)
+    return gone_through(loop, setup.test, states, reader(loop, setup.test, 7), still)
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +168,7 @@ def idle(setup: LoopSetup, backend) -> LoopRun:
 @pytest.mark.second
 def test_gain_nothing_is_the_open_loop_to_the_bit(idle: LoopRun) -> None:
     one, two = idle.closed, idle.open
-    for name in ("positions", "read_at", "expected", "covariance", "chi_square"):
+    for name in ("positions", "expected", "covariance", "chi_square"):
         assert np.array_equal(getattr(one.course, name), getattr(two.course, name)), name
     assert one.course.states == two.course.states
     assert np.array_equal(one.truth, two.truth)

@@ -125,6 +125,9 @@ def imaged_pair(
 
 
 _FEWEST = 8
+"""Points, of which a mean height and its scatter are told."""
+_TRANSMISSION = 0.8
+"""Of a lens, mean over the spectrum, as of payloads that say none."""
 
 
 def _optics(setup: LoopSetup, name: str, defocus: float) -> LineOptics:
@@ -144,9 +147,6 @@ def _optics(setup: LoopSetup, name: str, defocus: float) -> LineOptics:
     )
     sheet = setup.line_detectors[setup.instrument.cameras[name].camera]
     return LineOptics.from_specs(image, band.pixels, band.pitch, setup.test.line_time, sheet)
-
-
-_TRANSMISSION = 0.8
 
 
 def _sightings(sensor: Sensor, places: np.ndarray) -> Sightings:

@@ -16,7 +16,7 @@ import numpy as np
 from analysis.chi_square import chance_beyond, limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.jump_detection import Jump
-from analysis.monitor.recovery import judged_spots
+from analysis.monitor.recovery import MeasuredSpots, judged_spots
 from analysis.monitor.series_filter import Observed, SeriesFilter
 from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
@@ -47,8 +47,7 @@ class LoopCourse:
     Attributes:
         model: of the loop.
         times: (T,) seconds from the orbit's epoch.
-        read_at: (T, n) where the mechanisms are told to stand when the spots are read, rad or m.
-        positions: (T, n) likewise when images are taken.
+        positions: (T, n) where the mechanisms are told to stand when images are taken, rad or m.
         held: (T, n) whether a command was held by the end of a range.
         expected: (T, P) what the posterior says of the quantities when images are taken.
         covariance: (T, P, P) of its error.
@@ -60,7 +59,6 @@ class LoopCourse:
 
     model: LoopModel
     times: np.ndarray
-    read_at: np.ndarray
     positions: np.ndarray
     held: np.ndarray
     expected: np.ndarray
@@ -147,55 +145,45 @@ class Reading:
 Read: TypeAlias = Callable[[State, int], Reading]
 
 
-@dataclass(frozen=True, eq=False)
-class Reader:
-    """Renders and recovers one state after the other.
+def reader(model: LoopModel, spec: OrbitLoopSpec, seed: int) -> Read:
+    """Function of a state and the number of its moment -> what is read of it: rendered and recovered.
 
-    Attributes:
+    It raises BenchError where light is lost or a spot cannot be measured.
+
+    Args:
         model: of the loop.
         spec: the test.
         seed: of the detectors.
     """
+    experiment, errors = model.experiment, spec.errors
+    frames = spec.frames or experiment.instrument.spec.autocollimator.frames
+    noisy = errors.switched_on and errors.monitor
+    if noisy:
+        before = mean_frames(experiment.frames_before(frames, seed))
+    else:
+        before = experiment.expected_frames(experiment.nominal_photons)
+    centroid = spec.analysis.centroid
+    with one_blas_thread():
+        first = judged_spots(before, frames, experiment.calibration, centroid, cores())
 
-    model: LoopModel
-    spec: OrbitLoopSpec
-    seed: int
+    def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
+        if not noisy:
+            return first, experiment.expected_frames(photons)
+        return first, mean_frames(experiment.frames_after(photons, frames, seed, numbers))
 
-    def reading(self) -> Read:
-        """Function of a state and the number of its moment -> what is read of it.
+    how = Observing(record, centroid, stated=False, frames=frames)
 
-        Raises (the function):
-            BenchError: light is lost, or a spot cannot be measured.
-        """
-        experiment, spec, errors = self.model.experiment, self.spec, self.spec.errors
-        frames = spec.frames or experiment.instrument.spec.autocollimator.frames
-        noisy = errors.switched_on and errors.monitor
-        if noisy:
-            before = mean_frames(experiment.frames_before(frames, self.seed))
-        else:
-            before = experiment.expected_frames(experiment.nominal_photons)
-        centroid = spec.analysis.centroid
-        with one_blas_thread():
-            first = judged_spots(before, frames, experiment.calibration, centroid, cores())
+    def read(state: State, number: int) -> Reading:
+        when = spec.readings.times[number]
+        try:
+            found = next(iter(observe(experiment, [state], how, [number]))).recovery
+        except (*LOST, SpotError) as error:
+            text = f"the spots cannot be read at {moment(when)}: {error}"
+            raise BenchError(text, ("readings",), f"{TOO_FAR}; a smaller range of the mechanisms") from error
+        before, after = (np.diag(sigma[0].ravel() ** 2) for sigma in (found.sigma_before, found.sigma_after))
+        return Reading(Observed(when - spec.readings.times[0], found.shift[0], after), before, found.evidence)
 
-        def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[object, np.ndarray]:
-            if not noisy:
-                return first, experiment.expected_frames(photons)
-            return first, mean_frames(experiment.frames_after(photons, frames, self.seed, numbers))
-
-        how = Observing(record, centroid, stated=False, frames=frames)  # type: ignore[arg-type]
-
-        def read(state: State, number: int) -> Reading:
-            when = spec.readings.times[number]
-            try:
-                found = next(iter(observe(experiment, [state], how, [number]))).recovery
-            except (*LOST, SpotError) as error:
-                text = f"the spots cannot be read at {moment(when)}: {error}"
-                raise BenchError(text, ("readings",), f"{TOO_FAR}; a smaller range of the mechanisms") from error
-            before, after = (np.diag(sigma[0].ravel() ** 2) for sigma in (found.sigma_before, found.sigma_after))
-            return Reading(Observed(when - spec.readings.times[0], found.shift[0], after), before, found.evidence)
-
-        return read
+    return read
 
 
 def gone_through(
@@ -212,7 +200,7 @@ def gone_through(
         model: of the loop.
         spec: the test.
         states: of its T moments without mechanisms.
-        read: as of `Reader`.
+        read: as of `reader`.
         open_loop: leave all mechanisms where they are.
         advance: told of the number of moments that are done.
     """
@@ -236,15 +224,14 @@ def gone_through(
         mean, covariance = how.parameters(how.blended(belief), reading.time)
         commands = commands.given(mean)
         position = commands.standing
-        rows.append((standing, position, commands.held, mean + model.effects @ position, covariance))
+        rows.append((position, commands.held, mean + model.effects @ position, covariance))
         out.append(model.moved(state, position))
         advance(k + 1)
-    read_at, positions, held, expected, spread = (np.array(column) for column in zip(*rows, strict=True))
+    positions, held, expected, spread = (np.array(column) for column in zip(*rows, strict=True))
     times = np.array(spec.readings.times)
     return LoopCourse(
         model,
         times,
-        read_at,
         positions,
         held,
         expected,

@@ -31,6 +31,8 @@ from twin.monitor.truth import truth_jacobian
 
 FOCUS_FIELDS = (0.7, 0.0, -0.7)
 """Shares of half the line at which the focus is looked at."""
+_READ = 1e-3
+"""Pixels to which one reading knows a spot, about."""
 _SMALL = 1e-6
 """Of a mechanism's own effect on its quantity, over that of 1 rad or 1 m, below which it is none."""
 
@@ -129,7 +131,7 @@ class LoopModel:
     @cached_property
     def seen(self) -> np.ndarray:
         """(n,) which share of what a mechanism does beyond what is known of it one reading of the spots tells."""
-        gain = self.stated.best_gain(1e-6 * np.eye(len(self.spots)))
+        gain = self.stated.best_gain(_READ**2 * np.eye(len(self.spots)))
         told = gain @ self.spots
         return np.array([told[one.row, k] / one.own for k, one in enumerate(self.correctors)])
 

@@ -35,7 +35,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.corrected_lines import calibrated_line
 from twin.orbit.flight.line_camera import LineCamera, traced_line_cameras
 from twin.orbit.loop.line_images import ImagedPair, imaged_pair
-from twin.orbit.loop.loop_course import LoopCourse, Reader, drifting_states, gone_through
+from twin.orbit.loop.loop_course import LoopCourse, drifting_states, gone_through, reader
 from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model
 from twin.orbit.monitoring.monitor_series import TOO_FAR
 from twin.orbit.monitoring.monitoring_flight import fly, in_analysis, look_down
@@ -198,7 +198,7 @@ def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = s
         model = loop_model(setup, experiment)
         states = drifting_states(spec, experiment, number)
         advance("trace", 1, 1)
-        read = Reader(model, spec, number).reading()
+        read = reader(model, spec, number)
         courses = []
         for part, still in (("readings, loop closed", False), ("readings, loop open", True)):
 
