@@ -29,6 +29,8 @@ Given = TypeVar("Given")
 SLIPS = 1
 """Keys that a file of a kind may have and the kind does not know: a typing error does not make it another kind."""
 
+_MOST = 2
+"""Kinds that a file may be and be told as such; of more its keys say nothing."""
 
 _VALIDATED = "the checks of `python -m twin.validate`"
 
@@ -81,18 +83,23 @@ _RESOLVED = {"job": "job", "study": "study"}
 
 def kind_of(data: Any) -> FileKind | None:
     """The kind of file, or of a run's config.yaml, that these plain data can only be; None where that is not clear."""
+    nearest = kinds_of(data)
+    return nearest[0] if len(nearest) == 1 else None
+
+
+def kinds_of(data: Any) -> tuple[FileKind, ...]:
+    """The kinds that these plain data can be: more than one where no key tells them apart."""
     if not isinstance(data, Mapping):
-        return None
+        return ()
     keys = {key for key in data if isinstance(key, str)}
     for key, name in _RESOLVED.items():
         if key in keys:
-            return next(kind for kind in FILE_KINDS if kind.name == name)
+            return (next(kind for kind in FILE_KINDS if kind.name == name),)
     if "test" in keys:
-        return kind_of(data["test"])
+        return kinds_of(data["test"])
     found = [(strange, kind) for kind in FILE_KINDS if (strange := kind.strangers(keys)) is not None]
     least = min((strange for strange, _ in found), default=SLIPS + 1)
-    nearest = [kind for strange, kind in found if strange == least]
-    return nearest[0] if least <= SLIPS and len(nearest) == 1 else None
+    return tuple(kind for strange, kind in found if strange == least <= SLIPS)
 
 
 def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Given:
@@ -110,12 +117,17 @@ def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Give
         return resolve(file)
     except InputError as error:
         try:
-            kind = kind_of(read_yaml(file).data)
+            kinds = kinds_of(read_yaml(file).data)
         except InputError:
             raise error from None
-        if kind is None or kind.command == command:
+        if not kinds or len(kinds) > _MOST or any(kind.command == command for kind in kinds):
             raise
-        reads = f"python -m {kind.command} {file} does" if kind.command else ""
-        named = f"its name belongs into {kind.place}" if kind.place else ""
-        there = ", or ".join(filter(None, (reads, named)))
-        raise InputError(Issue(f"this is {kind.what}, which {command} does not read; {there}", str(file))) from None
+        what, there = " or ".join(kind.what for kind in kinds), ", or ".join(_place(kind, file) for kind in kinds)
+        raise InputError(Issue(f"this is {what}, which {command} does not read; {there}", str(file))) from None
+
+
+def _place(kind: FileKind, file: Path) -> str:
+    """Which command reads a file of a kind, and where its name belongs."""
+    reads = f"python -m {kind.command} {file} does" if kind.command else ""
+    named = f"its name belongs into {kind.place}" if kind.place else ""
+    return ", or ".join(filter(None, (reads, named)))
