@@ -418,6 +418,26 @@ PROCEDURES: dict[str, Procedure] = {
     Example: `python -m twin.orbit jitter scenes/orbit/jitter.yaml`
     """,
     ),
+    "orbit loop": Procedure(
+        "loop",
+        setup="scenes.specs.orbit.setup:LoopSetup",
+        resolve="scenes.specs.orbit.setup:resolve_loop",
+        run="twin.orbit.loop.loop_run:run_loop",
+        numbers="twin.orbit.loop.loop_numbers:LOOP",
+        report="twin.orbit.loop.loop_report:loop_report",
+        files=(FileKind("orbit_loop", "scenes.specs.orbit.loop:OrbitLoopSpec", "a monitor in a loop"),),
+        varied=True,
+        about="""
+    The monitor in a loop along one orbit: heat and mounts move the cameras, spots are rendered and read, and what the
+    posterior says goes to mechanisms that point and refocus, with gain, delay and steps; heights with the loop open and
+    closed.
+
+    loop.json holds what is left of angle, focus and height with the loop open and closed, with sigmas, gain and phase
+    margins, limit cycles, and the motions that no spot shows with what they cost in metres.
+
+    Example: `python -m twin.orbit loop scenes/orbit/loop.yaml`
+    """,
+    ),
     "orbit match": Procedure(
         "match",
         setup="scenes.specs.measured.orbit_data_setup:MatchSetup",
