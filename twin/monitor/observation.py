@@ -7,7 +7,6 @@ states. What differs from use to use is said by an `Observing`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
@@ -169,7 +168,7 @@ def light_of(
     Raises:
         BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD.
     """
-    with one_blas_thread(), one_kernel_thread() if len(states) > 1 else nullcontext():
+    with one_blas_thread(), one_kernel_thread():
         placed = experiment.instrument.assembly.place(states)
         truth = experiment.sight.truth(states, placed)
         if photons is None and len(states) == 1:
@@ -213,7 +212,7 @@ def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observa
         if isinstance(before, np.ndarray) and before.ndim == images.ndim and not whole:
             first = before[good]
         try:
-            with one_blas_thread():
+            with one_blas_thread(), one_kernel_thread():
                 recovery = recover(
                     first,
                     images if whole else images[good],
