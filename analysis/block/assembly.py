@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from analysis.block.block import Block, CameraKnowledge, Term
-from analysis.block.packets import Corrections, FixedPoints, Heights, LineImage, Packets, Part, Pointings
+from analysis.block.block import Block, CameraKnowledge, CamerasKnowledge, Term
+from analysis.block.corrections import Corrections, Part
+from analysis.block.packets import FixedPoints, Heights, LineImage, Packets, Pointings
 from analysis.block.point_reduction import PriorGroup, Reduction
 from analysis.block.processes import BlockError, Support
 from analysis.orbit.three_line_model import BIAS, DRIFT
@@ -90,10 +91,8 @@ class Assembly:
         parts = []
         for kind in ("attitude", "station"):
             for one in self.processes[kind, of]:
-                number, blend = one.support.blend(times)
-                sigma = np.array(one.support.law.sigma)
-                parts.append(Part(kind == "attitude", one.column, sigma, number.astype(np.int32), blend))
-        return Corrections(tuple(parts), self.axes[of], len(times))
+                parts.append(Part(kind == "attitude", one.column, one.support))
+        return Corrections(tuple(parts), self.axes[of], times)
 
 
 def assembled(block: Block, datum: bool = False) -> Assembly:
@@ -205,30 +204,49 @@ def _cameras(block: Block, priors: list[PriorGroup], size: int) -> tuple[dict[st
     order = [one.name for one in block.passes]
     changes: dict[str, Indices] = {}
     units: dict[str, Array] = {}
+    together = block.monitored if isinstance(block.monitored, CamerasKnowledge) else None
+    joint: list[tuple[Indices, Indices, Array]] = []
     for camera in dict.fromkeys(s.camera for s in block.scenes):
-        knowledge: CameraKnowledge = (block.monitored or block.known).get(camera, block.known[camera])
         mine = [s for s in block.scenes if s.camera == camera]
         held = sorted({order.index(s.of) for s in mine})
         where = (4 * np.array(held)[:, None] + np.arange(4)).ravel()
-        spread = knowledge.covariance[np.ix_(where, where)]
         deviation = np.sqrt(np.maximum(np.diag(block.known[camera].covariance), 0.0)).reshape(-1, 4).max(axis=0)
         if not np.all(deviation > 0.0):
             wrong = DRIFT[int(np.argmin(deviation))]
             raise BlockError(f"block: camera {camera!r}: {wrong} needs a standard deviation above zero")
         unit = np.tile(deviation, len(held))
-        values, vectors = np.linalg.eigh(spread / unit / unit[:, None])
-        # what is exactly known still moves by a hundred thousandth of its size, for it has to have an inverse
-        root = np.maximum(values, _FLOOR * max(float(values[-1]), 1.0))
-        precision = (vectors / root) @ vectors.T
         columns = size + np.arange(len(where))
-        mean = knowledge.mean[held].ravel() / unit
-        group = "camera" if block.monitored is None else "monitor"
-        priors.append(PriorGroup(group, columns, sparse.csr_matrix(0.5 * (precision + precision.T)), mean))
+        if together is not None:
+            joint.append((columns, 4 * len(order) * together.cameras.index(camera) + where, unit))
+        else:
+            knowledge: CameraKnowledge = _alone(block, camera)
+            group = "camera" if block.monitored is None else "monitor"
+            spread = knowledge.covariance[np.ix_(where, where)]
+            priors.append(_known_group(group, columns, knowledge.mean[held].ravel(), spread, unit))
         for scene in mine:
             place = 4 * held.index(order.index(scene.of))
             changes[scene.name], units[scene.name] = columns[place : place + 4], deviation
         size += len(where)
+    if together is not None:
+        columns, where, unit = (np.concatenate(part) for part in zip(*joint, strict=True))
+        spread = together.covariance[np.ix_(where, where)]
+        priors.append(_known_group("monitor", columns, together.mean.ravel()[where], spread, unit))
     return changes, units, size
+
+
+def _alone(block: Block, camera: str) -> CameraKnowledge:
+    """What is known of a camera by itself."""
+    assert not isinstance(block.monitored, CamerasKnowledge)
+    return (block.monitored or block.known).get(camera, block.known[camera])
+
+
+def _known_group(group: str, columns: Indices, mean: Array, spread: Array, unit: Array) -> PriorGroup:
+    """Knowledge of unknowns with their covariance (k, k), in units (k,)."""
+    values, vectors = np.linalg.eigh(spread / unit / unit[:, None])
+    # what is exactly known still moves by a hundred thousandth of its size, for it has to have an inverse
+    root = np.maximum(values, _FLOOR * max(float(values[-1]), 1.0))
+    precision = (vectors / root) @ vectors.T
+    return PriorGroup(group, columns, sparse.csr_matrix(0.5 * (precision + precision.T)), mean / unit)
 
 
 def _angles(block: Block, scopes: Mapping[tuple[str, int, str], Process]) -> list[PriorGroup]:

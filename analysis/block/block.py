@@ -16,6 +16,7 @@ __all__ = [
     "SENSORS",
     "Block",
     "CameraKnowledge",
+    "CamerasKnowledge",
     "Footprints",
     "Pass",
     "Points",
@@ -83,6 +84,27 @@ class CameraKnowledge:
 
     mean: Array
     covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CamerasKnowledge:
+    """The same of all cameras together, of which one body may have moved several.
+
+    Attributes:
+        cameras: C names.
+        mean: (C, T, 4).
+        covariance: (4 T C, 4 T C), camera by camera and in each pass by pass.
+    """
+
+    cameras: tuple[str, ...]
+    mean: Array
+    covariance: Array
+
+    def of(self, camera: str) -> CameraKnowledge:
+        """One camera by itself."""
+        k, size = self.cameras.index(camera), 4 * self.mean.shape[1]
+        own = slice(k * size, (k + 1) * size)
+        return CameraKnowledge(self.mean[k], self.covariance[own, own])
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +194,7 @@ class Block:
         scenes: of these passes.
         cameras: name -> camera as calibrated, without a change.
         known: name -> what is expected of its changes, without a monitor.
-        monitored: name -> the same after the monitor's readings; None for no monitor.
+        monitored: name -> the same after the monitor's readings, or of all cameras together; None for no monitor.
         attitude: laws of its readings' errors. station: likewise along the axes of the pass.
         image: unit of the rays' spread, metres.
         points: on the ground.
@@ -189,7 +211,7 @@ class Block:
     station: tuple[Term, ...]
     image: float
     points: Points
-    monitored: Mapping[str, CameraKnowledge] | None = None
+    monitored: Mapping[str, CameraKnowledge] | CamerasKnowledge | None = None
     footprints: tuple[Footprints, ...] = ()
     terrain: Terrain | None = None
     angles: tuple[TrackerAngle, ...] = field(default=())
@@ -259,7 +281,12 @@ class Block:
         if np.any(control) and not np.all(np.linalg.eigvalsh(points.covariance[control]) > 0):
             raise BlockError("block: covariances of control points must be positive definite")
         for name in self.cameras:
-            for known in (self.known, self.monitored or {}):
+            watched = self.monitored or {}
+            if isinstance(watched, CamerasKnowledge):
+                if name not in watched.cameras:
+                    raise BlockError(f"block: the monitor says nothing of camera {name!r}")
+                watched = {name: watched.of(name)}
+            for known in (self.known, watched):
                 one = known.get(name)
                 if one is not None and one.covariance.shape != (4 * len(names), 4 * len(names)):
                     shape = one.covariance.shape

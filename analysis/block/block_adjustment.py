@@ -1,11 +1,11 @@
 """Adjustment of a block: Gauss-Newton on all packets and priors, robust weights, variance components, covariances.
 
-The weights and factors follow the rules of the campaign's adjustment (`analysis.orbit.residual_tests`).
+The weights and factors follow the rules of `reweighting`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -14,17 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse.linalg import splu
 from scipy.stats import chi2
 
 from analysis.block.assembly import Assembly, assembled, group_ranks
 from analysis.block.block import Block
 from analysis.block.plausible_block import check_places, pruned
-from analysis.block.point_reduction import Reduced
+from analysis.block.point_reduction import Checked, Reduced, Reduction, State
 from analysis.block.processes import BlockError
-from analysis.orbit.residual_tests import bounded, extrapolated, robust_weights, standardised_packets
+from analysis.block.reweighting import SETTLED, GroupTest, Rule, UnsettledError, settled
+from analysis.block.shares import Pool, SharedReduction
 
-__all__ = ["BlockAdjustment", "GroupTest", "adjust_block", "kept_block"]
+__all__ = ["BlockAdjustment", "adjust_block", "kept_block"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -35,41 +37,8 @@ _DENSE = 2500
 _MOST = 20_000
 """Unknowns whose covariance is kept whole: 3.2 GB."""
 _COLUMNS = 256
-_ROUNDS = 40
+_SINGULAR = "block: the equations are singular; a sigma is too large for what observes it"
 _HUBER_ROUNDS = 4
-_FREE_ROUNDS = 8
-_SETTLED = 1e-3
-_LEAST_REDUNDANCY = 10.0
-"""A variance from fewer redundant observations is uncertain by 45% or more: the group keeps its factor."""
-
-
-@dataclass(frozen=True)
-class GroupTest:
-    """A variance group after the adjustment.
-
-    Attributes:
-        count: observations. redundancy: how many of them the others check.
-        square: their weighted squares, whose expectation is the redundancy.
-        factor: on the variances; 1 where not estimated.
-    """
-
-    count: int
-    redundancy: float
-    square: float
-    factor: float
-
-    @property
-    def ratio(self) -> float:
-        """Variance of the residuals over that which the sigmas predict; NaN where nothing checks the group."""
-        return self.square / self.redundancy if self.redundancy > 1e-6 else float("nan")
-
-    @property
-    def p_value(self) -> float:
-        """Two-sided chance of such squares, as of a chi-square with the redundancy for its freedom."""
-        if self.redundancy < 1.0:
-            return 1.0
-        high = float(chi2.sf(self.square, self.redundancy))
-        return 2.0 * min(high, 1.0 - high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,22 +84,22 @@ class BlockAdjustment:
     def _filled(self) -> Array:
         return np.where(np.isfinite(self.ground), self.ground, self.assembly.block.points.start)
 
+    @property
+    def state(self) -> State:
+        """Where the adjustment ended."""
+        return State(self.x, self._filled, self.weight, self.factors)
+
     def point_covariance(self, points: Indices) -> Array:
         """(k, 3, 3) covariance of any of the block's points, ITRS, m^2; NaN where nothing determines one."""
-        found = np.full((len(self.ground), 3, 3), np.nan)
-        wanted = np.zeros(len(self.ground), bool)
-        wanted[points] = True
-        for rows in self.assembly.reduction.rows(self.x, self._filled, self.weight, self.factors):
-            where = rows.bundle.points
-            use = wanted[where]
-            if not np.any(use):
-                continue
-            inner = self.spread[where[use]]
-            moved = inner @ np.swapaxes(rows.by_point[use], 1, 2) @ rows.by_x[use]
-            columns = rows.bundle.columns
-            found[where[use]] = inner + moved @ self.covariance[np.ix_(columns, columns)] @ np.swapaxes(moved, 1, 2)
-        found[~np.isfinite(self.ground).all(axis=1)] = np.nan
-        return np.asarray(found[points])
+        reduction = self.assembly.reduction
+        found = np.full((len(points), 3, 3), np.nan)
+        for rows in reduction.restricted(points).rows(reduction.state_of(points, self.state)):
+            where, columns = rows.bundle.points, rows.bundle.columns
+            inner = self.spread[points[where]]
+            moved = inner @ np.swapaxes(rows.by_point, 1, 2) @ rows.by_x
+            found[where] = inner + moved @ self.covariance[np.ix_(columns, columns)] @ np.swapaxes(moved, 1, 2)
+        found[~np.isfinite(self.ground[points]).all(axis=1)] = np.nan
+        return found
 
     def attitude_at(self, of: str, times: Array) -> tuple[Array, Array]:
         """Correction of the attitude of a pass about the body's axes, (n, 3), radians, with covariances (n, 3, 3)."""
@@ -159,14 +128,14 @@ class BlockAdjustment:
         return tuple(
             (str(ids[p]), one.name)
             for one, weight in zip(self.assembly.reduction.sets, self.weight, strict=True)
-            for p in one.point[weight <= _SETTLED].tolist()
+            for p in one.point[weight <= SETTLED].tolist()
         )
 
 
 def kept_block(found: BlockAdjustment) -> Block:
     """The block without the packets that robust weights gave up. Rejected control points become tie points."""
     block, sets = found.assembly.block, found.assembly.reduction.sets
-    keep = {one.name: weight > _SETTLED for one, weight in zip(sets, found.weight, strict=True)}
+    keep = {one.name: weight > SETTLED for one, weight in zip(sets, found.weight, strict=True)}
     scenes = tuple(
         replace(s, rays=s.rays.taken(keep[s.name])) if s.name in keep and not s.name.endswith(" laser") else s
         for s in block.scenes
@@ -176,7 +145,7 @@ def kept_block(found: BlockAdjustment) -> Block:
     role = points.role.copy()
     for one, weight in zip(sets, found.weight, strict=True):
         if one.group == "control":
-            role[one.point[weight <= _SETTLED]] = "tie"
+            role[one.point[weight <= SETTLED]] = "tie"
     terrain = block.terrain
     if terrain is not None:
         terrain = terrain.taken(keep["terrain"])
@@ -192,18 +161,18 @@ class _Factor:
         if not np.all(diagonal > 0):
             raise BlockError("block: an unknown that nothing determines")
         self.size = 1.0 / np.sqrt(diagonal)
-        scaled = sparse.diags(self.size) @ matrix @ sparse.diags(self.size)
+        self.scaled = (sparse.diags(self.size) @ matrix @ sparse.diags(self.size)).tocsc()
         self.count = matrix.shape[0]
         try:
             if self.count <= _DENSE:
-                factor = cho_factor(scaled.toarray())
+                factor = cho_factor(self.scaled.toarray())
                 self._solve = lambda right: cho_solve(factor, right)
             else:
                 options = {"SymmetricMode": True}
-                lu = splu(scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+                lu = splu(self.scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
                 self._solve = lu.solve
         except (np.linalg.LinAlgError, RuntimeError) as error:
-            raise BlockError("block: the equations are singular; a sigma is too large for what observes it") from error
+            raise BlockError(_SINGULAR) from error
 
     def solve(self, right: Array) -> Array:
         """Solution for right sides (P,) or (P, k)."""
@@ -211,27 +180,21 @@ class _Factor:
         return np.asarray(size * self._solve(size * right))
 
     def inverse(self) -> Array:
-        """(P, P)."""
+        """(P, P), whole: several times faster from a whole factor than column by column from a sparse one."""
         if self.count > _MOST:
             raise BlockError(f"block: {self.count} unknowns beside the points; at most {_MOST} are adjusted at once")
-        found = np.empty((self.count, self.count))
+        found, failed = dpotrf(self.scaled.toarray(order="F"), lower=1, clean=0, overwrite_a=1)
+        if failed:
+            raise BlockError(_SINGULAR)
+        found, _ = dpotri(found, lower=1, overwrite_c=1)
         for a in range(0, self.count, _COLUMNS):
-            some = np.arange(a, min(a + _COLUMNS, self.count))
-            right = np.zeros((self.count, len(some)))
-            right[some, some - a] = 1.0
-            found[:, some] = self.solve(right)
-        return 0.5 * (found + found.T)
-
-
-@dataclass(frozen=True, eq=False)
-class _At:
-    """Where an iteration stands."""
-
-    x: Array
-    ground: Array
-    weight: tuple[Array, ...]
-    factor: Mapping[str, float]
-    steps: int
+            b = min(a + _COLUMNS, self.count)
+            own = np.tril(found[a:b, a:b])
+            found[a:b, a:b] = own + np.tril(own, -1).T
+            found[a:b, b:] = found[b:, a:b].T
+        found *= self.size
+        found *= self.size[:, None]
+        return np.ascontiguousarray(found.T)
 
 
 def adjust_block(
@@ -241,6 +204,7 @@ def adjust_block(
     variance_components: bool | Collection[str] = False,
     datum: bool = False,
     iterations: int = 20,
+    pool: Pool | None = None,
 ) -> BlockAdjustment:
     """Adjust a block.
 
@@ -251,6 +215,7 @@ def adjust_block(
         variance_components: estimate a factor on the variances of every group, or of those named.
         datum: look for a shift that all control points have in common.
         iterations: most Gauss-Newton steps of one round.
+        pool: processes that reduce the points; None for this one alone.
 
     Raises:
         BlockError: input that cannot be used, points that are not what was photographed, no convergence.
@@ -259,136 +224,127 @@ def adjust_block(
     check_places(block)
     assembly = assembled(block, datum)
     reduction = assembly.reduction
+    points: Reduction | SharedReduction = reduction if pool is None else SharedReduction.of(reduction, pool)
     groups = [*(one.group for one in reduction.sets), *(one.group for one in reduction.priors)]
     weight = tuple(np.ones(len(one.point)) for one in reduction.sets)
-    at = _At(np.zeros(reduction.size), block.points.start.copy(), weight, dict.fromkeys(groups, 1.0), 0)
-    estimated = set(groups) if variance_components is True else set(variance_components or ())
-    factors: list[Mapping[str, float]] = []
-    for turn in range(_ROUNDS):
-        screening = robust is not None and turn < _HUBER_ROUNDS
+    at = _At(np.zeros(reduction.size), block.points.start.copy(), weight, dict.fromkeys(groups, 1.0))
+    rule = Rule(
+        "accept" if robust == "reject" else robust,
+        "components" if variance_components else None,
+        None if isinstance(variance_components, bool) else variance_components,
+        _HUBER_ROUNDS if robust else 0,
+    )
+    try:
+        at, found = settled(_Problem(assembly, points, iterations), at, rule)
+    except UnsettledError as error:
+        raise BlockError(f"block: {error}") from error
+    return _result(assembly, at, found)
+
+
+@dataclass(frozen=True, eq=False)
+class _At(State):
+    """Where an adjustment stands, with the Gauss-Newton steps so far."""
+
+    steps: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """Equations at a solution, covariance (P, P) of the unknowns, the packets beside what all others say, groups."""
+
+    reduced: Reduced
+    covariance: Array
+    checked: Checked
+    tests: Mapping[str, GroupTest]
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What does not change while weights come to rest."""
+
+    assembly: Assembly
+    points: Reduction | SharedReduction
+    iterations: int
+
+    def solve(self, at: _At, screening: bool) -> tuple[_At, _Solution]:
+        """See `Reweighted`."""
+        reduction = self.assembly.reduction
         # weights that will change are not worth more than a step or two
-        at, reduced, factor = _solved(assembly, at, iterations, 1e-2 if screening else _CONVERGED)
+        tolerance = 1e-2 if screening else _CONVERGED
+        at, reduced, factor = _solved(reduction, self.points, at, self.iterations, tolerance)
         covariance = factor.inverse()
-        standard, taken = _checked(assembly, at, covariance, reduced)
-        tests = _tests(assembly, at, covariance, reduced, taken)
-        if robust is None and not estimated:
-            return _result(assembly, at, covariance, standard, tests, reduced)
-        new_weight, new_factor = at.weight, dict(at.factor)
-        if robust is not None:
-            kind: Literal["huber", "accept"] = "accept"
-            if robust == "huber" or turn < _HUBER_ROUNDS:
-                kind = "huber"
-            new_weight = tuple(robust_weights(one, kind) for one in standard)
-            if kind == "accept" and turn >= _FREE_ROUNDS:
-                new_weight = tuple(np.minimum(a, b) for a, b in zip(new_weight, at.weight, strict=True))
-            new_weight = _without_lost(assembly, new_weight)
-        if estimated and not screening:
-            for name in estimated & set(tests):
-                one = tests[name]
-                if one.redundancy >= _LEAST_REDUNDANCY:
-                    new_factor[name] = bounded(at.factor[name] * one.square / one.redundancy)
-            factors.append(new_factor)
-        change = max(
-            max(
-                (float(np.abs(a - b).max(initial=0.0)) for a, b in zip(new_weight, at.weight, strict=True)), default=0.0
-            ),
-            max(abs(new_factor[g] / at.factor[g] - 1.0) for g in new_factor),
-        )
-        if change < _SETTLED and not screening:
-            return _result(assembly, at, covariance, standard, tests, reduced)
-        if len(factors) == 3:
-            new_factor, factors = extrapolated(factors), []
-        at = replace(at, weight=new_weight, factor=new_factor)
-    raise BlockError(f"block: weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}")
+        checked = self.points.checked(at, reduced.spread, _part_of(covariance))
+        tests = _tests(reduction, at, covariance, reduced, checked.taken)
+        return at, _Solution(reduced, covariance, checked, tests)
+
+    def judged(self, at: _At, found: _Solution) -> tuple[Array, ...]:
+        """See `Reweighted`."""
+        return found.checked.standard
+
+    def tests(self, at: _At, found: _Solution) -> Mapping[str, GroupTest]:
+        """See `Reweighted`."""
+        return found.tests
+
+    def weighed(self, at: _At, weight: tuple[Array, ...], factor: Mapping[str, float]) -> _At:
+        """The state without weights at points that fewer than three rows determine."""
+        lost = _rows_left(self.assembly, weight) < 3
+        sets = self.assembly.reduction.sets
+        kept = tuple(np.where(lost[one.point], 0.0, w) for one, w in zip(sets, weight, strict=True))
+        return replace(at, weight=kept, factor=factor)
 
 
-def _solved(assembly: Assembly, at: _At, iterations: int, tolerance: float) -> tuple[_At, Reduced, _Factor]:
+def _solved(
+    reduction: Reduction, points: Reduction | SharedReduction, at: _At, iterations: int, tolerance: float
+) -> tuple[_At, Reduced, _Factor]:
     """Gauss-Newton with the weights as they stand, until a step is below so many sigmas."""
-    reduction = assembly.reduction
     last = np.inf
     for _ in range(iterations):
-        reduced = reduction.reduced(at.x, at.ground, at.weight, at.factor)
+        reduced = reduction.with_priors(points.eliminated(at), at)
         total = reduced.data + reduced.prior
         factor = _Factor(total)
         step = -factor.solve(reduced.right)
-        moved = reduction.point_steps(at.x, at.ground, at.weight, at.factor, reduced, step)
         size = float(np.sqrt(max(float(step @ (total @ step)), 0.0)))
         # points that stay too far from where x puts them count, too
-        apart = float(np.sqrt(np.max(np.einsum("ni,nij,nj->n", moved, _inverses(reduced.spread), moved), initial=0.0)))
+        if size + _largest(reduced.start, reduced.spread) < _CONVERGED:
+            # what x moves them by is less than its own step
+            at = replace(at, x=at.x + step, ground=at.ground + reduced.start, steps=at.steps + 1)
+            return at, reduced, factor
+        moved = points.point_steps(at, reduced, step)
         at = replace(at, x=at.x + step, ground=at.ground + moved, steps=at.steps + 1)
-        size = max(size, apart)
+        size = max(size, _largest(moved, reduced.spread))
         if size < tolerance or (size < 1e3 * tolerance and size > 0.5 * last):
-            return at, reduction.reduced(at.x, at.ground, at.weight, at.factor), factor
+            return at, reduction.with_priors(points.eliminated(at), at), factor
         if not np.isfinite(size):
             break
         last = size
     raise BlockError(f"block: no convergence in {iterations} steps, the last of {last:.3g} sigmas")
 
 
-def _inverses(spread: Array) -> Array:
-    """(m, 3, 3) inverses; zero where there is none."""
+def _part_of(covariance: Array) -> Callable[[Indices], Array]:
+    return lambda some: np.asarray(covariance[np.ix_(some, some)])
+
+
+def _largest(moved: Array, spread: Array) -> float:
+    """Largest of steps (m, 3) of points with covariances (m, 3, 3), in sigmas; points without one do not count."""
     used = spread[:, 0, 0] > 0
-    found = np.zeros_like(spread)
-    found[used] = np.linalg.inv(spread[used])
-    return found
-
-
-def _without_lost(assembly: Assembly, weight: Sequence[Array]) -> tuple[Array, ...]:
-    """Weights with none left at points that fewer than three rows determine."""
-    rows = _rows_left(assembly, weight)
-    lost = rows < 3
-    return tuple(np.where(lost[one.point], 0.0, w) for one, w in zip(assembly.reduction.sets, weight, strict=True))
+    solved = np.linalg.solve(spread[used], moved[used][:, :, None])[:, :, 0]
+    return float(np.sqrt(np.max(np.sum(moved[used] * solved, axis=1), initial=0.0)))
 
 
 def _rows_left(assembly: Assembly, weight: Sequence[Array]) -> NDArray[np.intp]:
     """(m,) rows with any weight at each point."""
     rows = np.zeros(assembly.reduction.count, np.intp)
     for one, w in zip(assembly.reduction.sets, weight, strict=True):
-        np.add.at(rows, one.point, one.rows * (w > _SETTLED))
+        np.add.at(rows, one.point, one.rows * (w > SETTLED))
     return rows
 
 
-def _checked(
-    assembly: Assembly, at: _At, covariance: Array, reduced: Reduced
-) -> tuple[tuple[Array, ...], dict[str, float]]:
-    """Standardised residuals of all sets, and group -> what the adjustment took of its observations (count less
-    redundancy).
-    """
-    sets = assembly.reduction.sets
-    standard = [np.zeros((len(one.point), one.rows)) for one in sets]
-    taken = dict.fromkeys((one.group for one in sets), 0.0)
-    for rows in assembly.reduction.rows(at.x, at.ground, at.weight, at.factor, weighted=False):
-        columns, where = rows.bundle.columns, rows.bundle.points
-        weights = np.concatenate(
-            [
-                np.repeat((at.weight[k][w] / at.factor[sets[k].group])[:, None], sets[k].rows, axis=1)
-                for k, w in rows.bundle.members
-            ],
-            axis=1,
-        )
-        inner = reduced.spread[where]
-        moved = inner @ np.swapaxes(rows.by_point * weights[:, :, None], 1, 2) @ rows.by_x
-        through = rows.by_x - rows.by_point @ moved
-        shared = covariance[np.ix_(columns, columns)]
-        d = 0
-        for k, which in rows.bundle.members:
-            depth = sets[k].rows
-            part, by_point = through[:, d : d + depth], rows.by_point[:, d : d + depth]
-            cofactor = part @ shared @ np.swapaxes(part, 1, 2) + by_point @ inner @ np.swapaxes(by_point, 1, 2)
-            weight, unit = at.weight[k][which], at.factor[sets[k].group]
-            standard[k][which] = standardised_packets(rows.miss[:, d : d + depth], cofactor, weight, unit)
-            taken[sets[k].group] += float(np.sum(weight * np.trace(cofactor, axis1=1, axis2=2)) / unit)
-            d += depth
-    return tuple(standard), taken
-
-
 def _tests(
-    assembly: Assembly, at: _At, covariance: Array, reduced: Reduced, taken: Mapping[str, float]
+    reduction: Reduction, at: State, covariance: Array, reduced: Reduced, taken: Mapping[str, float]
 ) -> dict[str, GroupTest]:
-    reduction = assembly.reduction
     counts: dict[str, int] = {}
     for one, weight in zip(reduction.sets, at.weight, strict=True):
-        counts[one.group] = counts.get(one.group, 0) + one.rows * int(np.sum(weight > _SETTLED))
+        counts[one.group] = counts.get(one.group, 0) + one.rows * int(np.sum(weight > SETTLED))
     found = {
         name: GroupTest(counts[name], counts[name] - taken[name], reduced.square[name], at.factor[name])
         for name in taken
@@ -404,14 +360,7 @@ def _tests(
     return found
 
 
-def _result(
-    assembly: Assembly,
-    at: _At,
-    covariance: Array,
-    standard: tuple[Array, ...],
-    tests: Mapping[str, GroupTest],
-    reduced: Reduced,
-) -> BlockAdjustment:
+def _result(assembly: Assembly, at: _At, found: _Solution) -> BlockAdjustment:
     rows = _rows_left(assembly, at.weight)
     known = rows >= 3
     ranks = group_ranks(assembly.reduction.priors)
@@ -419,14 +368,14 @@ def _result(
     return BlockAdjustment(
         assembly=assembly,
         x=at.x,
-        covariance=covariance,
+        covariance=found.covariance,
         ground=np.where(known[:, None], at.ground, np.nan),
-        spread=reduced.spread,
+        spread=found.reduced.spread,
         weight=at.weight,
-        standard=standard,
-        groups=tests,
-        chi_square=sum(one.square for one in tests.values()),
+        standard=found.checked.standard,
+        groups=found.tests,
+        chi_square=sum(one.square for one in found.tests.values()),
         degrees_of_freedom=freedom,
-        reduced=reduced,
+        reduced=found.reduced,
         iterations=at.steps,
     )

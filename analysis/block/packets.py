@@ -6,19 +6,19 @@ whitened by their a-priori covariance: miss + by_x dx + by_point dp. The core (`
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.orbit.three_line_model import LineModel, Rays, misclosure, partials
+from analysis.block.corrections import Corrections, by_rotation_vector, cross, turned, turned_back
+from analysis.orbit.three_line_model import LineModel, Rays
 
-__all__ = ["Corrections", "FixedPoints", "Heights", "LineImage", "Packets", "Part", "Pointings"]
+__all__ = ["FixedPoints", "Heights", "LineImage", "Packets", "Pointings"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-_NOTHING = np.zeros(3)
 
 
 class Packets(Protocol):
@@ -53,116 +53,8 @@ class Packets(Protocol):
             ground: points of these packets, (k, 3), ITRS, metres.
         """
 
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """One law's share of a correction at the times of n observations.
-
-    Attributes:
-        turns: whether it turns the body, radians; else it shifts the station along the axes of the pass, metres.
-        first: of its unknowns, three axes of each number.
-        sigma: (3,) of the axes.
-        number: (n, w) of the law's numbers that each time meets. blend: (n, w) how much of each.
-    """
-
-    turns: bool
-    first: int
-    sigma: Array
-    number: NDArray[np.int32]
-    blend: Array
-
-    def value(self, which: Indices, x: Array) -> Array:
-        """(k, 3) at observations (k,)."""
-        number, blend = self.number[which], self.blend[which]
-        own = x[self.first + 3 * number[:, :, None] + np.arange(3)]
-        return np.asarray(self.sigma * np.einsum("nw,nwa->na", blend, own))
-
-
-@dataclass(frozen=True, eq=False)
-class Corrections:
-    """Corrections of attitude and station at the times of n observations, linear in the unknowns.
-
-    Attributes:
-        parts: of the laws; those that turn come first.
-        axes: (3, 3) axes of the pass (along, across, down) as columns, ITRS.
-        count: n.
-    """
-
-    parts: tuple[Part, ...]
-    axes: Array
-    count: int
-
-    @property
-    def columns(self) -> Indices:
-        """(n, w) unknowns of all parts."""
-        every = [np.zeros((self.count, 0), np.intp)]
-        for one in self.parts:
-            columns = one.first + 3 * one.number[:, :, None].astype(np.intp) + np.arange(3)
-            every.append(columns.reshape(self.count, -1))
-        return np.concatenate(every, axis=1)
-
-    def factors(self, turns: bool) -> tuple[Indices, Array]:
-        """Unknowns (n, w, 3) of the turns or of the shifts, and their coefficients (n, w, 3), SI."""
-        columns, factors = [np.zeros((self.count, 0, 3), np.intp)], [np.zeros((self.count, 0, 3))]
-        for one in self.parts:
-            if one.turns == turns:
-                columns.append(one.first + 3 * one.number[:, :, None].astype(np.intp) + np.arange(3))
-                factors.append(one.blend[:, :, None] * one.sigma)
-        return np.concatenate(columns, axis=1), np.concatenate(factors, axis=1)
-
-    def at(self, which: Indices, x: Array) -> tuple[Array, Array]:
-        """Turns (k, 3), radians, and shifts (k, 3) along the axes of the pass, metres."""
-        found = [np.zeros((len(which), 3)), np.zeros((len(which), 3))]
-        for one in self.parts:
-            found[0 if one.turns else 1] += one.value(which, x)
-        return found[0], found[1]
-
-    def slopes(self, which: Indices, by_turn: Array, by_station: Array) -> Array:
-        """(k, d, 3 a + 3 s) derivatives of d rows by the unknowns.
-
-        Args:
-            which: observations, (k,).
-            by_turn: derivatives by the rotation vector, (k, d, 3), 1/rad.
-            by_station: by the station, ITRS, (k, d, 3), 1/m.
-        """
-        count, depth = by_turn.shape[:2]
-        along = by_station @ self.axes
-        parts = [np.zeros((count, depth, 0))]
-        for one in self.parts:
-            by = (by_turn if one.turns else along) * one.sigma
-            parts.append((by[:, :, None, :] * one.blend[which][:, None, :, None]).reshape(count, depth, -1))
-        return np.concatenate(parts, axis=2)
-
-    def applied(self, which: Indices, x: Array, station: Array, attitude: Array) -> tuple[Array, Array, Array]:
-        """Corrected station (k, 3) and attitude (k, 3, 3), and the Jacobian (k, 3, 3) of the turn: a change of the
-        rotation vector as a small turn about the corrected body's axes.
-
-        Args:
-            which: observations, (k,).
-            x: all unknowns, (P,).
-            station: readings, ITRS, (k, 3), metres.
-            attitude: readings, body to ITRS, (k, 3, 3).
-        """
-        turn, shift = self.at(which, x)
-        matrix, jacobian = _rotation(turn)
-        return station + shift @ self.axes.T, attitude @ matrix, jacobian
-
-
-def _rotation(turn: Array) -> tuple[Array, Array]:
-    """Rotation matrices (k, 3, 3) of rotation vectors (k, 3), and their right Jacobians.
-
-    Series to the third order: turns are below a degree, so that 1e-9 of them is left out at most.
-    """
-    x, y, z = turn.T
-    zero = np.zeros_like(x)
-    skew = np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], axis=1)
-    square = skew @ skew
-    angle = np.sum(turn**2, axis=1)[:, None, None]
-    eye = np.eye(3)
-    return (
-        eye + (1.0 - angle / 6.0) * skew + (0.5 - angle / 24.0) * square,
-        eye - (0.5 - angle / 24.0) * skew + square / 6.0,
-    )
+    def taken(self, which: Indices, point: Indices) -> Packets:
+        """Some of the packets, (k,), whose points have other numbers, (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,18 +102,29 @@ class LineImage:
             ground: points of these packets, (k, 3), ITRS, metres.
         """
         rays, camera = self.rays, self.camera.drifted(self.unit * x[self.change])
-        station, attitude, jacobian = self.corrections.applied(which, x, rays.station[which], rays.attitude[which])
-        here = Rays(rays.point[which], rays.image[which], station, attitude)
-        by = partials(camera, here, ground, _NOTHING, _NOTHING)
-        miss = misclosure(camera, here, ground, _NOTHING, _NOTHING)
+        corrections = self.corrections.taken(which)
+        turn, shift = corrections.at(x)
+        attitude = rays.attitude[which]
+        arm = ground - rays.station[which] - shift @ corrections.axes.T
+        body = turned_back(turn, np.einsum("nji,nj->ni", attitude, arm))
+        seen = camera.seen(body, rays.image[which])
         white = self.white[which]
-        slopes = self.corrections.slopes(which, white @ by.attitude @ jacobian, -white @ by.ground)
-        changes = white @ (by.drift * self.unit)
+        by_body = white @ seen.by_body
+        by_measured = turned(turn, by_body)
+        by_ground = by_measured @ np.swapaxes(attitude, 1, 2)
+        # a small turn s of the body moves the arm by arm x s, and t . (arm x s) = (t x arm) . s
+        by_turn = by_rotation_vector(turn, cross(by_body, body[:, None]))
+        slopes = corrections.slopes(by_turn, -by_ground)
         return (
-            np.einsum("nij,nj->ni", white, miss),
-            np.concatenate([slopes, changes], axis=2),
-            white @ by.ground,
+            np.einsum("nij,nj->ni", white, seen.miss),
+            np.concatenate([slopes, white @ (seen.by_drift * self.unit)], axis=2),
+            by_ground,
         )
+
+    def taken(self, which: Indices, point: Indices) -> LineImage:
+        """See `Packets`."""
+        rays = replace(self.rays.taken(which), point=point)
+        return replace(self, rays=rays, white=self.white[which], corrections=self.corrections.taken(which))
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,8 +166,11 @@ class Pointings:
             x: all unknowns, (P,).
             ground: points of these packets, (k, 3), ITRS, metres.
         """
-        station, attitude, jacobian = self.corrections.applied(which, x, self.station[which], self.attitude[which])
-        arm = np.einsum("nji,nj->ni", attitude, ground - station)
+        corrections = self.corrections.taken(which)
+        turn, shift = corrections.at(x)
+        attitude = self.attitude[which]
+        arm = ground - self.station[which] - shift @ corrections.axes.T
+        arm = turned_back(turn, np.einsum("nji,nj->ni", attitude, arm))
         far = np.linalg.norm(arm, axis=1)
         unit = arm / far[:, None]
         aim = self.aim[which]
@@ -282,10 +188,23 @@ class Pointings:
         by_arm = np.concatenate(
             [unit[:, None] / self.sigma[0], across @ flat / (self.sigma[1] * far[:, None, None])], axis=1
         )
-        # a small turn s of the body moves the arm by arm x s
-        spun = np.stack([np.cross(arm, axis) for axis in np.eye(3)], axis=-1)
-        by_point = by_arm @ np.swapaxes(attitude, 1, 2)
-        return miss, self.corrections.slopes(which, by_arm @ spun @ jacobian, -by_point), by_point
+        by_turn = by_rotation_vector(turn, cross(by_arm, arm[:, None]))
+        by_point = turned(turn, by_arm) @ np.swapaxes(attitude, 1, 2)
+        return miss, corrections.slopes(by_turn, -by_point), by_point
+
+    def taken(self, which: Indices, point: Indices) -> Pointings:
+        """See `Packets`."""
+        rows = (self.station, self.attitude, self.aim, self.distance)
+        station, attitude, aim, distance = (row[which] for row in rows)
+        return replace(
+            self,
+            point=point,
+            station=station,
+            attitude=attitude,
+            aim=aim,
+            distance=distance,
+            corrections=self.corrections.taken(which),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,6 +245,10 @@ class FixedPoints:
         shift = x[self.datum] if len(self.datum) else np.zeros(3)
         miss = np.einsum("nij,nj->ni", white, ground - self.given[which] + shift)
         return miss, white[:, :, : len(self.datum)], white
+
+    def taken(self, which: Indices, point: Indices) -> FixedPoints:
+        """See `Packets`."""
+        return replace(self, point=point, given=self.given[which], white=self.white[which])
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,3 +292,8 @@ class Heights:
         above = np.sum(normal * (ground - self.place[which]), axis=1) - self.unit * float(x[self.common[0]])
         by_x = np.broadcast_to(-self.unit / sigma[:, None, None], (len(which), 1, 1))
         return (above / sigma)[:, None], by_x, (normal / sigma[:, None])[:, None]
+
+    def taken(self, which: Indices, point: Indices) -> Heights:
+        """See `Packets`."""
+        place, normal, sigma = self.place[which], self.normal[which], self.sigma[which]
+        return replace(self, point=point, place=place, normal=normal, sigma=sigma)

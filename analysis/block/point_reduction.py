@@ -9,7 +9,7 @@ with them is the reduced matrix.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,8 +19,9 @@ from scipy import sparse
 
 from analysis.block.packets import Packets
 from analysis.block.processes import BlockError
+from analysis.block.reweighting import standardised_packets
 
-__all__ = ["Bundle", "PriorGroup", "Reduced", "Reduction", "Rows"]
+__all__ = ["Bundle", "Checked", "Eliminated", "PriorGroup", "Reduced", "Reduction", "Rows", "State"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -28,6 +29,8 @@ _PIECE = 4_000
 """Points that are linearised at once."""
 _FLUSH = 4_000_000
 """Entries of the reduced matrix that are collected before they are added up."""
+_WHOLE = 10_000
+"""Unknowns up to which they are added up in a whole matrix, of 0.8 GB."""
 _LOOSE = 1e-10
 """1/m^2: a point's own weight where nothing else holds it; 100 km in each coordinate."""
 
@@ -56,12 +59,14 @@ class Bundle:
     Attributes:
         points: (n,).
         members: set and its packets (n,), in order.
-        columns: (W,) unknowns of all packets of a point one after the other; some may stand twice.
+        columns: (W,) unknowns of all packets of a point, each once.
+        places: of each member, where its unknowns stand among the columns.
     """
 
     points: Indices
     members: tuple[tuple[int, Indices], ...]
     columns: Indices
+    places: tuple[Indices, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,23 +80,62 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class Reduced:
-    """Equations at one state.
+class Eliminated:
+    """Equations of packets at one state, their points eliminated.
 
     Attributes:
-        data: (P, P) sparse, of the packets alone, points eliminated.
-        prior: (P, P) sparse, with the factors.
-        right: (P,) gradient of half the squares, with the priors, points eliminated.
+        data: (P, P) sparse.
+        right: (P,) gradient of half the squares.
         spread: (m, 3, 3) covariance of the points at known x. start: (m, 3) their steps where x stays.
         square: weighted squares of the packets by group.
     """
 
     data: sparse.csc_matrix
-    prior: sparse.csc_matrix
     right: Array
     spread: Array
     start: Array
     square: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced(Eliminated):
+    """Equations of packets and priors: `right` has the priors, too.
+
+    Attributes:
+        prior: (P, P) sparse, with the factors.
+    """
+
+    prior: sparse.csc_matrix
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where an iteration stands.
+
+    Attributes:
+        x: unknowns, (P,).
+        ground: points, (m, 3), ITRS, metres.
+        weight: set -> robust weights of its packets.
+        factor: group -> variance factor.
+    """
+
+    x: Array
+    ground: Array
+    weight: tuple[Array, ...]
+    factor: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """Packets beside what all others say.
+
+    Attributes:
+        standard: set -> (n, d) standardised residuals.
+        taken: group -> what the adjustment took of its observations: their count less their redundancy.
+    """
+
+    standard: tuple[Array, ...]
+    taken: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,37 +162,35 @@ class Reduction:
             columns = one.columns
             if not len(columns):
                 continue
-            table, code = (
-                np.unique(columns, axis=0, return_inverse=True)
-                if columns.shape[1]
-                else (np.zeros((1, 0), np.intp), np.zeros(len(columns), np.intp))
-            )
+            where, code = _distinct(columns)
             points.append(one.point)
-            codes.append(first + code.ravel())
-            owners.append(np.full(len(columns), k))
+            codes.append(first + code)
+            owners.append(np.full(len(columns), k, np.int32))
             places.append(np.arange(len(columns)))
-            tables += list(table)
-            first += len(table)
+            tables += list(columns[where])
+            first += len(where)
         if not points:
             raise BlockError("block: no observations")
-        point, code, owner, place = (np.concatenate(v) for v in (points, codes, owners, places))
-        order = np.lexsort((code, point))
-        point, code, owner, place = point[order], code[order], owner[order], place[order]
-        starts = np.flatnonzero(np.diff(point, prepend=-1))
+        order = np.lexsort((np.concatenate(codes), np.concatenate(points)))
+        every: list[Indices] = [np.concatenate(v).astype(np.intp)[order] for v in (points, codes, owners, places)]
+        point, code, owner, place = every
+        starts: Indices = np.flatnonzero(np.diff(point, prepend=-1))
         counts = np.diff(np.append(starts, len(point)))
         found = []
         for count in np.unique(counts).tolist():
             at = starts[counts == count][:, None] + np.arange(count)
-            kinds, kind = np.unique(code[at], axis=0, return_inverse=True)
-            sort = np.argsort(kind.ravel(), kind="stable")
-            for piece in np.split(sort, np.cumsum(np.bincount(kind.ravel(), minlength=len(kinds)))[:-1]):
+            kinds, kind = _distinct(code[at])
+            sort = np.argsort(kind, kind="stable")
+            for piece in np.split(sort, np.cumsum(np.bincount(kind, minlength=len(kinds)))[:-1]):
                 rows = at[piece]
-                members = tuple((int(owner[rows[0, j]]), place[rows[:, j]]) for j in range(count))
-                columns = np.concatenate([tables[c] for c in code[rows[0]].tolist()])
+                met = [tables[c] for c in code[rows[0]].tolist()]
+                meets = np.asarray(np.unique(np.concatenate(met)), np.intp)
+                standing = tuple(np.searchsorted(meets, one) for one in met)
                 # a long bundle is cut, so that its rows have bounded memory
                 for a in range(0, len(rows), _PIECE):
-                    part = tuple((k, w[a : a + _PIECE]) for k, w in members)
-                    found.append(Bundle(point[rows[a : a + _PIECE, 0]], part, columns))
+                    part = rows[a : a + _PIECE]
+                    members = tuple((int(owner[part[0, j]]), place[part[:, j]]) for j in range(count))
+                    found.append(Bundle(point[part[:, 0]], members, meets, standing))
         return tuple(found)
 
     @cached_property
@@ -172,16 +214,11 @@ class Reduction:
             found[one.point] = True
         return found
 
-    def rows(
-        self, x: Array, ground: Array, weight: Sequence[Array], factor: Mapping[str, float], weighted: bool = True
-    ) -> Iterator[Rows]:
+    def rows(self, at: State, weighted: bool = True) -> Iterator[Rows]:
         """Rows of all bundles, in the order of `pieces`.
 
         Args:
-            x: unknowns, (P,).
-            ground: points, (m, 3), ITRS, metres.
-            weight: set -> robust weights of its packets.
-            factor: group -> variance factor.
+            at: state.
             weighted: whether rows are multiplied by the roots of their weights.
         """
         for piece in self.pieces:
@@ -193,9 +230,9 @@ class Reduction:
             for k, several in wanted.items():
                 which = np.concatenate(several)
                 packets = self.sets[k]
-                miss, by_x, by_point = packets.linearised(which, x, ground[packets.point[which]])
+                miss, by_x, by_point = packets.linearised(which, at.x, at.ground[packets.point[which]])
                 if weighted:
-                    root = np.sqrt(weight[k][which] / factor.get(packets.group, 1.0))
+                    root = np.sqrt(at.weight[k][which] / at.factor.get(packets.group, 1.0))
                     miss, by_x, by_point = (
                         root[:, None] * miss,
                         root[:, None, None] * by_x,
@@ -206,31 +243,37 @@ class Reduction:
                 n, width = len(one.points), len(one.columns)
                 depth = sum(self.sets[k].rows for k, _ in one.members)
                 rows = Rows(one, np.zeros((n, depth, width)), np.empty((n, depth, 3)), np.empty((n, depth)))
-                d = c = 0
-                for k, which in one.members:
+                d = 0
+                for (k, which), place in zip(one.members, one.places, strict=True):
                     a = used[k]
                     used[k] = b = a + len(which)
                     miss, by_x, by_point = (v[a:b] for v in parts[k])
                     rows.miss[:, d : d + miss.shape[1]] = miss
                     rows.by_point[:, d : d + miss.shape[1]] = by_point
-                    rows.by_x[:, d : d + miss.shape[1], c : c + by_x.shape[2]] = by_x
-                    d, c = d + miss.shape[1], c + by_x.shape[2]
+                    rows.by_x[:, d : d + miss.shape[1], place] = by_x
+                    d += miss.shape[1]
                 yield rows
 
-    def reduced(self, x: Array, ground: Array, weight: Sequence[Array], factor: Mapping[str, float]) -> Reduced:
-        """Equations at a state.
+    def reduced(self, at: State) -> Reduced:
+        """Equations of packets and priors at a state."""
+        return self.with_priors(self.eliminated(at), at)
 
-        Args:
-            x: unknowns, (P,).
-            ground: points, (m, 3), ITRS, metres.
-            weight: set -> robust weights of its packets.
-            factor: group -> variance factor.
-        """
+    def with_priors(self, found: Eliminated, at: State) -> Reduced:
+        """The equations of the packets with what is known beforehand."""
+        departed = np.zeros(self.size)
+        for one in self.priors:
+            pull = one.precision @ (at.x[one.columns] - one.mean) / at.factor.get(one.group, 1.0)
+            np.add.at(departed, one.columns, pull)
+        right = found.right + departed
+        return Reduced(found.data, right, found.spread, found.start, found.square, self.prior(at.factor))
+
+    def eliminated(self, at: State) -> Eliminated:
+        """Equations of the packets at a state."""
         data = _Collected(self.size)
         right = np.zeros(self.size)
         spread, start = np.zeros((self.count, 3, 3)), np.zeros((self.count, 3))
         square = dict.fromkeys((one.group for one in self.sets), 0.0)
-        for rows in self.rows(x, ground, weight, factor):
+        for rows in self.rows(at):
             a, b, m = rows.by_x, rows.by_point, rows.miss
             turned = np.swapaxes(b, 1, 2)
             own = turned @ b + _LOOSE * np.eye(3)
@@ -243,19 +286,14 @@ class Reduction:
             half = (np.swapaxes(root, 1, 2) @ cross).reshape(3 * n, width)
             step = np.einsum("nij,nj->ni", inverse, pull)
             data.add(rows.bundle.columns, flat.T @ flat - half.T @ half)
-            np.add.at(right, rows.bundle.columns, flat.T @ m.ravel() - cross.reshape(3 * n, width).T @ step.ravel())
+            right[rows.bundle.columns] += flat.T @ m.ravel() - cross.reshape(3 * n, width).T @ step.ravel()
             spread[rows.bundle.points], start[rows.bundle.points] = inverse, -step
             d = 0
             for k, _ in rows.bundle.members:
                 depth = self.sets[k].rows
                 square[self.sets[k].group] += float(np.sum(m[:, d : d + depth] ** 2))
                 d += depth
-        prior = self.prior(factor)
-        departed = np.zeros(self.size)
-        for one in self.priors:
-            pull = one.precision @ (x[one.columns] - one.mean) / factor.get(one.group, 1.0)
-            np.add.at(departed, one.columns, pull)
-        return Reduced(data.total(), prior, right + departed, spread, start, square)
+        return Eliminated(data.total(), right, spread, start, square)
 
     def prior(self, factor: Mapping[str, float]) -> sparse.csc_matrix:
         """(P, P) precision of the unknowns beforehand, with the factors."""
@@ -277,37 +315,111 @@ class Reduction:
             found[one.group] = found.get(one.group, 0.0) + value
         return found
 
-    def point_steps(
-        self, x: Array, ground: Array, weight: Sequence[Array], factor: Mapping[str, float], at: Reduced, step: Array
-    ) -> Array:
+    def point_steps(self, at: State, found: Eliminated, step: Array) -> Array:
         """(m, 3) change of the points that goes with a change of the unknowns.
 
         Args:
-            x: unknowns, (P,).
-            ground: points, (m, 3), ITRS, metres.
-            weight: set -> robust weights of its packets.
-            factor: group -> variance factor.
-            at: equations of this state.
+            at: state.
+            found: equations of this state.
             step: change of the unknowns, (P,).
         """
-        found = at.start.copy()
-        for rows in self.rows(x, ground, weight, factor):
-            moved = rows.by_x @ step[rows.bundle.columns]
-            pull = np.einsum("nij,ni->nj", rows.by_point, moved)
-            found[rows.bundle.points] -= np.einsum("nij,nj->ni", at.spread[rows.bundle.points], pull)
-        return found
+        moved = found.start.copy()
+        for rows in self.rows(at):
+            pulled = np.einsum("nij,j->ni", rows.by_x, step[rows.bundle.columns])
+            pull = np.einsum("nij,ni->nj", rows.by_point, pulled)
+            moved[rows.bundle.points] -= np.einsum("nij,nj->ni", found.spread[rows.bundle.points], pull)
+        return moved
+
+    def checked(self, at: State, spread: Array, covariance: Callable[[Indices], Array]) -> Checked:
+        """Residuals over their standard deviations, and what the adjustment took of the observations.
+
+        Args:
+            at: state.
+            spread: covariance of the points at known x, (m, 3, 3).
+            covariance: of some unknowns (w,): (w, w).
+        """
+        sets = self.sets
+        standard = [np.zeros((len(one.point), one.rows)) for one in sets]
+        taken = dict.fromkeys((one.group for one in sets), 0.0)
+        for rows in self.rows(at, weighted=False):
+            where = rows.bundle.points
+            weights = np.concatenate(
+                [
+                    np.repeat((at.weight[k][w] / at.factor[sets[k].group])[:, None], sets[k].rows, axis=1)
+                    for k, w in rows.bundle.members
+                ],
+                axis=1,
+            )
+            inner = spread[where]
+            moved = inner @ np.swapaxes(rows.by_point * weights[:, :, None], 1, 2) @ rows.by_x
+            through = rows.by_x - rows.by_point @ moved
+            shared = covariance(rows.bundle.columns)
+            d = 0
+            for k, which in rows.bundle.members:
+                depth = sets[k].rows
+                part, by_point = through[:, d : d + depth], rows.by_point[:, d : d + depth]
+                told = np.tensordot(part, shared, 1)
+                cofactor = told @ np.swapaxes(part, 1, 2) + by_point @ inner @ np.swapaxes(by_point, 1, 2)
+                weight, unit = at.weight[k][which], at.factor[sets[k].group]
+                standard[k][which] = standardised_packets(rows.miss[:, d : d + depth], cofactor, weight, unit)
+                taken[sets[k].group] += float(np.sum(weight * np.trace(cofactor, axis1=1, axis2=2)) / unit)
+                d += depth
+        return Checked(tuple(standard), taken)
+
+    def packets_at(self, points: Indices) -> tuple[Indices, ...]:
+        """Set -> which of its packets observe some of the points, (k,)."""
+        wanted = np.zeros(self.count, bool)
+        wanted[points] = True
+        return tuple(np.flatnonzero(wanted[one.point]) for one in self.sets)
+
+    def restricted(self, points: Indices) -> Reduction:
+        """The packets of some of the points alone, which are counted in this order; without priors."""
+        number = np.full(self.count, -1)
+        number[points] = np.arange(len(points))
+        packets = self.packets_at(points)
+        sets = tuple(one.taken(which, number[one.point[which]]) for one, which in zip(self.sets, packets, strict=True))
+        return Reduction(sets, (), self.size, len(points))
+
+    def state_of(self, points: Indices, at: State) -> State:
+        """What of a state a restricted reduction has."""
+        weight = tuple(w[which] for w, which in zip(at.weight, self.packets_at(points), strict=True))
+        return State(at.x, at.ground[points], weight, at.factor)
+
+
+def _distinct(rows: Indices) -> tuple[Indices, Indices]:
+    """Where each distinct row (n, w) of whole numbers stands first (k,), in their order, and which each row is (n,)."""
+    if not rows.shape[1]:
+        return np.zeros(1, np.intp), np.zeros(len(rows), np.intp)
+    # a product of odd numbers wraps around and tells rows apart all but surely; whether it did is looked at
+    factors = np.random.default_rng(0).integers(1, 2**62, rows.shape[1]) * 2 + 1
+    with np.errstate(over="ignore"):
+        key = rows.astype(np.int64) @ factors
+    _, where, code = np.unique(key, return_index=True, return_inverse=True)
+    code = code.ravel()
+    if not np.array_equal(rows[where][code], rows):
+        _, where, code = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    # in the order of the numbers, so that neighbours in time stay neighbours
+    order = np.lexsort(rows[where].T[::-1])
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return np.asarray(where[order], np.intp), np.asarray(rank[code.ravel()], np.intp)
 
 
 class _Collected:
-    """A sum of dense blocks at indices, in a sparse matrix."""
+    """A sum of dense blocks at indices, whole where the unknowns are few and else in a sparse matrix."""
 
     def __init__(self, size: int) -> None:
         self.size = size
+        self.whole = np.zeros((size, size)) if size <= _WHOLE else None
         self.sum = sparse.csc_matrix((size, size))
         self.parts: list[tuple[Indices, Indices, Array]] = []
         self.entries = 0
 
     def add(self, columns: Indices, block: Array) -> None:
+        """Add a block (w, w) at its columns, of which none stands twice."""
+        if self.whole is not None:
+            self.whole[columns[:, None], columns] += block
+            return
         width = len(columns)
         self.parts.append((np.repeat(columns, width), np.tile(columns, width), block.ravel()))
         self.entries += width**2
@@ -315,11 +427,14 @@ class _Collected:
             self.flush()
 
     def flush(self) -> None:
+        """Add up what was collected."""
         if self.parts:
             row, column, value = (np.concatenate(v) for v in zip(*self.parts, strict=True))
             self.sum = self.sum + sparse.csc_matrix((value, (row, column)), shape=(self.size, self.size))
         self.parts, self.entries = [], 0
 
     def total(self) -> sparse.csc_matrix:
+        """The sum, made symmetric."""
         self.flush()
-        return 0.5 * (self.sum + self.sum.T)
+        found = self.sum if self.whole is None else sparse.csc_matrix(self.whole)
+        return 0.5 * (found + found.T)

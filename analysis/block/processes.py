@@ -8,12 +8,16 @@ with unknowns z whose prior is that of the process at unit size, the same about 
 
 - `constant`: one z of variance 1. `rate`: one, times the seconds from the middle of the scope.
 - `white`: readings at whole multiples of `interval`, independent, joined by the cubic spline through them
-  (`analysis.orbit.shared_noise` has the algebra). sigma is that of a reading.
+  (`analysis.orbit.ray_noise` has the algebra). sigma is that of a reading.
 - `walk`: a random walk that is zero at the middle of the scope; sigma is what it gains in a second.
 - `slow`: a first-order Gauss-Markov process of standard deviation sigma and correlation time `time`.
 - `orbital`: amplitudes of cosine and sine of 2 pi t / `time`, of standard deviation sigma each.
+- `jitter`: the same at `frequency`, each amplitude a slow process of standard deviation sigma and correlation time
+  `time`, so that sigma is the root mean square of the oscillation. It is a line of the spectrum of width 1 / (pi time):
+  a frequency that is known to s keeps its phase for 1 / (2 pi s).
 
-A walk and a slow process have unknowns at whole multiples of `interval` and are straight lines between them.
+A walk, a slow process and amplitudes of jitter have unknowns at whole multiples of `interval` and are straight lines
+between them.
 """
 
 from __future__ import annotations
@@ -26,14 +30,16 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from analysis.measurement_error import MeasurementError
-from analysis.orbit.shared_noise import spline_blend, spline_precision
+from analysis.orbit.ray_noise import spline_blend, spline_precision
 
-__all__ = ["BlockError", "Kind", "Law", "Support"]
+__all__ = ["STEPPED", "BlockError", "Kind", "Law", "Support"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital"]
-KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital")
+Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
+KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital", "jitter")
+STEPPED = ("white", "walk", "slow", "jitter")
+"""Laws with unknowns at multiples of an interval."""
 _GAP = 18
 """Stretches of a spline's unknowns this far apart correlate by 1e-9 and are kept apart."""
 _MOST = 1e5
@@ -54,8 +60,9 @@ class Law:
         group: its name, and that of its variance component.
         kind: of process, see the module.
         sigma: about or along three axes, radians or metres; of a rate per second, of a walk in a second.
-        interval: between the unknowns of `white`, `walk` and `slow`, seconds.
-        time: correlation time of `slow`, period of `orbital`, seconds.
+        interval: between the unknowns of `white`, `walk`, `slow` and `jitter`, seconds.
+        time: correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
+        frequency: of `jitter`, hertz.
     """
 
     group: str
@@ -63,6 +70,7 @@ class Law:
     sigma: tuple[float, float, float]
     interval: float = 1.0
     time: float = 0.0
+    frequency: float = 0.0
 
     def check(self) -> None:
         """Raises BlockError for numbers that cannot be used."""
@@ -70,9 +78,11 @@ class Law:
             raise BlockError(f"block: {self.group}: a law is one of {', '.join(KINDS)}, found {self.kind!r}")
         if len(self.sigma) != 3 or not np.all(np.isfinite(self.sigma)) or min(self.sigma) < 0:
             raise BlockError(f"block: {self.group}: three sigmas that are finite and not negative, found {self.sigma}")
-        if self.kind in ("white", "walk", "slow") and not (np.isfinite(self.interval) and self.interval > 0):
+        if self.kind in STEPPED and not (np.isfinite(self.interval) and self.interval > 0):
             raise BlockError(f"block: {self.group}: the interval must be positive, found {self.interval}")
-        if self.kind in ("slow", "orbital") and not (np.isfinite(self.time) and self.time > 0):
+        if self.kind == "jitter" and not (np.isfinite(self.frequency) and self.frequency > 0):
+            raise BlockError(f"block: {self.group}: the frequency must be positive, found {self.frequency}")
+        if self.kind in ("slow", "orbital", "jitter") and not (np.isfinite(self.time) and self.time > 0):
             raise BlockError(f"block: {self.group}: correlation time or period must be positive, found {self.time}")
 
     def spread(self, seconds: float) -> tuple[float, float, float]:
@@ -88,7 +98,8 @@ class Support:
 
     Attributes:
         law: which.
-        numbers: (k,) of the unknowns of one axis: multiples of the interval where there is one, else 0, 1.
+        numbers: (k,) of the unknowns of one axis: multiples of the interval where there is one, else 0, 1; of jitter
+            twice the multiple for the cosine, and one more for the sine.
         middle: time at which a rate vanishes, seconds.
         precision: (k, k) sparse, of the unknowns of one axis.
     """
@@ -142,6 +153,9 @@ class Support:
         kept = np.exp(-step / law.time)
         precision = _chain(kept, 1.0 - kept**2).tolil()
         precision[0, 0] += 1.0
+        if law.kind == "jitter":
+            both = (2 * numbers[:, None] + np.arange(2)).ravel()
+            return cls(law, both, middle, sparse.csr_matrix(sparse.kron(precision, sparse.eye(2))))
         return cls(law, numbers, middle, sparse.csr_matrix(precision))
 
     @property
@@ -150,7 +164,10 @@ class Support:
         return 3 * len(self.numbers)
 
     def blend(self, times: Array) -> tuple[Indices, Array]:
-        """Which numbers (n, w) of an axis' unknowns each time meets, counted from 0, and by how much (n, w)."""
+        """Which numbers (n, w) of an axis' unknowns each time meets, counted from 0, and by how much (n, w).
+
+        A time far from all observations meets nothing.
+        """
         count, law = len(times), self.law
         if law.kind == "constant":
             return np.zeros((count, 1), np.intp), np.ones((count, 1))
@@ -161,11 +178,17 @@ class Support:
             return np.tile(np.arange(2), (count, 1)), np.stack([np.cos(phase), np.sin(phase)], axis=1)
         if law.kind == "white":
             first, values = spline_blend(times, law.interval)
-            return np.searchsorted(self.numbers, first[:, None] + np.arange(4)), values
-        first = np.asarray(np.floor(times / law.interval), np.intp)
-        share = times / law.interval - first
-        where = np.searchsorted(self.numbers, np.stack([first, first + 1], axis=1))
-        return where, np.stack([1.0 - share, share], axis=1)
+            wanted = first[:, None] + np.arange(4)
+        else:
+            first = np.asarray(np.floor(times / law.interval), np.intp)
+            share = times / law.interval - first
+            wanted, values = np.stack([first, first + 1], axis=1), np.stack([1.0 - share, share], axis=1)
+            if law.kind == "jitter":
+                phase = 2.0 * np.pi * law.frequency * times
+                wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+                wanted, values = 2 * first[:, None] + np.arange(4), np.repeat(values, 2, axis=1) * np.tile(wave, 2)
+        where = np.minimum(np.searchsorted(self.numbers, wanted), len(self.numbers) - 1)
+        return where, np.where(self.numbers[where] == wanted, values, 0.0)
 
     def whitened(self) -> Array:
         """(k, k) dense root R of the precision, R R' = precision: R' z are independent and in order of time."""

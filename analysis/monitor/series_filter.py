@@ -27,7 +27,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from analysis.chi_square import limit_of
 from analysis.measurement_error import UndeterminedError
@@ -231,14 +231,14 @@ class SeriesFilter:
         for one in self.steps:
             if one.moment is not None:
                 does = self.space.level_doing
-                out.append(does @ one.moment @ does.T)
+                out.append(_even(does @ one.moment @ does.T))
                 continue
             together = np.zeros((self.space.size, self.space.size))
             for motions, variance in one.parts:
                 own = list(motions)
                 level = self.space.level_of(own)
                 together += variance * level @ self.stated.correlation[np.ix_(own, own)] @ level.T
-            out.append(together)
+            out.append(_even(together))
         return out
 
     @cached_property
@@ -248,6 +248,8 @@ class SeriesFilter:
 
     def _stepped(self, covariance: Array, then: float, now: float) -> Array:
         """With the steps that come after one time and not after another."""
+        if not self.steps:
+            return covariance
         ends = self._step_ends
         for k in np.flatnonzero((ends[:, 1] > then) & (ends[:, 0] <= now)).tolist():
             one = self.steps[k]
@@ -271,11 +273,9 @@ class SeriesFilter:
 
     @cached_property
     def _walk(self) -> Array:
-        """(n, m) what one of these does to the states, over the root of its rate."""
+        """(r, m) what one of these does to the states of the level, over the root of its rate."""
         rates = np.array([1.0 / float(self.stated.laws[k].every_s or 1.0) for k in self.walking])
-        if not len(rates):
-            return np.zeros((self.space.size, 0))
-        return self.space.level_of(self.walking.tolist()) * np.sqrt(rates)
+        return self.space.level_of(self.walking.tolist())[self.space.level] * np.sqrt(rates)
 
     def looks(self, between: ArrayLike) -> Array:
         """By how much the chance of one look for a jump is to be multiplied for that of all in the whole life.
@@ -322,9 +322,10 @@ class SeriesFilter:
         covariance = self._stepped(space.spread(track.covariance, then, now), then, now)
         if left is not None and len(left):
             walk = self._walk * np.sqrt(left * (now - then))
-            covariance = covariance + walk @ walk.T
+            covariance[space.level, space.level] += walk @ walk.T
         mean = space.moved(track.mean[:, None], then, now)[:, 0]
-        return replace(track, mean=mean, covariance=covariance, response=space.moved(track.response, then, now))
+        response = space.moved(track.response, then, now) if len(track.response) else track.response
+        return Track(mean, covariance, response, track.score, track.information)
 
     def update(self, belief: Belief, observed: Observed) -> tuple[Belief, Innovation]:
         """Take one reading.
@@ -339,8 +340,8 @@ class SeriesFilter:
         now = self.at(belief, observed.time)
         if observed.spots and self._may and observed.time > belief.last:
             now = self._with_step(now, belief.last, observed.time)
-        state, found = self._taken(now.state, observed)
-        search = None if now.search is None else self._taken(now.search, observed)[0]
+        state, found = self.taken(now.state, observed)
+        search = None if now.search is None else self.taken(now.search, observed)[0]
         last = observed.time if observed.spots else now.last
         now = replace(now, state=state, search=search, last=last)
         if not (observed.spots and self._may and len(now.until)):
@@ -406,20 +407,26 @@ class SeriesFilter:
         expected, rows, noise, picked = self.read(track.mean, track.covariance, observed)
         across = track.covariance @ rows.T
         spread = rows @ across + noise
-        try:
-            root = np.asarray(np.linalg.cholesky(spread), np.float64)
-        except np.linalg.LinAlgError as error:
-            raise UndeterminedError("filter: readings that say the same twice need noise") from error
+        # LAPACK itself: what NumPy and SciPy do about it takes longer than matrices of this size
+        root, failed = dpotrf(spread, lower=1, clean=1)
+        if failed:
+            raise UndeterminedError("filter: readings that say the same twice need noise")
         both = np.concatenate([(observed.value - expected)[:, None], rows, across.T, picked], axis=1)
-        both = solve_triangular(root, both, lower=True, check_finite=False)
+        both, _ = dtrtrs(root, both, lower=1)
         n = len(track.mean)
         return Whitened(root, both[:, 0], both[:, 1 : n + 1], both[:, n + 1 : 2 * n + 1], both[:, 2 * n + 1 :])
 
-    def _taken(self, track: Track, observed: Observed) -> tuple[Track, Innovation]:
-        w = self.whitened(track, observed)
-        covariance = track.covariance - w.gain.T @ w.gain
-        covariance = 0.5 * (covariance + covariance.T)
-        log_score = -0.5 * float(w.white @ w.white) - float(np.log(np.diag(w.root)).sum())
+    def taken(self, track: Track, observed: Observed, w: Whitened | None = None) -> tuple[Track, Innovation]:
+        """Take one reading into a filter.
+
+        Args:
+            track: at its time.
+            observed: the reading.
+            w: as `whitened` has it, if that is known.
+        """
+        w = self.whitened(track, observed) if w is None else w
+        covariance = track.covariance - w.gain.T @ w.gain  # symmetric to the bit, as the product is
+        log_score = -0.5 * float(w.white @ w.white) - float(np.log(w.root.diagonal()).sum())
         log_score -= 0.5 * len(w.white) * math.log(2.0 * math.pi)
         response, score, information = track.response, track.score, track.information
         if len(score):
@@ -571,6 +578,11 @@ class SeriesFilter:
             return rows @ mean, rows @ covariance @ rows.T + left
         values, rows, beside = self.space.acting(rows, mean, covariance)
         return values, rows @ covariance @ rows.T + left + beside
+
+
+def _even(square: Array) -> Array:
+    """A covariance, symmetric to the bit."""
+    return np.asarray(0.5 * (square + square.T))
 
 
 def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:

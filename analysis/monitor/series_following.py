@@ -23,7 +23,7 @@ from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesF
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.untold_jumps import added
 
-__all__ = ["Followed", "follow", "hinted", "smoothed"]
+__all__ = ["Followed", "follow", "hinted", "jointly", "smoothed"]
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
@@ -113,17 +113,19 @@ def hinted(
     """
     if not how.jumpers or not observed:
         return list(left)
-    levels = [how.space.level_of(one.motions) @ one.root for one in how.jumpers]
-    score = [np.empty((len(observed), level.shape[1])) for level in levels]
-    information = [np.empty((len(observed), level.shape[1], level.shape[1])) for level in levels]
+    at = how.space.level
+    levels = [how.space.level_of(one.motions)[at] @ one.root for one in how.jumpers]
+    scores = np.empty((len(observed), at.stop - at.start))
+    known_of = np.empty((*scores.shape, scores.shape[1]))
 
     def note(number: int, carried: Array, known: Array) -> None:
-        for level, own_score, own_information in zip(levels, score, information, strict=True):
-            own_score[number], own_information[number] = carried @ level, level.T @ known @ level
+        scores[number], known_of[number] = carried[at], known[at, at]
 
     plain = replace(knowing, unfound=False)
     none = np.zeros(0)
     smoothed(plain, replace(start, left=none), observed, none, [none] * len(observed), knowing.parameters_of, note)
+    score = [scores @ level for level in levels]
+    information = [level.T @ (known_of @ level) for level in levels]
     gap = np.diff([one.time for one in observed], prepend=observed[0].time)
     place = {k: i for i, k in enumerate(how.walking.tolist())}
     out = np.array(left)
@@ -160,7 +162,8 @@ def smoothed(
     for k, one in enumerate(observed):
         if k and k % _PIECE == 0:
             beliefs.append(belief)
-        belief, _ = how.update(replace(belief, left=left[k]), one)
+        there = how.at(replace(belief, left=left[k]), one.time)
+        belief = replace(there, state=how.taken(there.state, one)[0])
     out: dict[int, T] = {}
     size, moved = how.space.size, how.space.moved
     carried, known = np.zeros(size), np.zeros((size, size))
@@ -194,6 +197,66 @@ def smoothed(
     return [out[k] for k in range(len(times))]
 
 
+def jointly(
+    how: SeriesFilter, start: Belief, observed: Sequence[Observed], wanted: ArrayLike, left: Sequence[Array]
+) -> tuple[Array, Array]:
+    """What all readings say of times past together: values (T, P) of the parameters, and their covariance (T, P, T, P).
+
+    The states at the wanted times go along with the filter, as copies that move no more, up to the last of them; what
+    comes after that is what the smoother carries back to it.
+
+    Args:
+        how: a filter that looks for no jumps, since it knows of them.
+        start: what is known before the first reading.
+        observed: N readings in the order of time.
+        wanted: (T,) times, seconds, in order, none before ``start``.
+        left: as of `smoothed`.
+    """
+    times, space = np.asarray(wanted, np.float64), how.space
+    size, ahead = space.size, 0
+    behind = np.searchsorted(np.array([one.time for one in observed]), times, side="right")
+    last = int(behind[-1]) if len(times) else 0
+    means, own = np.empty((0, size)), np.empty((0, size, 0, size))
+    across, belief = np.empty((0, size, size)), start  # of each copy, the states now with it
+    for k in range(last + 1):
+        if k < len(observed):
+            belief = replace(belief, left=left[k])
+        while ahead < len(times) and behind[ahead] == k:
+            across = space.moved(across, belief.time, times[ahead])
+            belief = how.at(belief, times[ahead])
+            own = np.concatenate([own, across.transpose(0, 2, 1)[:, :, None]], axis=2)
+            row = np.concatenate([across.transpose(1, 0, 2), belief.covariance[:, None]], axis=1)
+            own, across = np.concatenate([own, row[None]]), np.concatenate([across, belief.covariance[None]])
+            means = np.concatenate([means, belief.mean[None]])
+            ahead += 1
+        if k == last:
+            break
+        across = space.moved(across, belief.time, observed[k].time)
+        there = how.at(belief, observed[k].time)
+        whitened = how.whitened(there.state, observed[k])
+        gain = whitened.rows @ across
+        means = means + np.einsum("kdn,d->kn", gain, whitened.white)
+        own = own - np.einsum("kdn,ldm->knlm", gain, gain)
+        across = across - whitened.gain.T @ gain
+        belief = replace(there, state=how.taken(there.state, observed[k], whitened)[0])
+    after: list[tuple[Array, Array]] = []
+
+    def note(number: int, carried: Array, known: Array) -> None:
+        if number == 0:
+            after.append((carried, known))
+
+    smoothed(how, belief, observed[last:], np.zeros(0), left[last:], how.parameters_of, note)
+    for carried, known in after:
+        until = observed[last].time
+        back = space.moved(carried[:, None], belief.time, until, back=True)[:, 0]
+        both = space.moved_both(known, belief.time, until, back=True)
+        means = means + np.einsum("kmn,m->kn", across, back)
+        own = own - np.einsum("kmn,mo,lop->knlp", across, both, across, optimize=True)
+    values, covariance = space.outputs_jointly(means, own, times)
+    width = space.width
+    return values[:, width:], covariance[:, width:, :, width:]
+
+
 def _again(
     how: SeriesFilter, belief: Belief, observed: Sequence[Observed], left: Sequence[Array]
 ) -> Iterator[tuple[Belief, Whitened]]:
@@ -201,5 +264,6 @@ def _again(
     for one, share in zip(observed, left, strict=True):
         before = replace(belief, left=share)
         there = how.at(before, one.time)
-        yield before, how.whitened(there.state, one)
-        belief, _ = how.update(there, one)
+        whitened = how.whitened(there.state, one)
+        yield before, whitened
+        belief = replace(there, state=how.taken(there.state, one, whitened)[0])

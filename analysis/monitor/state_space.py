@@ -16,6 +16,7 @@ which what heat really does to light is larger than computed: the product of the
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -90,6 +91,22 @@ class _Block:
 
 
 @dataclass(frozen=True, eq=False)
+class _Transition:
+    """Of the states over an interval.
+
+    Attributes:
+        kept: (n,) what is left of each; kept_both: (n, n) of the product of two.
+        turned: of each law with a period its states, and the matrix by which they turn.
+        gained: (n, n) covariance that laws without events add meanwhile.
+    """
+
+    kept: Array
+    kept_both: Array
+    turned: tuple[tuple[slice, Array], ...]
+    gained: Array
+
+
+@dataclass(frozen=True, eq=False)
 class StateSpace:
     """The process of all disturbances, and of the error of the reference that all shifts are counted from.
 
@@ -148,7 +165,8 @@ class StateSpace:
             for law in filter(_is_level, laws):
                 mine = own[law] & ~raw
                 at = basis.T @ (outputs[:, mine] / scale)
-                steps.append((law, at @ stated.correlation[np.ix_(mine, mine)] @ at.T))
+                come = at @ stated.correlation[np.ix_(mine, mine)] @ at.T
+                steps.append((law, 0.5 * (come + come.T)))
             none = np.zeros((basis.shape[1],) * 2)
             add("level", TimeLaw(), scale * basis, none, np.flatnonzero(level), tuple(steps))
         for law in laws:
@@ -191,6 +209,11 @@ class StateSpace:
         """
         own = list(motions)
         return np.concatenate([self.stated.spots[:, own], self.stated.parameters[:, own]])
+
+    @property
+    def level(self) -> slice:
+        """States that steps change, all others being untouched by them."""
+        return self._blocks[0].at if self._blocks else slice(0, 0)
 
     def level_of(self, motions: Sequence[int]) -> Array:
         """(n, m) change of the states by steps of motions of one standard deviation each.
@@ -249,13 +272,10 @@ class StateSpace:
         """
         if now == then:
             return states
-        kept, turned = self._transition(now - then)
-        out = np.asarray(states * kept[:, None])
-        for cosine, sine, angle in turned:
-            c, s = math.cos(angle), math.sin(-angle if back else angle)
-            first, second = out[..., cosine, :].copy(), out[..., sine, :].copy()
-            out[..., cosine, :] = c * first - s * second
-            out[..., sine, :] = s * first + c * second
+        over = self._transition(now - then)
+        out = np.asarray(states * over.kept[:, None])
+        for at, turn in over.turned:
+            out[..., at, :] = (turn.T if back else turn) @ out[..., at, :]
         return out
 
     def moved_both(self, square: Array, then: float, now: float, back: bool = False) -> Array:
@@ -269,26 +289,44 @@ class StateSpace:
         """
         if now == then:
             return square
-        kept, turned = self._transition(now - then)
-        if not turned:
-            return np.asarray(square * (kept[:, None] * kept))
-        out = self.moved(self.moved(square, then, now, back).T, then, now, back)
-        return np.asarray(0.5 * (out + out.T))
+        over = self._transition(now - then)
+        out = np.asarray(square * over.kept_both)
+        for at, turn in over.turned:
+            turn = turn.T if back else turn
+            strip = turn @ out[at]
+            own = strip[:, at] @ turn.T
+            strip[:, at] = 0.5 * (own + own.T)
+            out[at], out[:, at] = strip, strip.T
+        return out
 
-    def _transition(self, over: float) -> tuple[Array, list[tuple[slice, slice, float]]]:
+    def _transition(self, over: float) -> _Transition:
         if over not in self._transitions:
             if len(self._transitions) > _INTERVALS:
                 self._transitions.clear()
-            kept, turned = np.ones(self.size), []
+            kept, turned, gained = np.ones(self.size), [], np.zeros((self.size, self.size))
             for block in self._blocks:
                 kept[block.at] = _kept(block.law, over)
-                if block.law.period_s is not None:
-                    turned.append((*_halves(block.at), 2.0 * math.pi * over / block.law.period_s))
-            self._transitions[over] = kept, turned
+                if not block.law.event:
+                    self._add(gained, block, (1.0 - _kept(block.law, over) ** 2) * block.covariance)
+            for at, period, still, quarter in self._turning:
+                angle = 2.0 * math.pi * over / period
+                turned.append((at, math.cos(angle) * still + math.sin(angle) * quarter))
+            self._transitions[over] = _Transition(kept, kept[:, None] * kept, tuple(turned), gained)
         return self._transitions[over]
 
     @cached_property
-    def _transitions(self) -> dict[float, tuple[Array, list[tuple[slice, slice, float]]]]:
+    def _turning(self) -> list[tuple[slice, float, Array, Array]]:
+        """Of each law with a period its states, the period, and the turns of them by nothing and by a quarter."""
+        own = [block for block in self._blocks if block.law.period_s is not None]
+        quarters = [np.kron([[0.0, -1.0], [1.0, 0.0]], np.eye(block.rank)) for block in own]
+        periods = [float(block.law.period_s or 0.0) for block in own]
+        return [
+            (b.at, t, np.eye(2 * b.rank), np.asarray(q, np.float64))
+            for b, t, q in zip(own, periods, quarters, strict=True)
+        ]
+
+    @cached_property
+    def _transitions(self) -> dict[float, _Transition]:
         """Those of the last intervals: readings mostly come at the same few."""
         return {}
 
@@ -302,15 +340,22 @@ class StateSpace:
         """
         if now == then:
             return covariance
-        out = self.moved_both(covariance, then, now).copy()
-        for block in self._blocks:
-            gained = _variance(block.law, now) - _kept(block.law, now - then) ** 2 * _variance(block.law, then)
-            if gained > 0.0:
-                self._add(out, block, gained * block.covariance)
+        out = self.moved_both(covariance, then, now)
+        out += self._transition(now - then).gained
+        for block in self._stepping_blocks:
+            if block.law.event:
+                kept = _kept(block.law, now - then) ** 2
+                gained = _variance(block.law, now) - kept * _variance(block.law, then)
+                self._add(out, block, max(gained, 0.0) * block.covariance)
             for law, steps in block.steps:
                 if (come := _come(law, now) - _come(law, then)) > 0.0:
                     self._add(out, block, come * steps)
         return out
+
+    @cached_property
+    def _stepping_blocks(self) -> tuple[_Block, ...]:
+        """Those that events change: what they gain depends on the time, and not on the interval alone."""
+        return tuple(one for one in self._blocks if one.law.event or any(law.event for law, _ in one.steps))
 
     def outputs(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array, Array]:
         """What states do: values (D + P,), rows on the states (D + P, n), and the covariance of what rows leave out.
@@ -336,26 +381,58 @@ class StateSpace:
             return rows @ mean, rows, left
         rows = rows.copy()
         values = rows @ mean
+        plain = rows.copy()
         for factor, at in self._heated:
-            own = rows[:, at].copy()
-            product, cross = mean[factor] * mean[at], covariance[factor, at]
-            values += own @ (product + cross)
+            own = plain[:, at]
+            values += own @ (mean[factor] * mean[at] + covariance[factor, at])
             rows[:, at] = (1.0 + mean[factor]) * own
             rows[:, factor] = own @ mean[at]
-            second = covariance[factor, factor] * covariance[np.ix_(at, at)] + np.outer(cross, cross)
-            left += own @ second @ own.T
-        return values, rows, left
+        return values, rows, self._second(plain, plain, covariance)
+
+    def _second(self, rows: Array, others: Array, across: Array) -> Array:
+        """(R, R') covariance of the products of factors and temperatures beyond what rows make of them.
+
+        Args:
+            rows: (R, n), of temperatures as if heat did what was computed.
+            others: (R', n) likewise, of the states at another time or the same.
+            across: (n, n) covariance of the states with those.
+        """
+        out = np.zeros((len(rows), len(others)))
+        for factor, at in self._heated if self.heat is not None else ():
+            second = across[factor, factor] * across[np.ix_(at, at)] + np.outer(across[at, factor], across[factor, at])
+            out += rows[:, at] @ second @ others[:, at].T
+        return out
+
+    def outputs_jointly(self, means: Array, covariance: Array, times: Array) -> tuple[Array, Array]:
+        """What states at T times do together: values (T, D + P) and their covariance (T, D + P, T, D + P).
+
+        Args:
+            means: (T, n) of the states.
+            covariance: (T, n, T, n) of them.
+            times: (T,) seconds.
+        """
+        count, plain = len(times), [self._rows(float(time)).copy() for time in times]
+        own = [self.acting(plain[k], means[k], covariance[k, :, k]) for k in range(count)]
+        values = np.array([one for one, _, _ in own]).reshape(count, len(self.basis))
+        out = np.empty((count, len(self.basis), count, len(self.basis)))
+        for i, j in itertools.product(range(count), repeat=2):
+            across = covariance[i, :, j]
+            out[i, :, j] = own[i][1] @ across @ own[j][1].T + self._second(plain[i], plain[j], across)
+        return values, out
 
     def _rows(self, time: float) -> Array:
         if time not in self._rows_at:
             self._rows_at.clear()
             rows = self.basis.copy()
-            for block in self._blocks:
-                gain = _gain(block.law, time)
-                if gain != 1.0:
-                    rows[:, block.at] *= gain
+            for block in self._growing_blocks:
+                rows[:, block.at] *= _gain(block.law, time)
             self._rows_at[time] = rows
         return self._rows_at[time]
+
+    @cached_property
+    def _growing_blocks(self) -> tuple[_Block, ...]:
+        """Those of trends and relaxations, whose amplitude depends on the time."""
+        return tuple(one for one in self._blocks if (one.law.trend_s, one.law.relaxation_s) != (None, None))
 
     @cached_property
     def _rows_at(self) -> dict[float, Array]:

@@ -37,6 +37,7 @@ __all__ = [
     "LineModel",
     "Partials",
     "Rays",
+    "Seen",
     "bias_rotation",
     "misclosure",
     "partials",
@@ -141,12 +142,49 @@ class LineModel:
         look = np.column_stack([-at, np.full(len(at), self.principal_distance)]) @ self.axes.T
         return np.asarray(look / np.linalg.norm(look, axis=1, keepdims=True))
 
+    def seen(self, body: Array, image: Array) -> Seen:
+        """What image points see of places in the body frame.
+
+        Args:
+            body: ground points from the body's origin, in its true axes, (n, 3), metres.
+            image: x and y in the focal plane, (n, 2), metres.
+
+        Raises:
+            UndeterminedError: a ground point behind a camera.
+        """
+        f, mounted = self.principal_distance, (body - self.position) @ self.to_body
+        a, b, c = np.ascontiguousarray((mounted @ self._turned()).T)
+        if np.any(c <= 0):
+            raise UndeterminedError("three-line model: a ground point lies behind a camera")
+        place = image - self.interior[1:]
+        square = np.sum(place**2, axis=1)
+        grown = 1.0 + square * (self.k1 + self.k2 * square)
+        along = np.stack([a / c, b / c], axis=1)
+        own = np.zeros((len(c), 2, 3))
+        own[:, 0, 0] = own[:, 1, 1] = f / c
+        own[:, :, 2] = (-f / c)[:, None] * along
+        swung = np.concatenate([self._turned(k) for k in range(3)], axis=1)
+        swung = (mounted @ swung).reshape(-1, 3, 3).swapaxes(1, 2)
+        by_drift = np.concatenate([own @ swung, along[:, :, None]], axis=2)
+        return Seen(place * grown[:, None] + f * along, (own.reshape(-1, 3) @ self.axes.T).reshape(-1, 2, 3), by_drift)
+
     def _turned(self, slope: int | None = None) -> Array:
         """Rx(d_beta) Ry(d_alpha) Rz(d_gamma), or its derivative by one of DRIFT."""
         chain: list[np.ndarray] = [np.eye(3)] * 3
         for k, axis in enumerate(_DRIFT_AXIS):
             chain[axis] = _turn_slope(axis, self.drift[k]) if k == slope else _turn(axis, self.drift[k])
         return np.asarray(chain[0] @ chain[1] @ chain[2])
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Misclosures (n, 2) of image points, metres in the image as of `misclosure`, and their derivatives: (n, 2, 3) by
+    the place in the body frame, (n, 2, 4) by d_alpha, d_beta, d_gamma, d_f.
+    """
+
+    miss: Array
+    by_body: Array
+    by_drift: Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,6 +60,14 @@ def one_kernel_thread() -> Iterator[None]:
 
 LIMIT = "TWIN_THREADS"
 """Environment variable that limits ``cores``, for processes that share the machine with others of their kind."""
+ONE_THREAD = {
+    LIMIT: "1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMEXPR_NUM_THREADS": "1",
+}
+"""Environment of a worker process."""
 
 
 def cores() -> int:

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import j1
 
 from optics.numerics.threads import cores, one_blas_thread
 from optics.waves.field_samples import LONGEST, FieldSamples
@@ -322,6 +321,9 @@ def airy(radius: np.ndarray, wavelength: float, f_number: float) -> np.ndarray:
         wavelength: metres.
         f_number: of the beam.
     """
+    # messages about files of designs wait for this module, and scipy takes a tenth of a second
+    from scipy.special import j1
+
     z = np.pi * np.asarray(radius) / (wavelength * f_number)
     safe = np.where(z == 0.0, 1.0, z)
     return np.where(z == 0.0, 1.0, (2.0 * j1(safe) / safe) ** 2)

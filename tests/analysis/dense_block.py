@@ -34,8 +34,13 @@ def _basis(law, times, moments):
     knots = np.unique(np.concatenate([np.floor(moments / h), np.floor(moments / h) + 1]))
     number = np.arange(knots[0], knots[-1] + 1)
     line = make_interp_spline(h * number, np.eye(len(number)), k=1)(times)
+    alike = np.exp(-h * np.abs(number[:, None] - number) / law.time) if law.time else None
     if law.kind == "slow":
-        return line, np.exp(-h * np.abs(number[:, None] - number) / law.time)
+        return line, alike
+    if law.kind == "jitter":
+        # amplitude and phase as a cosine and a sine, each by itself a slow process
+        phase = 2 * np.pi * law.frequency * times[:, None]
+        return np.concatenate([line * np.cos(phase), line * np.sin(phase)], axis=1), np.kron(np.eye(2), alike)
     pin = np.round(middle / h)
     away = h * (number - pin)
     same = np.sign(away)[:, None] * np.sign(away) > 0

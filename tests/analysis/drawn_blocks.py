@@ -112,6 +112,23 @@ def drawn_process(law: Law, times: np.ndarray, random: np.random.Generator):
         a, b = sigma * random.standard_normal((2, 3))
         phase = 2 * np.pi / law.time
         return lambda t: np.cos(phase * t)[:, None] * a + np.sin(phase * t)[:, None] * b
+    if law.kind == "jitter":
+        # a rotating arrow that forgets itself: amplitude and phase in one complex number
+        number = np.arange(np.floor(first / law.interval) - 1, np.floor(last / law.interval) + 3)
+        arrow = np.zeros((len(number), 3), complex)
+        kept = np.exp(-law.interval / law.time)
+        for k in range(len(number)):
+            new = random.standard_normal(3) + 1j * random.standard_normal(3)
+            arrow[k] = new if k == 0 else kept * arrow[k - 1] + np.sqrt(1 - kept**2) * new
+
+        def swinging(t):
+            place = t / law.interval - number[0]
+            low = np.floor(place).astype(int)
+            share = (place - low)[:, None]
+            amplitude = (1 - share) * arrow[low] + share * arrow[low + 1]
+            return sigma * np.real(np.exp(-2j * np.pi * law.frequency * t)[:, None] * amplitude)
+
+        return swinging
     number = np.arange(np.floor(first / law.interval) - BEYOND, np.floor(last / law.interval) + BEYOND + 1)
     if law.kind == "white":
         return make_interp_spline(law.interval * number, sigma * random.standard_normal((len(number), 3)), k=3)

@@ -16,6 +16,7 @@ LAWS = {
     "walk": Law("walk", "walk", (0.5 * ARCSEC, 0.4 * ARCSEC, 0.8 * ARCSEC), 0.5),
     "slow": Law("slow", "slow", (0.5 * ARCSEC, 0.4 * ARCSEC, 0.8 * ARCSEC), 0.5, 20.0),
     "orbital": Law("thermal", "orbital", (1.5 * ARCSEC,) * 3, time=5900.0),
+    "jitter": Law("jitter", "jitter", (0.5 * ARCSEC, 0.4 * ARCSEC, 0.8 * ARCSEC), 1.0, 20.0, 0.65),
     "rate": Law("rate", "rate", (0.05 * ARCSEC,) * 3),
 }
 STATION = (Term(Law("orbit", "constant", (0.5, 0.4, 0.6))), Term(Law("gps", "white", (0.05,) * 3, 1.0)))

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.block.accuracy import circle_of_points, interval_of_points, predicted, realised
 from analysis.block.block import Term
 from analysis.block.block_adjustment import adjust_block
 from analysis.block.law_tests import law_tests
 from analysis.block.network import datum_test, network_of, open_combinations
 from analysis.block.processes import BlockError, Law
-from analysis.orbit.ground_errors import circular_error, linear_error
+from analysis.orbit.ground_errors import circle_of_points, interval_of_points, predicted, realised
 from optics.numerics.threads import one_blas_thread
 from tests.analysis.drawn_blocks import ARCSEC, EAST, PITCH, Plan, draw, without_errors_in_images
 from tests.tiers import quick
@@ -88,6 +87,36 @@ def test_a_wrong_law_is_told_and_a_right_one_is_not(stated, true):
         if stated is WHITE and true is WALK:
             assert test.p_value < 1e-6
             assert "not that of the readings" in str(test)
+
+
+SLOW = Law("attitude", "slow", (0.4 * ARCSEC,) * 3, 2.0, 60.0)
+JITTER = Term(Law("jitter", "jitter", (0.6 * ARCSEC,) * 3, 2.0, 40.0, 0.65))
+
+
+@pytest.mark.second
+@one_blas_thread()
+def test_jitter_as_an_unknown_makes_the_sigmas_right_and_without_it_the_block_is_refused():
+    """0.65 Hz, 0.6 arcsec rms: 0.5 px. Without it chi-square and check points contradict the sigmas."""
+    bias = Term(Law("tracker bias", "constant", (3 * ARCSEC,) * 3), "tracker")
+    true = plan(SLOW, ties=60, half=6e3, image=0.2 * PITCH, attitude=(bias, Term(SLOW), JITTER))
+    said = replace(true, attitude=(bias, Term(SLOW)))
+    square = freedom = check = without = count = 0
+    for seed in range(20):
+        drawn = draw(true, np.random.default_rng([6, seed]))
+        found = adjust_block(drawn.block)
+        square, freedom = square + found.chi_square, freedom + found.degrees_of_freedom
+        where = np.flatnonzero(drawn.block.points.role == "check")[:1]
+        wrong = adjust_block(replace(drawn.block, attitude=said.attitude))
+        assert wrong.p_value < 1e-6
+        for one in (found, wrong):
+            error = one.ground[where] - drawn.ground[where]
+            value = float(np.einsum("ni,nij,nj->", error, np.linalg.inv(one.point_covariance(where)), error))
+            check, without = (check + value, without) if one is found else (check, without + value)
+        count += 3
+    assert _two_sided(square, freedom) > _ALARM
+    assert _two_sided(check, count) > _ALARM
+    # check points of a pass whose jitter nobody told lie farther off than their sigmas
+    assert chi2.sf(without, count) < 1e-4
 
 
 @pytest.mark.second
@@ -192,12 +221,8 @@ def test_variance_components_find_a_wrong_image_sigma():
 def test_circular_and_linear_errors_of_known_normals():
     # a circle: 2.1460 sigma; a line: 1.6449 sigma in both
     assert circle_of_points(np.eye(2)[None] * 4.0) == pytest.approx(2 * 2.145966, rel=1e-5)
-    assert circle_of_points(np.diag([1.0, 1e-9])[None]) == pytest.approx(1.645, rel=5e-3)
+    assert circle_of_points(np.diag([1.0, 1e-9])[None]) == pytest.approx(1.644854, rel=1e-6)
     assert interval_of_points(np.array([9.0])) == pytest.approx(3 * 1.644854, rel=1e-5)
-    # of one point, another way of integration
-    one = np.array([[4.0, 1.5], [1.5, 1.0]])
-    assert circle_of_points(one[None]) == pytest.approx(float(circular_error(one)), rel=1e-6)
-    assert interval_of_points(np.array([2.0])) == pytest.approx(float(linear_error(2.0)), rel=1e-6)
     random = np.random.default_rng(1)
     spread = np.diag([4.0, 1.0, 9.0])
     error = random.standard_normal((40_000, 3)) * np.sqrt(np.diag(spread))

@@ -8,7 +8,7 @@ import pytest
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.jump_detection import steps
 from analysis.monitor.series_filter import Observed, SeriesFilter, of_shifts
-from analysis.monitor.series_following import follow
+from analysis.monitor.series_following import follow, jointly
 from analysis.monitor.series_smoother import smooth
 from analysis.monitor.state_space import HeatInputs, StateSpace
 
@@ -88,6 +88,34 @@ def test_the_same_as_the_joint_normal_of_the_series(laws) -> None:
         assert np.all(np.abs(one.total - two.total) <= limit)
     squares = np.array([one.chi_square for one in found.innovations])
     assert squares.sum() == pytest.approx(whole.consistency.chi_square, rel=1e-9)
+
+
+def test_times_together_are_those_of_the_joint_normal() -> None:
+    """Mean and covariance between times: before, between and after readings and at one of them."""
+    told, (times, shifts) = stated(LAWS, seed=3), series(25, NOISE)
+    wanted = np.sort(np.concatenate([np.random.default_rng(5).uniform(18.0, 31.0, 6), times[12:13], [-2.0]]))
+    how = SeriesFilter(told, REFERENCE**2 * np.eye(SPOTS), window=0)
+    read = of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS))
+    left = [np.zeros(0)] * len(times)
+    for asked in (wanted, np.append(wanted, [66.0, 70.0])):
+        mean, covariance = jointly(how, how.start(-3.0), read, asked, left)
+        every = np.concatenate([times, asked])
+        both = np.concatenate([told.spots, told.parameters])
+        prior = np.zeros((len(every), len(both), len(every), len(both)))
+        for law in dict.fromkeys(told.laws):
+            own = np.array([one == law for one in told.laws])
+            together = both[:, own] @ told.correlation[np.ix_(own, own)] @ both[:, own].T
+            prior += np.einsum("tu,ij->tiuj", law.covariance(every[:, None], every), together)
+        seen, sought = np.s_[: len(times), :SPOTS], np.s_[len(times) :, SPOTS:]
+        spread = prior[seen][:, :, : len(times), :SPOTS].reshape((shifts.size,) * 2) + Noise().covariance(shifts)
+        across = prior[sought][:, :, : len(times), :SPOTS].reshape(-1, shifts.size)
+        before = prior[sought][:, :, len(times) :, SPOTS:].reshape((mean.size,) * 2)
+        gain = np.linalg.solve(spread, across.T).T
+        after = before - gain @ across.T
+        sigma, start = np.sqrt(np.diag(after)), np.sqrt(np.diag(before))
+        assert np.all(np.abs(mean.ravel() - gain @ shifts.ravel()) <= 1e-9 * sigma + 1e-10 * start)
+        off = np.abs(covariance.reshape(after.shape) - after)
+        assert np.all(off <= 1e-9 * np.outer(sigma, sigma) + 1e-10 * np.outer(start, start))
 
 
 def test_pieces_do_not_matter(monkeypatch) -> None:

@@ -16,8 +16,8 @@ import psutil
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.study_bench import write_study
+from twin.run.cluster import local_workers
 from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.cluster import local_workers
 from twin.study.runs.engine import Engine, Progress
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from tests.benchmarks import (
     asbuilt_speed,
+    block_speed,
     cut_speed,
     growth_speed,
     jacobian_speed,
@@ -63,6 +64,7 @@ BENCHMARKS = (
     Benchmark("tolerance", "cameras drawn within their tolerances", tolerance_speed.measure, 85, 25),
     Benchmark("asbuilt", "the state of one instrument from its wavefronts", asbuilt_speed.measure, 12, 5),
     Benchmark("record", "one reading more in the record of an instrument", record_speed.measure, 60, 6),
+    Benchmark("block", "a block of a hundred scenes with a million tie points", block_speed.measure, 600, 30),
     Benchmark("study", "the engine of trade studies", study_speed.measure, 45, 20),
     Benchmark("live", "the live twin: from a slider to painted spots and readings", live_speed.measure, 75, 30),
     Benchmark("large", "a study of ten thousand states", large_speed.measure, 200, 25),

@@ -9,9 +9,9 @@ from pathlib import Path
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.study_bench import write_study
+from twin.run.cluster import Workers, local_workers
 from twin.run.provenance import source_digest
 from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.cluster import Workers, local_workers
 from twin.study.runs.engine import Engine, Progress
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK

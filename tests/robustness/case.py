@@ -31,7 +31,7 @@ CUTS = (
     "twin.orbit.export.export_run._exported",
     "twin.orbit.conventions.check_run._searched",
     "twin.orbit.matching.match_run.measure_points",
-    "twin.study.runs.cluster.local_workers",
+    "twin.run.cluster.local_workers",
     "twin.study.gradient.study_gradient._Traced",
     "twin.study.gradient.study_gradient._whole",
     "twin.design.design_run.search",

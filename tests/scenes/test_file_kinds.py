@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from scenes.kinds.file_kinds import FILE_KINDS, kind_of, read_for
+from scenes.kinds.file_kinds import FILE_KINDS, kind_of, kinds_of, read_for
 from scenes.specs.load import SCENES
 from scenes.specs.resolved import resolve
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.commands import invoke
 from twin.design.__main__ import app as design
@@ -53,6 +53,7 @@ FOLDERS = {
     "orbit/measured/jitter": "measured_jitter",
     "orbit/calibrate": "orbit_calibration",
     "orbit/jitter": "orbit_jitter",
+    "orbit/loop": "orbit_loop",
     "orbit/monitor": "orbit_monitor",
     "orbit/simulate": "orbit_simulate",
 }
@@ -81,6 +82,22 @@ def test_every_shipped_file_is_recognised(file: str) -> None:
 )
 def test_what_could_be_anything_is_nothing(data: object) -> None:
     assert kind_of(data) is None
+
+
+def test_a_file_of_either_of_two_kinds_is_told_as_either(tmp_path) -> None:
+    """An instrument and its disturbances alone are a job as well as a plan of operation; both commands take it."""
+    file = tmp_path / "either.yaml"
+    file.write_text("instrument: gf7_pair\ndisturbances: launch\n")
+    assert [kind.name for kind in kinds_of(read_yaml(file).data)] == ["job", "operation"]
+
+    def own(_: Path) -> None:
+        raise InputError(Issue("what the command says itself"))
+
+    with pytest.raises(InputError, match=r"a job of the monitor or a plan of operation.*twin\.render .*twin\.operate"):
+        read_for("twin.lab focus", file, own)
+    for command in ("twin.render", "twin.operate status"):
+        with pytest.raises(InputError, match="itself"):
+            read_for(command, file, own)
 
 
 def test_configs_of_runs_are_told_as_well() -> None:

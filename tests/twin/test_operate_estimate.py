@@ -23,7 +23,10 @@ from tests.twin.operation_records import (
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate import operation as operation_module
 from twin.operate.estimate.operation import Operation, beyond
+from twin.operate.posterior import posterior
 from twin.operate.record.entries import MICRO, Entry
+
+KEYS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +155,39 @@ def test_a_part_of_the_past_is_that_of_the_whole(
         assert np.all(np.abs(part.values[0] - whole.values[k]) < apart * whole.sigmas[k])
         ratio = whole.sigmas[k] / part.sigmas[0]
         assert np.all((ratio > 0.8) & (ratio < 1.0 + wider))
+
+
+def test_times_of_a_pass_go_together(known, tmp_path) -> None:
+    """Of each time the posterior is what `smoothed` says. Errors a minute apart are one error, and those of forty days
+    are not; the difference of the angle over three days is known to what it is off by.
+    """
+    life = life_of(known[2], 90.0, 3.0, 8, {})
+    estimate = followed(known, tmp_path, entries_of(known, life, 8))
+    first = int(life.times[10]) + 3600 * MICRO
+    times = [first, first + 60 * MICRO, int(life.times[11]) + 1, int(life.times[24]), int(life.times[-1]) + MICRO]
+    found = posterior(estimate, times, [f"{one.group} {one.key}" for one in estimate.quantities])
+    alone = estimate.smoothed(times[:-1])
+    sigma = np.sqrt(np.einsum("tqtq->tq", found.covariance))
+    assert np.allclose(found.mean[:-1], alone.values, rtol=0.0, atol=1e-7 * alone.sigmas.min())
+    assert np.allclose(sigma[:-1], alone.sigmas, rtol=1e-6)
+    share = np.einsum("tquq->tuq", found.covariance) / (sigma[:, None] * sigma)
+    assert np.all(share[0, 1] > 0.99)
+    assert np.all(np.abs(share[0, 3]) < 0.9)
+    angle = found.names.index("intersection_angle change_arcsec")
+    row = estimate.quantities[angle].row
+    own = found.covariance[:, angle, :, angle]
+    off = found.mean[3, angle] - found.mean[2, angle] - row @ (life.changes[24] - life.changes[11])
+    assert abs(off) < 4.0 * np.sqrt(own[3, 3] + own[2, 2] - 2.0 * own[2, 3])
+    cameras = posterior(estimate, times[3:])
+    assert cameras.names[:4] == tuple(f"forward {key}" for key in KEYS)
+    ahead = posterior(estimate, times[4:], ["forward d_f_um"])
+    assert ahead.mean[0, 0] == pytest.approx(estimate.forecast(times[4:]).values[0, 3], rel=1e-9)
+    with pytest.raises(Problem, match="out of order"):
+        posterior(estimate, times[::-1])
+    with pytest.raises(Problem, match="no such quantity"):
+        posterior(estimate, times, ["forward d_g_um"])
+    with pytest.raises(Problem, match="before all readings"):
+        posterior(estimate, [START - 1, START])
 
 
 def test_a_slip_is_told_with_its_body(known, tmp_path) -> None:

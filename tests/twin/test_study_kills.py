@@ -14,8 +14,8 @@ import pytest
 import xarray as xr
 
 from tests.twin.study_bench import ROOT, alive, children, chunks, same_bytes, start, wait_for, write_study
+from twin.run.cluster import local_workers
 from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.cluster import local_workers
 from twin.study.runs.engine import Engine, IncompleteError
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study

@@ -17,6 +17,7 @@ IDS = {
     "003": "equations model table1 table2 table3 table4 table5 table6 table7 fig4 fig5 fig6 "
     "scheme1 scheme2 scheme3 scheme4 scheme5 scale50000",
     "004": "eq1 eq2 eq3 eq4 table1 table2 turntable alignment",
+    "017": "bundle",
 }
 """What the papers number, and what they claim without a number."""
 CHECKS = {check.id: check for group in registry.GROUPS for check in group.checks}

@@ -58,7 +58,7 @@ def test_a_paper_without_a_file() -> None:
 
 def test_the_papers_files() -> None:
     """Their numbers are those of the checks; Table 2 of paper 004 has its 55 points, twice."""
-    assert {path.name[-3:] for path in FOLDERS if (path / FILE).exists()} == {"000", "001", "003", "004"}
+    assert {path.name[-3:] for path in FOLDERS if (path / FILE).exists()} == {"000", "001", "003", "004", "017"}
     printed = {check.id: check.printed for group in GROUPS for check in group.checks}
     assert printed["001.table4.together"] == load_printed("001").number("table4.spot_arcsec") == 0.145
     assert printed["004.table1.B3"] == load_printed("004").numbers("table1.mtf_nyquist")["B3"] == 0.37

@@ -13,17 +13,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
 
 from scenes.specs.orbit.sensors import SENSORS
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import Problem
+from scenes.yaml.standard_output import FAILURE, print_error
 from scenes.yaml.units import ANGLE, DISTANCE, parse_quantity
 from twin.run.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed
-from twin.run.command import Result, add_tests, finished, run_command, run_test
-from twin.run.procedure import Session
+from twin.run.command import Result, add_tests, finished, print_warnings, run_command, run_test
+from twin.run.procedure import Advance, Session
 
 if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
     from scenes.specs.measured.adjust_setup import AnyAdjust
+    from twin.orbit.block.block_run import BlockRun
     from twin.orbit.export.export_run import ExportSource, SceneSource
     from twin.orbit.export.polynomial_export import PolynomialSource
     from twin.orbit.export.quality import Wishes
@@ -68,6 +72,15 @@ def adjust(
         list[str] | None,
         typer.Option("--without", metavar="SENSOR", help=f"A sensor that is not used: {', '.join(SENSORS)}."),
     ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=1024, help="Number of worker processes that reduce the points. Default: this process alone."
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Use a running Dask cluster, as of `python -m twin.study --scheduler`.")
+    ] = None,
     out: Out = None,
     seed: Seed = None,
     backend: BackendName = "llvm",
@@ -84,7 +97,25 @@ def adjust(
         return without_sensors(resolve_any_adjust(path), without or ())
 
     options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve), file, options)
+    if workers is None and scheduler is None:
+        run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve), file, options)
+        return
+
+    def run(setup: AnyAdjust, backend: Backend, seed: int, advance: Advance) -> BlockRun:
+        from twin.orbit.block.block_run import run_adjustment
+        from twin.orbit.block.point_workers import point_workers
+
+        with point_workers(workers, scheduler, lambda text: print_warnings(errors, (text,))) as pool:
+            return run_adjustment(setup, backend, seed, advance, pool)
+
+    from twin.run.cluster import ClusterError
+
+    errors = Console(stderr=True)
+    try:
+        run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve, run=run), file, options)
+    except ClusterError as error:
+        print_error(errors, str(error))
+        raise typer.Exit(FAILURE) from None
 
 
 @app.command("export")

@@ -34,6 +34,7 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.yaml.errors import Problem, names_text, nearest
 from scenes.yaml.spec import Spec
+from twin.run.frame_store import frame_room, largest_of, let_go
 from twin.run.random_streams import stream
 from twin.sensors.exposure_kernel import FEWEST, Reading, exposing_bytes, kernels_there
 from twin.sensors.poisson_numbers import poisson_pieces
@@ -325,7 +326,7 @@ class EmvaDetector:
             raise ValueError(
                 f"detector: fixed pattern {pattern.gain.shape} does not fit photons {light.shape}"
             ) from error
-        out = np.empty((*lead, int(frames), height, width), dtype=np.uint16)
+        out = frame_room((*lead, int(frames), height, width))
         indices = list(np.ndindex(*lead))
         streams = _streams(seed, lead)
         together = self.frames_at_once(int(frames), height * width)
@@ -353,6 +354,7 @@ class EmvaDetector:
             start = 0
             for collected in poisson_pieces(mean_e, int(frames), rng, together):
                 out[index][start : start + together] = self._read_out(collected, shift, rng)
+                let_go(out)
                 start += together
 
         if threads == 1 or len(indices) == 1:
@@ -407,7 +409,7 @@ class EmvaDetector:
             raise ValueError(f"detector: frames must be (..., frames, H, W), found shape {frames.shape}")
         well = self.offset_dn + self.system_gain_dn_per_e * (self.full_well_e - _SATURATION_SIGMAS * self._read_sigma_e)
         level = float(min(self.max_dn, well))
-        return SaturationReport(level_dn=level, pixels=np.sum(np.max(frames, axis=-3) >= level, axis=(-2, -1)))
+        return SaturationReport(level_dn=level, pixels=np.sum(largest_of(frames) >= level, axis=(-2, -1)))
 
     @property
     def _read_sigma_e(self) -> float:

@@ -24,6 +24,7 @@ import numpy as np
 
 from optics.numerics.llvm import ensure_llvm
 from optics.numerics.threads import one_kernel_thread
+from twin.run.frame_store import let_go
 from twin.sensors.poisson_numbers import (
     CELLS_PER_UNIT,
     MOST_IN_TABLE,
@@ -124,6 +125,7 @@ class Reading:
                     following = group.draw(numbers, out[some.start : some.stop, start : start + together], pool)
                     if drawn is not None:
                         drawn.read_out()
+                        let_go(out)
                     drawn = following
             if drawn is not None:
                 drawn.read_out()
@@ -184,6 +186,7 @@ class _Group:
         self.how, self.pixels = how, pixels
         self.huge: list[np.ndarray] = []
         self.sources = []
+        self.last: list[Future[np.ndarray | None] | None] = [None] * len(streams)
         for image, own in enumerate(streams):
             mean = numbers.mean[self.own(image)]
             self.huge.append(np.flatnonzero(mean >= SERIES_END))
@@ -196,13 +199,18 @@ class _Group:
 
     def draw(self, numbers: _Numbers, out: np.ndarray, pool: ThreadPoolExecutor) -> _Drawn:
         """Begin to draw the numbers of the next frames (images, frames, pixels)."""
-        work = [pool.submit(self._drawn, numbers, image, out.shape[1]) for image in range(len(out))]
+        work = [pool.submit(self._drawn, numbers, image, out.shape[1], self.last[image]) for image in range(len(out))]
+        self.last = list(work)
         return _Drawn(self, numbers, out, work)
 
-    def _drawn(self, numbers: _Numbers, image: int, count: int) -> np.ndarray | None:
+    def _drawn(
+        self, numbers: _Numbers, image: int, count: int, before: Future[np.ndarray | None] | None
+    ) -> np.ndarray | None:
         """Draw the random numbers of an image; its Poisson numbers of huge means, (count, huge), None where no mean
         is.
         """
+        if before is not None:
+            before.result()  # another thread may still draw the image's last frames from the same streams
         words, huge, rng = self.sources[image]
         own, which = self.own(image), self.huge[image]
         numbers.words[:count, own] = words_of(words, count, self.pixels)

@@ -14,8 +14,8 @@ from optics.numerics.backend import load_backend
 from optics.numerics.threads import cores
 from scenes.kinds.file_kinds import read_for
 from scenes.yaml.errors import InputError
-from twin.run import cli, durable, memory, provenance, run_folder
-from twin.study.runs import cluster, sampling
+from twin.run import cli, cluster, durable, memory, provenance, run_folder
+from twin.study.runs import sampling
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.engine import Engine, Progress, fit_workers
 from twin.study.runs.plan import Plan, require_study_memory

@@ -17,9 +17,8 @@ from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec, resolve_tolera
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.camera.varied_beams import AT_ONCE
-from twin.run import durable, memory, run_folder
+from twin.run import cluster, durable, memory, run_folder
 from twin.run.procedure import Advance, silent
-from twin.study.runs import cluster
 from twin.study.runs.base_job import BlockResult, Failure, Outcome, Run, Tree, one_line, with_values
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.engine import Engine, Progress, fit_workers

@@ -13,6 +13,7 @@ from twin.validation.paper_001 import budget_checks, formulas, joint, table2
 from twin.validation.paper_001.ranges import ranges_group
 from twin.validation.paper_003 import fields, model
 from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks
+from twin.validation.paper_017 import bundle
 
 GROUPS: tuple[CheckGroup, ...] = (
     equations_000.GROUP,
@@ -32,6 +33,7 @@ GROUPS: tuple[CheckGroup, ...] = (
     turntable_checks.GROUP,
     distortion_checks.GROUP,
     group_of("004.figures"),
+    bundle.GROUP,
 )
 """Every group, in the order in which they run. A new one is added here."""
 

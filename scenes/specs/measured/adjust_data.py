@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from scenes.specs.measured.orbit_data import MeasuredTestSpec
-from scenes.specs.orbit.adjust import CameraChangeSpec, ReadingLawsSpec
+from scenes.specs.orbit.adjust import CameraChangeSpec, MonitorRecordSpec, ReadingLawsSpec, one_monitor
 from scenes.specs.orbit.calibration import MonitorReadingSpec
 from scenes.specs.orbit.flight import AngleErrors
 from scenes.yaml.errors import Problem, unknown
@@ -57,6 +57,7 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
         trackers: pass -> star tracker that gave its attitude; "tracker" where not said.
         changes: line -> how its camera may have changed since the calibration.
         monitor: readings of these changes; None for no monitor.
+        monitor_record: what a record of `twin.operate` says of them, in place of `monitor`.
         without: sensors that are there and are not used.
         robust: whether gross errors are looked for.
         components: laws and groups of measurements whose variances are estimated.
@@ -67,6 +68,7 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
     trackers: Named[Name] = Field(default_factory=dict, validate_default=True)
     changes: Annotated[Named[CameraChangeSpec], not_empty("no changes", "how each line may have changed")]
     monitor: MonitoredSpec | None = None
+    monitor_record: MonitorRecordSpec | None = None
     without: tuple[Literal["ties", "control", "monitor"], ...] = ()
     robust: Flag = True
     components: tuple[Name, ...] = ()
@@ -77,11 +79,13 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
         for k, name in enumerate(self.components):
             if name not in groups:
                 raise unknown("no such group of variances", name, groups, ("components", k))
-        if "monitor" in self.without and self.monitor is None:
+        one_monitor(self.monitor, self.monitor_record)
+        if "monitor" in self.without and "monitor" not in self.sensors:
             raise Problem("no monitor to do without", None, "a section `monitor:`", within=("without",))
         return self
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """What can be left out; whether there are points of a role is known when the tables are read."""
-        return ("ties", "control", "monitor") if self.monitor is not None else ("ties", "control")
+        watched = self.monitor is not None or self.monitor_record is not None
+        return ("ties", "control", "monitor") if watched else ("ties", "control")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from scenes.specs import load
 from scenes.specs.measured.adjust_data import MeasuredAdjustSpec
@@ -37,6 +38,7 @@ class MeasuredAdjustSetup(FixedSetup[MeasuredAdjustSpec]):
     data: OrbitDataSpec
 
 
+Adjusted = TypeVar("Adjusted", OrbitAdjustSpec, MeasuredAdjustSpec)
 AnyAdjust = AdjustSetup | MeasuredAdjustSetup
 """Simulated, or on measurements."""
 
@@ -58,7 +60,7 @@ def resolve_measured_adjust(path: str | Path) -> MeasuredAdjustSetup:
     if setup is None:
         test = load.load_named(MeasuredAdjustSpec, load.ORBIT, path)
         camera = load_three_line_camera(load.find_named(load.PAYLOADS, test.camera, test, ("camera",)))
-        setup = MeasuredAdjustSetup.model_construct(test=test, camera=camera, data=data_of(test))
+        setup = MeasuredAdjustSetup.model_construct(test=_placed(test), camera=camera, data=data_of(test))
     test = setup.test
     for name in test.trackers:
         if name not in setup.data.passes:
@@ -86,12 +88,23 @@ def resolve_adjust(path: str | Path) -> AdjustSetup:
     if setup is None:
         test = load.load_named(OrbitAdjustSpec, load.ORBIT, path)
         camera = load_three_line_camera(load.find_named(load.PAYLOADS, test.camera, test, ("camera",)))
-        setup = AdjustSetup.model_construct(test=test, camera=camera)
+        setup = AdjustSetup.model_construct(test=_placed(test), camera=camera)
     for k, name in enumerate(setup.test.lines):
         if name not in setup.camera.lines:
             raise setup.test.error(unknown("no such line", name, setup.camera.lines), ("lines", k))
     _require_sensors(setup.test)
     return setup
+
+
+def _placed(test: Adjusted) -> Adjusted:
+    """The test with paths of its record that hold from anywhere; the URL of a database stays."""
+    one = test.monitor_record
+    if one is None:
+        return test
+    folder = Path(test.source.file).parent if test.source.file else Path()
+    record = one.record if "://" in one.record else str((folder / one.record).resolve())
+    plan = None if one.plan is None else str((folder / one.plan).resolve())
+    return test.model_copy(update={"monitor_record": one.model_copy(update={"record": record, "plan": plan})})
 
 
 def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:

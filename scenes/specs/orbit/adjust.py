@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from scenes.specs.orbit.angle import Relief, TerrainHeight
 from scenes.specs.orbit.calibration import CameraDriftSpec, FieldLength, LineTime, MonitorReadingSpec
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, Interval, Latitude, Longitude, UtcTime
+from scenes.specs.orbit.jitter import Frequency
 from scenes.specs.orbit.sensors import SENSORS
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
@@ -20,7 +21,7 @@ from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, T
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 
 Sensor = Literal["ties", "control", "monitor", "laser", "terrain", "tracker_angles"]
-LawKind = Literal["constant", "rate", "white", "walk", "slow", "orbital"]
+LawKind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 Period = Annotated[float, Quantity(MOMENT, above_zero=True, largest="100000 h")]
 Sigmas = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, smallest="0 m", largest="10 km"))]
 Positive = Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")]
@@ -33,23 +34,30 @@ class LawSpec(Spec):
     Attributes:
         law: constant; rate, of even growth from the middle of what shares it; white, readings independent of one
             another that a cubic spline joins; walk, a random walk that is zero in the middle; slow, a stationary
-            process that forgets itself over `time`; orbital, cosine and sine of the period `time`.
+            process that forgets itself over `time`; orbital, cosine and sine of the period `time`; jitter, an
+            oscillation of `frequency` whose amplitude and phase forget themselves over `time`.
         shared_by: what has one draw of it: each pass, all passes of a star tracker, or the block.
-        interval: between independent readings of `white`; between the values of `walk` and `slow` that are solved for,
-            seconds.
-        time: correlation time of `slow`, period of `orbital`, seconds.
+        interval: between independent readings of `white`; between the values of `walk`, of `slow` and of the amplitudes
+            of `jitter` that are solved for, seconds.
+        time: correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
+        frequency: of `jitter`, hertz.
     """
 
     law: LawKind
     shared_by: Literal["pass", "tracker", "block"] = "pass"
     interval: Interval = 1.0
     time: Period | None = None
+    frequency: Frequency | None = None
 
     @model_validator(mode="after")
     def _has_its_time(self) -> LawSpec:
-        if (self.time is None) == (self.law in ("slow", "orbital")):
-            what = {"slow": "a correlation time", "orbital": "a period"}.get(self.law, "no `time:`")
+        if (self.time is None) == (self.law in ("slow", "orbital", "jitter")):
+            named = {"slow": "a correlation time", "orbital": "a period", "jitter": "a correlation time"}
+            what = named.get(self.law, "no `time:`")
             raise Problem(f"a {self.law} law has {what}", None, what, within=("time",))
+        if (self.frequency is None) == (self.law == "jitter"):
+            what = "a frequency" if self.law == "jitter" else "no `frequency:`"
+            raise Problem(f"a {self.law} law has {what}", None, what, within=("frequency",))
         return self
 
 
@@ -61,8 +69,9 @@ class AttitudeLawSpec(LawSpec):
         shared_by: what has one draw of it.
         interval: between independent readings, or between values that are solved for, seconds.
         time: correlation time or period, seconds.
-        sigma: standard deviation about body X, Y and Z, radians: of a constant, a reading, an amplitude; of a rate in
-            each second; of what a walk gains in a second.
+        frequency: of `jitter`, hertz.
+        sigma: standard deviation about body X, Y and Z, radians: of a constant, a reading, an amplitude, of jitter as a
+            root mean square; of a rate in each second; of what a walk gains in a second.
     """
 
     sigma: AngleSigmas
@@ -76,6 +85,7 @@ class OrbitLawSpec(LawSpec):
         shared_by: what has one draw of it.
         interval: between independent readings, or between values that are solved for, seconds.
         time: correlation time or period, seconds.
+        frequency: of `jitter`, hertz.
         sigma: standard deviation along body X, Y and Z of the middle of the pass, metres, as for the attitude.
     """
 
@@ -211,9 +221,9 @@ class CameraChangeSpec(Spec):
         walk: what it gains in a day, as a random walk from the first pass on.
     """
 
-    lasting: CameraDriftSpec = CameraDriftSpec()
-    each_pass: CameraDriftSpec = CameraDriftSpec()
-    walk: CameraDriftSpec = CameraDriftSpec()
+    lasting: CameraDriftSpec = CameraDriftSpec.model_construct()
+    each_pass: CameraDriftSpec = CameraDriftSpec.model_construct()
+    walk: CameraDriftSpec = CameraDriftSpec.model_construct()
 
     @model_validator(mode="after")
     def _may_change(self) -> CameraChangeSpec:
@@ -226,6 +236,24 @@ class CameraChangeSpec(Spec):
             problem = "the principal distance may not change at all, which no camera keeps"
             raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
         return self
+
+
+class MonitorRecordSpec(Spec):
+    """A record of `twin.operate`, whose estimate says how the cameras stand in every pass.
+
+    Attributes:
+        record: its folder, or the URL of its database.
+        plan: file of the plan of operation under which it is followed; None for the plan that the record keeps.
+    """
+
+    record: Reference
+    plan: Reference | None = None
+
+
+def one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None:
+    """Refuse two monitors."""
+    if monitor is not None and record is not None:
+        raise Problem("`monitor` and `monitor_record` are both given", None, "one of them", within=("monitor_record",))
 
 
 class OrbitAdjustSpec(TitledSpec):
@@ -249,6 +277,8 @@ class OrbitAdjustSpec(TitledSpec):
         angles: between star trackers.
         changes: line -> how its camera may have changed.
         monitor: how well an on-board monitor reads these changes in each pass; None for no monitor.
+        monitor_record: what a record of `twin.operate` says of them, in place of `monitor`; the true cameras are drawn
+            from that.
         laser: an altimeter; None for none.
         terrain: a terrain model; None for none.
         without: sensors that are there and are not used.
@@ -260,19 +290,20 @@ class OrbitAdjustSpec(TitledSpec):
 
     camera: Reference
     lines: tuple[Name, ...] = ("forward", "nadir", "backward")
-    earth: EarthSpec = EarthSpec()
+    earth: EarthSpec = EarthSpec.model_construct()
     altitude: Altitude = 500e3
     span: Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")] = 60.0
     line_time: LineTime = 0.7e-3
-    attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
+    attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")
     area: AreaSpec
     passes: Annotated[Named[BlockPassSpec], not_empty("no passes", "at least one pass")]
-    points: BlockPointsSpec = BlockPointsSpec()
+    points: BlockPointsSpec = BlockPointsSpec.model_construct()
     errors: ReadingLawsSpec
     truth: ReadingLawsSpec | None = None
     angles: tuple[TrackerAngleSpec, ...] = ()
     changes: Annotated[Named[CameraChangeSpec], not_empty("no changes", "how each line may have changed")]
     monitor: MonitorReadingSpec | None = None
+    monitor_record: MonitorRecordSpec | None = None
     laser: LaserSpec | None = None
     terrain: TerrainModelSpec | None = None
     without: tuple[Sensor, ...] = ()
@@ -291,6 +322,7 @@ class OrbitAdjustSpec(TitledSpec):
         for name in self.changes:
             if name not in self.lines:
                 raise unknown("no such line among `lines`", name, self.lines, ("changes", name))
+        one_monitor(self.monitor, self.monitor_record)
         trackers = tuple(dict.fromkeys(one.tracker for one in self.passes.values()))
         for k, angle in enumerate(self.angles):
             for j, name in enumerate(angle.between):
@@ -317,7 +349,7 @@ class OrbitAdjustSpec(TitledSpec):
         has = {
             "ties": self.points.tie > 0,
             "control": self.points.control > 0,
-            "monitor": self.monitor is not None,
+            "monitor": self.monitor is not None or self.monitor_record is not None,
             "laser": self.laser is not None,
             "terrain": self.terrain is not None,
             "tracker_angles": bool(self.angles),

@@ -20,8 +20,8 @@ from scipy.special import pdtrc
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.limits import Quantity
-from analysis.monitor.series_filter import Belief
-from analysis.monitor.series_following import hinted, smoothed
+from analysis.monitor.series_filter import Belief, Observed, SeriesFilter
+from analysis.monitor.series_following import hinted, jointly, smoothed
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.operation import OperationSetup
@@ -422,7 +422,6 @@ class Operation:
     ) -> list[tuple[Array, Array]]:
         """What is made of the states at times, by all readings; from the newest on it is what a forecast has."""
         taking, last = self._taking, self._standing
-        begin = self._begin()
         if len(times) and times.max() >= last.time:
             with one_blas_thread():
                 ahead = []
@@ -433,26 +432,62 @@ class Operation:
             return [next(ahead_of if time >= last.time else past) for time in times]
         if not len(times):
             return []
-        if times.min() < begin:
-            allowed = f"times from {utc_text(begin)} on, that of the first reading"
-            raise Problem("a time before all readings", utc_text(int(times.min())), allowed)
+        self._require_known(int(times.min()))
         with one_blas_thread():
-            start = self._before_all(int(times.min()))
-            told = None if start is None else start.time
-            steps = (*taking.how.steps, *self._steps(last, told))
-            used, left = self._used(told)
-            wanted = set(used.tolist())
-            every = (one for together in self._moments(told) for one in together)
-            said = {one["id"]: taking.observed(one) for one in every if one["id"] in wanted}
-            observed = [said[number] for number in used.tolist()]
-            belief = (taking.start(begin) if start is None else start).belief
-            belief = replace(
-                belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
-            )
             seconds = [taking.seconds(int(time)) for time in times]
-            knowing = replace(taking.how, steps=steps, window=0)
-            shares = hinted(taking.how, knowing, belief, observed, list(left))
-            return smoothed(knowing, belief, observed, seconds, shares, each)
+            how, start, observed, left = self._knowing(int(times.min()))
+            return smoothed(how, start, observed, seconds, left, each)
+
+    def jointly(self, times_us: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
+        """What all readings say of several times together; of one time it is what `smoothed` says.
+
+        Args:
+            times_us: (T,) microseconds of TAI since 2000 in order, from the first reading on; if one is before the
+                newest reading, jumps that the last readings hint at do not count for those after it.
+
+        Returns:
+            (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other, and (T, 4 K, T, 4 K) the
+            covariance of their errors, those of one time with those of another.
+
+        Raises:
+            Problem: a time before it.
+        """
+        times, taking = np.asarray(times_us, np.int64), self._taking
+        seconds = [taking.seconds(int(time)) for time in times]
+        with one_blas_thread():
+            if not len(times) or times[0] >= self._standing.time:
+                values, covariance = jointly(taking.how, self._now, (), seconds, ())
+            else:
+                self._require_known(int(times[0]))
+                how, start, observed, left = self._knowing(int(times[0]))
+                values, covariance = jointly(how, start, observed, seconds, left)
+        wide = self._widened_at(times)
+        return values, covariance * wide[:, None, None, None] * wide[:, None]
+
+    def _require_known(self, time: int) -> None:
+        """Refuse a time before all readings. Raises Problem."""
+        if time < (begin := self._begin()):
+            allowed = f"times from {utc_text(begin)} on, that of the first reading"
+            raise Problem("a time before all readings", utc_text(time), allowed)
+
+    def _knowing(self, time: int) -> tuple[SeriesFilter, Belief, list[Observed], list[Array]]:
+        """What a look back to a time rests on: the filter that knows of all jumps that were told, where it begins, the
+        readings from there on, and what of jumps could not be told before each.
+        """
+        taking, start = self._taking, self._before_all(time)
+        told = None if start is None else start.time
+        steps = (*taking.how.steps, *self._steps(self._standing, told))
+        used, left = self._used(told)
+        wanted = set(used.tolist())
+        every = (one for together in self._moments(told) for one in together)
+        said = {one["id"]: taking.observed(one) for one in every if one["id"] in wanted}
+        observed = [said[number] for number in used.tolist()]
+        belief = (taking.start(self._begin()) if start is None else start).belief
+        belief = replace(
+            belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
+        )
+        knowing = replace(taking.how, steps=steps, window=0)
+        return knowing, belief, observed, hinted(taking.how, knowing, belief, observed, list(left))
 
     def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
         """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""

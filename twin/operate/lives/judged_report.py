@@ -207,7 +207,7 @@ def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
 
 
 def _panel(axes: Any, life: JudgedLife, way: str, number: int) -> None:
-    """Errors of one way with its sigma, and when events came."""
+    """Errors of one way with its sigma, when events came, and between which readings jumps that were told."""
     years = (life.times - life.times[0]) / _YEAR
     error, sigma = life.errors(way)[:, number], life.ways[way].sigmas[:, number]
     svg.gridded(axes)
@@ -217,4 +217,7 @@ def _panel(axes: Any, life: JudgedLife, way: str, number: int) -> None:
             axes.fill_between(years, -times * sigma, times * sigma, color=colour, lw=0.0, label=name)
     for k, (moment, *_) in enumerate(life.following.events):
         axes.axvline((moment - life.times[0]) / _YEAR, color=svg.ORANGE, lw=0.9, ls="--", label="" if k else "event")
+    for k, jump in enumerate(life.following.jumps):
+        low, high = ((moment - life.times[0]) / _YEAR for moment in (jump.after_us, jump.until_us))
+        axes.axvspan(low, high, color=svg.PURPLE, alpha=0.5, lw=1.0, label="" if k else "jump that was told")
     axes.plot(years, error, color=svg.BLUE, lw=1.1, label="estimate minus truth")

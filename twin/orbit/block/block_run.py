@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.block.accuracy import Accuracy, level_axes, predicted, realised
 from analysis.block.block import Block
 from analysis.block.block_adjustment import BlockAdjustment, adjust_block, kept_block
 from analysis.block.law_tests import LawTest, law_tests
 from analysis.block.network import DatumTest, Network, Open, datum_test, network_of, open_combinations
 from analysis.block.processes import BlockError
+from analysis.block.shares import Pool
 from analysis.measurement_error import MeasurementError
+from analysis.orbit.ground_errors import Accuracy, level_axes, predicted, realised
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import measured_block
+from twin.orbit.block.pass_knowledge import MonitorSource
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
@@ -121,8 +123,23 @@ class BlockRun:
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
-def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance: Advance = silent) -> BlockRun:
+def run_adjustment(
+    setup: AnyAdjust,
+    backend: Backend | None,
+    seed: int,
+    advance: Advance = silent,
+    pool: Pool | None = None,
+    monitor: MonitorSource | None = None,
+) -> BlockRun:
     """Draw or read a block and adjust it. Nothing is traced: the backend is not used.
+
+    Args:
+        setup: what the file says.
+        backend: not used.
+        seed: of all that is drawn.
+        advance: told of the progress.
+        pool: processes that reduce the points; None for this one alone.
+        monitor: what a record says of the cameras, where the file names one.
 
     Raises:
         InputError: tables that cannot be used.
@@ -132,10 +149,10 @@ def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance
     advance("block", 0, 2)
     drawn = None
     if isinstance(setup, MeasuredAdjustSetup):
-        block, places = measured_block(setup, advance)
+        block, places = measured_block(setup, advance, monitor)
         known = _Known(places, block.points.covariance, {})
     else:
-        drawn = draw_block(setup, np.random.SeedSequence(seed))
+        drawn = draw_block(setup, np.random.SeedSequence(seed), monitor)
         block = drawn.block
         known = _Known(drawn.ground, np.zeros((len(drawn.ground), 3, 3)), drawn.change)
     for sensor in spec.without:
@@ -143,13 +160,13 @@ def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance
     advance("block", 1, 2)
     try:
         network = network_of(block)
-        datum, block, rejected = _datum(block, spec.robust)
+        datum, block, rejected = _datum(block, spec.robust, pool)
         robust = spec.robust and rejected is None
         found = adjust_block(
-            block, robust="reject" if robust else None, variance_components=_components(spec.components)
+            block, robust="reject" if robust else None, variance_components=_components(spec.components), pool=pool
         )
         advance("block", 2, 2)
-        worth = _worth(kept_block(found), found, known, advance)
+        worth = _worth(kept_block(found), found, known, advance, pool)
     except (MeasurementError, np.linalg.LinAlgError) as error:
         key = "data" if drawn is None else "points"
         raise BenchError(str(error), (key,), "more points, or scenes that see the same ground") from error
@@ -173,7 +190,7 @@ def run_adjustment(setup: AnyAdjust, backend: Backend | None, seed: int, advance
     )
 
 
-def _datum(block: Block, robust: bool) -> tuple[DatumTest | None, Block, Rejected | None]:
+def _datum(block: Block, robust: bool, pool: Pool | None) -> tuple[DatumTest | None, Block, Rejected | None]:
     """A common shift of the control points, the block to be adjusted, and what was left out of it already.
 
     It is looked for first: control points of another datum would else all be taken for gross errors. Where there is
@@ -181,7 +198,7 @@ def _datum(block: Block, robust: bool) -> tuple[DatumTest | None, Block, Rejecte
     """
     if not np.any(block.points.role == "control"):
         return None, block, None
-    shifted = adjust_block(block, robust="reject" if robust else None, datum=True)
+    shifted = adjust_block(block, robust="reject" if robust else None, datum=True, pool=pool)
     test = datum_test(shifted)
     assert test is not None
     if robust and chi2.sf(test.chi_square, 3) < DATUM_ALARM:
@@ -201,7 +218,9 @@ def _check(found: BlockAdjustment, known: _Known) -> tuple[np.ndarray, np.ndarra
     return where, found.ground[where] - known.places[where], spread
 
 
-def _worth(kept: Block, found: BlockAdjustment, known: _Known, advance: Advance) -> FrozenMap[str, Worth]:
+def _worth(
+    kept: Block, found: BlockAdjustment, known: _Known, advance: Advance, pool: Pool | None
+) -> FrozenMap[str, Worth]:
     """Check points by all sensors, without each, and by none but ties."""
     sensors = [name for name in kept.sensors if name != "ties"]
     cases: dict[str, tuple[str, ...]] = {ALL: ()}
@@ -216,7 +235,7 @@ def _worth(kept: Block, found: BlockAdjustment, known: _Known, advance: Advance)
             block = block.without(name)
         one = found
         if left_out:
-            one = adjust_block(block, variance_components=False)
+            one = adjust_block(block, pool=pool)
         rows[case] = _accuracy(left_out, one, known)
     advance("sensors", len(cases), len(cases))
     return FrozenMap(rows)

@@ -15,14 +15,14 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from analysis.block import block as known
-from analysis.block.processes import Law
+from analysis.block.processes import STEPPED, Law
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.measured.adjust_setup import AdjustSetup
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
-from twin.orbit.block.pass_knowledge import camera_sigmas, change_covariance, law_of, monitored_camera, pixels_per_line
+from twin.orbit.block.pass_knowledge import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.observations import PassData
 from twin.orbit.flight.earth import Earth, east_north_up, tai_of
@@ -36,6 +36,7 @@ from twin.run.procedure import BenchError
 from twin.run.random_streams import stream
 
 Course = Callable[[np.ndarray], np.ndarray]
+Monitored = dict[str, known.CameraKnowledge] | known.CamerasKnowledge
 _BEYOND = 30
 """Readings beyond the ends of a course: a cubic spline forgets its ends by a factor of 0.27 a reading."""
 _SPARE = 4.0
@@ -119,12 +120,25 @@ def drawn_course(law: Law, first: float, last: float, random: np.random.Generato
         values = np.cumsum(steps, axis=0) * np.sqrt(law.interval)
         values = values - values[np.flatnonzero(number == np.round(middle / law.interval))[0]]
     else:
-        kept = np.exp(-law.interval / law.time)
-        values = steps.copy()
-        for k in range(1, len(number)):
-            values[k] = kept * values[k - 1] + np.sqrt(1.0 - kept**2) * steps[k]
+        values = _slow(steps, law)
+    if law.kind == "jitter":
+        both = np.concatenate([values, _slow(random.standard_normal(steps.shape), law)], axis=1)
+        amplitude: Course = make_interp_spline(law.interval * number, np.tile(sigma, 2) * both, k=1)
+        turn = 2.0 * np.pi * law.frequency
+        return lambda t: (
+            np.cos(turn * t)[:, None] * amplitude(t)[:, :3] + np.sin(turn * t)[:, None] * amplitude(t)[:, 3:]
+        )
     line: Course = make_interp_spline(law.interval * number, sigma * values, k=1)
     return line
+
+
+def _slow(steps: np.ndarray, law: Law) -> np.ndarray:
+    """(k, 3) values of a stationary process of unit size from independent normals (k, 3)."""
+    kept = np.exp(-law.interval / law.time)
+    values = steps.copy()
+    for k in range(1, len(steps)):
+        values[k] = kept * values[k - 1] + np.sqrt(1.0 - kept**2) * steps[k]
+    return values
 
 
 def _courses(
@@ -147,7 +161,7 @@ def _courses(
                 last = max(begin[m] for m in members) + spec.span
                 random = np.random.default_rng(stream(seed, number))
                 number += 1
-                if (last - first) / term.law.interval > _MOST_STEPS and term.law.kind in ("white", "walk", "slow"):
+                if (last - first) / term.law.interval > _MOST_STEPS and term.law.kind in STEPPED:
                     problem = (
                         f"{name}: more than {_MOST_STEPS:.0e} values of a course; are passes too far apart to share it?"
                     )
@@ -165,9 +179,20 @@ def _summed(parts: list[Course]) -> Course:
 
 
 def _cameras(
-    spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator
-) -> tuple[dict[str, np.ndarray], dict[str, known.CameraKnowledge], dict[str, known.CameraKnowledge] | None]:
+    spec: OrbitAdjustSpec,
+    days: np.ndarray,
+    random: np.random.Generator,
+    recorded: known.CamerasKnowledge | None,
+) -> tuple[dict[str, np.ndarray], dict[str, known.CameraKnowledge], Monitored | None]:
     """Line -> true changes (T, 4), what is expected of them, and what is known after the monitor's readings."""
+    if recorded is not None:
+        values, vectors = np.linalg.eigh(recorded.covariance)
+        drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
+        changes = recorded.mean + drawn.reshape(recorded.mean.shape)
+        laws = {line: change_covariance(spec.changes[line], days) for line in spec.lines}
+        nothing = np.zeros((len(days), 4))
+        before = {line: known.CameraKnowledge(nothing, law) for line, law in laws.items()}
+        return dict(zip(recorded.cameras, changes, strict=True)), before, recorded
     true, expected, monitored = {}, {}, {}
     for line in spec.lines:
         law = change_covariance(spec.changes[line], days)
@@ -202,8 +227,13 @@ def _trajectory(spec: OrbitAdjustSpec, name: str, one: BlockPassSpec, earth: Ear
         raise BenchError(str(error), ("passes", name), "a place that a sun-synchronous orbit passes") from error
 
 
-def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence) -> DrawnBlock:
+def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence, monitor: MonitorSource | None = None) -> DrawnBlock:
     """Fly all passes and measure.
+
+    Args:
+        setup: what the file says.
+        seed: of all that is drawn.
+        monitor: what a record says of the cameras, from which the true ones are drawn.
 
     Raises:
         BenchError: no such orbit, or too few places that two scenes see.
@@ -218,7 +248,8 @@ def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence) -> DrawnBlock:
     }
     turns, shifts, constants = _courses(spec, spec.truth or spec.errors, begin, stream(seed, _COURSES))
     days = np.array(list(begin.values())) / _DAY
-    true, expected, monitored = _cameras(spec, days, np.random.default_rng(stream(seed, _CAMERAS)))
+    recorded = monitor({name: one.epoch for name, one in spec.passes.items()}, spec.lines) if monitor else None
+    true, expected, monitored = _cameras(spec, days, np.random.default_rng(stream(seed, _CAMERAS)), recorded)
     platforms = {
         name: TruePlatform(
             path, path.body_to_itrs(np.zeros(1))[0], _summed(turns[name]), _summed(shifts[name]), begin[name]
@@ -310,7 +341,7 @@ def _scenes(
         one = data[name]
         random = np.random.default_rng(stream(seed, _IMAGES, k))
         here = np.flatnonzero(np.isfinite(line))
-        unit = np.array([1.0 / pixels_per_line(one, camera, line[here], pixel[here], spec.area.height), 1.0])
+        unit = np.array([1.0 / one.pixels_per_line(camera), 1.0])
         noise = spec.points.image * unit * random.standard_normal((len(here), 2))
         spoilt = np.random.default_rng(stream(seed, _GROSS, k))
         wrong = (spoilt.random(len(here)) < spec.points.gross) & (role[here] == "tie")

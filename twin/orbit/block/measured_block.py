@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,11 +14,11 @@ from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.measured.adjust_setup import MeasuredAdjustSetup
 from twin.orbit.block.pass_knowledge import (
+    MonitorSource,
     camera_sigmas,
     change_covariance,
     law_of,
     monitored_camera,
-    pixels_per_line,
 )
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.observations import PassData, light_effects
@@ -27,13 +28,15 @@ from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.measurement_tables import read_measurements
-from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
+from twin.orbit.measured.pass_measurements import PassMeasurements
 from twin.run.procedure import Advance, BenchError, silent
 
 _DAY = 86400.0
 
 
-def measured_block(setup: MeasuredAdjustSetup, advance: Advance = silent) -> tuple[known.Block, np.ndarray]:
+def measured_block(
+    setup: MeasuredAdjustSetup, advance: Advance = silent, monitor: MonitorSource | None = None
+) -> tuple[known.Block, np.ndarray]:
     """The block of the tables of all passes, and the given coordinates of its points (m, 3), ITRS, metres, NaN of ties.
 
     Raises:
@@ -46,6 +49,7 @@ def measured_block(setup: MeasuredAdjustSetup, advance: Advance = silent) -> tup
     for line in lines:
         if line not in spec.changes:
             raise BenchError(f"it is not said how {line} may have changed", ("changes",), f"`{line}:`")
+    epochs = {one.name: one.platform.epoch for one in passes}
     moments = {one.name: tai_of(one.platform.epoch) for one in passes}
     zero = min(moments.values())
     begin = {name: round((day - zero[0]) * _DAY + (part - zero[1]) * _DAY, 6) for name, (day, part) in moments.items()}
@@ -66,7 +70,8 @@ def measured_block(setup: MeasuredAdjustSetup, advance: Advance = silent) -> tup
         mine = {line: raw[f"{one.name}/{line}"] for line in one.images}
         corrected = data[one.name].corrected(mine, one.images, removed, height[number[one.name]])
         for line, rays in corrected.items():
-            moved = _scene_rays(data[one.name], line, rays, one.images[line], begin[one.name], number[one.name])
+            assert rays.time is not None
+            moved = replace(rays, point=number[one.name][rays.point], time=rays.time + begin[one.name])
             scenes.append(known.Scene(f"{one.name}/{line}", one.name, line, moved))
     days = np.array(list(begin.values())) / _DAY
     expected = {
@@ -82,7 +87,7 @@ def measured_block(setup: MeasuredAdjustSetup, advance: Advance = silent) -> tup
         station=tuple(law_of(name, law) for name, law in spec.errors.orbit.items()),
         image=1.0,
         points=points,
-        monitored=_monitored(setup, lines, expected, tuple(begin)),
+        monitored=_monitored(setup, lines, expected, epochs, monitor),
     )
     return block, given
 
@@ -103,7 +108,7 @@ def _pass_data(one: PassMeasurements, setup: MeasuredAdjustSetup) -> PassData:
         height = float(np.mean(earth.geodetic(one.ground.itrs[known_places])[2]))
     models = FrozenMap({name: line_model(setup.camera, name) for name in one.images})
     pitch = FrozenMap({name: setup.camera.pitch_of(name) for name in one.images})
-    return PassData(one.name, FrozenMap(sensors), models, pitch, height, lines=setup.camera.lines)
+    return PassData(one.name, FrozenMap(sensors), models, pitch, height, 1.0, setup.camera.lines)
 
 
 def _points(passes: Sequence[PassMeasurements], shared: bool) -> tuple[known.Points, dict[str, np.ndarray]]:
@@ -159,21 +164,16 @@ def _started(
     return known.Points(points.ids, start, points.role, points.covariance)
 
 
-def _scene_rays(data: PassData, line: str, rays: Rays, images: ImagePoints, begin: float, number: np.ndarray) -> Rays:
-    """Rays of a scene on the block's time and points, with the covariance of their image points, m^2."""
-    scale = pixels_per_line(data, line, images.line, images.pixel, data.height)
-    to_plane = data.pitch[line] * np.array([-scale, 1.0])
-    spread = images.covariance * to_plane[:, None] * to_plane
-    assert rays.time is not None
-    return Rays(number[rays.point], rays.image, rays.station, rays.attitude, rays.time + begin, spread)
-
-
 def _monitored(
     setup: MeasuredAdjustSetup,
     lines: Sequence[str],
     expected: Mapping[str, known.CameraKnowledge],
-    passes: Sequence[str],
-) -> dict[str, known.CameraKnowledge] | None:
+    epochs: Mapping[str, str],
+    source: MonitorSource | None,
+) -> dict[str, known.CameraKnowledge] | known.CamerasKnowledge | None:
+    passes = tuple(epochs)
+    if source is not None:
+        return source(epochs, lines)
     monitor = setup.test.monitor
     if monitor is None:
         return None

@@ -10,8 +10,9 @@ from typing import Any
 
 from scenes.specs.study import NOISE, TOTAL
 from scenes.yaml.errors import KeyPath, Problem, key_text
+from twin.run import cluster
 from twin.run.provenance import source_digest
-from twin.study.runs import base_job, chunk_store, cluster, task
+from twin.study.runs import base_job, chunk_store, task
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
 

@@ -11,21 +11,12 @@ from functools import lru_cache
 from typing import Any
 
 from optics.numerics.backend import Backend, load_backend
-from optics.numerics.threads import LIMIT, kernel_threads
+from optics.numerics.threads import ONE_THREAD, kernel_threads
 from scenes.yaml.errors import InputError
 from twin.run.memory import largest_memory
 from twin.run.provenance import source_digest
 from twin.study.runs.base_job import BlockResult, Failure, Run
 from twin.study.runs.setup import StudySetup, study_from_text
-
-ONE_THREAD = {
-    LIMIT: "1",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NUMEXPR_NUM_THREADS": "1",
-}
-"""Environment of a worker process."""
 
 
 @dataclass(frozen=True)

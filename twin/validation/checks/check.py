@@ -176,6 +176,7 @@ PAPERS = {
     "001": "Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018), doi 10.3788/gxzb20184710.1012001",
     "003": "Mo et al. (2015), doi 10.3969/J.ISSN.1672-7274.2015.06.003",
     "004": "Li et al., Infrared and Laser Engineering, doi 10.3788/IRLA20200143",
+    "017": "Wang Renxiang, Acta Geodaetica et Cartographica Sinica 46(3) 332 (2017)",
 }
 """The source papers by the number that the ids begin with."""
 

@@ -1,4 +1,4 @@
-"""Worker processes: a local cluster that is made for the study and ends with it, or one that somebody else runs."""
+"""Worker processes: a local cluster that is made for a command and ends with it, or one that somebody else runs."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from optics.numerics.threads import ONE_THREAD
 from twin.run import cli, durable, owned_files, provenance
-from twin.study.runs.task import ONE_THREAD
 
 if TYPE_CHECKING:  # it takes half a second, and a study's file is read before workers are started
     from distributed import Client
@@ -44,7 +44,7 @@ class ClusterError(Exception):
 
 @dataclass(eq=False)
 class Workers:
-    """Worker processes of a study.
+    """Worker processes of a command.
 
     Attributes:
         client: of Dask.

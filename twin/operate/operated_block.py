@@ -1,0 +1,126 @@
+"""A block of scenes whose cameras a monitor watches in operation: its record says how they stood in every pass.
+
+The room of the block knows no record; this one hands it what the record's estimate says of all passes together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.block.block import CamerasKnowledge
+from analysis.units import ARCSEC
+from scenes.specs.measured.adjust_setup import AnyAdjust
+from scenes.specs.orbit.adjust import MonitorRecordSpec
+from scenes.yaml.errors import InputError, Problem, unknown
+from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.plans import kept_plan, read_plan
+from twin.operate.posterior import Posterior, posterior
+from twin.operate.record.database import RecordFailed
+from twin.operate.record.entries import micros
+from twin.operate.record.history import History
+from twin.operate.record.schema import NotARecord
+from twin.orbit.block.block_run import BlockRun, run_adjustment
+from twin.run.procedure import Advance, silent
+
+if TYPE_CHECKING:
+    from analysis.block.shares import Pool
+    from optics.numerics.backend import Backend
+
+__all__ = ["cameras_of", "run_operated_block"]
+
+KEYS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
+UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
+_NEAR = 0.02
+"""Share by which the focal length of a camera of the record may differ from the line's, of look angles radians."""
+
+
+def run_operated_block(
+    setup: AnyAdjust, backend: Backend | None, seed: int, advance: Advance = silent, pool: Pool | None = None
+) -> BlockRun:
+    """Draw or read a block and adjust it, with the record of its monitor where the file names one.
+
+    Args:
+        setup: what the file says.
+        backend: not used.
+        seed: of all that is drawn.
+        advance: told of the progress.
+        pool: processes that reduce the points; None for this one alone.
+
+    Raises:
+        InputError: tables or a record that cannot be used.
+        BenchError: no such orbit, or a block that cannot be adjusted.
+    """
+    spec = setup.test.monitor_record
+    if spec is None:
+        return run_adjustment(setup, backend, seed, advance, pool)
+    named = spec
+
+    def monitor(epochs: Mapping[str, str], lines: Sequence[str]) -> CamerasKnowledge:
+        try:
+            return _recorded(setup, named, epochs, lines, advance)
+        except Problem as problem:
+            raise setup.test.error(problem, ("monitor_record", *problem.within)) from None
+        except (RecordFailed, NotARecord) as error:
+            wrong = Problem(str(error), named.record, "a record that python -m twin.operate init made")
+            raise setup.test.error(wrong, ("monitor_record", "record")) from None
+
+    return run_adjustment(setup, backend, seed, advance, pool, monitor)
+
+
+def _recorded(
+    setup: AnyAdjust, spec: MonitorRecordSpec, epochs: Mapping[str, str], lines: Sequence[str], advance: Advance
+) -> CamerasKnowledge:
+    with History(spec.record) as history:
+        try:
+            plan = kept_plan(history) if spec.plan is None else read_plan(Path(spec.plan), history)
+        except InputError as error:
+            raise Problem(str(error), spec.plan, "a plan of the record's instrument", within=("plan",)) from None
+        if plan is None:
+            raise Problem("the record keeps no plan of operation", None, "`plan: FILE`", within=("plan",))
+        mounted = plan.model.instrument.cameras
+        for line in lines:
+            if line not in mounted:
+                text = f"the record is of {history.name}, which has no camera of this name"
+                raise unknown(text, line, tuple(mounted), ("record",))
+            look = setup.camera.lines[line].look
+            if abs(mounted[line].look - look) > _NEAR:
+                text = f"the record is of {history.name}, whose {line} camera looks elsewhere than this block's"
+                found = f"{np.degrees(mounted[line].look):.4g} deg, not {np.degrees(look):.4g} deg"
+                raise Problem(text, found, "the record of the instrument that took the images", within=("record",))
+        operation = Operation(history, plan, lambda done, of: advance("follow the record", done, of))
+        operation.follow()
+        for line in lines:
+            length = plan.model.cameras[mounted[line].camera].focal_length
+            stated = setup.camera.lines[line].principal_distance
+            if abs(length / stated - 1.0) > _NEAR:
+                text = f"the record is of {history.name}, whose {line} camera has another principal distance"
+                found = f"{1e3 * length:.5g} mm, not {1e3 * stated:.5g} mm"
+                raise Problem(text, found, "the record of the instrument that took the images", within=("record",))
+        times = {name: micros(epoch) for name, epoch in epochs.items()}
+        order = sorted(set(times.values()))
+        names = [f"{line} {key}" for line in lines for key in KEYS]
+        said = posterior(operation, order, names)
+        return cameras_of(said, lines, [order.index(time) for time in times.values()])
+
+
+def cameras_of(said: Posterior, cameras: Sequence[str], passes: Sequence[int]) -> CamerasKnowledge:
+    """What is said of cameras, as a block of scenes takes it.
+
+    Args:
+        said: d_alpha, d_beta, d_gamma and d_f of each camera in turn.
+        cameras: C names.
+        passes: (P,) number of the time of each pass.
+    """
+    scale = np.tile(UNITS, len(cameras))
+    where = np.array(passes)
+    mean = (said.mean * scale)[where].reshape(len(where), len(cameras), 4).swapaxes(0, 1)
+    spread = said.covariance * scale[:, None, None] * scale
+    spread = spread[where][:, :, where]
+    shape = (len(where), len(cameras), 4)
+    spread = spread.reshape(*shape, *shape).transpose(1, 0, 2, 4, 3, 5)
+    size = int(np.prod(shape))
+    return CamerasKnowledge(tuple(cameras), mean, spread.reshape(size, size))

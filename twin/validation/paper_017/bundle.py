@@ -1,0 +1,134 @@
+"""Heights by a bundle of coarse three-line images and by intersection in fine ones, with equal errors of the attitude.
+
+A strip of twice the base is flown by TH-1's three lines of 5 m. Its ties hold the attitudes of all times together; an
+image of 0.5 m, of the same look angles, is intersected line by line with the attitudes as they are read. Orbit and
+cameras are known in both, so that attitudes and image points alone differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from analysis.block.block_adjustment import adjust_block
+from analysis.orbit.calibration_parameters import Noise, vertical
+from analysis.orbit.forward_intersection import intersect
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.threads import one_blas_thread
+from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.measured.adjust_setup import AdjustSetup, resolve_adjust
+from scenes.specs.orbit.adjust import BlockPointsSpec, CameraChangeSpec, ReadingLawsSpec
+from twin.orbit.block.drawn_block import DrawnBlock, draw_block
+from twin.run.random_streams import stream
+from twin.validation.checks.check import CheckResult, Chosen, Supposed, mean_of
+from twin.validation.checks.group import Context, group_of
+
+FINER = 10.0
+"""Times that pixels of 5 m are larger than those of 0.5 m."""
+IMAGE, FINE = 0.3, 0.1
+"""Errors of an image point, pixels."""
+ERRORS = (0.35, 0.7, 1.4)
+"""Arcseconds of the attitude, between which the limit is looked for."""
+STATED = 0.5
+STRIPS, FAST_STRIPS = 5, 3
+TIES, CHECKS = 800, 150
+_FIXED = CameraChangeSpec.model_validate({"lasting": {"angles": 3 * ["0.002 arcsec"], "principal_distance": "0.1 um"}})
+
+
+def strip(image: float, attitude: float) -> AdjustSetup:
+    """One pass of three lines without control.
+
+    Args:
+        image: standard deviation of an image point, pixels of 5 m.
+        attitude: of a reading of the attitude, twice a second, arcseconds.
+    """
+    setup = resolve_adjust(SCENES / ORBIT / "adjust.yaml")
+    test, lines = setup.test, ("forward", "nadir", "backward")
+    readings = {"law": "white", "sigma": 3 * [f"{attitude} arcsec"], "interval": "0.5 s"}
+    orbit = {"law": "constant", "sigma": 3 * ["10 mm"]}
+    changed = {
+        "lines": lines,
+        "span": 100.0,
+        "area": test.area.model_copy(update={"east": 40e3, "north": 500e3}),
+        "passes": FrozenMap({"May": test.passes["May"]}),
+        "points": BlockPointsSpec.model_validate({"control": 0, "tie": TIES, "check": CHECKS, "image": image}),
+        "errors": ReadingLawsSpec.model_validate({"attitude": {"readings": readings}, "orbit": {"orbit": orbit}}),
+        "changes": FrozenMap(dict.fromkeys(lines, _FIXED)),
+        "angles": (),
+        "monitor": None,
+        "laser": None,
+        "terrain": None,
+    }
+    return setup.model_copy(update={"test": test.model_copy(update=changed)})
+
+
+def height_error(drawn: DrawnBlock, bundle: bool) -> float:
+    """Root mean square error of the heights of the check points, metres, by a bundle or by intersection."""
+    block = drawn.block
+    if bundle:
+        ground = adjust_block(block).ground
+    else:
+        rays = {scene.name: scene.rays for scene in block.scenes}
+        cameras = {scene.name: block.cameras[scene.camera] for scene in block.scenes}
+        ground = intersect(rays, cameras, Noise(1e-6), count=len(drawn.ground)).ground
+    where = np.flatnonzero(block.points.role == "check")
+    error = np.sum((ground - drawn.ground)[where] * vertical(drawn.ground[where]), axis=1)
+    return float(np.sqrt(np.nanmean(error**2)))
+
+
+@one_blas_thread()
+def ratios(image: float, seed: np.random.SeedSequence) -> np.ndarray:
+    """Errors of heights of a bundle at 5 m over those of intersection at 0.5 m, at `ERRORS` of the attitude."""
+    return np.array(
+        [
+            height_error(draw_block(strip(image, error), seed), True)
+            / height_error(draw_block(strip(image / FINER, error), seed), False)
+            for error in ERRORS
+        ]
+    )
+
+
+def limit(found: np.ndarray) -> float:
+    """Arcseconds from which on the bundle has the smaller errors, by ratios (3,) at `ERRORS`; their logarithms are all
+    but a parabola in that of the error.
+    """
+    place, value = np.log(ERRORS), np.log(found)
+    fine = np.linspace(np.log(0.05), np.log(5.0), 2001)
+    curve = np.polyval(np.polyfit(place, value, 2), fine)
+    return float(np.exp(fine[np.argmin(np.abs(curve))]))
+
+
+def run(context: Context) -> Iterator[CheckResult]:
+    """The row."""
+    count = context.count(STRIPS, FAST_STRIPS)
+    root = np.random.SeedSequence(context.seed)
+    every = []
+    for k in range(count):
+        context.progress(k / (count + 1), "strips")
+        every.append(ratios(IMAGE, stream(root, k)))
+    context.progress(count / (count + 1), "a strip with better image points")
+    fine = limit(ratios(FINE, stream(root, 0)))
+    limits = np.array([limit(one) for one in every])
+    measured, sigma = mean_of(limits)
+    at = np.log(STATED)
+    factor = float(np.exp(np.mean([np.interp(at, np.log(ERRORS), np.log(one)) for one in every])))
+    drawn = draw_block(strip(IMAGE, 0.01), stream(root, count))
+    floor = height_error(drawn, True)
+    # between the two the limit goes with a power of the image points' error
+    power = np.log(measured / fine) / np.log(IMAGE / FINE)
+    facts = {"floor": floor, "factor": factor, "finer": fine, "needed": IMAGE * (STATED / measured) ** (1.0 / power)}
+    how = (
+        f"{count} strips of 500 km with {TIES} ties each; at {', '.join(f'{e:g}″' for e in ERRORS)} of the attitude the"
+        " bundle's errors of heights are "
+        f"{', '.join(f'{r:.2f}' for r in np.mean(every, axis=0))} times those of intersection at 0.5 m."
+    )
+    inputs: list[Chosen | Supposed] = [
+        Chosen.power("error of an image point", IMAGE, "px", measured, float(power)),
+        Supposed("errors of the attitude are independent twice a second", "every 4 s likewise"),
+        Supposed("orbit and cameras are without errors", "they are the same in both"),
+    ]
+    yield context.check("017.bundle").evaluate(measured, sigma, how, explained=[measured], inputs=inputs, facts=facts)
+
+
+GROUP = group_of("017.bundle", run)
