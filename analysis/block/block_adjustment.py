@@ -1,6 +1,6 @@
 """Adjustment of a block: Gauss-Newton on all packets and priors, robust weights, variance components, covariances.
 
-The weights and factors follow the rules of the campaign's adjustment (`analysis.orbit.residual_tests`).
+The weights and factors follow the rules of `reweighting`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from scipy.stats import chi2
 from analysis.block.assembly import Assembly, assembled, group_ranks
 from analysis.block.block import Block
 from analysis.block.plausible_block import check_places, pruned
-from analysis.block.point_reduction import Reduced, Reduction, State
+from analysis.block.point_reduction import Checked, Reduced, Reduction, State
 from analysis.block.processes import BlockError
+from analysis.block.reweighting import SETTLED, GroupTest, Rule, UnsettledError, settled
 from analysis.block.shares import Pool, SharedReduction
-from analysis.orbit.residual_tests import bounded, extrapolated, robust_weights
 
-__all__ = ["BlockAdjustment", "GroupTest", "adjust_block", "kept_block"]
+__all__ = ["BlockAdjustment", "adjust_block", "kept_block"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -38,41 +38,7 @@ _MOST = 20_000
 """Unknowns whose covariance is kept whole: 3.2 GB."""
 _COLUMNS = 256
 _SINGULAR = "block: the equations are singular; a sigma is too large for what observes it"
-_ROUNDS = 40
 _HUBER_ROUNDS = 4
-_FREE_ROUNDS = 8
-_SETTLED = 1e-3
-_LEAST_REDUNDANCY = 10.0
-"""A variance from fewer redundant observations is uncertain by 45% or more: the group keeps its factor."""
-
-
-@dataclass(frozen=True)
-class GroupTest:
-    """A variance group after the adjustment.
-
-    Attributes:
-        count: observations. redundancy: how many of them the others check.
-        square: their weighted squares, whose expectation is the redundancy.
-        factor: on the variances; 1 where not estimated.
-    """
-
-    count: int
-    redundancy: float
-    square: float
-    factor: float
-
-    @property
-    def ratio(self) -> float:
-        """Variance of the residuals over that which the sigmas predict; NaN where nothing checks the group."""
-        return self.square / self.redundancy if self.redundancy > 1e-6 else float("nan")
-
-    @property
-    def p_value(self) -> float:
-        """Two-sided chance of such squares, as of a chi-square with the redundancy for its freedom."""
-        if self.redundancy < 1.0:
-            return 1.0
-        high = float(chi2.sf(self.square, self.redundancy))
-        return 2.0 * min(high, 1.0 - high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,14 +128,14 @@ class BlockAdjustment:
         return tuple(
             (str(ids[p]), one.name)
             for one, weight in zip(self.assembly.reduction.sets, self.weight, strict=True)
-            for p in one.point[weight <= _SETTLED].tolist()
+            for p in one.point[weight <= SETTLED].tolist()
         )
 
 
 def kept_block(found: BlockAdjustment) -> Block:
     """The block without the packets that robust weights gave up. Rejected control points become tie points."""
     block, sets = found.assembly.block, found.assembly.reduction.sets
-    keep = {one.name: weight > _SETTLED for one, weight in zip(sets, found.weight, strict=True)}
+    keep = {one.name: weight > SETTLED for one, weight in zip(sets, found.weight, strict=True)}
     scenes = tuple(
         replace(s, rays=s.rays.taken(keep[s.name])) if s.name in keep and not s.name.endswith(" laser") else s
         for s in block.scenes
@@ -179,7 +145,7 @@ def kept_block(found: BlockAdjustment) -> Block:
     role = points.role.copy()
     for one, weight in zip(sets, found.weight, strict=True):
         if one.group == "control":
-            role[one.point[weight <= _SETTLED]] = "tie"
+            role[one.point[weight <= SETTLED]] = "tie"
     terrain = block.terrain
     if terrain is not None:
         terrain = terrain.taken(keep["terrain"])
@@ -261,56 +227,78 @@ def adjust_block(
     points: Reduction | SharedReduction = reduction if pool is None else SharedReduction.of(reduction, pool)
     groups = [*(one.group for one in reduction.sets), *(one.group for one in reduction.priors)]
     weight = tuple(np.ones(len(one.point)) for one in reduction.sets)
-    at = State(np.zeros(reduction.size), block.points.start.copy(), weight, dict.fromkeys(groups, 1.0))
-    steps = 0
-    estimated = set(groups) if variance_components is True else set(variance_components or ())
-    factors: list[Mapping[str, float]] = []
-    for turn in range(_ROUNDS):
-        screening = robust is not None and turn < _HUBER_ROUNDS
+    at = _At(np.zeros(reduction.size), block.points.start.copy(), weight, dict.fromkeys(groups, 1.0))
+    rule = Rule(
+        "accept" if robust == "reject" else robust,
+        "components" if variance_components else None,
+        None if isinstance(variance_components, bool) else variance_components,
+        _HUBER_ROUNDS if robust else 0,
+    )
+    try:
+        at, found = settled(_Problem(assembly, points, iterations), at, rule)
+    except UnsettledError as error:
+        raise BlockError(f"block: {error}") from error
+    return _result(assembly, at, found)
+
+
+@dataclass(frozen=True, eq=False)
+class _At(State):
+    """Where an adjustment stands, with the Gauss-Newton steps so far."""
+
+    steps: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """Equations at a solution, covariance (P, P) of the unknowns, the packets beside what all others say, groups."""
+
+    reduced: Reduced
+    covariance: Array
+    checked: Checked
+    tests: Mapping[str, GroupTest]
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What does not change while weights come to rest."""
+
+    assembly: Assembly
+    points: Reduction | SharedReduction
+    iterations: int
+
+    def solve(self, at: _At, screening: bool) -> tuple[_At, _Solution]:
+        """See `Reweighted`."""
+        reduction = self.assembly.reduction
         # weights that will change are not worth more than a step or two
-        at, reduced, factor, more = _solved(reduction, points, at, iterations, 1e-2 if screening else _CONVERGED)
-        steps += more
+        tolerance = 1e-2 if screening else _CONVERGED
+        at, reduced, factor = _solved(reduction, self.points, at, self.iterations, tolerance)
         covariance = factor.inverse()
-        checked = points.checked(at, reduced.spread, _part_of(covariance))
-        standard = checked.standard
+        checked = self.points.checked(at, reduced.spread, _part_of(covariance))
         tests = _tests(reduction, at, covariance, reduced, checked.taken)
-        if robust is None and not estimated:
-            return _result(assembly, at, covariance, standard, tests, reduced, steps)
-        new_weight, new_factor = at.weight, dict(at.factor)
-        if robust is not None:
-            kind: Literal["huber", "accept"] = "accept"
-            if robust == "huber" or turn < _HUBER_ROUNDS:
-                kind = "huber"
-            new_weight = tuple(robust_weights(one, kind) for one in standard)
-            if kind == "accept" and turn >= _FREE_ROUNDS:
-                new_weight = tuple(np.minimum(a, b) for a, b in zip(new_weight, at.weight, strict=True))
-            new_weight = _without_lost(assembly, new_weight)
-        if estimated and not screening:
-            for name in estimated & set(tests):
-                one = tests[name]
-                if one.redundancy >= _LEAST_REDUNDANCY:
-                    new_factor[name] = bounded(at.factor[name] * one.square / one.redundancy)
-            factors.append(new_factor)
-        change = max(
-            max(
-                (float(np.abs(a - b).max(initial=0.0)) for a, b in zip(new_weight, at.weight, strict=True)), default=0.0
-            ),
-            max(abs(new_factor[g] / at.factor[g] - 1.0) for g in new_factor),
-        )
-        if change < _SETTLED and not screening:
-            return _result(assembly, at, covariance, standard, tests, reduced, steps)
-        if len(factors) == 3:
-            new_factor, factors = extrapolated(factors), []
-        at = replace(at, weight=new_weight, factor=new_factor)
-    raise BlockError(f"block: weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}")
+        return at, _Solution(reduced, covariance, checked, tests)
+
+    def judged(self, at: _At, found: _Solution) -> tuple[Array, ...]:
+        """See `Reweighted`."""
+        return found.checked.standard
+
+    def tests(self, at: _At, found: _Solution) -> Mapping[str, GroupTest]:
+        """See `Reweighted`."""
+        return found.tests
+
+    def weighed(self, at: _At, weight: tuple[Array, ...], factor: Mapping[str, float]) -> _At:
+        """The state without weights at points that fewer than three rows determine."""
+        lost = _rows_left(self.assembly, weight) < 3
+        sets = self.assembly.reduction.sets
+        kept = tuple(np.where(lost[one.point], 0.0, w) for one, w in zip(sets, weight, strict=True))
+        return replace(at, weight=kept, factor=factor)
 
 
 def _solved(
-    reduction: Reduction, points: Reduction | SharedReduction, at: State, iterations: int, tolerance: float
-) -> tuple[State, Reduced, _Factor, int]:
-    """Gauss-Newton with the weights as they stand, until a step is below so many sigmas; and how many there were."""
+    reduction: Reduction, points: Reduction | SharedReduction, at: _At, iterations: int, tolerance: float
+) -> tuple[_At, Reduced, _Factor]:
+    """Gauss-Newton with the weights as they stand, until a step is below so many sigmas."""
     last = np.inf
-    for steps in range(1, iterations + 1):
+    for _ in range(iterations):
         reduced = reduction.with_priors(points.eliminated(at), at)
         total = reduced.data + reduced.prior
         factor = _Factor(total)
@@ -319,12 +307,13 @@ def _solved(
         # points that stay too far from where x puts them count, too
         if size + _largest(reduced.start, reduced.spread) < _CONVERGED:
             # what x moves them by is less than its own step
-            return replace(at, x=at.x + step, ground=at.ground + reduced.start), reduced, factor, steps
+            at = replace(at, x=at.x + step, ground=at.ground + reduced.start, steps=at.steps + 1)
+            return at, reduced, factor
         moved = points.point_steps(at, reduced, step)
-        at = replace(at, x=at.x + step, ground=at.ground + moved)
+        at = replace(at, x=at.x + step, ground=at.ground + moved, steps=at.steps + 1)
         size = max(size, _largest(moved, reduced.spread))
         if size < tolerance or (size < 1e3 * tolerance and size > 0.5 * last):
-            return at, reduction.with_priors(points.eliminated(at), at), factor, steps
+            return at, reduction.with_priors(points.eliminated(at), at), factor
         if not np.isfinite(size):
             break
         last = size
@@ -342,18 +331,11 @@ def _largest(moved: Array, spread: Array) -> float:
     return float(np.sqrt(np.max(np.sum(moved[used] * solved, axis=1), initial=0.0)))
 
 
-def _without_lost(assembly: Assembly, weight: Sequence[Array]) -> tuple[Array, ...]:
-    """Weights with none left at points that fewer than three rows determine."""
-    rows = _rows_left(assembly, weight)
-    lost = rows < 3
-    return tuple(np.where(lost[one.point], 0.0, w) for one, w in zip(assembly.reduction.sets, weight, strict=True))
-
-
 def _rows_left(assembly: Assembly, weight: Sequence[Array]) -> NDArray[np.intp]:
     """(m,) rows with any weight at each point."""
     rows = np.zeros(assembly.reduction.count, np.intp)
     for one, w in zip(assembly.reduction.sets, weight, strict=True):
-        np.add.at(rows, one.point, one.rows * (w > _SETTLED))
+        np.add.at(rows, one.point, one.rows * (w > SETTLED))
     return rows
 
 
@@ -362,7 +344,7 @@ def _tests(
 ) -> dict[str, GroupTest]:
     counts: dict[str, int] = {}
     for one, weight in zip(reduction.sets, at.weight, strict=True):
-        counts[one.group] = counts.get(one.group, 0) + one.rows * int(np.sum(weight > _SETTLED))
+        counts[one.group] = counts.get(one.group, 0) + one.rows * int(np.sum(weight > SETTLED))
     found = {
         name: GroupTest(counts[name], counts[name] - taken[name], reduced.square[name], at.factor[name])
         for name in taken
@@ -378,15 +360,7 @@ def _tests(
     return found
 
 
-def _result(
-    assembly: Assembly,
-    at: State,
-    covariance: Array,
-    standard: tuple[Array, ...],
-    tests: Mapping[str, GroupTest],
-    reduced: Reduced,
-    steps: int,
-) -> BlockAdjustment:
+def _result(assembly: Assembly, at: _At, found: _Solution) -> BlockAdjustment:
     rows = _rows_left(assembly, at.weight)
     known = rows >= 3
     ranks = group_ranks(assembly.reduction.priors)
@@ -394,14 +368,14 @@ def _result(
     return BlockAdjustment(
         assembly=assembly,
         x=at.x,
-        covariance=covariance,
+        covariance=found.covariance,
         ground=np.where(known[:, None], at.ground, np.nan),
-        spread=reduced.spread,
+        spread=found.reduced.spread,
         weight=at.weight,
-        standard=standard,
-        groups=tests,
-        chi_square=sum(one.square for one in tests.values()),
+        standard=found.checked.standard,
+        groups=found.tests,
+        chi_square=sum(one.square for one in found.tests.values()),
         degrees_of_freedom=freedom,
-        reduced=reduced,
-        iterations=steps,
+        reduced=found.reduced,
+        iterations=at.steps,
     )

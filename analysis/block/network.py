@@ -19,14 +19,18 @@ from analysis.block.block import Block, Term
 from analysis.block.block_adjustment import BlockAdjustment
 from analysis.block.point_reduction import State
 from analysis.block.processes import Law
-from analysis.orbit.calibration_parameters import vertical
-from analysis.units import ARCSEC
+from analysis.orbit.ground_errors import level_axes
+from analysis.orbit.null_space import echelon, shown
 
 __all__ = ["Network", "Open", "datum_test", "network_of", "open_combinations", "simplified"]
 
 Array = NDArray[np.float64]
 _SHOWN = 0.25
 """Of the largest part: smaller parts of a combination are not named."""
+_TAKING = 6
+"""Unknowns of one combination that are named."""
+_NOTHING = 1e-3
+"""Sigma of the prior over that of the observations, below which they tell nothing."""
 _MOST = 12
 """Combinations that are named, the widest open first."""
 
@@ -102,17 +106,16 @@ class Open:
     told: float
 
     def __str__(self) -> str:
-        parts = [
-            f"{name} {change:+.2g} m" if "offset" in name or "height" in name
-            else f"{name} {1e6 * change:+.2g} um" if name.endswith("d_f")
-            else f"{name} {change / ARCSEC:+.2g} arcsec"
-            for name, change in zip(self.names, self.change, strict=True)
-        ]  # fmt: skip
+        parts = [shown(name, change) for name, change in zip(self.names, self.change, strict=True)]
         return f"{', '.join(parts)} (told to {100.0 * self.told:.2g}% of the prior)"
 
 
 def open_combinations(found: BlockAdjustment) -> tuple[Open, ...]:
-    """What of the block's unknowns the observations leave to the priors, by name, the widest open first."""
+    """What of the block's unknowns the observations leave to the priors, by name, the widest open first.
+
+    What is told to less than a thousandth, and the rest, are a space each, and a combination has an unknown that is in
+    no other one of its space (`null_space.echelon`): the eigenvectors of a space whose eigenvalues are alike are any.
+    """
     plain = assembled(simplified(found.assembly.block))
     ground = np.where(np.isfinite(found.ground), found.ground, found.assembly.block.points.start)
     weight = tuple(np.ones(len(one.point)) for one in plain.reduction.sets)
@@ -121,21 +124,16 @@ def open_combinations(found: BlockAdjustment) -> tuple[Open, ...]:
     # eigenvalues of the observations' information in units of the priors'
     values, vectors = eigh(data, prior)
     names, sizes = plain.names(), _sizes(plain.block, plain.names())
+    spaces = np.split(vectors[:, values < 1.0], [int(np.sum(values < _NOTHING**2))], axis=1)
     combinations = []
-    for value, vector in list(zip(values.tolist(), vectors.T, strict=True))[:_MOST]:
-        if value >= 1.0:
-            break
+    for vector in np.concatenate([echelon(one) for one in spaces], axis=1).T:
+        vector = vector / np.sqrt(vector @ prior @ vector)
         taking = np.flatnonzero(np.abs(vector) >= _SHOWN * np.abs(vector).max())
-        taking = taking[np.argsort(-np.abs(vector[taking]), kind="stable")][:6]
+        taking = taking[np.argsort(-np.abs(vector[taking]), kind="stable")][:_TAKING]
         change = vector * sizes * np.sign(vector[taking[0]])
-        combinations.append(
-            Open(
-                tuple(names[i] for i in taking.tolist()),
-                tuple(change[taking].tolist()),
-                float(np.sqrt(max(value, 0.0))),
-            )
-        )
-    return tuple(combinations)
+        told = float(np.sqrt(max(float(vector @ data @ vector), 0.0)))
+        combinations.append(Open(tuple(names[i] for i in taking.tolist()), tuple(change[taking].tolist()), told))
+    return tuple(sorted(combinations, key=lambda one: one.told)[:_MOST])
 
 
 def _sizes(block: Block, names: tuple[str, ...]) -> Array:
@@ -180,16 +178,8 @@ def datum_test(found: BlockAdjustment) -> DatumTest | None:
     value, covariance = shift
     points = found.assembly.block.points
     middle = np.mean(points.start[points.role == "control"], axis=0)
-    axes = _level(middle)
+    axes = level_axes(middle[None])[0]
     level, spread = axes @ value, axes @ covariance @ axes.T
     a, b, c = np.sqrt(np.diag(spread)).tolist()
     east, north, up = level.tolist()
     return DatumTest(east, north, up, (a, b, c), float(level @ np.linalg.solve(spread, level)))
-
-
-def _level(place: Array) -> Array:
-    """(3, 3) east, north and up as rows."""
-    up = vertical(place[None])[0]
-    east = np.cross([0.0, 0.0, 1.0], up)
-    east = east / np.linalg.norm(east)
-    return np.stack([east, np.cross(up, east), up])

@@ -19,7 +19,7 @@ from scipy import sparse
 
 from analysis.block.packets import Packets
 from analysis.block.processes import BlockError
-from analysis.orbit.residual_tests import standardised_packets
+from analysis.block.reweighting import standardised_packets
 
 __all__ = ["Bundle", "Checked", "Eliminated", "PriorGroup", "Reduced", "Reduction", "Rows", "State"]
 

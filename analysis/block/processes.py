@@ -8,7 +8,7 @@ with unknowns z whose prior is that of the process at unit size, the same about 
 
 - `constant`: one z of variance 1. `rate`: one, times the seconds from the middle of the scope.
 - `white`: readings at whole multiples of `interval`, independent, joined by the cubic spline through them
-  (`analysis.orbit.shared_noise` has the algebra). sigma is that of a reading.
+  (`analysis.orbit.ray_noise` has the algebra). sigma is that of a reading.
 - `walk`: a random walk that is zero at the middle of the scope; sigma is what it gains in a second.
 - `slow`: a first-order Gauss-Markov process of standard deviation sigma and correlation time `time`.
 - `orbital`: amplitudes of cosine and sine of 2 pi t / `time`, of standard deviation sigma each.
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from analysis.measurement_error import MeasurementError
-from analysis.orbit.shared_noise import spline_blend, spline_precision
+from analysis.orbit.ray_noise import spline_blend, spline_precision
 
 __all__ = ["STEPPED", "BlockError", "Kind", "Law", "Support"]
 
@@ -164,7 +164,10 @@ class Support:
         return 3 * len(self.numbers)
 
     def blend(self, times: Array) -> tuple[Indices, Array]:
-        """Which numbers (n, w) of an axis' unknowns each time meets, counted from 0, and by how much (n, w)."""
+        """Which numbers (n, w) of an axis' unknowns each time meets, counted from 0, and by how much (n, w).
+
+        A time far from all observations meets nothing.
+        """
         count, law = len(times), self.law
         if law.kind == "constant":
             return np.zeros((count, 1), np.intp), np.ones((count, 1))
@@ -175,16 +178,17 @@ class Support:
             return np.tile(np.arange(2), (count, 1)), np.stack([np.cos(phase), np.sin(phase)], axis=1)
         if law.kind == "white":
             first, values = spline_blend(times, law.interval)
-            return np.searchsorted(self.numbers, first[:, None] + np.arange(4)), values
-        first = np.asarray(np.floor(times / law.interval), np.intp)
-        share = times / law.interval - first
-        if law.kind == "jitter":
-            where = np.searchsorted(self.numbers, 2 * first[:, None] + np.arange(4))
-            phase = 2.0 * np.pi * law.frequency * times
-            wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
-            return where, np.concatenate([(1.0 - share)[:, None] * wave, share[:, None] * wave], axis=1)
-        where = np.searchsorted(self.numbers, np.stack([first, first + 1], axis=1))
-        return where, np.stack([1.0 - share, share], axis=1)
+            wanted = first[:, None] + np.arange(4)
+        else:
+            first = np.asarray(np.floor(times / law.interval), np.intp)
+            share = times / law.interval - first
+            wanted, values = np.stack([first, first + 1], axis=1), np.stack([1.0 - share, share], axis=1)
+            if law.kind == "jitter":
+                phase = 2.0 * np.pi * law.frequency * times
+                wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+                wanted, values = 2 * first[:, None] + np.arange(4), np.repeat(values, 2, axis=1) * np.tile(wave, 2)
+        where = np.minimum(np.searchsorted(self.numbers, wanted), len(self.numbers) - 1)
+        return where, np.where(self.numbers[where] == wanted, values, 0.0)
 
     def whitened(self) -> Array:
         """(k, k) dense root R of the precision, R R' = precision: R' z are independent and in order of time."""

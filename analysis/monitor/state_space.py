@@ -319,7 +319,11 @@ class StateSpace:
         """Of each law with a period its states, the period, and the turns of them by nothing and by a quarter."""
         own = [block for block in self._blocks if block.law.period_s is not None]
         quarters = [np.kron([[0.0, -1.0], [1.0, 0.0]], np.eye(block.rank)) for block in own]
-        return [(b.at, float(b.law.period_s or 0.0), np.eye(len(q)), q) for b, q in zip(own, quarters, strict=True)]
+        periods = [float(block.law.period_s or 0.0) for block in own]
+        return [
+            (b.at, t, np.eye(2 * b.rank), np.asarray(q, np.float64))
+            for b, t, q in zip(own, periods, quarters, strict=True)
+        ]
 
     @cached_property
     def _transitions(self) -> dict[float, _Transition]:

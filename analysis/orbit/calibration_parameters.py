@@ -52,9 +52,10 @@ class NoiseTerm:
     Attributes:
         group: variance group.
         kind: what it acts on.
-        sigma: of a reading, about each body axis in radians or along each axis in metres.
+        sigma: of a reading, about each body axis in radians or along each axis in metres; of a random walk what it
+            gains in a second.
         interval: of the readings, seconds, that a cubic spline joins; None where each exposure has noise of its own.
-        walks: whether the readings are those of a random walk, of which sigma is what it gains in an interval.
+        walks: whether it is a random walk, straight between its values at the interval.
     """
 
     group: str
@@ -99,9 +100,7 @@ class Noise:
             NoiseTerm("attitude", "attitude", self.attitude, self.attitude_interval),
             NoiseTerm("slow attitude", "attitude", self.slow_attitude, self.slow_interval),
             NoiseTerm("station", "station", self.station, self.station_interval),
-            NoiseTerm(
-                "attitude walk", "attitude", self.attitude_walk * self.walk_interval**0.5, self.walk_interval, True
-            ),
+            NoiseTerm("attitude walk", "attitude", self.attitude_walk, self.walk_interval, True),
         )
         return tuple(t for t in every if t.sigma > 0)
 

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.calibration_parameters import CalibrationError, Noise, vertical
-from analysis.orbit.shared_noise import ray_covariance
+from analysis.orbit.ray_noise import ray_covariance
 from analysis.orbit.three_line_model import LineModel, Rays, bias_rotation, misclosure, partials
 
 Array = NDArray[np.float64]

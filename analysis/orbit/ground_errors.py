@@ -1,31 +1,67 @@
-"""Errors of points on the ground as map standards count them: circles and intervals that hold a share of them."""
+"""Errors of points on the ground as map standards count them: circles and intervals that hold a share of them.
+
+CE90 is the radius in plan that holds nine points in ten, LE90 the height that does: of one point by its covariance, of
+a set of points with different covariances for a point that is drawn from the set, and of errors that are known.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri
+from scipy.optimize import brentq, elementwise
+from scipy.special import erf, ndtri
+
+from analysis.orbit.calibration_parameters import vertical
+
+__all__ = [
+    "Accuracy",
+    "circle_of_points",
+    "circular_error",
+    "interval_of_points",
+    "level_axes",
+    "linear_error",
+    "predicted",
+    "realised",
+]
 
 Array = NDArray[np.float64]
-_ANGLES = 400
-"""Of the integral over half a circle; it is periodic, so that an ellipse of 1 : 50 has 1e-10."""
-_ROUND = 0.02
-"""Ratio of an ellipse's axes below which the short one counts as this share of the long one: 5e-4 of the radius."""
-_BISECTIONS = 60
+_SHARE = 0.9
+_DIRECTIONS = 0.5 * np.pi * (np.arange(32) + 0.5) / 32
+"""Of the mean over a quarter of a circle, 1e-12 of CE90 for axes of any ratio."""
+_FARTHEST = 40.0
+"""Radius beyond which nothing lies, in standard deviations."""
 
 
-def linear_error(variance: ArrayLike, share: float = 0.9) -> Array:
+@dataclass(frozen=True)
+class Accuracy:
+    """CE90 and LE90, metres, and of how many points."""
+
+    ce90: float
+    le90: float
+    count: int
+
+
+def level_axes(points: Array) -> Array:
+    """(m, 3, 3) east, north and up as rows, at points (m, 3), ITRS, metres."""
+    up = vertical(points)
+    east = np.cross([0.0, 0.0, 1.0], up)
+    east = east / np.linalg.norm(east, axis=1, keepdims=True)
+    return np.stack([east, np.cross(up, east), up], axis=1)
+
+
+def linear_error(variance: ArrayLike, share: float = _SHARE) -> Array:
     """Half width (...) of the interval about zero that holds a share of normal errors of these variances (...); LE90
     for 0.9, 1.645 sigma.
     """
     return np.asarray(float(ndtri(0.5 + 0.5 * share)) * np.sqrt(variance))
 
 
-def circular_error(covariance: ArrayLike, share: float = 0.9) -> Array:
+def circular_error(covariance: ArrayLike, share: float = _SHARE) -> Array:
     """Radius of the circle about zero that holds a share of normal errors in the plane; CE90 for 0.9.
 
-    In polar coordinates the radius of a direction is integrated in closed form, which leaves a smooth periodic integral
-    over the angle. A round covariance has 2.146 sigma, one along a line 1.645 sigma.
+    A round covariance has 2.146 sigma, one along a line 1.645 sigma.
 
     Args:
         covariance: (..., 2, 2).
@@ -37,21 +73,67 @@ def circular_error(covariance: ArrayLike, share: float = 0.9) -> Array:
     Raises:
         ValueError: a share that is none, a covariance that is none.
     """
+    values = _axes(covariance, share)
+    longer = np.sqrt(values[..., 1])
+    ratio = np.divide(values[..., 0], values[..., 1], out=np.ones_like(longer), where=longer > 0.0)
+
+    def missing(radius: Array, short: Array) -> Array:
+        return share - _within(radius, np.stack([short, np.ones_like(short)], axis=-1))
+
+    found = elementwise.find_root(missing, (np.zeros_like(ratio), np.full_like(ratio, _FARTHEST)), args=(ratio,))
+    return np.asarray(longer * found.x)
+
+
+def circle_of_points(covariance: Array, share: float = _SHARE) -> float:
+    """Radius that holds a share of points with covariances (m, 2, 2) in plan; see `circular_error`."""
+    values = _axes(covariance, share)
+
+    def missing(radius: float) -> float:
+        return float(np.mean(_within(radius, values))) - share
+
+    return float(brentq(missing, 0.0, _FARTHEST * float(np.sqrt(values.max())), xtol=1e-9))
+
+
+def interval_of_points(variance: Array, share: float = _SHARE) -> float:
+    """Distance, metres, that holds the share of points with variances (m,), m^2."""
+    sigma = np.sqrt(np.maximum(variance, 1e-300))
+
+    def missing(size: float) -> float:
+        return float(np.mean(erf(size / sigma / np.sqrt(2.0)))) - share
+
+    return float(brentq(missing, 0.0, _FARTHEST * float(sigma.max()), xtol=1e-9))
+
+
+def predicted(points: Array, covariance: Array) -> Accuracy:
+    """By covariances (m, 3, 3), ITRS, of points (m, 3)."""
+    axes = level_axes(points)
+    level = axes @ covariance @ np.swapaxes(axes, 1, 2)
+    return Accuracy(circle_of_points(level[:, :2, :2]), interval_of_points(level[:, 2, 2]), len(points))
+
+
+def realised(points: Array, error: Array) -> Accuracy:
+    """By errors (m, 3), ITRS, metres, of points (m, 3): quantiles of the sample."""
+    level = np.einsum("nij,nj->ni", level_axes(points), error)
+    plan, height = np.linalg.norm(level[:, :2], axis=1), np.abs(level[:, 2])
+    return Accuracy(float(np.quantile(plan, _SHARE)), float(np.quantile(height, _SHARE)), len(points))
+
+
+def _axes(covariance: ArrayLike, share: float) -> Array:
+    """(..., 2) variances along the axes of the ellipses, the shorter first."""
     if not 0.0 < share < 1.0:
         raise ValueError("a share lies between 0 and 1")
     values = np.linalg.eigvalsh(np.asarray(covariance, np.float64))
     if not np.all(values >= -1e-12 * np.abs(values[..., -1:])):
         raise ValueError("a covariance has no negative variances")
-    longer = np.sqrt(np.maximum(values[..., 1], 0.0))
-    shorter = np.sqrt(np.maximum(values[..., 0], 0.0))
-    ratio = np.maximum(np.divide(shorter, longer, out=np.ones_like(longer), where=longer > 0.0), _ROUND)
-    angle = np.pi * np.arange(_ANGLES) / _ANGLES
-    # inverse variance along each direction, in units of the longer axis
-    q = np.cos(angle) ** 2 + (np.sin(angle) / ratio[..., None]) ** 2
-    low, high = np.zeros_like(ratio), np.full_like(ratio, 40.0)
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        outside = np.mean(np.exp(-0.5 * q * middle[..., None] ** 2) / q, axis=-1) / ratio
-        within = 1.0 - outside
-        low, high = np.where(within < share, middle, low), np.where(within < share, high, middle)
-    return np.asarray(longer * 0.5 * (low + high))
+    return np.asarray(np.maximum(values, 0.0))
+
+
+def _within(radius: ArrayLike, variances: Array) -> Array:
+    """(...) share of normal errors with variances (..., 2) along two axes that lie within radii (...).
+
+    In units of the axes the errors are round: directions are alike, and in each the length is Rayleigh's. The ellipse
+    that the circle becomes has the radius R / sqrt(a cos^2 + b sin^2) there.
+    """
+    along = variances[..., :1] * np.sin(_DIRECTIONS) ** 2 + variances[..., 1:] * np.cos(_DIRECTIONS) ** 2
+    square = np.asarray(radius, np.float64)[..., None] ** 2
+    return np.asarray(np.mean(-np.expm1(-0.5 * square / np.maximum(along, 1e-300)), axis=-1))

@@ -44,8 +44,10 @@ __all__ = [
     "Gauge",
     "RankError",
     "combinations",
+    "echelon",
     "free_basis",
     "null_vectors",
+    "shown",
     "solved",
     "weak_vectors",
 ]
@@ -80,7 +82,7 @@ class Combination:
     sigma: float
 
     def __str__(self) -> str:
-        parts = [_shown(n, c) for n, c in zip(self.names, self.change, strict=True)]
+        parts = [shown(n, c) for n, c in zip(self.names, self.change, strict=True)]
         return f"{', '.join(parts)} (strength {self.strength:.1e}, sigma {self.sigma * 1e3:.2g} mm)"
 
 
@@ -190,7 +192,7 @@ def combinations(
         length: of the columns before the ground points were eliminated, (P,).
     """
     found = []
-    for vector in _echelon(vectors).T:
+    for vector in echelon(vectors).T:
         change = scale * vector / np.abs(vector).max()
         form = float(np.sqrt(max(float(change @ reduced @ change), 0.0)))
         taking = np.flatnonzero(np.abs(vector) >= _SHOWN * np.abs(vector).max())
@@ -277,7 +279,7 @@ def solved(normal: Array, right: Array) -> Array:
     return np.asarray(size[:, None] * cho_solve(factor, size[:, None] * wide)).reshape(right.shape)
 
 
-def _echelon(vectors: Array) -> Array:
+def echelon(vectors: Array) -> Array:
     """(P, k) of the same space as independent vectors (P, k), each with an unknown of its own and a largest entry of 1.
 
     The own unknowns are those that have most part in the space, which does not depend on the vectors that span it.
@@ -291,8 +293,9 @@ def _echelon(vectors: Array) -> Array:
     return np.asarray(found / found[largest, np.arange(found.shape[1])])
 
 
-def _shown(name: str, change: float) -> str:
-    if "offset" in name:
+def shown(name: str, change: float) -> str:
+    """A change of an unknown, metres or radians, in words."""
+    if "offset" in name or "height" in name:
         return f"{name} {change:+.4g} m"
     if name.split()[-1] in _ANGLES:
         per = "/s" if name.endswith("rate") else ""

@@ -232,10 +232,11 @@ def _modules() -> dict[str, tuple[Callable[[], Mapping[str, tuple[float, int, st
     """Beginning of the names of figures that no command writes -> what measures them (value, decimals, unit), and the
     seed of its random numbers. The modules are imported here, since they need what ``setup.sh --test`` installs.
     """
-    from docs.figures import ccd_growth, libraries, simulated_years
+    from docs.figures import ccd_growth, libraries, loop_orbit, simulated_years
 
     return {
         "ccd": (ccd_growth.measured, ccd_growth.SEED),
+        "loop": (loop_orbit.measured, loop_orbit.SEED),
         "libraries": (libraries.measured, libraries.SEED),
         "operation": (simulated_years.measured, simulated_years.SEED),
     }

@@ -105,7 +105,7 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
     cameras = load.load_cameras(instrument)
     line_detectors = None
     if job.render.target_images:
-        line_detectors = FrozenMap({name: _line_detector(camera) for name, camera in cameras.items()})
+        line_detectors = FrozenMap({name: line_detector(camera) for name, camera in cameras.items()})
     # Built from checked parts: validating again would ask for quantities as text.
     return ResolvedJob.model_construct(
         job=job,
@@ -167,8 +167,15 @@ def target_band(camera: CameraSpec) -> str:
     return PANCHROMATIC if PANCHROMATIC in camera.bands else next(iter(camera.bands))
 
 
-def _line_detector(camera: CameraSpec) -> DetectorSpec:
-    """Data sheet of the line CCD that images the targets."""
+def line_detector(camera: CameraSpec) -> DetectorSpec:
+    """Data sheet of the line CCD with which a camera images.
+
+    Args:
+        camera: with bands.
+
+    Raises:
+        InputError: it has no band, or there is no such sheet.
+    """
     return load.load_band_detectors(camera)[camera.bands[target_band(camera)].detector]
 
 

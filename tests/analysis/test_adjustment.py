@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.orbit.adjustment import adjust
+from analysis.block.reweighting import LARGEST_FACTOR, REJECT, robust_weights, standardised_packets
+from analysis.calibration.adjustment import adjust
+from analysis.calibration.normal_equations import State, Weights, assemble
+from analysis.calibration.shared_noise import SharedNoise
+from analysis.calibration.stepwise import stepwise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, Unknowns
 from analysis.orbit.forward_intersection import check_errors, intersect
-from analysis.orbit.normal_equations import State, Weights, assemble
 from analysis.orbit.null_space import WORST, Gauge, RankError, solved
-from analysis.orbit.residual_tests import LARGEST_FACTOR, REJECT, robust_weights, standardised
-from analysis.orbit.shared_noise import SharedNoise
-from analysis.orbit.stepwise import stepwise
 from tests.analysis.test_three_line_model import (
     ARCSEC,
     INTERIOR,
@@ -557,7 +557,8 @@ def test_standardised_residuals_do_not_depend_on_the_own_weight():
             at = at.moved(equations, step)
         equations = assemble([field], LABORATORY, parameters, at, noise, (), weights, shared)
         covariance[np.ix_(kept, kept)] = solved(equations.reduced[np.ix_(kept, kept)], np.eye(len(kept)))
-        sizes.append(standardised(equations, equations.image_cofactors(covariance), weights)[7])
+        cofactors = equations.image_cofactors(covariance)
+        sizes.append(standardised_packets(equations.residuals.image, cofactors, weights.image, 1.0)[7])
         raw.append(np.linalg.norm(equations.residuals.image[7]))
     assert raw[-1] > 5 * raw[0]
     # rounding of the covariances, and the little that the system bends over a millionth of a radian

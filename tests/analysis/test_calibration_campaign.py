@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.orbit.adjustment import adjust
+from analysis.calibration.adjustment import adjust
+from analysis.calibration.hidden_terms import FALSE_ALARM
 from analysis.orbit.calibration_parameters import Noise, Prior, Unknowns
 from analysis.orbit.null_space import Gauge
-from analysis.orbit.residual_tests import FALSE_ALARM
 from analysis.orbit.three_line_model import LineModel
 from tests.analysis.test_adjustment import INNER, LABORATORY, measured
 from tests.analysis.test_hidden_terms import random_walk, turned

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.adjustment import adjust
+from analysis.calibration.adjustment import adjust
 from analysis.orbit.calibration_parameters import CalibrationError, Noise, Prior, Unknowns, monitor_priors
 from analysis.orbit.forward_intersection import check_errors, intersect
 from analysis.orbit.null_space import RankError

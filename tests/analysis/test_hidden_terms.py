@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.adjustment import adjust
+from analysis.calibration.adjustment import adjust
+from analysis.calibration.hidden_terms import FALSE_ALARM, Steps
 from analysis.orbit.calibration_parameters import CalibrationError, Prior, Unknowns
-from analysis.orbit.residual_tests import FALSE_ALARM, Steps
 from tests.analysis.test_adjustment import HOLD_XY, LABORATORY, NOISE, measured, seen, truth
 from tests.analysis.test_three_line_model import ARCSEC, PITCH
 

@@ -8,12 +8,12 @@ import pytest
 from scipy import stats
 from scipy.linalg import subspace_angles
 
-from analysis.orbit.adjustment import adjust
+from analysis.calibration.adjustment import adjust
+from analysis.calibration.normal_equations import State, Weights, assemble
+from analysis.calibration.plausibility import FarPointsError, NoiseError
+from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit.calibration_parameters import CalibrationError, Noise, Parameters, Unknowns
-from analysis.orbit.normal_equations import State, Weights, assemble
 from analysis.orbit.null_space import WORST, Gauge, RankError, combinations, free_basis, null_vectors, weak_vectors
-from analysis.orbit.plausibility import FarPointsError, NoiseError
-from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import LineModel
 from tests.analysis.test_adjustment import BIAS, INNER, LABORATORY, NOISE, PITCH, measured, truth
 from tests.analysis.test_three_line_model import ARCSEC, cameras, field_points, mounting, observe

@@ -8,11 +8,13 @@ import pytest
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
-from analysis.orbit.adjustment import adjust
+from analysis.calibration.adjustment import adjust
+from analysis.calibration.normal_equations import State, Weights, assemble
+from analysis.calibration.plausibility import single_ray
+from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters
 from analysis.orbit.forward_intersection import intersect
-from analysis.orbit.normal_equations import State, Weights, assemble
-from analysis.orbit.shared_noise import SharedNoise, reading_variance
+from analysis.orbit.ray_noise import reading_variance
 from analysis.orbit.three_line_model import Partials, Rays, misclosure, partials
 from tests.analysis.test_adjustment import (
     BIAS,
@@ -105,6 +107,19 @@ def test_corrections_at_any_time_are_those_of_the_rays():
         assert np.array_equal(direct.station, other.station)
         assert np.array_equal(direct.attitude, other.attitude)
         assert np.abs(direct.station - rays.station).max() > 0.01
+        # far from all rays nothing is known
+        far = shared.corrected_at("F0", replace(rays, time=rays.time + 1e4), values)
+        assert np.array_equal(far.station, rays.station)
+        assert np.array_equal(far.attitude, rays.attitude)
+
+
+def test_a_walk_of_the_attitude_is_as_large_whatever_the_interval_of_its_values():
+    fields, _ = campaign(flight(8, SEVEN_NODES[:1]), np.random.default_rng(1))
+    sizes = [
+        single_ray(fields, LABORATORY, Noise(PITCH, attitude_walk=1e-6, walk_interval=step))["attitude walk"]
+        for step in (0.05, 1.0)
+    ]
+    assert sizes[1] == pytest.approx(sizes[0], rel=1e-6)
 
 
 def test_rows_of_shared_noise_are_derivatives_of_the_misclosures():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from analysis.calibration.strip_adjustment import adjust_strip
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.forward_intersection import check_errors, intersect
-from analysis.orbit.strip_adjustment import adjust_strip
 from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, make_rays, observe, orbit
 
 BIAS = np.array([40.0, -60.0, 90.0]) * ARCSEC

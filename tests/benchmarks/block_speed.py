@@ -118,7 +118,7 @@ def large_block(ties: int, seed: int = 1) -> tuple[Block, np.ndarray]:
 
 
 def measured(ties: int) -> dict[str, float]:
-    """Seconds, by the clock and of the processor, to adjust a block in this process; largest memory, GiB, of the process
+    """Seconds, by the clock and of the processor, to adjust a block here; largest memory, GiB, of the process
     and of the block alone; and what was adjusted.
     """
     block, ground = large_block(ties)
@@ -175,4 +175,4 @@ def measure(bench: Workbench, quick: bool) -> Speed:
 
 
 if __name__ == "__main__":
-    print(json.dumps(measured(int(sys.argv[1]))))
+    sys.stdout.write(json.dumps(measured(int(sys.argv[1]))))

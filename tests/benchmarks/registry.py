@@ -9,6 +9,7 @@ from tests.benchmarks import (
     asbuilt_speed,
     block_speed,
     cut_speed,
+    growth_speed,
     jacobian_speed,
     large_speed,
     layout_speed,
@@ -19,6 +20,7 @@ from tests.benchmarks import (
     pushbroom_speed,
     quality_speed,
     record_speed,
+    roofline_speed,
     start_speed,
     study_speed,
     table_speed,
@@ -51,6 +53,7 @@ BENCHMARKS = (
     Benchmark("trace", "sequential trace beside batoid and optiland", trace_speed.measure, 45, 8),
     Benchmark("psf", "image of a far point beside poppy", psf_speed.measure, 12, 2),
     Benchmark("monitor", "a batch of states of the monitor", monitor_speed.measure, 18, 6),
+    Benchmark("roofline", "what each part of a state takes, and could take", roofline_speed.measure, 30, 12),
     Benchmark("jacobian", "derivatives in reverse and forward mode", jacobian_speed.measure, 60, 8),
     Benchmark("paths", "paths of the path tracer", path_speed.measure, 25, 10),
     Benchmark("layouts", "information of a monitor's layout, and a search for layouts", layout_speed.measure, 90, 20),
@@ -65,6 +68,9 @@ BENCHMARKS = (
     Benchmark("study", "the engine of trade studies", study_speed.measure, 45, 20),
     Benchmark("live", "the live twin: from a slider to painted spots and readings", live_speed.measure, 75, 30),
     Benchmark("large", "a study of ten thousand states", large_speed.measure, 200, 25),
+    Benchmark(
+        "growth", "how processor time grows with states, pixels, bodies and frames", growth_speed.measure, 300, 8
+    ),
     Benchmark(
         "start",
         "help, a bad file, the main job with an empty and a filled cache",

@@ -174,6 +174,7 @@ ALL = (
     _job("orbit_check", "twin.orbit check scenes/orbit/measured/check.yaml --out {out}"),
     _job("orbit_jitter", f"twin.orbit jitter {RUN % 'jitter'} --json"),
     _job("orbit_jitter_measured", "twin.orbit jitter scenes/orbit/measured/jitter.yaml --out {out} --quiet"),
+    _job("orbit_loop", f"twin.orbit loop {RUN % 'loop'}"),
     _job("orbit_match", "twin.orbit match {here}/match.yaml --out {out}", prepare=_files),
     _job("orbit_monitor", f"twin.orbit monitor {RUN % 'monitor'}"),
     _job("orbit_export", "twin.orbit export {here}/pass --out {out}", prepare=_pass),

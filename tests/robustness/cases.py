@@ -217,6 +217,7 @@ def _orbits() -> Iterator[Case]:
         yield _of_one(f"orbit-{name}", "calibration", orbit, "calibrate", f"{name}.yaml", whole=whole)
     yield _of_one("orbit-adjust", "block", orbit, "adjust", "adjust.yaml", weight=0.5, whole=30)
     yield _of_one("orbit-monitor", "monitoring", orbit, "monitor", "monitor.yaml", weight=0.5, whole=40)
+    yield _of_one("orbit-loop", "monitor in a loop", orbit, "loop", "loop.yaml", weight=0.5, whole=0)
     yield _of_one("orbit-simulate", "simulation", orbit, "simulate", "simulate.yaml", whole=30)
     yield _of_one("orbit-export", "simulation", orbit, "export", "simulate.yaml", weight=0.5)
     configs = {

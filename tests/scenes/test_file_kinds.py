@@ -53,6 +53,7 @@ FOLDERS = {
     "orbit/measured/jitter": "measured_jitter",
     "orbit/calibrate": "orbit_calibration",
     "orbit/jitter": "orbit_jitter",
+    "orbit/loop": "orbit_loop",
     "orbit/monitor": "orbit_monitor",
     "orbit/simulate": "orbit_simulate",
 }

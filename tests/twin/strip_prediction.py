@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from analysis.calibration.normal_equations import State, Weights, assemble
+from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit.calibration_parameters import CalibrationField, Parameters, Unknowns
 from analysis.orbit.forward_intersection import intersect
-from analysis.orbit.normal_equations import State, Weights, assemble
-from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import LineModel
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass

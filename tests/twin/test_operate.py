@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine, inspect
+from sqlalchemy import create_engine, event, inspect
 
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
@@ -643,3 +643,42 @@ def test_frames_of_a_file_are_kept_with_it(record: Path) -> None:
         history.take(Given("f", "b" * 64, "", [entry], {"x.tiff": "c" * 64}))
         with history.reading() as connection:
             assert connection.exec_driver_sql("SELECT file, sha256 FROM frame").all() == [("x.tiff", "c" * 64)]
+
+
+def test_one_reading_more_is_as_much_work_in_a_long_record(tmp_path: Path) -> None:
+    """Counted in steps of SQLite's machine: taking a reading, and all that an estimate asks the record for after it."""
+    steps = [0]
+
+    def count() -> int:
+        steps[0] += 1
+        return 0
+
+    def counted(raw: sqlite3.Connection, *_: object) -> None:
+        raw.set_progress_handler(count, 1)
+
+    def released(raw: sqlite3.Connection, *_: object) -> None:
+        raw.set_progress_handler(None, 1)
+
+    def work(history: History, k: int) -> int:
+        newest, time = history.newest_id(), START + MINUTE * (k - 1)
+        steps[0] = 0
+        assert history.take(given(f"one{k}", temperatures(k, 1))).new == 1
+        assert history.first("temperature") is not None
+        assert history.subjects("temperature") == ["base"]
+        assert not history.came_late(newest, time)
+        assert [one["time_us"] for one in history.entries(after_us=time)] == [time + MINUTE]
+        assert history.save_checkpoint("plan", 0, time, newest, b"")
+        assert history.checkpoint("plan", valid=True) is not None
+        return steps[0]
+
+    with made(tmp_path / "record") as history:
+        event.listen(history._engine, "checkin", released)
+        history.take(given("few", temperatures(0, 100)))
+        event.listen(history._engine, "checkout", counted)
+        few = work(history, 100)
+        event.remove(history._engine, "checkout", counted)
+        history.take(given("many", temperatures(101, 1500)))
+        event.listen(history._engine, "checkout", counted)
+        many = work(history, 1601)
+    assert few > 100
+    assert many < 1.1 * few

@@ -13,6 +13,7 @@ import pytest
 
 from analysis.monitor.disturbances import TimeLaw
 from scenes.models.disturbances import Component, StatedMotions
+from scenes.models.drawn_motions import drawn_course
 from scenes.specs.disturbances import TimeLawSpec
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
@@ -21,7 +22,7 @@ from twin.operate.__main__ import app
 from twin.operate.lives.judged_life import covered
 from twin.operate.lives.judged_report import likely_shares
 from twin.operate.lives.simulate import Simulation, sensed_temperatures
-from twin.operate.lives.simulated_life import Life, drawn_course, drawn_life
+from twin.operate.lives.simulated_life import Life, drawn_life
 from twin.operate.lives.simulation_run import take_files
 from twin.operate.record.entries import MICRO, micros
 from twin.operate.record.history import History, content_of, initialised

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.block.accuracy import predicted
 from analysis.block.block_adjustment import adjust_block
+from analysis.orbit.ground_errors import predicted
 from analysis.orbit.three_line_model import misclosure
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.load import SCENES

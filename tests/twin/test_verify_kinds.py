@@ -33,6 +33,7 @@ KINDS = (
         "orbit_match",
         "orbit_jitter",
         "orbit_jitter_measured",
+        "orbit_loop",
         "orbit_monitor",
         "orbit_export",
         "export",

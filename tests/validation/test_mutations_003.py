@@ -16,9 +16,10 @@ from operator import itemgetter
 import numpy as np
 import pytest
 
-from analysis.orbit import forward_intersection, normal_equations, null_space, three_line_model
-from analysis.orbit import stepwise as stepwise_module
-from analysis.orbit.adjustment import Adjustment
+from analysis.calibration import normal_equations
+from analysis.calibration import stepwise as stepwise_module
+from analysis.calibration.adjustment import Adjustment
+from analysis.orbit import forward_intersection, null_space, three_line_model
 from analysis.orbit.third_difference import third_difference
 from optics.numerics.backend import load_backend
 from tests.tiers import one_of_each

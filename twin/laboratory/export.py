@@ -111,7 +111,7 @@ def _focus_tables(
             for k, at in enumerate(scan.target):
                 place = (site.band, x, y, edge, float(shift[k]))
                 file = f"{stem}/{site.band}_field{field}_{edge}_{k + 1:02d}.tiff"
-                out[file] = tiff(recorder.frames(i, edge, float(at), scan.take + k), facts)
+                out[file] = bytes(tiff(recorder.frames(i, edge, float(at), scan.take + k), facts))
                 images.append((*place, file))
                 # where no edge was measured there is no value
                 if np.isfinite(scan.sigma[edge][k]):

@@ -161,6 +161,13 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "intersection_angle": _ANGLE,
             "height, plan": "local horizon of each point: up, and east and north together",
         },
+        "loop": {
+            "times_s, held_s": "seconds from the epoch in UTC of the orbit in config.yaml",
+            "quantity, positions": _CAMERA,
+            "angle": _ANGLE,
+            "height": "local horizon of each point, up: found minus true",
+            "defocus, told_um": "best focus less line CCD along the light, positive downstream",
+        },
         "simulate": {
             "longitude_deg, latitude_deg": _GEODETIC,
             "times": _SECONDS,

@@ -1,13 +1,11 @@
 """A life that could have been: amounts of every stated motion over time, drawn by the laws of their disturbances.
 
-Each law is drawn exactly at any times, without steps between them, so that readings may be as far apart as they like:
-a drift is an Ornstein-Uhlenbeck process, a period the real part of a turning random pointer, and steps come by chance
-at a stated mean rate, or at the dates of events. Nothing here uses the filter or the smoother that such lives test.
+Laws without steps are drawn by `scenes.models.drawn_motions`; steps come by chance at a stated mean rate, or at the
+dates of events. Nothing here uses the filter or the smoother that such lives test.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenes.models.disturbances import Component, StatedMotions
-from scenes.specs.disturbances import TimeLawSpec
+from scenes.models.drawn_motions import causes_of, correlation_root, drawn_motions
 from twin.operate.record.entries import MICRO
 from twin.run.random_streams import stream
 
@@ -117,13 +115,9 @@ def drawn_life(
             relative.
     """
     seconds = (times - zero) / MICRO
-    own, drawn = causes_of(stated), np.zeros((len(times), len(stated.components)))
-    steps: list[Step] = []
+    drawn = drawn_motions(stated, seconds, lambda number: np.random.default_rng(stream(seed, _MOTIONS, number)))
+    own, steps = causes_of(stated), list[Step]()
     for number, (cause, where) in enumerate(own.items()):
-        rng = np.random.default_rng(stream(seed, _MOTIONS, number))
-        root = _root(stated.correlation[np.ix_(where, where)])
-        size = stated.sigma[where]
-        drawn[:, where] = drawn_course(stated.laws[where[0]], seconds, rng, len(where)) @ root * size
         steps += _jumps(stated, cause, where, times, np.random.default_rng(stream(seed, _JUMPS, number)))
     came = _drawn_dates(sorted(causes), times, seed) if dates is None else tuple(sorted(dates))
     for number, (moment, name) in enumerate(came):
@@ -134,57 +128,6 @@ def drawn_life(
     warm = dict.fromkeys(c.body for c in stated.components if c.kind == "temperature")
     coefficients = dict(zip(warm, (coefficient_error * rng.standard_normal(len(warm))).tolist(), strict=True))
     return Life(times, stated.components, drawn, tuple(sorted(steps, key=_when)), came, coefficients)
-
-
-def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, count: int) -> Array:
-    """Independent courses (T, count) of unit standard deviation that have the covariance of a law of time.
-
-    Args:
-        law: of all of them. A jump does nothing here: its times are drawn for a body.
-        seconds: (T,) rising.
-        rng: source of what is drawn.
-        count: how many.
-    """
-    each = (len(seconds), count)
-    if law.kind == "white":
-        return rng.standard_normal(each)
-    if law.kind == "jump" or law.jump is not None:
-        return np.zeros(each)
-    if law.period is None:
-        out = _drifting(law.drift, seconds, rng, count)
-    else:
-        # the real part of a random pointer that turns once in a period, and forgets where it was if it drifts
-        turn = (2.0 * math.pi / law.period * seconds)[:, None]
-        along = _drifting(law.drift, seconds, rng, count)
-        out = along * np.cos(turn) + _drifting(law.drift, seconds, rng, count) * np.sin(turn)
-    since = seconds - (law.since or 0.0)
-    if law.trend is not None:
-        out = out * (since / law.trend)[:, None]
-    if law.relaxation is not None:
-        out = out * -np.expm1(-np.maximum(since, 0.0) / law.relaxation)[:, None]
-    if law.event is not None:
-        out = out * (seconds >= law.event)[:, None]
-    return np.asarray(out)
-
-
-def _drifting(drift: float | None, seconds: Array, rng: np.random.Generator, count: int) -> Array:
-    """(T, count) of unit variance that forget where they were in ``drift`` seconds; None for never."""
-    unit = rng.standard_normal((len(seconds), count))
-    if drift is None:
-        return np.broadcast_to(unit[:1], unit.shape)
-    kept = np.exp(-np.diff(seconds) / drift)
-    fresh = np.sqrt(-np.expm1(-2.0 * np.diff(seconds) / drift))
-    for k, (part, new) in enumerate(zip(kept, fresh, strict=True)):
-        unit[k + 1] = part * unit[k] + new * unit[k + 1]
-    return unit
-
-
-def causes_of(stated: StatedMotions) -> dict[str, list[int]]:
-    """Cause -> numbers of its components."""
-    out: dict[str, list[int]] = {}
-    for k, one in enumerate(stated.components):
-        out.setdefault(one.cause, []).append(k)
-    return out
 
 
 def _jumps(
@@ -204,15 +147,9 @@ def _jumps(
 def _step(stated: StatedMotions, where: Sequence[int], rng: np.random.Generator) -> Array:
     """(M,) SI by which some motions step, together as they are correlated; others by nothing."""
     out = np.zeros(len(stated.components))
-    root = _root(stated.correlation[np.ix_(where, where)])
+    root = correlation_root(stated.correlation[np.ix_(where, where)])
     out[list(where)] = rng.standard_normal(len(where)) @ root * stated.sigma[list(where)]
     return out
-
-
-def _root(correlation: Array) -> Array:
-    """Symmetric root of a correlation matrix."""
-    values, vectors = np.linalg.eigh(correlation)
-    return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
 
 
 def _drawn_dates(events: Sequence[str], times: Moments, seed: int) -> tuple[tuple[int, str], ...]:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from analysis.block.accuracy import Accuracy
-from analysis.block.block_adjustment import GroupTest
 from analysis.block.law_tests import LawTest
 from analysis.block.network import DatumTest, Network, Open
+from analysis.block.reweighting import GroupTest
+from analysis.orbit.ground_errors import Accuracy
 from twin.orbit.block.block_run import BlockRun, CameraChange, Worth
 from twin.run.quantity import Quantity, Record
 

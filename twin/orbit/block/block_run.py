@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.block.accuracy import Accuracy, level_axes, predicted, realised
 from analysis.block.block import Block
 from analysis.block.block_adjustment import BlockAdjustment, adjust_block, kept_block
 from analysis.block.law_tests import LawTest, law_tests
@@ -17,6 +16,7 @@ from analysis.block.network import DatumTest, Network, Open, datum_test, network
 from analysis.block.processes import BlockError
 from analysis.block.shares import Pool
 from analysis.measurement_error import MeasurementError
+from analysis.orbit.ground_errors import Accuracy, level_axes, predicted, realised
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup

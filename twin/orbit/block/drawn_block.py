@@ -22,14 +22,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.measured.adjust_setup import AdjustSetup
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
-from twin.orbit.block.pass_knowledge import (
-    MonitorSource,
-    camera_sigmas,
-    change_covariance,
-    law_of,
-    monitored_camera,
-    pixels_per_line,
-)
+from twin.orbit.block.pass_knowledge import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.observations import PassData
 from twin.orbit.flight.earth import Earth, east_north_up, tai_of
@@ -348,7 +341,7 @@ def _scenes(
         one = data[name]
         random = np.random.default_rng(stream(seed, _IMAGES, k))
         here = np.flatnonzero(np.isfinite(line))
-        unit = np.array([1.0 / pixels_per_line(one, camera, line[here], pixel[here], spec.area.height), 1.0])
+        unit = np.array([1.0 / one.pixels_per_line(camera), 1.0])
         noise = spec.points.image * unit * random.standard_normal((len(here), 2))
         spoilt = np.random.default_rng(stream(seed, _GROSS, k))
         wrong = (spoilt.random(len(here)) < spec.points.gross) & (role[here] == "tie")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +19,6 @@ from twin.orbit.block.pass_knowledge import (
     change_covariance,
     law_of,
     monitored_camera,
-    pixels_per_line,
 )
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.observations import PassData, light_effects
@@ -28,7 +28,7 @@ from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.measurement_tables import read_measurements
-from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
+from twin.orbit.measured.pass_measurements import PassMeasurements
 from twin.run.procedure import Advance, BenchError, silent
 
 _DAY = 86400.0
@@ -70,7 +70,8 @@ def measured_block(
         mine = {line: raw[f"{one.name}/{line}"] for line in one.images}
         corrected = data[one.name].corrected(mine, one.images, removed, height[number[one.name]])
         for line, rays in corrected.items():
-            moved = _scene_rays(data[one.name], line, rays, one.images[line], begin[one.name], number[one.name])
+            assert rays.time is not None
+            moved = replace(rays, point=number[one.name][rays.point], time=rays.time + begin[one.name])
             scenes.append(known.Scene(f"{one.name}/{line}", one.name, line, moved))
     days = np.array(list(begin.values())) / _DAY
     expected = {
@@ -107,7 +108,7 @@ def _pass_data(one: PassMeasurements, setup: MeasuredAdjustSetup) -> PassData:
         height = float(np.mean(earth.geodetic(one.ground.itrs[known_places])[2]))
     models = FrozenMap({name: line_model(setup.camera, name) for name in one.images})
     pitch = FrozenMap({name: setup.camera.pitch_of(name) for name in one.images})
-    return PassData(one.name, FrozenMap(sensors), models, pitch, height, lines=setup.camera.lines)
+    return PassData(one.name, FrozenMap(sensors), models, pitch, height, 1.0, setup.camera.lines)
 
 
 def _points(passes: Sequence[PassMeasurements], shared: bool) -> tuple[known.Points, dict[str, np.ndarray]]:
@@ -161,15 +162,6 @@ def _started(
     unknown = ~np.isfinite(start).all(axis=1)
     start[unknown] = np.nanmean(start, axis=0)
     return known.Points(points.ids, start, points.role, points.covariance)
-
-
-def _scene_rays(data: PassData, line: str, rays: Rays, images: ImagePoints, begin: float, number: np.ndarray) -> Rays:
-    """Rays of a scene on the block's time and points, with the covariance of their image points, m^2."""
-    scale = pixels_per_line(data, line, images.line, images.pixel, data.height)
-    to_plane = data.pitch[line] * np.array([-scale, 1.0])
-    spread = images.covariance * to_plane[:, None] * to_plane
-    assert rays.time is not None
-    return Rays(number[rays.point], rays.image, rays.station, rays.attitude, rays.time + begin, spread)
 
 
 def _monitored(

@@ -10,7 +10,6 @@ from analysis.block.block import CameraKnowledge, CamerasKnowledge, Term
 from analysis.block.processes import Law
 from scenes.specs.orbit.adjust import CameraChangeSpec, LawSpec
 from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
-from twin.orbit.calibration.observations import PassData
 
 MonitorSource = Callable[[Mapping[str, str], Sequence[str]], CamerasKnowledge]
 """Epochs of passes, UTC, and lines -> what a record of the monitor says of the lines' cameras in these passes."""
@@ -47,30 +46,3 @@ def monitored_camera(law: np.ndarray, reading: np.ndarray, sigma: np.ndarray) ->
     gain = law[:, use] @ np.linalg.inv(law[np.ix_(use, use)] + np.diag(sigma[use] ** 2))
     rest = law - gain @ law[use]
     return CameraKnowledge((gain @ reading[use]).reshape(-1, 4), 0.5 * (rest + rest.T))
-
-
-def pixels_per_line(one: PassData, camera: str, line: np.ndarray, pixel: np.ndarray, height: float) -> float:
-    """What one image line is in x of the focal plane where the points lie, pixels: by the ground that the next sees.
-
-    Args:
-        one: the pass.
-        camera: of its lines.
-        line: of the image points, (n,).
-        pixel: likewise.
-        height: of the ground above the ellipsoid, metres.
-    """
-    if not len(line):
-        return 1.0
-    sensor, model = one.sensors[camera], one.models[camera]
-    here = np.array([np.clip(np.mean(line), 0.0, sensor.lines - 2.0)])
-    at = np.array([np.mean(pixel)])
-    place = []
-    for step in (0.0, 1.0):
-        ground = sensor.ground(here + step, at, height)
-        seconds = sensor.time(here)
-        arm = np.einsum(
-            "nji,nj->ni", sensor.trajectory.body_to_itrs(seconds), ground - sensor.trajectory.position(seconds)
-        )
-        a, _, c = ((arm - model.position) @ model.to_body).T
-        place.append(-model.interior[0] * a / c)
-    return abs(float(place[1][0] - place[0][0])) / one.pitch[camera]

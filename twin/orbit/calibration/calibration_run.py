@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.orbit.adjustment import Adjustment
+from analysis.calibration.adjustment import Adjustment
+from analysis.calibration.plausibility import FarPointsError, NoiseError
+from analysis.calibration.stepwise import Stepwise, stepwise
 from analysis.orbit.calibration_parameters import OFFSET, RATE, CalibrationError
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.null_space import RankError
-from analysis.orbit.plausibility import FarPointsError, NoiseError
-from analysis.orbit.stepwise import Stepwise, stepwise
 from analysis.orbit.third_difference import ThirdDifference, third_difference
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.numerics.frozen_map import FrozenMap

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.orbit.adjustment import Adjustment, adjust
+from analysis.calibration.adjustment import Adjustment, adjust
 from analysis.orbit.calibration_parameters import Prior, Unknowns, monitor_priors
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.units import ARCSEC

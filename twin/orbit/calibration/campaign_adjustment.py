@@ -10,10 +10,11 @@ from typing import Literal
 
 import numpy as np
 
-from analysis.orbit.adjustment import Adjustment, adjust
+from analysis.block.reweighting import Robust
+from analysis.calibration.adjustment import Adjustment, adjust
+from analysis.calibration.hidden_terms import FALSE_ALARM
 from analysis.orbit.calibration_parameters import OFFSET, RATE, Prior, Unknowns
 from analysis.orbit.null_space import Gauge
-from analysis.orbit.residual_tests import FALSE_ALARM, Robust
 from analysis.orbit.three_line_model import BIAS
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, FoundDrift

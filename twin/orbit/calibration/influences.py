@@ -17,9 +17,9 @@ from typing import Self
 import numpy as np
 from scipy.stats import chi2, norm
 
-from analysis.orbit.adjustment import Adjustment
+from analysis.calibration.adjustment import Adjustment
+from analysis.calibration.hidden_terms import FALSE_ALARM, Rates, Steps
 from analysis.orbit.calibration_parameters import OFFSET
-from analysis.orbit.residual_tests import FALSE_ALARM, Rates, Steps
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from scenes.specs.measured.orbit_data import MeasuredCalibrationSpec

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import chi2
 
-from analysis.orbit.adjustment import Adjustment
+from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import Prior, index
 from analysis.orbit.three_line_model import BIAS
 from twin.orbit.calibration.campaign import Campaign, FieldPass

@@ -148,15 +148,20 @@ class PassData:
     def pixels_per_line(self, name: str) -> float:
         """What one image line of the middle of a line's image is in x of the focal plane, pixels.
 
-        Where lines are spaced as pixels are, 1 at nadir and cos^2 of the look angle in a line that looks ahead.
+        It is where the ground that the next line sees, at the pass' mean height, lies in the focal plane at one moment.
+        Where lines are spaced as pixels are, 1 at nadir and about cos^2 of the look angle in a line that looks ahead.
         """
         sensor, model = self.sensors[name], self.models[name]
-        seconds = sensor.time(0.5 * (sensor.lines - 1) + np.array([-0.5, 0.5]))
-        station = sensor.trajectory.position(seconds)
-        above = float(self.earth.geodetic(station[0])[2]) - self.height
-        moved = float(np.linalg.norm(station[1] - station[0])) * (1.0 - above / float(np.linalg.norm(station[0])))
-        look = float(model.to_body[2, 2])
-        return moved / above * look**2 * float(model.interior[0]) / self.pitch[name]
+        middle = np.full(2, 0.5 * (sensor.lines - 1))
+        ground = sensor.ground(
+            middle + np.array([-0.5, 0.5]), np.full(2, 0.5 * (sensor.camera.pixels - 1)), self.height
+        )
+        seconds = sensor.time(middle)
+        to_body = np.swapaxes(sensor.trajectory.body_to_itrs(seconds), 1, 2)
+        arm = np.einsum("nij,nj->ni", to_body, ground - sensor.trajectory.position(seconds))
+        a, _, c = ((arm - model.position) @ model.to_body).T
+        x = -float(model.interior[0]) * a / c
+        return abs(float(x[1] - x[0])) / self.pitch[name]
 
     def rays(self, images: Mapping[str, ImagePoints]) -> dict[str, Rays]:
         """Rays of image points with what happened to the light left in.

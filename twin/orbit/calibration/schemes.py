@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.orbit.adjustment import Adjustment
+from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.orbit.three_line_model import BIAS, LineModel
 from optics.numerics.frozen_map import FrozenMap

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.orbit.adjustment import Adjustment
+from analysis.block.reweighting import REJECT
+from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.forward_intersection import intersect
-from analysis.orbit.residual_tests import REJECT
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, Rejected
 from twin.orbit.calibration.campaign_adjustment import simultaneous

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.orbit.adjustment import Adjustment, adjust
+from analysis.calibration.adjustment import Adjustment, adjust
+from analysis.calibration.strip_adjustment import Datum, StripAdjustment, adjust_strip
 from analysis.orbit.calibration_parameters import CalibrationField
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
-from analysis.orbit.strip_adjustment import Datum, StripAdjustment, adjust_strip
 from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread

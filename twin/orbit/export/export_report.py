@@ -122,7 +122,7 @@ def export_files(run: Export) -> dict[str, bytes]:
             facts = FrameFacts(
                 line.window.name, line.window.pitch, note=f"second 0 of its orbit is {run.epoch}", place=line.polynomial
             )
-            found[names["image"]] = tiff(line.window.frame[None], facts)
+            found[names["image"]] = bytes(tiff(line.window.frame[None], facts))
     return found
 
 

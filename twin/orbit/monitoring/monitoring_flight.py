@@ -35,8 +35,10 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.monitoring.monitor_series import TOO_FAR, MonitorSeries, Readings, SmoothedReadings
 from twin.run.procedure import Advance, BenchError
+from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
+    from scenes.specs.orbit.loop import OrbitLoopSpec
     from scenes.specs.orbit.monitor import OrbitMonitorSpec
     from scenes.specs.orbit.setup import MonitorSetup
 
@@ -204,7 +206,7 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
         angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
         worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
         # before the images, which take longer
-        views = _look_down(spec, pair, lines, ground_seed, advance)
+        views = look_down(spec, spec.course.times, pair, lines, ground_seed, advance)
         monitor = MonitorSeries(experiment, spec, reference, pair)
         noisy, clean = monitor.measured(states, number)
         truth, distance = _changes(clean.truth, spec.referred)
@@ -293,8 +295,9 @@ def _turned(experiment: MonitorExperiment, state: State, camera: str) -> State:
     return compose(state, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
 
 
-def _look_down(
-    spec: OrbitMonitorSpec,
+def look_down(
+    spec: OrbitMonitorSpec | OrbitLoopSpec,
+    times: Sequence[float],
     pair: tuple[str, str],
     lines: Sequence[Mapping[str, LineCamera]],
     seed: np.random.SeedSequence,
@@ -302,44 +305,73 @@ def _look_down(
 ) -> tuple[View, ...]:
     """Check points at every time, as both lines see them.
 
+    Args:
+        spec: of orbit, attitude, ground and errors.
+        times: T of them, seconds from the orbit's epoch.
+        pair: the two cameras.
+        lines: of each time: camera -> its line as it truly is.
+        seed: of places and errors.
+        advance: told of the progress.
+
     Raises:
         BenchError: no such orbit, or not enough points that both lines see.
+    """
+    flown, out = fly(spec, seed), []
+    for k, line in enumerate(lines):
+        out.append(_view(spec, times[k], [line[name] for name in pair], flown, stream(seed, k + 1)))
+        advance("ground", k + 1, len(lines))
+    return tuple(out)
+
+
+@dataclass(frozen=True, eq=False)
+class Flown:
+    """Orbit and attitude.
+
+    Attributes:
+        earth: below them.
+        true: as they are; measured: as the satellite says.
+    """
+
+    earth: Earth
+    true: Trajectory
+    measured: Trajectory
+
+
+def fly(spec: OrbitMonitorSpec | OrbitLoopSpec, seed: np.random.SeedSequence) -> Flown:
+    """Orbit and attitude of a test, the same for the same seed.
+
+    Raises:
+        BenchError: no such orbit.
     """
     earth = Earth.from_spec(spec.earth)
     try:
         true = Trajectory.flown(propagate(spec.orbit, earth), spec.attitude, seed)
     except ValueError as error:
         raise BenchError(str(error), ("orbit",), "an orbit that exists") from error
-    data, *streams = seed.spawn(1 + len(lines))
     measured = true
     if spec.errors.switched_on:
-        measured = true.with_errors(spec.errors, int(np.random.default_rng(data).integers(2**31)))
-    out = []
-    for k, (line, stream) in enumerate(zip(lines, streams, strict=True)):
-        out.append(_view(spec, k, [line[name] for name in pair], true, measured, earth, stream))
-        advance("ground", k + 1, len(lines))
-    return tuple(out)
+        measured = true.with_errors(spec.errors, int(np.random.default_rng(stream(seed, 0)).integers(2**31)))
+    return Flown(earth, true, measured)
 
 
 def _view(
-    spec: OrbitMonitorSpec,
-    number: int,
+    spec: OrbitMonitorSpec | OrbitLoopSpec,
+    time: float,
     cameras: Sequence[LineCamera],
-    true: Trajectory,
-    measured: Trajectory,
-    earth: Earth,
+    flown: Flown,
     seed: np.random.SeedSequence,
 ) -> View:
-    """Points at time number ``number``."""
-    place, image = (np.random.default_rng(s) for s in seed.spawn(2))
-    ground, time = spec.ground, spec.course.times[number]
+    """Points at a time."""
+    place, image = (np.random.default_rng(stream(seed, k)) for k in range(2))
+    true, earth = flown.true, flown.earth
+    ground = spec.ground
     begin, lines = time - HALF_SPAN, int(2.0 * HALF_SPAN / spec.line_time)
     try:
         sensors = [Sensor(c, true, earth, spec.line_time, begin, lines, NO_EFFECTS) for c in cameras]
     except ValueError as error:
         remedy = "an orbit that goes on for a minute before the first and after the last time of the course"
         raise BenchError(f"{error} around {moment(time)}", ("orbit", "after"), remedy) from error
-    at = _second_view(sensors, time, 0.5 * (ground.first + ground.last), ground.height, number)
+    at = second_view(sensors, time, 0.5 * (ground.first + ground.last), ground.height)
     wanted = ground.points
     height = ground.height + ground.relief * place.uniform(-1.0, 1.0, _SPARE * wanted)
     pixel = place.uniform(ground.first, ground.last, len(height))
@@ -361,12 +393,22 @@ def _view(
     for sensor, (row, column) in zip(sensors, seen, strict=True):
         exact.append(_sightings(sensor, true, row[good], column[good]))
         offsets = noise * image.standard_normal((2, len(good)))
-        noisy.append(_sightings(sensor, measured, row[good] + offsets[0], column[good] + offsets[1]))
+        noisy.append(_sightings(sensor, flown.measured, row[good] + offsets[0], column[good] + offsets[1]))
     return View(points[good], (exact[0], exact[1]), (noisy[0], noisy[1]))
 
 
-def _second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: float, number: int) -> float:
-    """When the second line sees a point that the first sees as long before ``time`` (or after it), seconds."""
+def second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: float) -> float:
+    """When the second line sees a point that the first sees as long before ``time`` (or after it), seconds.
+
+    Args:
+        sensors: of the two lines.
+        time: between their views, seconds.
+        pixel: of the second line.
+        height: of the point, metres.
+
+    Raises:
+        BenchError: the first line does not see what the second sees.
+    """
     at = time
     for _ in range(20):
         line = (at - sensors[1].first_line_time) / sensors[1].line_time

@@ -7,7 +7,7 @@ where errors are counted, and in two cases that are bounds: the true four parame
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
 from twin.orbit.monitoring.monitor_series import Readings
-from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight, fly_monitored, in_analysis
+from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight, View, fly_monitored, in_analysis
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
@@ -267,12 +267,12 @@ def _analysed(flight: MonitorFlight, setup: MonitorSetup, seed: int) -> MonitorR
         "parameters": dict(flight.truth),
     }
     true = _intersected(flight, [_true_pair(flight, k) for k in range(count)])
-    cases = {name: _errors(_intersected(flight, _corrected(flight, each)), true) for name, each in changes.items()}
-    cases["true"] = _errors(true, true)
+    cases = {name: case_errors(_intersected(flight, _corrected(flight, each)), true) for name, each in changes.items()}
+    cases["true"] = case_errors(true, true)
 
     def interpolated(interval: float) -> CaseErrors:
         changes = _interpolated(flight, monitored, interval)
-        return _errors(_intersected(flight, _corrected(flight, changes)), true)
+        return case_errors(_intersected(flight, _corrected(flight, changes)), true)
 
     intervals = {interval: interpolated(interval) for interval in spec.compared}
     slopes = _slopes(flight)
@@ -312,7 +312,7 @@ def _smoothing(
     readings: Readings = found.readings
     assert readings.total is not None
     changes = {n: readings[n].vector * mask for n in flight.pair}
-    case = _errors(_intersected(flight, _corrected(flight, changes)), true)
+    case = case_errors(_intersected(flight, _corrected(flight, changes)), true)
     wrong = [np.sum(slopes[n] * mask * (readings[n].vector - flight.truth[n]), axis=1) for n in flight.pair]
     # what rounding leaves at the reference is no sigma
     variance = np.maximum(_propagated(flight, slopes, readings.total), 0.0)
@@ -337,9 +337,21 @@ def _true_pair(flight: MonitorFlight, k: int) -> list[CalibratedLine]:
     return [flight.true_line(n, k) for n in flight.pair]
 
 
-def _found(flight: MonitorFlight, cameras: list[CalibratedLine], k: int, exact_data: bool = False) -> np.ndarray:
-    """Errors (n, 3) east, north, up of time number k."""
-    view = flight.views[k]
+def _found(flight: MonitorFlight, cameras: Sequence[CalibratedLine], k: int, exact_data: bool = False) -> np.ndarray:
+    return point_errors(cameras, flight.views[k], exact_data)
+
+
+def point_errors(cameras: Sequence[CalibratedLine], view: View, exact_data: bool = False) -> np.ndarray:
+    """Errors (n, 3) east, north, up of points that two cameras intersect, metres.
+
+    Args:
+        cameras: the two, as the analysis takes them.
+        view: the points.
+        exact_data: with exact image points, orbit and attitude.
+
+    Raises:
+        IntersectionError: rays that are parallel.
+    """
     seen = view.exact if exact_data else view.seen
     return check_errors(intersect_pair(cameras[0], cameras[1], *seen).ground, view.ground).error
 
@@ -349,7 +361,13 @@ def _intersected(flight: MonitorFlight, cameras: list[list[CalibratedLine]]) -> 
     return np.array([_found(flight, pair, k) for k, pair in enumerate(cameras)])
 
 
-def _errors(found: np.ndarray, true: np.ndarray) -> CaseErrors:
+def case_errors(found: np.ndarray, true: np.ndarray) -> CaseErrors:
+    """Errors of a case.
+
+    Args:
+        found: (T, n, 3) errors east, north, up of the points, metres.
+        true: (T, n, 3) those by the true cameras with the same image points, orbit and attitude.
+    """
     alone = found - true
     return CaseErrors(
         plan=np.sqrt(np.mean(np.sum(found[..., :2] ** 2, axis=-1), axis=1)),
@@ -362,17 +380,30 @@ def _errors(found: np.ndarray, true: np.ndarray) -> CaseErrors:
 
 
 def _slopes(flight: MonitorFlight) -> dict[str, np.ndarray]:
-    """Slopes by central differences of the intersection of exact image points by the calibrated cameras."""
+    return height_slopes(flight.calibrated, flight.pair, flight.views)
+
+
+def height_slopes(
+    calibrated: Mapping[str, CalibratedLine], pair: tuple[str, str], views: Sequence[View]
+) -> dict[str, np.ndarray]:
+    """Camera -> (T, 4) slopes of the mean height by d_alpha, d_beta, d_gamma and d_f that the analysis is told, m/rad
+    and m/m: central differences of the intersection of exact image points.
+
+    Args:
+        calibrated: camera -> its line, about which they are taken.
+        pair: the two cameras.
+        views: of T times.
+    """
     out = {}
-    for i, name in enumerate(flight.pair):
-        table = np.empty((len(flight.times), 4))
-        for k in range(len(flight.times)):
+    for i, name in enumerate(pair):
+        table = np.empty((len(views), 4))
+        for k, view in enumerate(views):
             for j, step in enumerate(_STEP):
                 ends = []
                 for sign in (1.0, -1.0):
-                    pair = [flight.calibrated[n] for n in flight.pair]
-                    pair[i] = pair[i].corrected(sign * step * np.eye(4)[j])
-                    ends.append(float(_found(flight, pair, k, exact_data=True)[:, 2].mean()))
+                    both = [calibrated[n] for n in pair]
+                    both[i] = both[i].corrected(sign * step * np.eye(4)[j])
+                    ends.append(float(point_errors(both, view, exact_data=True)[:, 2].mean()))
                 table[k, j] = (ends[0] - ends[1]) / (2.0 * step)
         out[name] = table
     return out

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.adjustment import Adjustment, adjust
+from analysis.calibration.adjustment import Adjustment, adjust
+from analysis.calibration.stepwise import Stepwise, stepwise
 from analysis.orbit.null_space import Combination, Gauge
-from analysis.orbit.stepwise import Stepwise, stepwise
 from analysis.orbit.three_line_model import BIAS, INTERIOR, Rays, misclosure, partials
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.orbit.adjustment import Adjustment
+from analysis.calibration.adjustment import Adjustment
+from analysis.calibration.stepwise import Stepwise, stepwise
 from analysis.orbit.forward_intersection import CheckErrors
-from analysis.orbit.stepwise import Stepwise, stepwise
 from analysis.orbit.three_line_model import BIAS, INTERIOR, misclosure
 from analysis.units import ARCSEC
 from scenes.specs.orbit.angle import LINES

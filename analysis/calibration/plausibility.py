@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise
-from analysis.orbit.shared_noise import ray_covariance
+from analysis.orbit.ray_noise import ray_covariance
 from analysis.orbit.three_line_model import BIAS, INTERIOR, LineModel, misclosure, partials
 
 __all__ = ["FarPointsError", "NoiseError", "check_places", "single_ray"]

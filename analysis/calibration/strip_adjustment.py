@@ -28,10 +28,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import splu
 from scipy.stats import chi2
 
+from analysis.block.corrections import Corrections
+from analysis.calibration.normal_equations import Equations, State, Weights, assemble
+from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters
 from analysis.orbit.forward_intersection import intersect
-from analysis.orbit.normal_equations import Equations, State, Weights, assemble
-from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import BIAS, LineModel, Rays, bias_rotation
 
 __all__ = ["Datum", "StripAdjustment", "adjust_strip"]
@@ -164,18 +165,14 @@ def _solved(
 
 def _datum(rays: Mapping[str, Rays], shared: SharedNoise, inverse: Array) -> tuple[Datum, ...]:
     """Constant and slope of the attitude's errors over all rays, by least squares."""
-    series = [s for s in shared.series[_NAME] if s.term.kind == "attitude"]
-    if not series:
+    if not any(part.turns for part in shared.parts[_NAME]):
         return ()
     time = np.concatenate([r.time for r in rays.values() if r.time is not None])
     fit = np.linalg.pinv(np.column_stack([np.ones_like(time), time - time.mean()]))
-    parts = np.split(fit, np.cumsum([len(r.point) for r in rays.values()])[:-1], axis=1)
+    columns, factors = Corrections(shared.parts[_NAME], np.eye(3), time).factors(True)
     form = np.zeros((6, shared.size))
-    for line, part in zip(rays, parts, strict=True):
-        for s in series:
-            columns, blend = s.columns(line), s.term.sigma * s.blends[line]
-            for k in range(6):  # roll, pitch, yaw, then their rates
-                np.add.at(form[k], columns[:, :, k % 3], part[k // 3][:, None] * blend)
+    for k in range(6):  # roll, pitch, yaw, then their rates
+        np.add.at(form[k], columns[:, :, k % 3], fit[k // 3][:, None] * factors[:, :, k % 3])
     before = np.einsum("ks,sk->k", form, splu(shared.precision.tocsc()).solve(form.T))
     after = np.einsum("ks,st,kt->k", form, inverse, form, optimize=True)
     names = (*BIAS, *(f"{n} rate" for n in BIAS))

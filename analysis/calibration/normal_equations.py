@@ -20,8 +20,10 @@ from scipy import sparse
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse.linalg import splu
 
+from analysis.block.reweighting import GroupTest
+from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, index
-from analysis.orbit.shared_noise import SharedNoise, ray_covariance
+from analysis.orbit.ray_noise import ray_covariance
 from analysis.orbit.three_line_model import LineModel, Partials, Rays, misclosure, partials
 
 __all__ = ["Equations", "Hidden", "Residuals", "State", "Weights", "assemble"]
@@ -153,13 +155,43 @@ class Equations:
             total = total + self._of_shared(by_z, self.point_spans, 3)
         return np.where(self.movable[:, None, None], total, 0.0)
 
-    def shared_redundancy(self, covariance: Array) -> dict[str, float]:
-        """Group -> how many of its readings the image points check."""
+    def tests(
+        self, covariance: Array, cofactors: Array, weights: Weights, priors: Sequence[Prior]
+    ) -> dict[str, GroupTest]:
+        """Variance groups after an adjustment.
+
+        Args:
+            covariance: of the P unknowns, (P, P), SI.
+            cofactors: of the adjusted image points, (M, 2, 2), whitened.
+            weights: of the observations.
+            priors: further observations of the unknowns.
+        """
+        residuals, factor = self.residuals, weights.factor
+        squares = weights.image * np.sum(residuals.image**2, axis=1) / factor["image"]
+        adjusted = weights.image * np.trace(cofactors, axis1=1, axis2=2) / factor["image"]
+        rows: dict[str, tuple[float, float, float]] = {}
+        rows["image"] = (2.0 * np.sum(weights.image > 0), np.sum(adjusted), np.sum(squares))
+        # control_weight is block diagonal: the sum of products is the trace with the points' own blocks
+        given = self.control_weight.tobsr((3, 3))
+        own = self.point_covariance(covariance)[given.indices]
+        control = np.sum(residuals.control**2) / factor["control"]
+        rows["control"] = (np.sum(self.control_weight.diagonal() > 0), np.sum(given.data * own), control)
+        told = self.prior_weight * np.einsum("kp,pq,kq->k", self.design_prior, covariance, self.design_prior)
+        square = self.prior_weight * residuals.prior**2
+        for group in dict.fromkeys(p.group for p in priors):
+            member = np.array([p.group == group for p in priors])
+            rows[group] = (np.sum(member), np.sum(told[member]), np.sum(square[member]))
+        for group, taken in self._taken(covariance).items():
+            rows[group] = (len(self.shared.groups[group]), taken, residuals.shared[group] / factor[group])
+        return {g: GroupTest(int(n), float(n - t), float(v), float(factor[g])) for g, (n, t, v) in rows.items()}
+
+    def _taken(self, covariance: Array) -> dict[str, float]:
+        """Group of the shared noise -> how many of its readings the image points do not check."""
         taken = np.zeros(self.shared.size)
         for (a, b), inverse in zip(self.shared.spans, self.shared_inverse, strict=True):
             found = inverse + self.follow[a:b] @ covariance @ self.follow[a:b].T
             taken[a:b] = np.asarray(self.shared_weight[a:b, a:b].multiply(found).sum(axis=1)).ravel()
-        return {g: float(len(c) - np.sum(taken[c])) for g, c in self.shared.groups.items()}
+        return {g: float(np.sum(taken[c])) for g, c in self.shared.groups.items()}
 
     @cached_property
     def _carried(self) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
@@ -296,7 +328,8 @@ def _reduce(
     weighted = (sparse.diags(row_weight) @ every).tocsr()
     cross = (design_point.T @ weighted).tocsr()
     own_blocks = _point_blocks(point, rows.place, weights.image / weights.factor.get("image", 1.0), total) + held.data
-    own_blocks[exact] = np.eye(3)
+    # of what was given up no ray has any weight
+    own_blocks[exact | ~np.any(own_blocks, axis=(1, 2))] = np.eye(3)
     try:
         point_inverse = _blocks(np.asarray(np.linalg.inv(own_blocks), np.float64))
     except np.linalg.LinAlgError:

@@ -10,12 +10,25 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from analysis.block.reweighting import (
+    HUBER,
+    SETTLED,
+    GroupTest,
+    Robust,
+    Rule,
+    UnsettledError,
+    settled,
+    standardised_packets,
+)
+from analysis.calibration.hidden_terms import Courses, HiddenTerms, Rates, Unseen
+from analysis.calibration.normal_equations import Equations, State, Weights, assemble
+from analysis.calibration.plausibility import FarPointsError, NoiseError, check_places, single_ray
+from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit import null_space
 from analysis.orbit.calibration_parameters import (
     CalibrationError,
@@ -26,23 +39,6 @@ from analysis.orbit.calibration_parameters import (
     Unknowns,
     index,
 )
-from analysis.orbit.normal_equations import Equations, State, Weights, assemble
-from analysis.orbit.plausibility import FarPointsError, NoiseError, check_places, single_ray
-from analysis.orbit.residual_tests import (
-    HUBER,
-    Courses,
-    HiddenTerms,
-    Rates,
-    Robust,
-    Unseen,
-    bounded,
-    extrapolated,
-    median_factor,
-    robust_weights,
-    standardised,
-)
-from analysis.orbit.residual_tests import variance_components as components
-from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import BIAS, DRIFT, LineModel
 
 Array = NDArray[np.float64]
@@ -150,11 +146,7 @@ class Adjustment:
 
 # A step of this many sigmas ends the iteration, and so does one that rounding keeps from falling further.
 _CONVERGED = 1e-6
-_ROUNDS = 50
 _HUBER_ROUNDS = 6
-# From then on the weights of "igg" only fall: two rays of a point that are doubted in turns would never come to rest.
-_FREE_ROUNDS = 12
-_SETTLED = 1e-3
 
 
 def adjust(
@@ -203,7 +195,7 @@ def adjust(
     shared = SharedNoise.of(fields, noise)
     none = np.zeros(sum(len(f.ground) for f in fields), bool)
     estimated = None if isinstance(variance_components, bool) else frozenset(variance_components)
-    problem = _Problem(fields, cameras, parameters, noise, shared, tuple(priors), gauge, iterations, none, estimated)
+    problem = _Problem(fields, cameras, parameters, noise, shared, tuple(priors), gauge, iterations, estimated)
     groups = ("image", "control", *shared.groups, *dict.fromkeys(p.group for p in priors))
     count = sum(len(r.point) for f in fields for r in f.rays.values())
     if 2 * count < len(parameters.names) - len(gauge.held) - len(priors):
@@ -212,104 +204,58 @@ def adjust(
         )
     check_places(fields, cameras, gauge.start if isinstance(gauge.start, Mapping) else None)
     start_state = State(parameters.start, tuple(f.ground for f in fields), np.zeros(shared.size))
-    state = _Iteration(start_state, Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0)
+    state = _Iteration(start_state, Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0, none)
     try:
         return _adjusted(problem, state, robust, bool(variance_components))
     except null_space.RankError as error:
         raise problem.cause(error) from error
+    except UnsettledError as error:
+        raise CalibrationError(f"calibration: {error}") from error
 
 
-def _adjusted(problem: _Problem, state: _Iteration, robust: Robust | None, variance_components: bool) -> Adjustment:
+def _adjusted(problem: _Problem, at: _Iteration, robust: Robust | None, variance_components: bool) -> Adjustment:
     """Solve with weights and factors that have come to rest."""
     if robust and variance_components:
-        found = _settled(problem, state, _SCREENING)
-        found = _settled(found.problem, found.state, _ACCEPTED)
-        state = replace(
-            state, weights=replace(state.weights, factor=found.state.weights.factor), steps=found.state.steps
-        )
+        # Gross errors are found against the scatter of the others first. Variance components then need good points of
+        # full weight: weights that fall with the residual would pass for smaller noise.
+        found, _ = settled(problem, at, Rule("huber", "median", tolerance=0.05))
+        found, _ = settled(problem, found, Rule("accept", "components", problem.estimated))
+        at = replace(at, weights=replace(at.weights, factor=found.factor), steps=found.steps)
     elif variance_components:
-        return _settled(problem, state, _COMPONENTS).result()
-    return _settled(problem, state, _Rule(robust)).result(robust)
-
-
-@dataclass(frozen=True)
-class _Rule:
-    """Rule by which weights of image points and factors of groups follow from residuals.
-
-    tolerance: largest change of a weight, or relative one of a factor, that is left.
-    """
-
-    image: Robust | Literal["accept"] | None = None
-    factor: Literal["median", "components"] | None = None
-    tolerance: float = _SETTLED
-
-    @property
-    def least(self) -> int:
-        """Rounds that it takes at least."""
-        return _HUBER_ROUNDS if self.image == "igg" else 0
-
-
-# Gross errors are found against the scatter of the others first. Variance components then need good points of full
-# weight: weights that fall with the residual would pass for smaller noise.
-_SCREENING = _Rule("huber", "median", 0.05)
-_ACCEPTED = _Rule("accept", "components")
-_COMPONENTS = _Rule(None, "components")
-
-
-@dataclass(frozen=True, eq=False)
-class _Settled:
-    """Where the weights came to rest: without points that were given up, with the equations there."""
-
-    problem: _Problem
-    state: _Iteration
-    equations: Equations
-    covariance: Array
-
-    def result(self, robust: Robust | None = None) -> Adjustment:
-        return self.problem.result(self.state, self.equations, self.covariance, robust)
-
-
-def _settled(problem: _Problem, state: _Iteration, rule: _Rule) -> _Settled:
-    """Solve until weights and factors rest."""
-    factors: list[Mapping[str, float]] = []
-    change = np.inf
-    for turn in range(_ROUNDS):
-        state, equations, covariance = problem.solve(state)
-        old, before = state.weights, problem
-        if rule.image is None and rule.factor is None:
-            return _Settled(problem, state, equations, covariance)
-        cofactors = equations.image_cofactors(covariance)
-        standard = standardised(equations, cofactors, old)
-        factor = dict(old.factor)
-        if rule.factor == "median":
-            factor["image"] = bounded(factor["image"] * median_factor(standard))
-        elif rule.factor == "components":
-            found, _ = components(equations, covariance, cofactors, old, problem.priors)
-            factor |= {g: v for g, v in found.items() if problem.estimated is None or g in problem.estimated}
-            factors.append(factor)
-        image = old.image
-        if rule.image is not None:
-            image = robust_weights(standard, "huber" if turn < rule.least else rule.image)
-            if rule.image != "huber" and turn >= _FREE_ROUNDS:
-                image = np.minimum(image, old.image)
-        problem, state = problem.without_lost(replace(state, weights=Weights(image, factor)))
-        change = float(np.abs(state.weights.image - old.image).max())
-        change = max(change, *(abs(factor[g] / old.factor[g] - 1.0) for g in factor))
-        if change < rule.tolerance and problem is before and turn >= rule.least:
-            return _Settled(problem, replace(state, weights=old), equations, covariance)
-        if len(factors) == 3:
-            state = replace(state, weights=replace(state.weights, factor=extrapolated(factors)))
-            factors = []
-    raise CalibrationError(f"calibration: weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}")
+        return problem.result(*settled(problem, at, Rule(None, "components", problem.estimated)), None)
+    screening = _HUBER_ROUNDS if robust == "igg" else 0
+    return problem.result(*settled(problem, at, Rule(robust, screening=screening)), robust)
 
 
 @dataclass(frozen=True, eq=False)
 class _Iteration:
-    """Where the iteration stands, its weights, Gauss-Newton steps so far."""
+    """Where the iteration stands, its weights, Gauss-Newton steps so far, which points were given up, for good."""
 
     state: State
     weights: Weights
     steps: int
+    lost: NDArray[np.bool_]
+
+    @property
+    def weight(self) -> tuple[Array, ...]:
+        return (self.weights.image,)
+
+    @property
+    def factor(self) -> Mapping[str, float]:
+        return self.weights.factor
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """Equations at a solution, and the covariance (P, P) of the unknowns."""
+
+    equations: Equations
+    covariance: Array
+
+    @cached_property
+    def cofactors(self) -> Array:
+        """(M, 2, 2) of the adjusted image points."""
+        return self.equations.image_cofactors(self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +270,6 @@ class _Problem:
     priors: tuple[Prior, ...]
     gauge: null_space.Gauge
     iterations: int
-    lost: NDArray[np.bool_]
     estimated: frozenset[str] | None = None
 
     @cached_property
@@ -333,24 +278,21 @@ class _Problem:
         first = np.concatenate([[0], np.cumsum([len(f.ground) for f in self.fields])])
         return np.concatenate([a + r.point for a, f in zip(first, self.fields, strict=False) for r in f.rays.values()])
 
-    def without_lost(self, at: _Iteration) -> tuple[_Problem, _Iteration]:
+    def judged(self, at: _Iteration, found: _Solved) -> tuple[Array, ...]:
+        """(M, 2) standardised residuals of the image points."""
+        image = found.equations.residuals.image
+        return (standardised_packets(image, found.cofactors, at.weights.image, at.factor["image"]),)
+
+    def tests(self, at: _Iteration, found: _Solved) -> dict[str, GroupTest]:
+        """Variance groups."""
+        return found.equations.tests(found.covariance, found.cofactors, at.weights, self.priors)
+
+    def weighed(self, at: _Iteration, weight: tuple[Array, ...], factor: Mapping[str, float]) -> _Iteration:
         """Points without coordinates and with fewer than two rays of any weight are given up, for good."""
         control = np.concatenate([f.control for f in self.fields])
-        rays = np.bincount(self.place[at.weights.image > _SETTLED], minlength=len(control))
-        every = self.lost | (~control & (rays < 2))
-        weights = replace(at.weights, image=np.where(every[self.place], 0.0, at.weights.image))
-        new = every & ~self.lost
-        if not np.any(new):
-            return self, replace(at, weights=weights)
-        fields, grounds = [], []
-        cuts = np.cumsum([len(f.ground) for f in self.fields])[:-1]
-        for one, ground, gone in zip(self.fields, at.state.grounds, np.split(new, cuts), strict=True):
-            # kept loosely where they are, for their blocks must have an inverse; no image point sees them any more
-            kept = np.where(gone[:, None, None], np.eye(3), one.covariance)
-            fields.append(replace(one, control=one.control | gone, covariance=kept))
-            grounds.append(np.where(gone[:, None], one.ground, ground))
-        state = replace(at.state, grounds=tuple(grounds))
-        return replace(self, fields=fields, lost=every), replace(at, state=state, weights=weights)
+        rays = np.bincount(self.place[weight[0] > SETTLED], minlength=len(control))
+        lost = at.lost | (~control & (rays < 2))
+        return replace(at, weights=Weights(np.where(lost[self.place], 0.0, weight[0]), factor), lost=lost)
 
     def equations(self, at: _Iteration, hidden: HiddenTerms | None = None) -> Equations:
         return assemble(
@@ -370,13 +312,13 @@ class _Problem:
         """Source of noise -> of a single image point, metres."""
         return single_ray(self.fields, self.cameras, self.noise)
 
-    def solve(self, state: _Iteration) -> tuple[_Iteration, Equations, Array]:
-        """Gauss-Newton with the weights of the state: state, equations there and covariance (P, P)."""
+    def solve(self, state: _Iteration, screening: bool = False) -> tuple[_Iteration, _Solved]:
+        """Gauss-Newton with the weights of the state, to the end in any case."""
         equations = self.equations(state)
         try:
             freedom = self.freedom(state, equations)
         except null_space.RankError as error:
-            lost = int(np.sum(state.weights.image <= _SETTLED))
+            lost = int(np.sum(state.weights.image <= SETTLED))
             if not lost:
                 raise
             raise FarPointsError(
@@ -392,7 +334,7 @@ class _Problem:
             step = np.zeros(len(right))
             step[kept] = null_space.solved(total[np.ix_(kept, kept)], -right[kept])
             size = float(np.sqrt(max(float(step @ total @ step), 0.0)))
-            state = _Iteration(state.state.moved(equations, step), state.weights, state.steps + 1)
+            state = replace(state, state=state.state.moved(equations, step), steps=state.steps + 1)
             equations = self.equations(state)
             if size < _CONVERGED or (size < 1e3 * _CONVERGED and size > 0.5 * last):
                 break
@@ -404,7 +346,7 @@ class _Problem:
         total = (equations.reduced + pull)[np.ix_(kept, kept)]
         spread = np.zeros(pull.shape)
         spread[np.ix_(kept, kept)] = null_space.solved(total, np.eye(len(kept)))
-        return state, equations, 0.5 * (spread + spread.T)
+        return state, _Solved(equations, 0.5 * (spread + spread.T))
 
     def freedom(self, state: _Iteration, equations: Equations) -> null_space.Freedom:
         """What may be solved for: by the robust weights, but the sigmas as they were given.
@@ -438,16 +380,16 @@ class _Problem:
         """(P, k) change of the values with start values of held unknowns, `held` (P, k) columns of ones."""
         return np.asarray(held - covariance @ (equations.reduced @ held))
 
-    def result(self, state: _Iteration, equations: Equations, covariance: Array, robust: Robust | None) -> Adjustment:
+    def result(self, state: _Iteration, found: _Solved, robust: Robust | None) -> Adjustment:
+        equations, covariance = found.equations, found.covariance
         names, scale = self.parameters.names, self.parameters.scale
         freedom = self.freedom(state, equations)
         rows = freedom.rows
         vectors = null_space.weak_vectors(
             equations.reduced + rows.T @ rows, equations.length, scale, np.eye(len(names))[:, freedom.kept]
         )
-        cofactors = equations.image_cofactors(covariance)
-        standard = standardised(equations, cofactors, state.weights)
-        _, redundancy = components(equations, covariance, cofactors, state.weights, self.priors)
+        (standard,) = self.judged(state, found)
+        tests = self.tests(state, found)
         held = np.eye(len(names))[:, [index(names, n) for n in self.gauge.held]]
         follow = self.followed(equations, covariance, held)
         pulled = rows @ covariance
@@ -464,19 +406,12 @@ class _Problem:
                 )
         cuts = np.cumsum([len(f.ground) for f in self.fields])[:-1]
         spread = equations.point_covariance(covariance)
-        spread[self.lost] = np.nan
-        spreads, lost = np.split(spread, cuts), np.split(self.lost, cuts)
+        spread[state.lost] = np.nan
+        spreads, lost = np.split(spread, cuts), np.split(state.lost, cuts)
         used = int(np.sum(state.weights.image > 0))
         controls = sum(int(np.sum(f.control & np.any(f.covariance, axis=(1, 2)))) for f in self.fields)
         known = 2 * used + 3 * controls + len(self.priors) + len(rows)
-        r = equations.residuals
-        square = float(
-            np.sum(state.weights.image * np.sum(r.image**2, axis=1)) / state.weights.factor["image"]
-            + np.sum(r.control**2) / state.weights.factor["control"]
-            + np.sum(equations.prior_weight * r.prior**2)
-            + sum(v / state.weights.factor[g] for g, v in r.shared.items())
-            + np.sum((rows @ (state.state.values - self.parameters.start)) ** 2)
-        )
+        pulled_square = float(np.sum((rows @ (state.state.values - self.parameters.start)) ** 2))
         parts = self.parameters.parts
 
         def unseen(terms: HiddenTerms) -> Unseen:
@@ -504,10 +439,10 @@ class _Problem:
             ground_covariance={f.name: s for f, s in zip(self.fields, spreads, strict=True)},
             residual=self._by_line(standard),
             weight=self._by_line(state.weights.image),
-            chi_square=square,
-            degrees_of_freedom=known - 3 * int(equations.movable.sum()) - len(freedom.kept),
+            chi_square=sum(one.square for one in tests.values()) + pulled_square,
+            degrees_of_freedom=known - 3 * int(np.sum(equations.movable & ~state.lost)) - len(freedom.kept),
             factors=state.weights.factor,
-            redundancy=redundancy,
+            redundancy={g: one.redundancy for g, one in tests.items()},
             iterations=state.steps,
             fields=self.fields,
             unseen=unseen,

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.calibration.normal_equations import State, Weights, assemble
+from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, Unknowns
-from analysis.orbit.normal_equations import State, Weights, assemble
 from analysis.orbit.null_space import free_basis, solved
-from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import LineModel
 
 __all__ = ["Stepwise", "stepwise"]

@@ -1,0 +1,127 @@
+"""Loops of integrators with a delay: limits, margins and limit cycles against recursions that are gone through here."""
+
+import math
+
+import numpy as np
+import pytest
+
+from analysis.monitor.control_loop import (
+    common_margin,
+    limit_cycle,
+    margins,
+    open_loop,
+    rejection,
+    spectral_radius,
+)
+
+DELAYS = (0, 1, 2, 3, 7)
+
+
+def left_over(gain: float, delay: int, course: np.ndarray) -> np.ndarray:
+    """What is left of a course when images are taken, reading by reading: a recursion that shares nothing with the
+    module.
+    """
+    commands, left = [], []
+    for value in course:
+        seen = value + (commands[-1 - delay] if len(commands) > delay else 0.0)
+        commands.append((commands[-1] if commands else 0.0) - gain * seen)
+        left.append(value + (commands[-1 - delay] if len(commands) > delay else 0.0))
+    return np.array(left)
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_just_below_the_limit_errors_decay_and_just_above_they_grow(delay: int) -> None:
+    limit, step = margins(0.1, delay).limit, np.ones(20_000)
+    # 1 % off the limit errors change by e in some hundred readings, twenty thousand are enough for any delay here
+    below, above = (np.abs(left_over(factor * limit, delay, step)) for factor in (0.99, 1.01))
+    assert below[-100:].max() < 1e-6
+    assert above[-100:].max() > 1e6
+    assert margins(0.99 * limit, delay).stable
+    assert not margins(1.01 * limit, delay).stable
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_the_recursion_of_many_loops_has_the_limit_of_one(delay: int) -> None:
+    limit = 2.0 * math.sin(math.pi / (4 * delay + 2))
+    assert common_margin([[1.0]], [0.25], [delay]) == pytest.approx(limit / 0.25, rel=1e-9)
+    assert spectral_radius([[1.0]], [0.999 * limit], [delay]) < 1.0 < spectral_radius([[1.0]], [1.001 * limit], [delay])
+
+
+@pytest.mark.parametrize(("gain", "delay"), [(0.5, 0), (0.8, 1), (0.3, 2)])
+def test_margins_are_those_of_the_open_loop(gain: float, delay: int) -> None:
+    found = margins(gain, delay)
+    at = open_loop(gain, delay, found.crossover)
+    assert abs(at) == pytest.approx(1.0, rel=1e-12)
+    assert 180.0 + math.degrees(np.angle(at)) == pytest.approx(found.phase_deg, abs=1e-9)
+    # at the gain margin the curve goes through -1
+    frequency = 0.5 / (2 * delay + 1)
+    assert open_loop(gain * found.gain, delay, frequency) == pytest.approx(-1.0, abs=1e-12)
+
+
+def test_a_phase_lost_in_full_makes_the_loop_unstable() -> None:
+    # a phase margin of p degrees at w is a further delay of p / (360 w) readings: at whole readings of it the loop with
+    # that delay more is at its limit
+    gain = 2.0 * math.sin(math.pi / (4 * 3 + 2))
+    found = margins(gain, 1)
+    assert found.phase_deg / (360.0 * found.crossover) == pytest.approx(2.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(("gain", "delay"), [(0.5, 0), (1.0, 0), (0.5, 1), (0.2, 3)])
+@pytest.mark.parametrize("frequency", [0.01, 0.1, 0.3])
+def test_the_share_that_is_left_of_a_swing(gain: float, delay: int, frequency: float) -> None:
+    k = np.arange(6000)
+    swing = np.exp(2j * np.pi * frequency * k)
+    left = left_over(gain, delay, swing.real) + 1j * left_over(gain, delay, swing.imag)
+    assert np.abs(left[-500:]).max() == pytest.approx(float(rejection(gain, delay, frequency)), rel=1e-6, abs=1e-9)
+
+
+def test_loops_that_work_on_each_other() -> None:
+    # two that do to each other what they do to themselves are one loop of the sum of their gains
+    both = np.ones((2, 2))
+    assert common_margin(both, [0.3, 0.2], [1, 1], [4, 4]) == pytest.approx(margins(0.5, 1).gain, rel=1e-9)
+    # those that do nothing to each other are as stable as the worse
+    assert common_margin(np.eye(2), [0.3, 0.2], [0, 3]) == pytest.approx(margins(0.2, 3).gain, rel=1e-9)
+    assert spectral_radius(both, [0.0, 0.5], [9, 1]) == spectral_radius([[1.0]], [0.5], [1])
+    assert common_margin(both, [0.0, 0.0], [0, 0]) == math.inf
+    # two mechanisms on two quantities to which they do the same cannot correct both: they drift off
+    assert common_margin(both, [0.3, 0.2], [1, 1]) == 0.0
+    # order does not matter
+    coupling = np.array([[1.0, 0.3], [-0.2, 1.0]])
+    there = common_margin(coupling, [0.5, 0.7], [0, 2])
+    assert common_margin(coupling[::-1, ::-1], [0.7, 0.5], [2, 0]) == pytest.approx(there, rel=1e-9)
+
+
+def worst_cycle(gain: float, delay: int, band: float) -> tuple[int, float]:
+    """Steps and what is left, by going through many places between two steps one by one."""
+    steps, worst = 0, 0.0
+    for place in np.linspace(0.003, 0.997, 60):
+        commands, at = [], []
+        for _ in range(700):
+            stands = round(commands[-1 - delay]) if len(commands) > delay else 0
+            left = place + stands
+            commands.append((commands[-1] if commands else 0.0) - gain * left * (abs(left) > band))
+            at.append(round(commands[-1 - delay]) if len(commands) > delay else 0)
+        seen = at[400:]
+        steps, worst = max(steps, max(seen) - min(seen)), max(worst, *(abs(place + p) for p in seen))
+    return steps, worst
+
+
+@pytest.mark.parametrize(
+    ("gain", "delay", "band"), [(0.5, 0, 0.0), (0.8, 0, 0.0), (0.5, 1, 0.0), (0.8, 0, 0.6), (0.3, 2, 0.0)]
+)
+def test_the_limit_cycle(gain: float, delay: int, band: float) -> None:
+    found = limit_cycle(gain, delay, band)
+    steps, left = worst_cycle(gain, delay, band)
+    assert found.steps == steps
+    # the two look at other places between the steps, 1/41 of a step apart
+    assert found.left == pytest.approx(left, abs=0.05)
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5])
+def test_a_mechanism_of_whole_steps_goes_to_and_fro_by_one_step_at_most(share: float, delay: int) -> None:
+    """At up to half of the limit, a gain margin of 2, whatever there is to correct."""
+    found = limit_cycle(share * margins(0.1, delay).limit, delay)
+    assert found.steps == 1
+    assert found.left <= 1.0
+    assert limit_cycle(share * margins(0.1, delay).limit, delay, 0.75).steps == 0

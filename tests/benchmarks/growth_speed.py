@@ -1,0 +1,131 @@
+"""How the processor time of the monitor grows: with states, pixels of a CCD, bodies and frames.
+
+Slopes are those of straight lines through the logarithms of the upper half of the sizes; a cost in proportion has 1.
+``docs/figures/growth.py`` draws the times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.geometry.pose import Pose
+from optics.geometry.tree import Body, Motion, RigidTree
+from scenes.specs.job import JobSpec
+from scenes.specs.resolved import resolve_job
+from tests.benchmarks.monitor_speed import random_states
+from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.stopwatch import Work, timed
+from tests.benchmarks.workbench import Workbench
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import Observing, observe, one_detector
+
+SIDE = 48
+"""Of the CCDs of many states, pixels."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """One size that grows.
+
+    Attributes:
+        key, text: its name.
+        sizes, quick_sizes: that are measured.
+        work: size -> what is timed, ready to be.
+        steepest: largest slope.
+    """
+
+    key: str
+    text: str
+    sizes: tuple[int, ...]
+    quick_sizes: tuple[int, ...]
+    work: Callable[[Workbench, int], Callable[[], object]]
+    steepest: float
+
+
+def with_ccd(bench: Workbench, side: int) -> MonitorExperiment:
+    """The pair with area CCDs of so many pixels on a side."""
+    resolved = resolve_job(JobSpec(instrument="gf7_pair"))
+    spec = resolved.instrument
+    assert spec.monitor is not None
+    ccd = spec.monitor.area_ccd.model_copy(update={"rows": side, "columns": side})
+    monitor = spec.monitor.model_copy(update={"area_ccd": ccd})
+    instrument = spec.model_copy(update={"monitor": monitor})
+    return MonitorExperiment(resolved.model_copy(update={"instrument": instrument}), bench.backend)
+
+
+def of_states(bench: Workbench, count: int) -> Callable[[], object]:
+    """States observed, with one frame of small CCDs, that nobody keeps."""
+    experiment = with_ccd(bench, SIDE)
+    how = Observing(one_detector(experiment, 1, 1), stated=False)
+    every = random_states(count, 2)
+
+    def observed() -> int:
+        return sum(len(found.numbers) for found in observe(experiment, every, how))
+
+    list(observe(experiment, every[:40], how))
+    return observed
+
+
+def of_pixels(bench: Workbench, side: int) -> Callable[[], object]:
+    """One state rendered and exposed, without its fit."""
+    experiment = with_ccd(bench, side)
+    state = random_states(1, 2)
+
+    def seen() -> object:
+        photons = experiment.path.expected_photons(state)
+        return experiment.frames_after(photons, 1, 1)
+
+    seen()
+    return seen
+
+
+def of_bodies(bench: Workbench, count: int) -> Callable[[], object]:
+    """Bodies of 100 states placed, all of which move, ten on each carrier."""
+    pose = Pose(np.eye(3), np.array([0.1, 0.2, 0.3]))
+    paths = [f"c{n // 10}" if n % 10 == 0 else f"c{n // 10}/b{n % 10}" for n in range(count)]
+    tree = RigidTree(tuple(Body(path, pose) for path in paths))
+    states = [{path: Motion(shift=(1e-6 * n, 0.0, 0.0)) for path in paths} for n in range(100)]
+    return lambda: tree.place(states)
+
+
+def of_frames(bench: Workbench, count: int) -> Callable[[], object]:
+    """Frames of one CCD of 96 x 96 pixels exposed."""
+    experiment = bench.experiment("gf7_pair")
+    photons, pattern = experiment.nominal_photons[:1], experiment.pattern(1)
+    one = type(pattern)(pattern.gain[:1], pattern.offset_e[:1])
+    return lambda: experiment.detector.expose(photons, one, count, experiment.exposure, 1)
+
+
+GROWTHS = (
+    Growth("states", "states", (100, 1000, 10_000, 30_000), (25, 50), of_states, 1.1),
+    Growth("pixels", "pixels on a side", (32, 64, 128, 256, 512, 1024), (32, 64), of_pixels, 4.2),
+    Growth("bodies", "bodies", (10, 20, 40, 80, 160), (10, 40), of_bodies, 1.6),
+    Growth("frames", "frames", (1, 10, 100, 1000, 10_000), (1, 10), of_frames, 1.1),
+)
+
+
+def slope(times: Mapping[int, float]) -> float:
+    """Slope of the logarithms of the upper half of some sizes."""
+    sizes = sorted(times)[-max(2, (len(times) + 1) // 2) :]
+    return float(np.polyfit(np.log(sizes), np.log([times[size] for size in sizes]), 1)[0])
+
+
+def measure(bench: Workbench, quick: bool) -> Speed:
+    """Seconds of processor time at each size, and slopes."""
+    return Speed(tuple(number for growth in GROWTHS for number in _numbers(bench, growth, quick)))
+
+
+def _numbers(bench: Workbench, growth: Growth, quick: bool) -> Iterator[Number]:
+    times = {}
+    for size in growth.quick_sizes if quick else growth.sizes:
+        work = growth.work(bench, size)
+        first = timed(Work(lambda _, work=work: work()))
+        # short work again, for an undisturbed turn
+        again = 0 if quick else int(min(20, 1.0 / max(first.cpu_s, 1e-3)))
+        best = min(first.cpu_s, timed(Work(lambda _, work=work: work(), repeats=again)).cpu_s if again else np.inf)
+        times[size] = best
+        yield Number(f"{growth.key}_{size}_s", best, f"  {size:,} {growth.text}", "s")
+    yield Number(f"{growth.key}_slope", slope(times), f"slope with {growth.text}", "", Limit(growth.steepest))

@@ -1,0 +1,322 @@
+"""A loop closed and open along one orbit: what is left of pointing and focus, and heights of points both lines see.
+
+Heights are those of forward intersection of exact lines of sight with the stated errors of image points, orbit and
+attitude: the lines are traced through the state that the mechanisms have left, and the intersection knows the lines as
+calibrated, with the corrections that the processing makes. Truth enters where errors are counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import norm
+
+from analysis.monitor.control_loop import (
+    DECAYING,
+    LimitCycle,
+    Margins,
+    common_margin,
+    limit_cycle,
+    margins,
+    spectral_radius,
+)
+from analysis.monitor.disturbances import FALSE_ALARM
+from analysis.monitor.unseen_motions import UnseenMode, floor, unseen_modes
+from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
+from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from twin.monitor.image_quality import image_quality
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.orbit.flight.corrected_lines import calibrated_line
+from twin.orbit.flight.line_camera import LineCamera, traced_line_cameras
+from twin.orbit.loop.line_images import ImagedPair, imaged_pair
+from twin.orbit.loop.loop_course import LoopCourse, drifting_states, gone_through, reader
+from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model
+from twin.orbit.monitoring.monitor_series import TOO_FAR
+from twin.orbit.monitoring.monitoring_flight import fly, in_analysis, look_down
+from twin.orbit.monitoring.monitoring_run import CaseErrors, case_errors, height_slopes, point_errors, rms
+from twin.run.procedure import Advance, BenchError, silent
+from twin.run.random_streams import stream
+
+if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+    from scenes.specs.orbit.setup import LoopSetup
+
+_IMAGES = 100_000
+"""Random stream of line images; moments of the check points have those up to the number of readings."""
+FOCUS_SCALE = 10e-6
+"""Metres of defocus that count as much as a metre of height where modes are sought: a tenth of what blurs an image."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopPass:
+    """One course with what it truly leaves.
+
+    Attributes:
+        course: of it.
+        truth: (T, P) true quantities when images are taken, less what the processing corrects.
+        heights: errors at the check points.
+        slopes: (T, P) of the mean height error by the quantities, m/rad and m/m.
+        angle: (P,) row of the angle between the pair's lines of sight, opening positive.
+        mtf: camera -> (T, 2) at Nyquist along the line and along the track, mean over the fields.
+        images: pairs of line images, at the moments that the file names.
+    """
+
+    course: LoopCourse
+    truth: np.ndarray
+    heights: CaseErrors
+    slopes: np.ndarray
+    angle: np.ndarray
+    mtf: Mapping[str, np.ndarray]
+    images: tuple[ImagedPair, ...] = ()
+
+    def told(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(T,) what the posterior says of a quantity, and its sigma.
+
+        Args:
+            rows: (P,) or (T, P) of it on the quantities.
+        """
+        each = np.broadcast_to(rows, self.truth.shape)
+        value = np.einsum("tp,tp->t", each, self.course.expected)
+        variance = np.einsum("tp,tpq,tq->t", each, self.course.covariance, each)
+        return value, np.sqrt(np.maximum(variance, 0.0))
+
+    def true(self, rows: np.ndarray) -> np.ndarray:
+        """(T,) of a quantity, by the traced states; arguments as of `told`."""
+        return np.einsum("tp,tp->t", np.broadcast_to(rows, self.truth.shape), self.truth)
+
+    def ratio(self, rows: np.ndarray) -> float:
+        """Largest error of what the posterior says of a quantity over its sigma; arguments as of `told`."""
+        value, sigma = self.told(rows)
+        known = sigma > 0.0
+        return float(np.max(np.abs(value - self.true(rows))[known] / sigma[known], initial=0.0))
+
+    def unit(self, row: int) -> np.ndarray:
+        """(P,) of one of the quantities."""
+        return np.eye(self.truth.shape[1])[row]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopFacts:
+    """One correction as a loop.
+
+    Attributes:
+        corrector: of it.
+        loop_gain: gain, times what the spots tell of what the mechanism does beyond what is known.
+        margins: of this gain with the delay.
+        cycle: of a mechanism of whole steps; None for another one.
+        ends: numbers of the moments at which the end of the range held it.
+    """
+
+    corrector: Corrector
+    loop_gain: float
+    margins: Margins
+    cycle: LimitCycle | None
+    ends: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopRun:
+    """A finished loop.
+
+    Attributes:
+        setup: what its file says.
+        seed: of all random numbers.
+        model: of the loop.
+        closed: with the corrections; open: without.
+        bare: errors of the true cameras at the points of the closed course: image, orbit and attitude.
+        loops: of the corrections, by name.
+        radius: largest size of the eigenvalues of all loops together.
+        margin: by how much all gains together may be larger.
+        modes: what no spot shows; quantities are height (m) and the defocus (m) of the pair.
+        unseen: (3, T) standard deviations of the same that no estimate from the spots can have less of.
+    """
+
+    setup: LoopSetup
+    seed: int
+    model: LoopModel
+    closed: LoopPass
+    open: LoopPass
+    bare: CaseErrors
+    loops: Mapping[str, LoopFacts]
+    radius: float
+    margin: float
+    modes: tuple[UnseenMode, ...]
+    unseen: np.ndarray
+
+    @property
+    def stable(self) -> bool:
+        """Whether all loops together are."""
+        return self.radius < DECAYING
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """The two cameras."""
+        return self.setup.pair
+
+    @property
+    def ratios(self) -> dict[str, float]:
+        """Quantity -> largest error of what the posterior says of it over its sigma, both courses together."""
+        rows = {f"defocus of {name}": self.open.unit(self.model.row(name, "defocus")) for name in self.pair}
+        every = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
+        every |= {name: (row, row) for name, row in rows.items()}
+        return {name: max(self.closed.ratio(one), self.open.ratio(two)) for name, (one, two) in every.items()}
+
+    @property
+    def ratio_limit(self) -> float:
+        """Of `ratios`, exceeded with a chance of `FALSE_ALARM` at most whatever the correlations."""
+        return float(norm.isf(0.5 * FALSE_ALARM / (2 * len(self.closed.course.times) * len(self.ratios))))
+
+    @property
+    def phase_deg(self) -> float:
+        """Smallest phase margin of the loops; NaN where none has one."""
+        known = [one.margins.phase_deg for one in self.loops.values() if math.isfinite(one.margins.phase_deg)]
+        return min(known, default=math.nan)
+
+
+_SCALE = np.array([1.0, FOCUS_SCALE, FOCUS_SCALE])
+
+
+def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = silent) -> LoopRun:
+    """Draw, render, read, correct, look down: ``python -m twin.orbit loop``.
+
+    Raises:
+        InputError: a mechanism or a node that the instrument does not have, or that does not move so.
+        BenchError: the loop cannot be run as its file says.
+    """
+    spec, pair = setup.test, setup.pair
+    ground_seed, monitor_seed = np.random.SeedSequence(seed).spawn(2)
+    number = int(np.random.default_rng(monitor_seed).integers(2**31))
+    advance("trace", 0, 1)
+    experiment = MonitorExperiment(setup.resolved, backend)
+    try:
+        model = loop_model(setup, experiment)
+        states = drifting_states(spec, experiment, number)
+        advance("trace", 1, 1)
+        read = reader(model, spec, number)
+        courses = []
+        for part, still in (("readings, loop closed", False), ("readings, loop open", True)):
+
+            def told(done: int, part: str = part) -> None:
+                advance(part, done, len(states))
+
+            courses.append(gone_through(model, spec, states, read, still, told))
+        nominal = traced_line_cameras(experiment.instrument, backend)
+        calibrated = {
+            name: calibrated_line(
+                nominal[name], experiment.sight.axes[name], experiment.nominal_truth.principal_distance[name]
+            )
+            for name in pair
+        }
+        passes = [_passed(setup, course, nominal, calibrated, ground_seed, advance) for course in courses]
+    except (AimError, BeamMissedError) as error:
+        raise BenchError(f"the instrument cannot be traced: {error}", ("readings",), TOO_FAR) from error
+    except IntersectionError as error:
+        raise BenchError(str(error), ("cameras",), "cameras that look different ways") from error
+    closed, free = (one for one, _ in passes)
+    rows = _mode_rows(model, pair, free.slopes.mean(axis=0))
+    facts = {one.name: _facts(model, k, closed.course) for k, one in enumerate(model.correctors)}
+    loops = (
+        [one.loop_gain for one in facts.values()],
+        [one.spec.delay for one in model.correctors],
+        [one.row for one in model.correctors],
+    )
+    return LoopRun(
+        setup,
+        seed,
+        model,
+        closed,
+        free,
+        passes[0][1],
+        FrozenMap(facts),
+        spectral_radius(model.coupling, *loops),
+        common_margin(model.coupling, *loops),
+        unseen_modes(model.stated, rows, _SCALE),
+        np.stack(
+            [_floor(model, free.slopes), *(np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])]
+        ),
+    )
+
+
+def _facts(model: LoopModel, k: int, course: LoopCourse) -> LoopFacts:
+    one = model.correctors[k]
+    spec, step = one.spec, one.spec.smallest
+    gain = spec.gain * (1.0 + float(model.seen[k]) * (spec.response - 1.0))
+    cycle = None
+    if step is not None and spec.gain:
+        cycle = limit_cycle(spec.gain, spec.delay, spec.band / abs(step * one.own))
+    return LoopFacts(one, gain, margins(gain, spec.delay), cycle, tuple(np.flatnonzero(course.held[:, k]).tolist()))
+
+
+def _floor(model: LoopModel, rows: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.maximum(np.diag(floor(model.stated, rows)), 0.0))
+
+
+def _mode_rows(model: LoopModel, pair: tuple[str, str], slopes: np.ndarray) -> np.ndarray:
+    """(3, P) rows of the height and of the foci of the pair."""
+    unit = np.eye(len(slopes))
+    return np.stack([slopes, *(unit[model.row(name, "defocus")] for name in pair)])
+
+
+def _passed(
+    setup: LoopSetup,
+    course: LoopCourse,
+    nominal: Mapping[str, LineCamera],
+    calibrated: Mapping[str, CalibratedLine],
+    seed: np.random.SeedSequence,
+    advance: Advance,
+) -> tuple[LoopPass, CaseErrors]:
+    """A course with its truth and heights, and the errors of the true cameras at the same points."""
+    model, pair, experiment = course.model, setup.pair, course.model.experiment
+    backend, names = experiment.backend, model.cameras
+    lines = []
+    for state in course.states:
+        traced = traced_line_cameras(experiment.instrument, backend, state)
+        lines.append({name: traced[name] for name in pair})
+    views = look_down(setup.test, setup.test.readings.times, pair, lines, seed, advance)
+    corrected, true = [], []
+    for k, view in enumerate(views):
+        known = [calibrated[n].corrected(model.on_ground(n, course.positions[k])) for n in pair]
+        exact = [in_analysis(lines[k][n], calibrated[n]) for n in pair]
+        corrected.append(point_errors(known, view))
+        true.append(point_errors(exact, view))
+    found, best = np.array(corrected), np.array(true)
+    slopes = height_slopes(calibrated, pair, views)
+    rows = np.zeros((len(views), len(model.stated.parameters)))
+    for name in pair:
+        # what the analysis is told too little of, the height is wrong by the other way
+        rows[:, 4 * names.index(name) : 4 * names.index(name) + 4] = -slopes[name]
+    truth = experiment.sight.truth(list(course.states))
+    quality = image_quality(experiment.instrument, backend, list(course.states), FOCUS_FIELDS, obstruction=False)
+    traced_quantities = np.concatenate([*(truth.vector(name) for name in names), defocus(quality).T], axis=1)
+    for k, position in enumerate(course.positions):
+        for name in names:
+            own = slice(4 * names.index(name), 4 * names.index(name) + 4)
+            traced_quantities[k, own] -= model.on_ground(name, position)
+    looks = [experiment.instrument.spec.cameras[name].look for name in pair]
+    angle = np.zeros(rows.shape[1])
+    angle[[model.row(name, "d_alpha") for name in pair]] = [1.0, -1.0] if looks[0] > looks[1] else [-1.0, 1.0]
+    mtf = {
+        name: np.stack([one.mtf_along_line.mean(axis=1), one.mtf_along_track.mean(axis=1)], axis=1)
+        for name, one in quality.cameras.items()
+    }
+    images = []
+    for time in setup.test.images.times if setup.test.images is not None else ():
+        k = setup.test.readings.times.index(time)
+        changes = {name: model.on_ground(name, course.positions[k]) for name in pair}
+        foci = {name: float(traced_quantities[k, model.row(name, "defocus")]) for name in pair}
+        given = nominal, calibrated, changes, foci, fly(setup.test, seed), stream(seed, _IMAGES, k)
+        images.append(imaged_pair(setup, k, lines[k], *given))
+    heights = case_errors(found, best)
+    passed = LoopPass(course, traced_quantities, heights, rows, angle, FrozenMap(mtf), tuple(images))
+    return passed, case_errors(best, best)
+
+
+def height_rms(one: LoopPass) -> float:
+    """RMS over the moments of the mean height error that the cameras alone make, metres."""
+    return rms(one.heights.camera)
