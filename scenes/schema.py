@@ -4,6 +4,8 @@ An editor that knows them completes keys, shows what they mean and marks mistake
 server, the first line of a file names its schema: `# yaml-language-server: $schema=schemas/job.schema.json`.
 """
 
+from __future__ import annotations
+
 if __name__ == "__main__":
     from scenes.yaml.interrupt import end_quietly
 
@@ -13,28 +15,40 @@ import json
 import re
 import sys
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
 from rich.console import Console
 
-from optics.numerics.backend import BackendUnavailable
-from optics.numerics.llvm import LibraryMissing
 from scenes.kinds.file_kinds import FILE_KINDS
-from scenes.specs.job import JobSpec
-from scenes.specs.load import INSTRUMENTS, library_names
-from scenes.specs.perturbation import ACTIONS, NodeInfo
-from scenes.specs.resolved import resolve_job
-from scenes.yaml.spec import Spec
 from scenes.yaml.standard_output import to_stdout
 
-MODELS: dict[str, type[Spec]] = {kind.name: kind.model for kind in FILE_KINDS}
+if TYPE_CHECKING:
+    from scenes.specs.perturbation import NodeInfo
+    from scenes.yaml.spec import Spec
+
+    MODELS: dict[str, type[Spec]]
+
 _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
 _SI_UNIT = re.compile(r",? (?:metres|radians|seconds)\b")
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+
+@cache
+def _models() -> dict[str, type[Spec]]:
+    """Name of each kind of file -> model of what it may say; all modules of them are imported here."""
+    return {kind.name: kind.model for kind in FILE_KINDS}
+
+
+def __getattr__(name: str) -> Any:
+    """``MODELS`` when it is first used: ``--help`` does not wait for it."""
+    if name == "MODELS":
+        return _models()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def json_schema(name: str) -> dict[str, Any]:
@@ -46,7 +60,7 @@ def json_schema(name: str) -> dict[str, Any]:
     Raises:
         KeyError: another name.
     """
-    schema = MODELS[name].model_json_schema(schema_generator=_Generator)
+    schema = _models()[name].model_json_schema(schema_generator=_Generator)
     for model in (schema, *schema.get("$defs", {}).values()):
         _describe(model)
     return {"$schema": DIALECT, **schema}
@@ -85,6 +99,9 @@ def shipped_nodes() -> dict[str, Mapping[str, NodeInfo]]:
     """
     from optics.numerics.backend import load_backend
     from scenes.models.instrument_builder import build_instrument
+    from scenes.specs.job import JobSpec
+    from scenes.specs.load import INSTRUMENTS, library_names
+    from scenes.specs.resolved import resolve_job
 
     backend, out = load_backend(), {}
     for name in library_names(INSTRUMENTS):
@@ -119,6 +136,8 @@ def _only(properties: Mapping[str, Any]) -> dict[str, Any]:
 
 def _of_nodes(nodes: Mapping[str, NodeInfo]) -> dict[str, Any]:
     """Node path -> what may stand below it."""
+    from scenes.specs.perturbation import ACTIONS
+
     out = {}
     for path, info in nodes.items():
         never = {action: False for action in ACTIONS if action not in info.allows}
@@ -140,7 +159,7 @@ def write_schemas(folder: Path, instruments: Mapping[str, Mapping[str, NodeInfo]
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    for name in MODELS:
+    for name in _models():
         path = folder / f"{name}.schema.json"
         schema = json_schema(name)
         schema = with_nodes(schema, instruments) if name == "job" else schema
@@ -161,6 +180,9 @@ def main(
 
     Then the first line of a job's file may be: # yaml-language-server: $schema=schemas/job.schema.json
     """
+    from optics.numerics.backend import BackendUnavailable
+    from optics.numerics.llvm import LibraryMissing
+
     instruments: dict[str, Mapping[str, NodeInfo]] = {}
     try:
         instruments = shipped_nodes()

@@ -8,19 +8,23 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from optics.numerics.backend import load_backend
 from scenes.kinds.file_kinds import read_for
-from scenes.specs.perturbation import ACTIONS
-from scenes.specs.resolved import ResolvedJob, resolve
+from scenes.yaml.named import Named
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.run import cli
 from twin.run.command import Result, run_command
 from twin.run.procedure import Session
+
+if TYPE_CHECKING:
+    from scenes.specs.resolved import ResolvedJob
+    from twin.run.cost import Cost
+
+RESOLVE = Named("scenes.specs.resolved:resolve")
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -106,11 +110,17 @@ def main(
 
         return run_render(resolved, session, frames, seed, picture)
 
+    def cost(resolved: ResolvedJob) -> Cost:
+        from twin.main_job.render_cost import render_cost
+
+        return render_cost(resolved, frames)
+
     run_command(
         job.stem,
         cli.Options(out, seed, backend, force, as_json, quiet),
-        lambda: read_for("twin.render", job, resolve),
+        lambda: read_for("twin.render", job, RESOLVE),
         work,
+        cost,
     )
 
 
@@ -123,8 +133,10 @@ def print_nodes(job: Path, backend: str, as_json: bool) -> None:
     errors = Console(stderr=True)
     with cli.explained(errors):
         cli.check_backend(backend)
-        resolved = read_for("twin.render", job, resolve)
+        resolved = read_for("twin.render", job, RESOLVE)
+        from optics.numerics.backend import load_backend
         from scenes.models.instrument_builder import build_instrument
+        from scenes.specs.perturbation import ACTIONS
 
         nodes = build_instrument(resolved.instrument, resolved.cameras, load_backend(backend)).nodes
     with to_stdout(errors):

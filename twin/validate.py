@@ -18,38 +18,14 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.table import Column
 from rich.text import Text
 
-from optics.numerics.backend import load_backend
 from scenes.yaml.standard_output import FAILURE, Terminal, print_json, to_stdout
 from twin.run import cli
 from twin.run.durable import exit_on_terminate
-from twin.run.provenance import program_digest
-from twin.run.run_folder import RunFolder
-from twin.validation.checks.check import (
-    CONFIRMED,
-    CONSISTENT,
-    CORRECTED,
-    FAILED,
-    NOT_CHECKABLE,
-    REFUTED,
-    REPRODUCED,
-    UNDECIDED,
-    Verdict,
-)
 
 if TYPE_CHECKING:  # all that the checks compute with is imported when one is asked for
+    from twin.run.run_folder import RunFolder
     from twin.validation.registry import Selection
     from twin.validation.runner import Validation
-
-STYLES: dict[Verdict, str] = {
-    CONFIRMED: "green",
-    REPRODUCED: "dark_sea_green4",
-    CONSISTENT: "blue",
-    CORRECTED: "yellow",
-    REFUTED: "cyan",
-    UNDECIDED: "magenta",
-    NOT_CHECKABLE: "dim",
-    FAILED: "bold red",
-}
 
 LISTED = (
     "id", "paper", "equation", "statement", "also", "printed", "unit", "comparison", "tolerance", "because", "tells",
@@ -123,7 +99,9 @@ def main(
     errors = Console(stderr=True)
     with cli.explained(errors):
         cli.check_backend(backend)
+        from twin.run.run_folder import RunFolder
         from twin.validation import registry
+        from twin.validation.checks.check import FAILED
         from twin.validation.registry import UnknownCheck, select
 
         try:
@@ -162,6 +140,10 @@ def _run(
     folder: RunFolder | None,
     errors: Console,
 ) -> Validation:
+    from optics.numerics.backend import load_backend
+    from twin.run.command import tell_cost
+    from twin.run.cost import Cost
+    from twin.run.provenance import program_digest
     from twin.validation.runner import rough_seconds, run_checks
     from twin.validation.validation_report import write_validation
 
@@ -174,8 +156,9 @@ def _run(
     )
     tracer = load_backend(backend)
     program_digest()  # of the files that compute, which may be others when the checks end
+    total = rough_seconds(selections, fast)
+    tell_cost(Cost(0.0, total), errors, quiet=False)
     with Progress(*columns, console=errors, disable=not errors.is_terminal, transient=True) as bar:
-        total = rough_seconds(selections, fast)
         task = bar.add_task("start", total=total)
 
         begun, at = time.monotonic(), "start"
@@ -241,8 +224,19 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
 
 def _print_result(validation: Validation, target: Path | None) -> None:
     """Every check in a line, and where to read more."""
+    from twin.validation.checks import check
     from twin.validation.validation_report import claim_text, comparison_text, measured_text, sigma_text, verdict
 
+    styles = {
+        check.CONFIRMED: "green",
+        check.REPRODUCED: "dark_sea_green4",
+        check.CONSISTENT: "blue",
+        check.CORRECTED: "yellow",
+        check.REFUTED: "cyan",
+        check.UNDECIDED: "magenta",
+        check.NOT_CHECKABLE: "dim",
+        check.FAILED: "bold red",
+    }
     table = cli.result_table()
     table.add_column("check", no_wrap=True)
     table.add_column("claim", justify="right", no_wrap=True)
@@ -254,7 +248,7 @@ def _print_result(validation: Validation, target: Path | None) -> None:
     for r in validation.results:
         unit = "" if r.unit == "1" else r.unit
         cells = (r.id, claim_text(r), comparison_text(r), measured_text(r), sigma_text(r), unit)
-        table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=STYLES[r.verdict]))
+        table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=styles[r.verdict]))
     console = Terminal()
     cli.print_verdict(console, verdict(validation))
     cli.print_whole(console, table)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft, ndimage
+from scipy import fft
 
 from analysis.spots import spot_image
 from analysis.spots.noise import NoiseModel
@@ -296,7 +296,11 @@ def _best_elsewhere(surface: Array) -> NDArray[np.intp]:
     place farther than a step or two away.
     """
     size = np.array(surface.shape)
-    tops = np.argwhere((surface == ndimage.maximum_filter(surface, 5, mode="wrap")) & (surface > _LIKE * surface.max()))
+    # few places are as high, and only these need to be looked at for tops
+    high = np.argwhere(surface > _LIKE * surface.max())
+    rows, columns = ((high[:, axis, None] + np.arange(-2, 3)) % size[axis] for axis in (0, 1))
+    around = surface[rows[:, :, None], columns[:, None, :]]
+    tops = high[surface[high[:, 0], high[:, 1]] == around.max(axis=(1, 2))]
     lags = np.where(tops > size // 2, tops - size, tops)
     away = np.any(np.abs(lags) > _SAME_PX, axis=1)
     if not np.any(away):

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any, assert_never
 
 import numpy as np
-from scipy.ndimage import map_coordinates, spline_filter
 
 from optics.geometry import zernike
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
@@ -78,6 +77,9 @@ class GridFigure:
     @cached_property
     def spline(self) -> np.ndarray:
         """B-spline coefficients with a mirrored margin of two samples on every side, shape (rows + 4, columns + 4)."""
+        # messages about files wait for this module, and scipy takes a quarter of a second
+        from scipy.ndimage import spline_filter
+
         coefficients = spline_filter(self.values, order=3, mode="mirror")
         return np.pad(coefficients, 2, mode="reflect")
 
@@ -113,6 +115,9 @@ class GridFigure:
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
         """Sag error at x, y (metres), NumPy."""
+        # as in ``spline``
+        from scipy.ndimage import map_coordinates
+
         dx, dy = self.spacing
         column = (np.asarray(x) - self.bounds[0]) / dx
         row = (np.asarray(y) - self.bounds[2]) / dy

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from optics.geometry.pose import Pose, rotation_matrix, triple
 from optics.geometry.surface import GridFigure
@@ -341,6 +340,9 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
     Raises:
         ValueError: both have a grid figure of the same body, on different samples.
     """
+    # messages about files and help wait for this module, and scipy takes a quarter of a second
+    from scipy.spatial.transform import Rotation
+
     out = dict(first)
     for path, motion in then.items():
         before = out.get(path)

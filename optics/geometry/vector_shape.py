@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import j1
 
 from optics.numerics.physical_error import UnphysicalError
 
@@ -170,6 +169,9 @@ class Disk:
 
     def spectrum(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         """Fourier transform, area * 2 J1(q)/q with q = |radius stretch^T k|, m^2; arguments as ``Polygon.spectrum``."""
+        # messages about files wait for this module, and scipy takes a tenth of a second
+        from scipy.special import j1
+
         kx, ky, shape = _wave_numbers(fx, fy)
         (a, b), (c, d) = self.radius * self.stretch
         # the offset changes nothing but q = 0

@@ -185,6 +185,17 @@ def sample_distance(u: Any, scale: Any, exponent: Any) -> Any:
     return scale * select(square > 0.0, square, 0.0 * square) ** 0.5
 
 
+def lobe_area(scale: float, exponent: float) -> float:
+    """Integral of (1 + (d/l)^2)^(-g/2) over d^2 < WIDEST^2; the function over it is the density of d^2 that
+    ``sample_distance`` draws.
+
+    Args:
+        scale: l, in direction cosines.
+        exponent: g.
+    """
+    return _harvey_integral(scale, exponent, WIDEST) / float(np.pi)
+
+
 def acceptance(distance: Any, scale: Any, exponent: Any, abg: Any) -> Any:
     """Probability of keeping a drawn distance, 0.5 or more for usual g; 1 for Harvey-Shack (``abg`` < 0.5)."""
     x = distance / scale

@@ -41,6 +41,23 @@ def kernel_threads(count: int) -> None:
         dr.set_thread_count(count)
 
 
+@contextmanager
+def one_kernel_thread() -> Iterator[None]:
+    """Let kernels inside the ``with`` block run on the thread that calls them.
+
+    Threads that have run a kernel look for the next one for some milliseconds, actively. Where short kernels alternate
+    with other work, they take more time than the kernels.
+    """
+    import drjit as dr
+
+    count = dr.thread_count()
+    kernel_threads(1)
+    try:
+        yield
+    finally:
+        kernel_threads(count)
+
+
 LIMIT = "TWIN_THREADS"
 """Environment variable that limits ``cores``, for processes that share the machine with others of their kind."""
 

@@ -19,12 +19,9 @@ coarse.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import sparse
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from optics.geometry import zernike
 from optics.geometry.aperture import Aperture
@@ -33,6 +30,9 @@ from optics.geometry.surface import GridFigure, Surface
 from optics.geometry.tree import Motion
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.physical_error import PhysicalError
+
+if TYPE_CHECKING:  # every file of a job waits for this module, and none for scipy
+    from scipy.sparse import sparray
 
 TERMS = 36
 """Zernike terms by default: to seventh order."""
@@ -170,6 +170,8 @@ def nodal_deformation(
     fitted = np.linalg.lstsq(basis * root[:, None], change * root, rcond=zernike.HELD)[0]
     residual = change - basis @ fitted
     grid, lost, between = _gridded(places[:, :2], residual, weight, aperture, spacing)
+    from scipy.spatial.transform import Rotation
+
     return NodalDeformation(
         triple(Rotation.from_matrix(turn).as_rotvec()),
         triple(shift),
@@ -244,6 +246,8 @@ def _cells(places: np.ndarray, aperture: Aperture, spacing: float) -> np.ndarray
     Raises:
         NodesError: a part of the aperture is far from all.
     """
+    from scipy.spatial import cKDTree
+
     lattice = _lattice(aperture, spacing / _LATTICE)
     distance, nearest = cKDTree(places).query(lattice)
     worst = int(np.argmax(distance))
@@ -303,6 +307,8 @@ class _Spline:
     """
 
     def __init__(self, places: np.ndarray, bounds: tuple[float, float, float, float], shape: tuple[int, int]) -> None:
+        from scipy import sparse
+
         self._bounds, self._shape = bounds, shape
         rows, columns = shape
         u = (places[:, 0] - bounds[0]) / (bounds[1] - bounds[0]) * (columns - 1)
@@ -322,7 +328,8 @@ class _Spline:
 
     def fit(self, values: np.ndarray, used: np.ndarray) -> GridFigure:
         """The grid nearest to values (K,) at the places that are used (K,)."""
-        from scipy.sparse.linalg import splu  # every file of a job waits for this module, and none for that
+        from scipy import sparse
+        from scipy.sparse.linalg import splu
 
         design = self._design[used]
         normal = sparse.csc_array(design.T @ design + self._bending)
@@ -343,11 +350,15 @@ def _cubic(place: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return weights, np.where(number > count - 1, 2 * (count - 1) - number, number)
 
 
-def _first(count: int) -> sparse.sparray:
+def _first(count: int) -> sparray:
+    from scipy import sparse
+
     return sparse.diags_array([-np.ones(count - 1), np.ones(count - 1)], offsets=[0, 1], shape=(count - 1, count))
 
 
-def _second(count: int) -> sparse.sparray:
+def _second(count: int) -> sparray:
+    from scipy import sparse
+
     ones = np.ones(count - 2)
     return sparse.diags_array([ones, -2.0 * ones, ones], offsets=[0, 1, 2], shape=(count - 2, count))
 

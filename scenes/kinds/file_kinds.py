@@ -5,22 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from scenes.specs.as_built import AsBuiltInstrumentSpec
-from scenes.specs.autocollimators import AutocollimatorTestSpec
-from scenes.specs.camera import CameraSpec
-from scenes.specs.detector import DetectorSpec
-from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.error_budget import ErrorBudgetSpec
-from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.job import JobSpec
-from scenes.specs.measured.monitor_frames import MeasurementSpec
-from scenes.specs.measured.orbit_data import OrbitDataSpec
-from scenes.specs.measured.telemetry import TelemetrySpec
-from scenes.specs.operation import OperationSpec
-from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.procedures import PROCEDURES, FileKind
-from scenes.specs.study import StudySpec
-from scenes.specs.tolerance import ToleranceBudgetSpec
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import read_yaml
 
@@ -35,45 +20,106 @@ _MOST = 2
 _VALIDATED = "the checks of `python -m twin.validate`"
 
 FILE_KINDS = (
-    FileKind("job", JobSpec, "a job of the monitor", "twin.render"),
-    FileKind("measurement", MeasurementSpec, "a measurement of a monitor", "twin.recover"),
-    FileKind("instrument", InstrumentSpec, "an instrument", place="a job's `instrument: FILE`"),
+    FileKind("job", "scenes.specs.job:JobSpec", "a job of the monitor", "twin.render", needs=("instrument",)),
+    FileKind(
+        "measurement",
+        "scenes.specs.measured.monitor_frames:MeasurementSpec",
+        "a measurement of a monitor",
+        "twin.recover",
+        needs=("frames",),
+    ),
+    FileKind(
+        "instrument",
+        "scenes.specs.instrument:InstrumentSpec",
+        "an instrument",
+        place="a job's `instrument: FILE`",
+        needs=("cameras", "name"),
+    ),
     FileKind(
         "as_built_instrument",
-        AsBuiltInstrumentSpec,
+        "scenes.specs.as_built:AsBuiltInstrumentSpec",
         "an instrument as built",
         place="a job's `instrument: FILE`",
+        needs=("design", "name"),
     ),
     FileKind(
         "camera",
-        CameraSpec,
+        "scenes.specs.camera:CameraSpec",
         "a camera's prescription",
         "twin.camera",
         "an instrument's `cameras: {NAME: {camera: FILE}}`",
+        needs=("mirrors", "focal_length"),
     ),
-    FileKind("detector", DetectorSpec, "a detector's data sheet", place="`detector: FILE` of an area CCD or a band"),
+    FileKind(
+        "detector",
+        "scenes.specs.detector:DetectorSpec",
+        "a detector's data sheet",
+        place="`detector: FILE` of an area CCD or a band",
+        needs=("bit_depth", "full_well_e"),
+    ),
     FileKind(
         "disturbances",
-        DisturbancesSpec,
+        "scenes.specs.disturbances:DisturbancesSpec",
         "a list of disturbances",
         place="a job's `disturbances: FILE`",
         one_of=("causes", "joint"),
+        needs=("name",),
     ),
-    FileKind("error_budget", ErrorBudgetSpec, "an error budget", place=_VALIDATED),
-    FileKind("principle_experiment", AutocollimatorTestSpec, "a test of two autocollimators", place=_VALIDATED),
+    FileKind(
+        "error_budget",
+        "scenes.specs.error_budget:ErrorBudgetSpec",
+        "an error budget",
+        place=_VALIDATED,
+        needs=("angle_errors", "disturbances"),
+    ),
+    FileKind(
+        "principle_experiment",
+        "scenes.specs.autocollimators:AutocollimatorTestSpec",
+        "a test of two autocollimators",
+        place=_VALIDATED,
+        needs=("autocollimator", "programme"),
+    ),
     *(
         replace(kind, command=f"twin.{command}")
         for command, procedure in PROCEDURES.items()
         for kind in procedure.files
     ),
-    FileKind("orbit_data", OrbitDataSpec, "measurements of passes", place="`data: DIR` of a test on measurements"),
     FileKind(
-        "three_line_camera", ThreeLineCameraSpec, "a three-line payload", place="`camera: FILE` of a test in orbit"
+        "orbit_data",
+        "scenes.specs.measured.orbit_data:OrbitDataSpec",
+        "measurements of passes",
+        place="`data: DIR` of a test on measurements",
+        needs=("conventions", "passes"),
     ),
-    FileKind("telemetry", TelemetrySpec, "what tables of readings hold", "twin.operate ingest"),
-    FileKind("operation", OperationSpec, "a plan of operation", "twin.operate status"),
-    FileKind("study", StudySpec, "a study", "twin.study"),
-    FileKind("tolerance", ToleranceBudgetSpec, "a tolerance budget", "twin.tolerance"),
+    FileKind(
+        "three_line_camera",
+        "scenes.specs.orbit.three_line_camera:ThreeLineCameraSpec",
+        "a three-line payload",
+        place="`camera: FILE` of a test in orbit",
+        needs=("lines", "pixels"),
+    ),
+    FileKind(
+        "telemetry",
+        "scenes.specs.measured.telemetry:TelemetrySpec",
+        "what tables of readings hold",
+        "twin.operate ingest",
+        needs=("instrument", "readings"),
+    ),
+    FileKind(
+        "operation",
+        "scenes.specs.operation:OperationSpec",
+        "a plan of operation",
+        "twin.operate status",
+        needs=("instrument", "disturbances"),
+    ),
+    FileKind("study", "scenes.specs.study:StudySpec", "a study", "twin.study", needs=("base", "factors")),
+    FileKind(
+        "tolerance",
+        "scenes.specs.tolerance:ToleranceBudgetSpec",
+        "a tolerance budget",
+        "twin.tolerance",
+        needs=("merits", "tolerances"),
+    ),
 )
 """Every kind, in the order in which their schemas are listed; those of tests are in the list of these."""
 

@@ -456,7 +456,7 @@ class AsBuiltSpec(Spec):
     merits: Annotated[Named[MeritSpec], Field(min_length=1, max_length=50)]
     actuators: Annotated[Named[ActuatorSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     moves: Annotated[Named[MoveSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    candidates: Annotated[MeasurementsSpec, NothingIsEmpty] = MeasurementsSpec()
+    candidates: Annotated[MeasurementsSpec, NothingIsEmpty] = MeasurementsSpec.model_construct()
     draws: Annotated[Whole, Field(ge=20, le=100_000)] = 200
     seed: Seed = 0
     simulate: Annotated[SimulatedInstrumentSpec, NothingIsEmpty] | None = None

@@ -72,7 +72,7 @@ class BandSpec(Spec):
     spectrum: Spectrum
     detector: Reference
     diffusion: Diffusion = 0.0
-    tdi: TdiSpec = TdiSpec()
+    tdi: TdiSpec = TdiSpec.model_construct()
 
     @property
     def exposure(self) -> float:
@@ -277,8 +277,8 @@ class MonitorDesignSpec(Spec):
     photons_per_frame: instruments.Photons | None = None
     frames: instruments.Frames | None = None
     goal: MonitorGoalSpec
-    limits: MonitorLimitsSpec = MonitorLimitsSpec()
-    search: MonitorSearchSpec = MonitorSearchSpec()
+    limits: MonitorLimitsSpec = MonitorLimitsSpec.model_construct()
+    search: MonitorSearchSpec = MonitorSearchSpec.model_construct()
     seed: Seed = 0
 
 

@@ -304,7 +304,7 @@ class JointSpec(Spec):
     components: JointSigmas
     correlation: tuple[tuple[Correlation, ...], ...] | None = None
     correlation_file: Reference | None = None
-    time: TimeLaw = TimeLawSpec(kind="constant")
+    time: TimeLaw = TimeLawSpec.model_construct(kind="constant")
     reason: Reason
 
     @model_validator(mode="after")
@@ -411,7 +411,7 @@ class CauseSpec(_CauseWords):
 
     bodies: BodyPatterns
     correlations: tuple[CorrelationSpec, ...] = ()
-    time: TimeLaw = TimeLawSpec(kind="white")
+    time: TimeLaw = TimeLawSpec.model_construct(kind="white")
     reason: Reason
 
     @model_validator(mode="after")

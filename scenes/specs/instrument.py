@@ -450,7 +450,7 @@ class InstrumentSpec(TitledSpec):
     central_prism: CentralPrismSpec | None = None
     monitor: MonitorSpec | None = None
     temperature: Annotated[float, Quantity(TEMPERATURE, above_zero=True, largest="1000 K")] = 293.15
-    materials: Annotated[MaterialsSpec, NothingIsEmpty] = MaterialsSpec()
+    materials: Annotated[MaterialsSpec, NothingIsEmpty] = MaterialsSpec.model_construct()
     baffles: Annotated[Named[BaffleSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     altitude: Annotated[float, Quantity(DISTANCE, smallest="100 km", largest="50000 km")] | None = None
     disturbances: Reference | None = None

@@ -219,8 +219,8 @@ class JobSpec(Spec):
     perturb: Annotated[Paths[PerturbationSpec], IN_WORDS] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None
     disturbances: JobDisturbances | None = None
-    render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec()
-    analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec()
+    render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec.model_construct()
+    analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec.model_construct()
 
     @model_validator(mode="after")
     def _stray_of_one_state(self) -> "JobSpec":

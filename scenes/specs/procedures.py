@@ -9,38 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.named import Named
 
 if TYPE_CHECKING:
     from scenes.yaml.spec import Spec
-
-_BEFORE = __name__.removesuffix("scenes.specs.procedures")
-_OURS = ("analysis", "optics", "scenes", "twin")
-"""The packages that a wheel holds within one, and what stands before their names there (docs/wheel)."""
-
-
-@dataclass(frozen=True)
-class Named:
-    """A function or a class that is imported when it is used.
-
-    Attributes:
-        path: module and name, ``twin.laboratory.export:export_focus``.
-    """
-
-    path: str
-
-    def get(self) -> Any:
-        """The function or the class."""
-        module, _, name = self.path.partition(":")
-        before = _BEFORE if module.partition(".")[0] in _OURS else ""
-        return getattr(import_module(before + module), name)
-
-    def __call__(self, *values: Any, **named: Any) -> Any:
-        """Import the function and call it."""
-        return self.get()(*values, **named)
 
 
 @dataclass(frozen=True)
@@ -49,32 +24,40 @@ class FileKind:
 
     Attributes:
         name: of its JSON Schema.
-        described: model of what it may say, or its name as `Named` takes it.
+        described: model of what it may say, as `Named` takes its name.
         what: it is, with article, for messages.
         command: that reads it, as the user calls it; empty for what only other files name.
         place: where other files name it; empty for what only a command reads.
         one_of: keys of which it has at least one.
+        needs: keys that the model requires and few other kinds have: a file without them is known to be of another
+            kind before the model is imported.
     """
 
     name: str
-    described: type[Spec] | str
+    described: str
     what: str
     command: str = ""
     place: str = ""
     one_of: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
 
     @property
     def model(self) -> type[Spec]:
         """What it may say."""
-        described: Any = self.described
-        return Named(described).get() if isinstance(described, str) else described
+        model: type[Spec] = Named(self.described).get()
+        return model
+
+    def may_be(self, keys: set[str]) -> bool:
+        """Whether a file with these keys can be one of this kind, by what is known before the model is imported."""
+        return keys >= set(self.needs) and (not self.one_of or bool(keys & set(self.one_of)))
 
     def strangers(self, keys: set[str]) -> int | None:
         """How many of the keys are none of this kind's; None if one that it needs is missing."""
+        if not self.may_be(keys):
+            return None
         fields = self.model.model_fields
         needed = {name for name, item in fields.items() if item.is_required()}
-        missing = not needed <= keys or (self.one_of and not keys & set(self.one_of))
-        return None if missing else len(keys - set(fields))
+        return len(keys - set(fields)) if needed <= keys else None
 
 
 @dataclass(frozen=True)
@@ -92,6 +75,7 @@ class Procedure:
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
         report: run -> `twin.run.report.Report`.
         export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
+        cost: set-up -> `twin.run.cost.Cost`, what a run takes of memory and time; none for what never takes much.
         files: kinds of file that it reads; their command is known from the list.
         varied: whether a study can vary it.
         judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
@@ -107,6 +91,7 @@ class Procedure:
     numbers: Any
     report: Any
     export: Any = None
+    cost: Any = None
     files: tuple[FileKind, ...] = ()
     varied: bool = False
     judged: bool = True
@@ -116,7 +101,7 @@ class Procedure:
 
     def __post_init__(self) -> None:
         """Functions that are given by name are imported when they are called."""
-        for name in ("resolve", "run", "numbers", "report", "export"):
+        for name in ("resolve", "run", "numbers", "report", "export", "cost"):
             if isinstance(path := getattr(self, name), str):
                 object.__setattr__(self, name, Named(path))
 
@@ -149,8 +134,13 @@ PROCEDURES: dict[str, Procedure] = {
         report="twin.laboratory.focus_report:focus_report",
         export="twin.laboratory.export:export_focus",
         files=(
-            FileKind("focus_test", "scenes.specs.camera_tests:FocusTestSpec", "a focus test"),
-            FileKind("measured_focus", "scenes.specs.camera_tests:MeasuredFocusSpec", "a focus test on measurements"),
+            FileKind("focus_test", "scenes.specs.camera_tests:FocusTestSpec", "a focus test", needs=("misset", "scan")),
+            FileKind(
+                "measured_focus",
+                "scenes.specs.camera_tests:MeasuredFocusSpec",
+                "a focus test on measurements",
+                needs=("measured", "mount"),
+            ),
         ),
         varied=True,
         about="""
@@ -172,11 +162,17 @@ PROCEDURES: dict[str, Procedure] = {
         report="twin.laboratory.distortion_report:distortion_report",
         export="twin.laboratory.export:export_distortion",
         files=(
-            FileKind("distortion_test", "scenes.specs.camera_tests:DistortionTestSpec", "a distortion test"),
+            FileKind(
+                "distortion_test",
+                "scenes.specs.camera_tests:DistortionTestSpec",
+                "a distortion test",
+                needs=("pinhole", "sets"),
+            ),
             FileKind(
                 "measured_distortion",
                 "scenes.specs.camera_tests:MeasuredDistortionSpec",
                 "a distortion test on measurements",
+                needs=("measured", "principal_distance"),
             ),
         ),
         varied=True,
@@ -200,9 +196,17 @@ PROCEDURES: dict[str, Procedure] = {
         report="twin.laboratory.turntable_report:turntable_report",
         export="twin.laboratory.export:export_turntable",
         files=(
-            FileKind("turntable_test", "scenes.specs.turntable:TurntableTestSpec", "a turntable test"),
             FileKind(
-                "measured_turntable", "scenes.specs.turntable:MeasuredTurntableSpec", "a turntable test on measurements"
+                "turntable_test",
+                "scenes.specs.turntable:TurntableTestSpec",
+                "a turntable test",
+                needs=("dividing_error", "calibration"),
+            ),
+            FileKind(
+                "measured_turntable",
+                "scenes.specs.turntable:MeasuredTurntableSpec",
+                "a turntable test on measurements",
+                needs=("measured",),
             ),
         ),
         varied=True,
@@ -218,13 +222,20 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.adjust_setup:resolve_any_adjust",
         run="twin.orbit.block.block_run:run_adjustment",
         numbers="twin.orbit.block.block_numbers:BLOCK",
+        cost="twin.orbit.block.block_cost:block_cost",
         report="twin.orbit.block.block_report:block_report",
         files=(
-            FileKind("orbit_adjust", "scenes.specs.orbit.adjust:OrbitAdjustSpec", "an adjustment of a block"),
+            FileKind(
+                "orbit_adjust",
+                "scenes.specs.orbit.adjust:OrbitAdjustSpec",
+                "an adjustment of a block",
+                needs=("area", "passes"),
+            ),
             FileKind(
                 "measured_adjust",
                 "scenes.specs.measured.adjust_data:MeasuredAdjustSpec",
                 "an adjustment of measured passes",
+                needs=("names", "changes"),
             ),
         ),
         varied=True,
@@ -250,11 +261,17 @@ PROCEDURES: dict[str, Procedure] = {
         report="twin.orbit.angle.angle_report:angle_report",
         export="twin.orbit.angle.measured_angle:angle_exported",
         files=(
-            FileKind("orbit_angle", "scenes.specs.orbit.angle:OrbitAngleSpec", "a test of intersection angles"),
+            FileKind(
+                "orbit_angle",
+                "scenes.specs.orbit.angle:OrbitAngleSpec",
+                "a test of intersection angles",
+                needs=("orbit", "strips"),
+            ),
             FileKind(
                 "measured_angle",
                 "scenes.specs.measured.orbit_data:MeasuredAngleSpec",
                 "intersection angles on measurements",
+                needs=("camera", "errors"),
             ),
         ),
         varied=True,
@@ -282,12 +299,16 @@ PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.calibration.calibration_export:exported",
         files=(
             FileKind(
-                "orbit_calibration", "scenes.specs.orbit.calibration:OrbitCalibrationSpec", "an in-orbit calibration"
+                "orbit_calibration",
+                "scenes.specs.orbit.calibration:OrbitCalibrationSpec",
+                "an in-orbit calibration",
+                needs=("fields", "schemes"),
             ),
             FileKind(
                 "measured_calibration",
                 "scenes.specs.measured.orbit_data:MeasuredCalibrationSpec",
                 "a calibration on measurements",
+                needs=("errors", "schemes"),
             ),
         ),
         varied=True,
@@ -314,7 +335,10 @@ PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.conventions.check_run:exported",
         files=(
             FileKind(
-                "orbit_check", "scenes.specs.measured.orbit_data:OrbitCheckSpec", "a check of the conventions of a pass"
+                "orbit_check",
+                "scenes.specs.measured.orbit_data:OrbitCheckSpec",
+                "a check of the conventions of a pass",
+                needs=("ground", "platform"),
             ),
         ),
         judged=False,
@@ -341,11 +365,17 @@ PROCEDURES: dict[str, Procedure] = {
         report="twin.orbit.jitter.jitter_report:jitter_report",
         export="twin.orbit.jitter.jitter_run:exported",
         files=(
-            FileKind("orbit_jitter", "scenes.specs.orbit.jitter_search:OrbitJitterSpec", "a search for jitter"),
+            FileKind(
+                "orbit_jitter",
+                "scenes.specs.orbit.jitter_search:OrbitJitterSpec",
+                "a search for jitter",
+                needs=("points", "search"),
+            ),
             FileKind(
                 "measured_jitter",
                 "scenes.specs.measured.orbit_data:MeasuredJitterSpec",
                 "a search for jitter on measurements",
+                needs=("camera", "search"),
             ),
         ),
         varied=True,
@@ -373,12 +403,10 @@ PROCEDURES: dict[str, Procedure] = {
         files=(FileKind("orbit_loop", "scenes.specs.orbit.loop:OrbitLoopSpec", "a monitor in a loop"),),
         varied=True,
         about="""
-    The monitor in a loop along one orbit: heat and mounts move the cameras, spots are rendered and read, and what the
-    posterior says goes to mechanisms that point and refocus, with gain, delay and steps; heights with the loop open and
-    closed.
+    The monitor in a loop along one orbit: heat and mounts move the cameras, rendered spots are read, and the posterior
+    moves mechanisms that point and refocus, with gain, delay and steps; heights with the loop open and closed.
 
-    loop.json holds what is left of angle, focus and height with the loop open and closed, with sigmas, gain and phase
-    margins, limit cycles, and the motions that no spot shows with what they cost in metres.
+    loop.json holds what is left of angle, focus and height with sigmas, gain and phase margins, and what no spot shows.
 
     Example: `python -m twin.orbit loop scenes/orbit/loop.yaml`
     """,
@@ -393,7 +421,10 @@ PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.matching.match_run:exported",
         files=(
             FileKind(
-                "orbit_match", "scenes.specs.measured.orbit_data:OrbitMatchSpec", "points to be measured in line images"
+                "orbit_match",
+                "scenes.specs.measured.orbit_data:OrbitMatchSpec",
+                "points to be measured in line images",
+                needs=("orthophoto", "dem"),
             ),
         ),
         judged=False,
@@ -416,7 +447,12 @@ PROCEDURES: dict[str, Procedure] = {
         numbers="twin.orbit.monitoring.monitoring_numbers:MONITOR",
         report="twin.orbit.monitoring.monitoring_report:monitor_report",
         files=(
-            FileKind("orbit_monitor", "scenes.specs.orbit.monitor:OrbitMonitorSpec", "a test of monitoring in orbit"),
+            FileKind(
+                "orbit_monitor",
+                "scenes.specs.orbit.monitor:OrbitMonitorSpec",
+                "a test of monitoring in orbit",
+                needs=("course", "interval"),
+            ),
         ),
         varied=True,
         about="""
@@ -435,6 +471,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.orbit.setup:resolve_simulate",
         run="twin.orbit.images.simulate_run:run_simulation",
         numbers="twin.orbit.images.simulate_numbers:SIMULATE",
+        cost="twin.orbit.images.simulate_cost:simulation_cost",
         report="twin.orbit.images.simulate_report:simulation_report",
         export="twin.orbit.calibration.calibration_export:simulation_exported",
         files=(
@@ -442,6 +479,7 @@ PROCEDURES: dict[str, Procedure] = {
                 "orbit_simulate",
                 "scenes.specs.orbit.simulate:OrbitSimulateSpec",
                 "a simulation of images of the ground",
+                needs=("orbit", "patch"),
             ),
         ),
         about="""
@@ -462,7 +500,14 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.design.design_run:run_design",
         numbers="twin.design.design_run:DESIGN",
         report="twin.design.design_report:design_report",
-        files=(FileKind("camera_design", "scenes.specs.camera:CameraDesignSpec", "an optimisation of a camera"),),
+        files=(
+            FileKind(
+                "camera_design",
+                "scenes.specs.camera:CameraDesignSpec",
+                "an optimisation of a camera",
+                needs=("camera", "vary"),
+            ),
+        ),
         judged=False,
         about="""
     Optimise a camera's prescription: curvatures, conics, aspheric terms and places vary; the wavefront error over
@@ -484,7 +529,14 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.design.monitor_design:run_monitor_design",
         numbers="twin.design.monitor_design:LAYOUTS",
         report="twin.design.monitor_report:monitor_design_report",
-        files=(FileKind("monitor_design", "scenes.specs.camera:MonitorDesignSpec", "a search for a monitor's layout"),),
+        files=(
+            FileKind(
+                "monitor_design",
+                "scenes.specs.camera:MonitorDesignSpec",
+                "a search for a monitor's layout",
+                needs=("beams", "goal"),
+            ),
+        ),
         judged=False,
     ),
     "asbuilt estimate": Procedure(
@@ -494,7 +546,14 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.asbuilt.asbuilt_run:run_asbuilt",
         numbers="twin.asbuilt.asbuilt_run:ASBUILT",
         report="twin.asbuilt.asbuilt_report:asbuilt_report",
-        files=(FileKind("asbuilt", "scenes.specs.asbuilt:AsBuiltSpec", "the measurements of one instrument"),),
+        files=(
+            FileKind(
+                "asbuilt",
+                "scenes.specs.asbuilt:AsBuiltSpec",
+                "the measurements of one instrument",
+                needs=("measurements", "merits"),
+            ),
+        ),
         about="""
     Estimate the state of one instrument: all motions of its prior from everything that was measured, with the
     combinations that are known, what is possible for the camera beside what the design promises, and the next move.

@@ -489,11 +489,11 @@ class StudySpec(TitledSpec):
 
     base: BaseSpec
     factors: Annotated[Named[FactorSpec], Field(min_length=1)]
-    design: Annotated[DesignSpec, NothingIsEmpty] = DesignSpec()
+    design: Annotated[DesignSpec, NothingIsEmpty] = DesignSpec.model_construct()
     noise: Literal["own", "shared"] = "own"
     responses: Annotated[Named[ResponseSpec], Field(min_length=1)]
-    limits: Annotated[LimitsSpec, NothingIsEmpty] = LimitsSpec()
-    report: Annotated[StudyReportSpec, NothingIsEmpty] = StudyReportSpec()
+    limits: Annotated[LimitsSpec, NothingIsEmpty] = LimitsSpec.model_construct()
+    report: Annotated[StudyReportSpec, NothingIsEmpty] = StudyReportSpec.model_construct()
 
     @model_validator(mode="after")
     def _fits_together(self) -> StudySpec:

@@ -432,7 +432,7 @@ class ToleranceBudgetSpec(Spec):
     samples: Annotated[Whole, Field(ge=20, le=MOST_RUNS)] = 1000
     seed: Seed = 0
     allocation: AllocationSpec | None = None
-    limits: Annotated[LimitsSpec, NothingIsEmpty] = LimitsSpec()
+    limits: Annotated[LimitsSpec, NothingIsEmpty] = LimitsSpec.model_construct()
 
     @model_validator(mode="after")
     def _disturbances_have_readings(self) -> ToleranceBudgetSpec:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import os
 import sys
 from types import TracebackType
 
@@ -19,6 +20,8 @@ def end_quietly() -> None:
     # the imports of a command make hundreds of thousands of objects that stay, and at its end all that is left ends
     # with the process
     gc.set_threshold(50_000)
+    # pydantic would look through the metadata of all installed packages for plugins of its own
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     atexit.register(gc.freeze)
 
 

@@ -167,11 +167,15 @@ class _Told(TypedDict, total=False):
 class Spec(BaseModel):
     """Base of all specifications: immutable, and unknown keys are errors.
 
+    What checks a model is built when the first file of its kind is read (``defer_build``). A default that is itself a
+    specification is therefore made by ``model_construct``, which needs no checks: an instance of the class would have
+    them built at the import.
+
     Attributes:
         old_keys: names that keys had until the last version -> names now; they are read with a note.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False, defer_build=True)
     old_keys: ClassVar[OldKeys] = {}
 
     _source: Source = PrivateAttr(default_factory=Source)

@@ -1,4 +1,4 @@
-"""Path tracer: paths per second through three mirrors, and out and back through all prisms.
+"""Path tracer: paths per second through three mirrors, and out and back through all prisms; time for stray light.
 
 A path per second of two cores is counted in the processor time of all threads: what the neighbours on a shared machine
 take does not count.
@@ -10,6 +10,8 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from scenes.models.instrument_model import Instrument
 from scenes.models.scenery import build_scenery
 from tests.benchmarks.number import Limit, Number, Speed
@@ -18,14 +20,16 @@ from tests.benchmarks.workbench import Workbench
 from tests.twin.path_bench import IDEAL, scene_beam
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.source import DiskSource
-from twin.path_tracing.stray_light import monitor_families, pinhole
+from twin.path_tracing.stray_light import monitor_families, pinhole, trace_stray
 from twin.path_tracing.tracer import PathTracer
 
 INSTRUMENTS = ("gf7_pair", "monitor_pair")
 PATHS, PATHS_BACK, QUICK_PATHS = 1 << 19, 1 << 18, 1 << 15
 CORES = 2
 ROUNDS, MOST_ROUNDS = 3, 15
-LEAST_IMAGING, LEAST_OUT_AND_BACK = 3.0e6, 0.5e6
+LEAST_IMAGING, LEAST_OUT_AND_BACK = 4.7e6, 1.5e6
+STRAY_PATHS, STRAY_SIGMA, MOST_STRAY_S = 1 << 19, 1e-7, 8.5
+"""Paths of one source, and the standard deviation, in spots, that its stray light on its area CCD is to have."""
 
 
 def imaging(bench: Workbench, chosen: Instrument, paths: int) -> Callable[[int], Any]:
@@ -59,8 +63,22 @@ def out_and_back(bench: Workbench, chosen: Instrument, paths: int) -> Callable[[
     return work
 
 
+def stray(bench: Workbench, chosen: Instrument, paths: int) -> Callable[[int], float]:
+    """Relative variance of the stray light of a source on its area CCD, in spots squared."""
+    channel = chosen.channels[0]
+    name = f"{channel.key}/area_ccd"
+
+    def work(seed: int) -> float:
+        run = trace_stray(chosen, bench.backend, {}, paths, seed, channels=[channel]).runs[channel.key]
+        errors = [f.error for f in run.families if f.detector == name and f.kind != "nominal"]
+        return float(np.sum(np.square(errors))) / run.nominal(name).energy ** 2
+
+    work(0)
+    return work
+
+
 def measure(bench: Workbench, quick: bool) -> Speed:
-    """Paths per second of two cores."""
+    """Paths per second of two cores, and processor time for a standard deviation of stray light."""
     numbers = []
     kinds = (("imaging", imaging, PATHS, LEAST_IMAGING), ("out_and_back", out_and_back, PATHS_BACK, LEAST_OUT_AND_BACK))
     for name, (kind, prepare, full, least) in itertools.product(INSTRUMENTS[:1] if quick else INSTRUMENTS, kinds):
@@ -81,4 +99,12 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         key = "" if name == INSTRUMENTS[0] else f"{name}_"
         text = f"paths of {name}, {kind.replace('_', ' ')}, two cores"
         numbers.append(Number(f"{key}{kind}_paths_per_s", rate(spent), text, "paths/s", limit))
+    faint, seeds = (
+        stray(bench, bench.instrument(INSTRUMENTS[0]), QUICK_PATHS if quick else STRAY_PATHS),
+        itertools.count(),
+    )
+    spent = in_turns({"stray": Work(lambda _: faint(next(seeds)))}, 1 if quick else ROUNDS)["stray"]
+    text = f"processor time for stray light of one source to {STRAY_SIGMA:g} of a spot"
+    seconds = spent.cpu_s * spent.result / STRAY_SIGMA**2
+    numbers.append(Number("stray_s", seconds, text, "s", Limit(MOST_STRAY_S)))
     return Speed(tuple(numbers))

@@ -1,5 +1,7 @@
-"""Commands as a user runs them, start of Python included: help, a bad file, the main job with an empty kernel cache and
-again.
+"""Commands as a user runs them, start of Python included: help, completion, a bad file, the main job with an empty
+kernel cache and again.
+
+Python's own cache of compiled modules is there, as from a user's second start on.
 """
 
 from __future__ import annotations
@@ -16,22 +18,31 @@ from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 
 ROOT = Path(__file__).resolve().parents[2]
-COLD_S, WARM_S, START_S = 12.0, 4.0, 2.0
+COLD_S, WARM_S, START_S, IMPORT_S = 12.0, 4.0, 0.5, 0.3
 PROGRAMS = (
     *("twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate", "twin.compare"),
     *("twin.doctor", "twin.live", "twin.recover", "scenes.schema", "analysis.mtf"),
 )
 READ = (("twin.render",), ("twin.study",), ("twin.design",), ("twin.lab", "focus"), ("twin.orbit", "angle"))
 BAD = "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: [0 um, 0 um, 3 arcsec]}}\nno_such_key: 1\n"
+UNKNOWN = Limit(2.0)
+"""All modules of the checks are imported for their names."""
 START = Limit(START_S)
+COMPLETION = {"_CAMTWIN_COMPLETE": "complete_bash", "COMP_WORDS": "camtwin render --", "COMP_CWORD": "2"}
+"""What a shell asks for after ``camtwin render --`` and the tabulator."""
+
+
+def user(home: Path) -> dict[str, str]:
+    """Environment of a user with this home, whose Python keeps compiled modules there."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return {**kept, "HOME": str(home), "PYTHONPYCACHEPREFIX": str(home / "compiled")}
 
 
 def run_job(home: Path, out: Path) -> float:
     """Wall time, seconds; the kernels are kept in HOME."""
     command = [sys.executable, "-m", "twin.render", "scenes/examples/perturb.yaml", "--out", str(out), "--quiet"]
-    environment = {**os.environ, "HOME": str(home)}
     begun = time.monotonic()
-    subprocess.run(command, cwd=ROOT, env=environment, check=True, timeout=300)
+    subprocess.run(command, cwd=ROOT, env=user(home), check=True, timeout=300)
     return time.monotonic() - begun
 
 
@@ -39,15 +50,17 @@ def _slowest(seconds: dict[str, float]) -> str:
     return max(seconds, key=lambda name: seconds[name])
 
 
-def start_cpu(words: tuple[str, ...], code: int) -> float:
-    """Processor time of a command that ends with this exit code, user and system, seconds; the shorter of two runs.
+def start_cpu(words: tuple[str, ...], code: int, environment: dict[str, str]) -> float:
+    """Processor time of Python with these arguments, which ends with this exit code, user and system, seconds; the
+    shortest of three runs, of which the first compiles the modules.
 
     Of the wall time a busy machine gives any share.
     """
     spent = []
-    for _ in range(2):
+    for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        done = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, capture_output=True, timeout=120, check=False)
+        command = [sys.executable, *words]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, timeout=120, check=False)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         assert done.returncode == code, (words, done.stderr)
         spent.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
@@ -61,15 +74,21 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         cold = run_job(home, home / "cold")
         assert any((home / ".drjit").iterdir())
         (home / "bad.yaml").write_text(BAD, "utf-8")
-        shown = {program: start_cpu((program, "--help"), 0) for program in PROGRAMS}
-        refused = {words: start_cpu((*words, str(home / "bad.yaml")), 2) for words in READ}
-        unknown = start_cpu(("twin.validate", "--only", "no.such.check"), 2)
+        place = user(home)
+        shown = {program: start_cpu(("-m", program, "--help"), 0, place) for program in PROGRAMS}
+        asked = ("-c", "from twin.run.console import main; main()")
+        completed = start_cpu(asked, 0, {**place, **COMPLETION})
+        imported = start_cpu(("-c", "import twin"), 0, place)
+        refused = {words: start_cpu(("-m", *words, str(home / "bad.yaml")), 2, place) for words in READ}
+        unknown = start_cpu(("-m", "twin.validate", "--only", "no.such.check"), 2, place)
         warm = min(run_job(home, home / f"warm{i}") for i in range(1 if quick else 3))
     return Speed(
         (
             Number("help_s", max(shown.values()), f"--help of {_slowest(shown)}: processor time", "s", START),
+            Number("completion_s", completed, "completion of an option: processor time", "s", START),
+            Number("import_s", imported, "import twin: processor time", "s", Limit(IMPORT_S)),
             Number("bad_s", max(refused.values()), "a bad file, the slowest command: processor time", "s", START),
-            Number("unknown_s", unknown, "an unknown check of twin.validate: processor time", "s", START),
+            Number("unknown_s", unknown, "an unknown check of twin.validate: processor time", "s", UNKNOWN),
             Number("cold_s", cold, "main job, empty kernel cache", "s", Limit(COLD_S)),
             Number("warm_s", warm, "main job, kernels in the cache", "s", Limit(WARM_S)),
         )

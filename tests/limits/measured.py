@@ -1,7 +1,8 @@
 """``python -m tests.limits.measured COMMAND ARGUMENTS``: a command in a process of its own, and what it took.
 
 The last line of stdout is JSON: exit code, seconds of the processor and of the clock, bytes at most above those of the
-imported program, and bytes that were estimated (0 where nothing was).
+imported program, bytes that a monitor's job was estimated to take, and bytes and seconds of one core that the command
+was said to take before it started (0 where nothing was).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import importlib
 import json
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ def resident(what: str) -> int:
 def taken(command: str, arguments: list[str]) -> dict[str, Any]:
     """What the command takes."""
     from twin.monitor.monitor_memory import MonitorSize
+    from twin.run import cost
 
     app = importlib.import_module(command if command != "twin.study" else "twin.study.__main__").app
     if command in BEFORE:
@@ -37,6 +40,13 @@ def taken(command: str, arguments: list[str]) -> dict[str, Any]:
         return estimates[-1]
 
     MonitorSize.bytes = remembered  # type: ignore[method-assign]
+    said, required = [cost.Cost(0.0, 0.0)], cost.require_memory
+
+    def checked(asked: cost.Cost) -> None:
+        said.append(replace(asked, seconds=asked.seconds * cost.pace()))
+        required(asked)
+
+    cost.require_memory = checked
     start, clock, processor = resident("VmRSS"), time.monotonic(), time.process_time()
     code: Any = 0
     try:
@@ -48,7 +58,8 @@ def taken(command: str, arguments: list[str]) -> dict[str, Any]:
         if not hasattr(error, "exit_code"):
             raise
     seconds = {"clock": time.monotonic() - clock, "processor": time.process_time() - processor}
-    return {"code": code, **seconds, "used": resident("VmHWM") - start, "estimated": estimates[-1]}
+    told = {"told_bytes": said[-1].bytes, "told_seconds": said[-1].seconds}
+    return {"code": code, **seconds, "used": resident("VmHWM") - start, "estimated": estimates[-1], **told}
 
 
 if __name__ == "__main__":

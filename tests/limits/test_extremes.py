@@ -32,7 +32,7 @@ MEMORY = "4 GB"
 """That the commands may take here, whatever this machine has."""
 
 
-def run(folder: Path, command: str, file: Path, *options: str) -> tuple[dict[str, Any], str]:
+def run(folder: Path, command: str, file: Path | str, *options: str) -> tuple[dict[str, Any], str]:
     """What a command took in a process of its own, and what it said on stderr."""
     arguments = [command, str(file), "--out", str(folder / "out"), "--quiet", *options]
     done = subprocess.run(

@@ -5,14 +5,18 @@ Statistical tests use fixed seeds; a deviation of Z_LIMIT standard errors has a 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
 from optics.materials.finish import ABSORBER, BARE, Finish, reflectance
+from optics.materials.scatter import ABg
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
@@ -23,7 +27,7 @@ from tests.twin.path_bench import facing, frame, glass_scene, right_angle_prism,
 from twin.path_tracing.families import Event, decode, nominal_codes
 from twin.path_tracing.path_result import Family, PathResult
 from twin.path_tracing.source import DiskSource, RaySource
-from twin.path_tracing.tracer import PathTracer, Sampling
+from twin.path_tracing.tracer import BALANCED, FAINT, PathTracer, Sampling
 
 Z_LIMIT = 3.89
 INDEX = 1.5
@@ -237,3 +241,31 @@ def test_more_detections_than_expected_are_all_kept(backend) -> None:
     assert result.detections.path.size == 0
     kept = tracer.run(source, 70_000, chunk=60_000, keep=True).detections
     np.testing.assert_array_equal(kept.path, np.arange(70_000))
+
+
+@pytest.mark.second
+def test_paths_that_are_drawn_for_faint_light_find_what_plain_ones_find(backend) -> None:
+    """Energies of all families of a scattering plate, drawn for faint light and as the power goes: chi-square with a
+    false-alarm rate of 1e-3. Floors, what they are after a weak way, distances drawn near the specular direction and
+    roulette are all in it; each of them, forgotten in the weights, moves it beyond 1e-12.
+    """
+    coated = Finish(reflectance=0.06, transmission=0.9, diffuse=0.01, scatter=ABg(2e-4, 1e-3, 2.0))
+    scenery = glass_scene(slab(0.3, THICKNESS), INDEX, coated)
+    direction = unit(np.sin(0.3), 0.0, np.cos(0.3))
+    source = DiskSource.along(-0.2 * direction / direction[2], direction, 1e-3)
+    runs = [
+        PathTracer(backend, scenery, sampling=sampling).run(source, 2 * PATHS, seed)
+        for sampling, seed in ((replace(FAINT, roulette=0.02), 3), (BALANCED, 4))
+    ]
+    faint, plain = ({(f.detector, f.text): f for f in run.families} for run in runs)
+    squares = []
+    for key, found in faint.items():
+        other = plain.get(key)
+        if other is not None and min(found.count, other.count) > 50:
+            squares.append((found.energy - other.energy) ** 2 / (found.error**2 + other.error**2))
+    assert len(squares) > 10
+    assert {"ghost", "stray"} == {f.kind for f in faint.values()}
+    assert sum(squares) < chi2.ppf(0.999, len(squares))
+    # the same number of paths tells the faint ones better
+    twice = way("entry>", "exit", "entry", "exit>")
+    assert faint["behind", twice].error < 0.5 * plain["behind", twice].error

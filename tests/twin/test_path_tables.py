@@ -18,8 +18,8 @@ from tests.optics.bench import unit
 from tests.optics.test_scatter_table import lambert, of_lobe
 from tests.twin.path_bench import flat_mirror, glass_scene, screen, slab
 from twin.path_tracing.families import Event
-from twin.path_tracing.kernel import Leaving, TableDraw, spread
 from twin.path_tracing.source import DiskSource, random_streams
+from twin.path_tracing.spreading import Leaving, TableDraw, spread
 from twin.path_tracing.tables import upload_finishes
 from twin.path_tracing.tracer import PathTracer, Sampling
 
@@ -57,9 +57,11 @@ def scattered(backend, finish: Finish, specular: np.ndarray, floor: float = 0.0,
     marks = tables.of(dr.zeros(backend.UInt, N), every)
     share = tables.total(marks, cosine, every)
     rng = random_streams(backend, dr.arange(backend.UInt, N), seed)
-    lobe = [share, backend.Float(1.0), backend.Float(2.0), backend.Float(0.0)]
-    drawn = TableDraw(tables, marks, cosine)
-    out, event, weight, _ = spread(backend, rng, every, lobe, backend.Float(floor), leaving, drawn)
+    lobe = [backend.Float(v) for v in (1.0, 2.0, 0.0, 1.0)]
+    drawn, near = TableDraw(tables, marks, cosine), backend.Float(0.5)  # of lobes alone
+    out, event, weight, _ = spread(
+        backend, rng, every, share, lambda active: lobe, backend.Float(floor), near, leaving, drawn
+    )
     return np.stack([c.numpy() for c in out], axis=-1), event.numpy(), weight.numpy()
 
 

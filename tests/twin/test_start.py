@@ -1,22 +1,47 @@
 """How commands start: their help, and what is wrong with a file, wait for nothing that computes or draws; Ctrl-C ends
 them without a traceback from the first moment on.
+
+Which modules are loaded is the same on every machine; how long it takes is in tests/benchmarks/start_speed.py.
 """
 
+import json
 import multiprocessing
 import re
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from scenes.kinds.file_kinds import FILE_KINDS
 from tests.twin.study_bench import ROOT
+from twin.run.console import PROGRAMS as ALL_PROGRAMS
 from twin.run.durable import ending_later
 from twin.study.runs.cluster import _children_deaf_to_ctrl_c
 
-HEAVY = {"mitsuba", "drjit", "matplotlib", "dask", "distributed", "sklearn", "trimesh", "xarray", "pandas", "pint"}
+DRAWS = {"matplotlib", "mitsuba", "trimesh", "xarray"}
+HEAVY = {
+    *(
+        "cv2",
+        "dask",
+        "distributed",
+        "drjit",
+        "erfa",
+        "h5netcdf",
+        "h5py",
+        "jinja2",
+        "networkx",
+        "pandas",
+        "pint",
+        "pyproj",
+    ),
+    *("scipy", "skfem", "sklearn", "sqlalchemy", "tifffile"),
+    *DRAWS,
+}
 """What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""
 READ = (
     ("twin.render",),
@@ -43,12 +68,12 @@ def run(*words: object, **options) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, **options)
 
 
-def heavy(words: tuple) -> tuple[int, set[str]]:
-    """Exit code of a command, and what it imported of HEAVY."""
+def heavy(words: tuple, of: set[str] = HEAVY) -> tuple[int, set[str]]:
+    """Exit code of a command, and what it imported of some packages."""
     done = run("-X", "importtime", "-m", *words)
     names = set(re.findall(r"^import time:.*\| +([\w.]+)$", done.stderr, re.M))
     assert len(names) > 100
-    return done.returncode, {name.split(".")[0] for name in names} & HEAVY
+    return done.returncode, {name.split(".")[0] for name in names} & of
 
 
 @pytest.mark.second
@@ -65,9 +90,115 @@ def test_a_bad_file_is_told_before_anything_that_computes_is_imported(words: tup
     assert heavy((*words, path)) == (2, set())
 
 
+TOLD = """
+import json, sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+{before}
+print(json.dumps({{"modules": sorted(sys.modules), **globals().get("more", {{}})}}))
+"""
+
+
+def loaded(before: str, *words: object) -> dict[str, Any]:
+    """What a process has loaded after these lines of Python.
+
+    Args:
+        before: the lines.
+        words: its arguments.
+    """
+    done = run("-c", TOLD.format(before=before), *words)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def packages(modules: Iterable[str]) -> set[str]:
+    return {module.partition(".")[0] for module in modules}
+
+
+def test_help_waits_for_nothing_that_computes_or_reads() -> None:
+    """The parsers of all programs: what --help and a shell's completion need."""
+    # last the schemas, whose generator is pydantic's
+    names = sorted((module for module, _ in ALL_PROGRAMS.values()), key=lambda name: name == "scenes.schema")
+    found = loaded(
+        f"from twin.run.console import parser\nfor name in {names}:\n"
+        " more = {'pydantic': 'pydantic' in sys.modules}\n parser(name)"
+    )
+    assert {"typer", "twin.run.cli", "twin.study.__main__", "analysis.mtf.__main__"} <= set(found["modules"])
+    assert (packages(found["modules"]) & HEAVY, found["pydantic"]) == (set(), False)
+
+
+OWN = {
+    "twin.render": ("", "instrument: gf7_pair\nno_such_key: 1\n"),
+    "twin.lab": ("focus", "name: x\nmisset: {}\nscan: {}\nno_such_key: 1\n"),
+    "twin.orbit.__main__": ("angle", "name: x\ncamera: tlc\norbit: {}\nstrips: []\nno_such_key: 1\n"),
+    "twin.study.__main__": ("", "name: x\nbase: {}\nfactors: {}\nresponses: {}\nno_such_key: 1\n"),
+    "twin.tolerance.__main__": ("", "instrument: gf7\ntolerances: {}\nmerits: {}\nno_such_key: 1\n"),
+    "twin.design.__main__": ("", "name: x\ncamera: gf7\nvary: {}\nno_such_key: 1\n"),
+    "twin.recover.__main__": ("", "frames: {}\nno_such_key: 1\n"),
+}
+"""Program -> its subcommand, and a file of its kind with a key that it does not know."""
+REFUSED = """
+import importlib
+more = {}
+for program, words in json.loads(sys.argv[1]):
+    with redirect_stderr(StringIO()) as told, redirect_stdout(StringIO()):
+        try: importlib.import_module(program).app(words)
+        except SystemExit as end: code = end.code
+    more[program] = [code, told.getvalue(), sorted({name.partition(".")[0] for name in sys.modules})]
+"""
+
+
+@pytest.mark.second
+def test_a_bad_file_waits_for_nothing_that_computes(tmp_path: Path) -> None:
+    runs = []
+    for program, (sub, text) in OWN.items():
+        file = tmp_path / f"{program}.yaml"
+        file.write_text(text, "utf-8")
+        runs.append((program, [*sub.split(), str(file)]))
+    found = loaded(REFUSED, json.dumps(runs))
+    for program, (_, text) in OWN.items():
+        code, told, there = found[program]
+        line = text.count("\n")
+        assert (code, set(there) & HEAVY) == (2, set()), (program, told)
+        assert f"{program}.yaml:{line}: no_such_key: unknown key; found 'no_such_key'" in told
+
+
+def test_a_bad_job_waits_for_no_other_kind_of_file(tmp_path: Path) -> None:
+    """Nor is a model built that it does not need."""
+    file = tmp_path / "job.yaml"
+    file.write_text(OWN["twin.render"][1], "utf-8")
+    found = loaded(
+        REFUSED + "from scenes.yaml.spec import Spec\n"
+        "def below(model):\n return [model, *(one for part in model.__subclasses__() for one in below(part))]\n"
+        "more['built'] = [model.__name__ for model in below(Spec) if model.__pydantic_complete__]",
+        json.dumps([("twin.render", [str(file)])]),
+    )
+    modules = set(found["modules"])
+    assert "scenes.specs.job" in modules
+    kinds = {kind.described.partition(":")[0] for kind in FILE_KINDS}
+    assert not {name for name in modules & kinds if name.startswith(("scenes.specs.orbit", "scenes.specs.measured"))}
+    assert not modules & {"scenes.specs.study", "scenes.specs.tolerance", "scenes.specs.operation"}
+    assert "JobSpec" in found["built"]
+    assert not {"InstrumentSpec", "CameraSpec", "DisturbancesSpec"} & set(found["built"])
+
+
+def test_import_twin_imports_nothing() -> None:
+    found = loaded("import twin")["modules"]
+    assert packages(found) & (HEAVY | {"numpy", "pydantic", "rich", "ruamel", "typer"}) == set()
+
+
+def test_a_kind_is_told_by_keys_that_its_model_requires() -> None:
+    """`FileKind.needs` is looked at before the model is imported, so it must say no more than the model does."""
+    for kind in FILE_KINDS:
+        required = {name for name, item in kind.model.model_fields.items() if item.is_required()}
+        assert kind.needs, kind.name
+        assert set(kind.needs) <= required, kind.name
+
+
 @pytest.mark.second
 def test_a_wrong_option_of_the_mtf_is_told_before_anything_is_drawn() -> None:
-    assert heavy(("analysis.mtf", "none.png", "--roi", "0,0,64,64", "--pitch", "7 um")) == (2, set())
+    assert heavy(("analysis.mtf", "none.png", "--roi", "0,0,64,64", "--pitch", "7 um"), DRAWS) == (2, set())
 
 
 @pytest.mark.second

@@ -27,6 +27,7 @@ import twin.study.__main__ as command
 from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import ROOT, children, chunks, same_bytes, start, wait_for, write_study
+from twin.study import study_command
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.cluster import local_workers
 from twin.study.runs.engine import Engine
@@ -143,7 +144,7 @@ def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch
     plan = Plan.of(resolve_study(path))
     fault = plan.setup.error("states too much", ("responses", "df", "sigma"), "the noise alone")
     made = StudyRun(numbers, "Seen.", folder, fault)
-    monkeypatch.setattr(command, "run_study", lambda *_: made)
+    monkeypatch.setattr(study_command, "run_study", lambda *_: made)
     result = run(path, "--out", tmp_path / "run")
     assert (result.exit_code, "df" in result.stdout, "Seen." in result.stdout) == (2, True, True)
     assert re.search(r"study.yaml:8: responses.df.sigma: states too much; allowed: the noise alone", result.stderr)

@@ -18,6 +18,7 @@ from scenes.specs.procedures import Procedure
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT, wait_for, write_study
 from twin.sensors.area_detector import EmvaDetector
+from twin.study import study_command
 from twin.study.runs.base_job import Failure, ProcedureBase, Run
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.engine import Engine, ProgramFault
@@ -121,7 +122,7 @@ def test_a_study_all_of_whose_runs_failed_ends_with_1(tmp_path, monkeypatch) -> 
     for failed, code in ((99, 0), (100, 1)):
         numbers = {"name": "study", "runs": 100, "failed": failed, "responses": {}}
         done = StudyRun(numbers, "Nothing.", tmp_path / "run")
-        monkeypatch.setattr(command, "run_study", lambda *_, done=done: done)
+        monkeypatch.setattr(study_command, "run_study", lambda *_, done=done: done)
         said = invoke(command.app, tmp_path / "study.yaml")
         assert said.exit_code == code
         assert ("all 100 runs failed" in said.stderr) == bool(code)

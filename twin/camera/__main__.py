@@ -8,15 +8,16 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scenes.specs.instrument import BASE
-from scenes.specs.resolved import CameraSetup, resolve_camera
 from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
+
+if TYPE_CHECKING:
+    from scenes.specs.resolved import CameraSetup
 
 PROGRAM, KIND, TILT = "twin.camera", "optics", "tilt"
 
@@ -78,6 +79,9 @@ def main(
     turned = tilt or what is not None  # what stood there in earlier versions
 
     def resolve() -> CameraSetup:
+        from scenes.specs.instrument import BASE
+        from scenes.specs.resolved import resolve_camera
+
         if what is not None and (what != TILT or not refocus):
             raise InputErrorText(f"{what!r} has no meaning here; there is --refocus --{TILT}")
         if tilt and not refocus:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
 from analysis.short_repr import shows
 from optics.geometry import zernike
 from optics.numerics.invariants import hold_below, hold_equal, hold_within
 from twin.run.reference_frames import frames_text
+
+if TYPE_CHECKING:  # takes half a second with pandas, and only who asks for a data set needs it
+    import xarray as xr
 
 Field = tuple[float, float]
 """Shares of the half angles of view: along the line, along the track."""
@@ -100,6 +103,8 @@ class Wavefront:
 
     def to_xarray(self) -> xr.Dataset:
         """``wavefront`` over pupil coordinates and ``zernike`` over Noll's index, with units and names."""
+        import xarray as xr
+
         index = np.arange(1, len(self.coefficients) + 1)
         names = [zernike.name(int(j)) for j in index]
         along = "{} on the stop over its radius"
@@ -153,6 +158,8 @@ class Spot:
 
     def to_xarray(self) -> xr.Dataset:
         """The rays, metres from the chief ray."""
+        import xarray as xr
+
         names = {"along_line": self.rays[:, 0], "along_track": self.rays[:, 1]}
         data = {name: ("ray", values, {"units": "m"}) for name, values in names.items()}
         told = {"reference_frames": frames_text("optics"), "field": self.field}
@@ -199,6 +206,8 @@ class Mtf:
 
     def to_xarray(self) -> xr.Dataset:
         """``mtf`` and ``limit`` over direction and frequency."""
+        import xarray as xr
+
         return xr.Dataset(
             {"mtf": (("direction", "frequency"), self.values), "limit": (("direction", "frequency"), self.limit)},
             {

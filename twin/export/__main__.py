@@ -8,7 +8,7 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,7 +17,9 @@ from scenes.yaml.yaml_file import dump_yaml
 from twin.run.cli import AsJson, Force, InputErrorText, Options, Out, Quiet
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
-from twin.run.run_folder import Manifest
+
+if TYPE_CHECKING:
+    from twin.run.run_folder import Manifest
 
 PROGRAM = "twin.export"
 

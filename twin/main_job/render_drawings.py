@@ -12,11 +12,13 @@ from twin.main_job.render_results import JobRun, RenderRun
 from twin.pictures.light_paths import LightPaths
 from twin.run.artefact import Undrawn
 
-__all__ = ["APART", "FILES", "IRRADIANCE", "SCENE", "SUMMARY", "drawings", "load_drawing", "without_failed"]
+__all__ = ["APART", "FILES", "IRRADIANCE", "LOADED", "SCENE", "SUMMARY", "drawings", "load_drawing", "without_failed"]
 
 SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
 """What is no figure of the report: the bytes of summary.png, scene.glb, irradiance.nc."""
 APART = (SUMMARY, SCENE, IRRADIANCE)
+LOADED = (SCENE, IRRADIANCE)
+"""What needs libraries that nothing else of a run needs, trimesh and xarray: drawn where `load_drawing` was called."""
 FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"}
 """Where these are written."""
 

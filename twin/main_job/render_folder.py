@@ -13,7 +13,7 @@ from markupsafe import Markup
 from twin.main_job.crosstalk_sections import crosstalk_section, formula_section, motion_section
 from twin.main_job.job_tables import config_text, faces_of, heated_of
 from twin.main_job.part_sections import finish_section, quality_section, stray_section, target_section
-from twin.main_job.render_drawings import APART, FILES, SCENE, drawings, load_drawing, without_failed
+from twin.main_job.render_drawings import APART, FILES, LOADED, SCENE, drawings, load_drawing, without_failed
 from twin.main_job.render_files import write_results
 from twin.main_job.render_results import PROGRAM, JobRun, RenderRun
 from twin.main_job.result_sections import (
@@ -54,7 +54,8 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
             return write_run(run, session, picture, helper)
     seconds, folder = session.seconds, session.folder
     session.advance(WRITE, 0, 1)
-    beside.start(drawings(run, trace_light_paths(run.experiment.instrument, run.experiment.backend, run.state)))
+    pieces = drawings(run, trace_light_paths(run.experiment.instrument, run.experiment.backend, run.state))
+    beside.start(pieces, LOADED)
     write_results(run, folder)
     tables = tuple(section for section in _tabled(run) if section is not None)
     further = further_sections("render", run)

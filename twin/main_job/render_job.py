@@ -34,6 +34,7 @@ from twin.monitor.monitor_memory import require_memory
 from twin.monitor.observation import LOST, Observing, light_of, read
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.path_tracing.stray_light import NominalPathLost, ghost_warnings, stray_light
+from twin.run.frame_store import mean_of
 from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import coarse_warnings
 from twin.targets.target_images import TargetLostError
@@ -420,7 +421,8 @@ def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotEr
         return f"a spot cannot be measured ({reasons})"
 
     try:
-        recover(before, before[None], experiment.calibration, resolved.job.analysis.centroid)
+        mean, centroid = mean_of(before), resolved.job.analysis.centroid
+        recover(mean, mean[None], experiment.calibration, centroid, frames=before.shape[-3])
     except SpotError as first:
         return _no_spots(experiment, "; ".join([told(first), *_blurred(experiment, focus)]))
     return _too_large(resolved, told(error))

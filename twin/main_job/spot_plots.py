@@ -18,6 +18,7 @@ from twin.main_job.result_sections import part_title
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.run import svg
 from twin.run.artefact import FAR, SAME, residual, shown_unit, significant, tick_text
+from twin.run.frame_store import mean_of
 
 STRETCH = 150.0
 """The asinh stretch is linear up to this fraction (1/STRETCH) of the peak."""
@@ -28,7 +29,7 @@ _LEAST_CORE = 7.0
 
 def mean_images(run: RenderRun) -> tuple[np.ndarray, np.ndarray]:
     """Mean frame of every channel before and after, DN, (C, rows, columns)."""
-    return run.before.mean(axis=1), run.after.mean(axis=1)
+    return mean_of(run.before), mean_of(run.after)
 
 
 def stretch(images: np.ndarray) -> Normalize:

@@ -5,7 +5,6 @@ it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from functools import cached_property
 
@@ -20,7 +19,7 @@ from analysis.short_repr import shows
 from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.threads import one_blas_thread
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import NodalDeformation
 from optics.waves.pixel_response import UnsampledImageError
@@ -344,21 +343,9 @@ class MonitorExperiment:
                 a state do not depend on how a series is cut into pieces.
             first: number of the first state, or of each, (S,).
         """
-        pattern = self.pattern(seed)
-        out = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
         numbers = first if isinstance(first, np.ndarray) else first + np.arange(len(photons))
-
-        def expose(s: int) -> None:
-            own = stream(seed, 2, int(numbers[s]))
-            out[s] = self.detector.expose(photons[s], pattern, frames, self.exposure, own, threads=1)
-
-        if len(photons) == 1:
-            expose(0)
-            return out
-        # one thread per state: threads then wait for each other once per batch and not once per state
-        with ThreadPoolExecutor(min(cores(), 8)) as pool:
-            list(pool.map(expose, range(len(photons))))
-        return out
+        own = [stream(seed, 2, int(number)) for number in numbers]
+        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, own)
 
     def expected_frames(self, photons: np.ndarray) -> np.ndarray:
         """Noise-free, unrounded grey values of a uniform detector, same shape as ``photons``."""

@@ -17,6 +17,7 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.spec import Spec
 from twin.monitor.image_sampling import NodeClasses
+from twin.run.frame_store import IN_MEMORY, kept_bytes
 from twin.run.memory import LIMIT, amount_text, free_memory, largest, taken_already
 from twin.sensors.area_detector import EmvaDetector
 
@@ -64,8 +65,6 @@ GREY = 2.0
 """Bytes per pixel of a recorded frame."""
 _OF_COURSE = 6.0
 """Bytes per pixel and time of a course: expected photons in single precision, and a first frame."""
-_IN_FILES = 2.0
-"""Bytes per pixel of the frames of one channel while they become a file."""
 WRITTEN = 60.0
 """Bytes per pixel of a spot's image while it is drawn and written: photons, their file, means."""
 _OF_STATE = 24.0
@@ -115,7 +114,9 @@ class MonitorSize:
         threads = min(cores(), 8, self.spots * states)  # that expose images
         return {
             "ccd": every * (_PIXEL + (states - 1) * _OF_STATE) + self.rays * _RAY,
-            "frames": (1 + states) * every * frames * GREY + threads * detector.exposing_bytes(frames, image),
+            "frames": kept_bytes(every * frames * GREY)
+            + kept_bytes(states * every * frames * GREY)
+            + detector.exposing_bytes(frames, image, threads),
             "times": self.times * every * _OF_COURSE,
             "pictures": self.pictures * GREY,
         }
@@ -128,7 +129,9 @@ class MonitorSize:
         """
         parts = self.parts(detector)
         every = self.spots * self.rows * self.columns
-        written = every * (WRITTEN + 2.0 * self.frames * GREY) + every / self.spots * self.frames * _IN_FILES
+        stack = every * self.frames * GREY
+        written = every * WRITTEN + 2.0 * kept_bytes(stack)
+        written += stack / self.spots if stack <= IN_MEMORY else kept_bytes(stack)
         return max(STARTED + sum(parts.values()), DRAWN + written + parts["times"] + parts["pictures"])
 
 

@@ -7,6 +7,7 @@ states. What differs from use to use is said by an `Observing`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
@@ -18,11 +19,12 @@ from analysis.short_repr import shows
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.threads import cores, one_blas_thread, one_kernel_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
+from twin.run.frame_store import in_file, mean_of
 
 LOST = (AimError, BeamMissedError)
 """What says that the light of a state is lost."""
@@ -167,7 +169,7 @@ def light_of(
     Raises:
         BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD.
     """
-    with one_blas_thread():
+    with one_blas_thread(), one_kernel_thread() if len(states) > 1 else nullcontext():
         placed = experiment.instrument.assembly.place(states)
         truth = experiment.sight.truth(states, placed)
         if photons is None and len(states) == 1:
@@ -198,25 +200,30 @@ def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observa
         SpotError: a spot cannot be measured.
     """
     before, after = how.record(light.photons, light.numbers)
+    images, count = after, how.frames
+    if in_file(after):
+        # what recover would do with the frames, a part of them at a time
+        images, count = mean_of(after), after.shape[-3]
+        before = mean_of(before) if isinstance(before, np.ndarray) else before
     channels = experiment.path.channels
     good = np.arange(len(after))
     while len(good):
         whole = len(good) == len(after)
         first = before
-        if isinstance(before, np.ndarray) and before.ndim == after.ndim and not whole:
+        if isinstance(before, np.ndarray) and before.ndim == images.ndim and not whole:
             first = before[good]
         try:
             with one_blas_thread():
                 recovery = recover(
                     first,
-                    after if whole else after[good],
+                    images if whole else images[good],
                     experiment.calibration,
                     how.centroid,
                     cores() if len(good) > 1 else 1,
                     experiment.disturbances if how.stated else None,
                     how.keep_parts,
                     experiment.motion_models if how.stated else None,
-                    how.frames,
+                    count,
                 )
             return Observation(light, good, after, recovery)
         except SpotError as error:

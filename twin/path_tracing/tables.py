@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, assert_never
@@ -185,15 +185,18 @@ def _header(drawn: DrawnScatter, first: int) -> list[float]:
 
 
 BLOCK = 4
-BLOCKS = 8
+BLOCKS = 7
 ROW = BLOCK * BLOCKS
-"""Numbers of a geometry row: 0-8 rotation world to local, 9-11 its shift, 12 curvature, 13 conic, 14-16 A4, A6, A8,
-17 clearance, 18-27 two clear apertures, 28 refractive index behind, 29 number of the part plus one."""
+"""Numbers of a geometry row: 0-8 rotation world to local, 9-11 its shift, 12 clearance, 13 refractive index behind, 14
+number of the part plus one, 15 reciprocal of the index, 16-25 two clear apertures."""
 
-CLEARANCE, APERTURES, INDEX, PART = 17, 18, 28, 29
+CLEARANCE, INDEX, PART, INVERSE, APERTURES = 12, 13, 14, 15, 16
+
+CURVES = 2
+"""Blocks of a curved surface: curvature, conic, A4, A6, A8."""
 
 APERTURE = 5
-"""Numbers of a clear aperture: four that its shape has, and which shape it is."""
+"""Numbers of a clear aperture: four that its shape has, of an ellipse the half axes' reciprocals, and which shape."""
 RING, RECTANGLE, ELLIPSE = 0.0, 1.0, 2.0
 
 GRID_ROW = 8
@@ -201,6 +204,8 @@ _NO_GRID = (0.0, 0.0, 0.0, 0.0, 4.0, 4.0, 0.0)
 """Numbers of a grid for surfaces without one: four by four samples of 0, whose 8 x 8 coefficients head the table."""
 
 FINISH_ROW = 8
+"""Numbers of a finish: reflectance (-1 for bare glass), transmission, diffuse, share of the lobe; scale, exponent and
+kind of the lobe, and its area."""
 ROWS_PER_SURFACE = 3
 """Finishes of a surface: met from +z, met from -z, outside its clear apertures."""
 
@@ -217,6 +222,7 @@ class Kind:
 
     SOLID = 1
     ENDS = 2
+    CURVED = 4
     BODY_SHIFT, BODY_MASK = 8, 0xFF
     DETECTOR_SHIFT, DETECTOR_MASK = 16, 0xFF
 
@@ -256,6 +262,7 @@ class SceneTables:
 
     Attributes:
         rows: (surfaces * ROW) geometry; finishes: (surfaces * 3 * FINISH_ROW).
+        curves: (surfaces * CURVES * BLOCK) curvature, conic and aspheric terms.
         terms: (surfaces * 4 * blocks) numbers of all kinds of further terms; width 1 when there are none.
         figures: (surfaces * 4 * blocks) centre and coefficients of polynomial figures; width 1 when there are none.
         grids, samples: (surfaces * GRID_ROW) numbers of grid figures and the coefficients of all; likewise.
@@ -268,6 +275,7 @@ class SceneTables:
     """
 
     rows: Any
+    curves: Any
     terms: Any
     figures: Any
     grids: Any
@@ -287,8 +295,9 @@ class SceneTables:
         """The row of each path's surface, ``ROW`` numbers."""
         return self._row(self.rows, surface, BLOCKS, active)
 
-    def surface(self, number: Any, row: list[Any], form: SurfaceForm, active: Any) -> SurfaceNumbers:
-        """The shape of each path's surface, whose row of the geometry is given."""
+    def surface(self, number: Any, form: SurfaceForm, active: Any) -> SurfaceNumbers:
+        """The shape of each path's surface."""
+        c = self._row(self.curves, number, CURVES, active)
         figure = grid = None
         terms: list[SagTerm] = []
         if form.terms:
@@ -303,11 +312,15 @@ class SceneTables:
             figure = FigureNumbers(f[0], f[1], tuple(f[2 : 2 + size]))
         if form.grid:
             grid = GridNumbers(*self._row(self.grids, number, GRID_ROW // BLOCK, active)[:7])
-        return SurfaceNumbers(row[12], row[13], tuple(row[14 : 14 + form.even]), tuple(terms), figure, grid)
+        return SurfaceNumbers(c[0], c[1], tuple(c[2 : 2 + form.even]), tuple(terms), figure, grid)
 
     def finish(self, row: Any, active: Any) -> list[Any]:
-        """The finish of each path's row, ``FINISH_ROW`` numbers."""
-        return self._row(self.finishes, row, FINISH_ROW // BLOCK, active)
+        """Reflectance (-1 for bare glass), transmission, diffuse and lobe's share of each path's row."""
+        return self._row(self.finishes, 2 * row, 1, active)
+
+    def lobe(self, row: Any) -> Callable[[Any], list[Any]]:
+        """Looks scale, exponent, kind and area of the lobe of each path's row up, for active paths."""
+        return lambda active: self._row(self.finishes, 2 * row + 1, 1, active)
 
     def detector(self, number: Any, active: Any) -> list[Any]:
         """The row of each path's detector."""
@@ -349,6 +362,7 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> Sc
     rows = np.zeros((len(surfaces), ROW))
     planes = np.zeros((len(surfaces), BLOCK))
     kind = np.zeros(len(surfaces), np.uint32)
+    curves = np.zeros((len(surfaces), CURVES * BLOCK))
     finishes = np.zeros((len(surfaces), ROWS_PER_SURFACE, FINISH_ROW))
     numbers = {d.name: i + 1 for i, d in enumerate(detectors)}
     parts = scenery.parts
@@ -357,12 +371,14 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> Sc
         rows[i, PART] = parts.index(s.part) + 1
         normal = s.pose.rotation[:, 2]
         planes[i] = [*normal, normal @ s.pose.translation]
-        kind[i] = Kind.SOLID * (s.solid is not None) | Kind.ENDS * s.ends
+        curves[i] = _curves(s)
+        curved = not s.surface.is_plane or s.surface.figure is not None
+        kind[i] = Kind.SOLID * (s.solid is not None) | Kind.ENDS * s.ends | Kind.CURVED * curved
         if s.solid is not None:
             kind[i] |= (bodies.index(s.solid) + 1) << Kind.BODY_SHIFT
         if s.detector is not None:
             kind[i] |= numbers[s.detector] << Kind.DETECTOR_SHIFT
-        finishes[i] = [finish.numbers for finish in (s.front, s.back, s.outside)]
+        finishes[i] = [_finish(finish) for finish in (s.front, s.back, s.outside)]
     first, count = np.zeros(len(bodies) + 1, np.uint32), np.zeros(len(bodies) + 1, np.uint32)
     for b, body in enumerate(bodies):
         own = [i for i, s in enumerate(surfaces) if s.solid == body]
@@ -379,6 +395,7 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> Sc
     signatures = np.array([nominal.get(d.name, 0) for d in detectors] or [0], np.uint64)
     out = SceneTables(
         backend.opaque(rows),
+        backend.opaque(curves),
         backend.opaque(_terms(surfaces, form)),
         backend.opaque(figures),
         backend.opaque(placements),
@@ -403,16 +420,26 @@ def _geometry(s: SceneSurface) -> np.ndarray:
     inverse = s.pose.rotation.T
     row[0:9] = inverse.ravel()
     row[9:12] = -inverse @ s.pose.translation
-    even = s.surface.even
-    if len(even) > MOST_EVEN:
-        raise ValueError(f"{s.name}: the path tracer takes {MOST_EVEN} aspheric terms, found {len(even)}")
-    row[12], row[13] = s.surface.curvature, s.surface.conic
-    row[14 : 14 + len(even)] = even
-    row[CLEARANCE], row[INDEX] = s.clearance, s.index
+    row[CLEARANCE], row[INDEX], row[INVERSE] = s.clearance, s.index, 1.0 / s.index
     for k in range(2):  # one alone counts twice
         start = APERTURES + k * APERTURE
         row[start : start + APERTURE] = _aperture(s.apertures[-k] if s.apertures else None)
     return row
+
+
+def _curves(s: SceneSurface) -> np.ndarray:
+    row = np.zeros(CURVES * BLOCK)
+    even = s.surface.even
+    if len(even) > MOST_EVEN:
+        raise ValueError(f"{s.name}: the path tracer takes {MOST_EVEN} aspheric terms, found {len(even)}")
+    row[: 2 + len(even)] = [s.surface.curvature, s.surface.conic, *even]
+    return row
+
+
+def _finish(finish: Finish) -> list[float]:
+    reflectance, transmission, bare, diffuse, share, scale, exponent, kind = finish.numbers
+    area = 1.0 if finish.scatter is None else scatter.lobe_area(scale, exponent)
+    return [-1.0 if bare else reflectance, transmission, diffuse, share, scale, exponent, kind, area]
 
 
 def _blocks(numbers: int) -> int:
@@ -464,7 +491,7 @@ def _aperture(aperture: Aperture | None) -> tuple[float, ...]:
         case RectangleNumbers() as box:
             return (box.x, box.y, box.half_x, box.half_y, RECTANGLE)
         case EllipseNumbers() as ellipse:
-            return (ellipse.x, ellipse.y, ellipse.half_x, ellipse.half_y, ELLIPSE)
+            return (ellipse.x, ellipse.y, 1.0 / ellipse.half_x, 1.0 / ellipse.half_y, ELLIPSE)
         case other:
             assert_never(other)
 
@@ -473,5 +500,8 @@ def within(x: Any, y: Any, a: Sequence[Any]) -> Any:
     """Inside a clear aperture, whose numbers (``APERTURE`` of a row) may be those of another shape for each path."""
     import drjit as dr
 
-    box, ellipse = RectangleNumbers(*a[:4]).contains(x, y), EllipseNumbers(*a[:4]).contains(x, y)
+    box = RectangleNumbers(*a[:4]).contains(x, y)
+    # a path that divides waits long; the table has the half axes' reciprocals
+    u, v = (x - a[0]) * a[2], (y - a[1]) * a[3]
+    ellipse = dr.fma(u, u, v * v) <= 1.0
     return dr.select(a[4] == RING, RingNumbers(*a[:4]).contains(x, y), dr.select(a[4] == RECTANGLE, box, ellipse))

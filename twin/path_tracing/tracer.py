@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -86,26 +86,51 @@ class Sampling:
         floor: smallest probability of each way that a path can go at a surface. 0: as the power goes, and the balance
             of the power is exact in every run. Above 0 weak ways are drawn more often and carry less each, which finds
             faint ghosts; the balance then holds on average.
-        scatter_floor: the same for scattering out of the specular direction.
+        second: the floor of paths that have gone one way that a floor made more likely, and ``further`` of those that
+            have gone more of them or have been scattered; None for ``floor``. A ghost comes of two weak reflections:
+            after the first the second is worth drawing, and after the second nothing is.
+        scatter_floor: the floor of scattering out of the specular direction; where ``second`` is given it ends with the
+            first weak way.
+        near: share of scattered directions whose distance from the specular one is drawn even in its logarithm: a small
+            detector in the specular light's focus sees the innermost part of a lobe alone.
         roulette: relative to a path's mean weight at the start: below it a path is ended at random, and those that go
             on carry more; 0: never.
     """
 
     steps: int = 96
     floor: float = 0.0
+    second: float | None = None
+    further: float | None = None
     scatter_floor: float = 0.0
+    near: float = 0.0
     roulette: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if self.steps < 1 or not 0.0 <= self.floor < 1.0 or not 0.0 <= self.scatter_floor < 1.0 or self.roulette < 0.0:
+        shares = (*self.floors, self.scatter_floor, self.near)
+        if self.steps < 1 or not all(0.0 <= share < 1.0 for share in shares) or self.roulette < 0.0:
             raise ValueError(f"impossible sampling: {self}")
+
+    @property
+    def floors(self) -> tuple[float, float, float]:
+        """Floors after none, one, and more weak ways."""
+        return (
+            self.floor,
+            self.floor if self.second is None else self.second,
+            self.floor if self.further is None else self.further,
+        )
+
+    @property
+    def scatter_floors(self) -> tuple[float, float, float]:
+        """Likewise of scattering."""
+        later = self.scatter_floor if self.second is None else 0.0
+        return self.scatter_floor, later, later
 
 
 BALANCED = Sampling()
 """Every way is drawn as the power goes."""
 
-FAINT = Sampling(floor=0.1, scatter_floor=0.02, roulette=1e-6)
+FAINT = Sampling(floor=0.1, second=0.5, further=0.0, scatter_floor=0.02, near=0.5, roulette=1e-6)
 """Weak ways are drawn more often: for ghosts and stray light."""
 
 
@@ -121,8 +146,7 @@ def _register(variant: str) -> Callable[..., Any]:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            usual = asdict(BALANCED)
-            self.sampling = Sampling(**{name: type(value)(props.get(name, value)) for name, value in usual.items()})
+            self.sampling = Sampling(**{f.name: props[f.name] for f in fields(Sampling) if f.name in props})
 
         def sample(self, *arguments: Any, **options: Any) -> Any:
             raise NotImplementedError(f"{NAME} follows light from its sources; call launch")
@@ -138,8 +162,9 @@ def _register(variant: str) -> Callable[..., Any]:
             limits = Limits(
                 dr.opaque(backend.UInt, s.steps),
                 dr.opaque(backend.UInt, sinks.room),
-                backend.opaque(s.floor),
-                backend.opaque(s.scatter_floor),
+                [backend.opaque(floor) for floor in s.floors],
+                [backend.opaque(floor) for floor in s.scatter_floors],
+                backend.opaque(s.near),
                 backend.opaque(s.roulette * mean_weight),
             )
             with dr.suspend_grad():
@@ -159,7 +184,7 @@ def make_integrator(backend: Backend, sampling: Sampling) -> Any:
     """The integrator as Mitsuba's plugin."""
     mi = load_mitsuba(backend)
     _register(mi.variant())
-    return mi.load_dict({"type": NAME, **asdict(sampling)})
+    return mi.load_dict({"type": NAME, **{name: n for name, n in asdict(sampling).items() if n is not None}})
 
 
 CHUNK = 1 << 20
@@ -209,8 +234,10 @@ class PathTracer:
             form=SurfaceForm.of(surfaces),
             glass=any(s.solid is not None for s in surfaces),
             branching=any(f.bare or f.transmission or f.diffuse or f.scatter or f.table for f in finishes),
+            bare=any(f.bare for f in finishes),
             measured=any(f.coating or f.table for f in finishes),
             roulette=self.sampling.roulette > 0.0,
+            near=self.sampling.near > 0.0,
             keep_nominal=keep_nominal,
             log=log,
         )

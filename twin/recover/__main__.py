@@ -8,15 +8,18 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from scenes.kinds.file_kinds import read_for
-from scenes.specs.measured.monitor_frames import MeasurementSetup, resolve_measurement
+from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
+
+if TYPE_CHECKING:
+    from scenes.specs.measured.monitor_frames import MeasurementSetup
 
 PROGRAM = "twin.recover"
 
@@ -74,7 +77,7 @@ def main(
     run_command(
         measurement.stem,
         Options(out, None, backend, force, as_json, quiet),
-        lambda: read_for(PROGRAM, measurement, resolve_measurement),
+        lambda: read_for(PROGRAM, measurement, Named("scenes.specs.measured.monitor_frames:resolve_measurement")),
         work,
     )
 

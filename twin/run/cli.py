@@ -16,11 +16,9 @@ from rich import box, progress
 from rich.console import Console
 from rich.table import Table
 
-from optics.numerics.backend import NAMES, BackendUnavailable
-from optics.numerics.llvm import LibraryMissing
+from optics.numerics.backend import NAMES
 from scenes.yaml.errors import InputError
 from scenes.yaml.standard_output import FAILURE, print_error
-from twin.run.run_folder import RunFolderError
 
 BAD_INPUT, INTERRUPTED = 2, 128 + signal.SIGINT
 LARGEST_SEED = 2**63 - 1
@@ -82,15 +80,22 @@ def explained(errors: Console) -> Iterator[None]:
     """Turn the errors that a user can cause into one sentence on ``errors`` and the command's exit code."""
     try:
         yield
-    except (InputError, InputErrorText, RunFolderError) as error:
+    except (InputError, InputErrorText) as error:
         print_error(errors, str(error))
         raise typer.Exit(BAD_INPUT) from None
-    except (BackendUnavailable, LibraryMissing) as error:
-        print_error(errors, str(error))
-        raise typer.Exit(FAILURE) from None
     except KeyboardInterrupt:
         errors.print("interrupted: nothing was kept", style="bold red")
         raise typer.Exit(INTERRUPTED) from None
+    except Exception as error:
+        # the work that failed has imported these; help and a bad file do not wait for them
+        from optics.numerics.backend import BackendUnavailable
+        from optics.numerics.llvm import LibraryMissing
+        from twin.run.run_folder import RunFolderError
+
+        if not isinstance(error, RunFolderError | BackendUnavailable | LibraryMissing):
+            raise
+        print_error(errors, str(error))
+        raise typer.Exit(BAD_INPUT if isinstance(error, RunFolderError) else FAILURE) from None
 
 
 TICK_SECONDS = 8.0

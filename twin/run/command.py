@@ -16,15 +16,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from optics.numerics.backend import load_backend
 from scenes.kinds.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run import cli, durable, provenance, reference_frames, run_folder
+from twin.run import cli, durable
 from twin.run.procedure import Advance, Session, performed
 
 if TYPE_CHECKING:
+    from twin.run.cost import Cost
     from twin.run.report import Report
+    from twin.run.run_folder import RunFolder
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,7 @@ def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, 
         numbers: of the run; the report's verdict is added to them.
         facts: how it was run, as `twin.run.page.RunFacts` takes them, beside what the session knows.
     """
+    from twin.run import reference_frames
     from twin.run.page import RunFacts, write_test
 
     told = {**numbers, "verdict": report.verdict}
@@ -68,7 +70,11 @@ Given = TypeVar("Given")
 
 
 def run_command(
-    stem: str, options: cli.Options, resolve: Callable[[], Given], work: Callable[[Given, Session], Result]
+    stem: str,
+    options: cli.Options,
+    resolve: Callable[[], Given],
+    work: Callable[[Given, Session], Result],
+    cost: Callable[[Given], Cost] | None = None,
 ) -> None:
     """Read what is asked for, do it in a run folder and print what it gave.
 
@@ -77,6 +83,7 @@ def run_command(
         options: what the user chose.
         resolve: reads the files and checks what is asked for. Raises InputError, InputErrorText.
         work: computes and writes all files of the run folder, the manifest last. Raises InputError.
+        cost: what that takes of memory and time; None where it never takes much.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
@@ -85,6 +92,12 @@ def run_command(
     with cli.explained(errors):
         cli.check_backend(options.backend)
         given = resolve()
+        if cost is not None:
+            tell_cost(cost(given), errors, options.quiet)
+        # a bad file is told before these are imported
+        from optics.numerics.backend import load_backend
+        from twin.run import provenance, run_folder
+
         folder = run_folder.RunFolder(run_folder.chosen(options.out, stem), options.force)
         started, clock = time.time(), time.monotonic()
         tracer = load_backend(options.backend)
@@ -104,6 +117,25 @@ def run_command(
         raise typer.Exit(FAILURE)
     if result.code:
         raise typer.Exit(result.code)
+
+
+def tell_cost(cost: Cost, errors: Console, quiet: bool) -> None:
+    """Say what a command takes before it starts, where it is much.
+
+    Args:
+        cost: of the command.
+        errors: where it is said.
+        quiet: nothing is said.
+
+    Raises:
+        InputError: more memory than there is.
+    """
+    from twin.run.cost import require_memory, told
+
+    require_memory(cost)
+    text = "" if quiet else told(cost, cli.time_text)
+    if text:
+        errors.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
@@ -196,6 +228,7 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
 
     def work(setup: Any, session: Session) -> Result:
         from twin.run.report import numbers_only, with_warnings
+        from twin.run.run_folder import write_manifest
 
         # a folder that cannot be made is told before the run
         folder = None if options.export is None else _export_folder(setup, options.export, options.force)
@@ -206,7 +239,7 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
                 for name, content in procedure.export(run).items():
                     folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
                 said = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
-                run_folder.write_manifest(folder, program, session.started, session.seconds, **said)
+                write_manifest(folder, program, session.started, session.seconds, **said)
         try:
             made, problem = procedure.report(run), ""
         except Exception as error:  # minutes or hours of computing are not thrown away for a figure
@@ -220,10 +253,12 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
         done = finished(session, procedure.kind, shown, numbers, program=program, **facts)
         return replace(done, problem=problem)
 
-    run_command(file.stem, options, lambda: read_for(f"{program} {command}", file, procedure.resolve), work)
+    run_command(
+        file.stem, options, lambda: read_for(f"{program} {command}", file, procedure.resolve), work, procedure.cost
+    )
 
 
-def _export_folder(setup: Any, target: Path, force: bool) -> run_folder.RunFolder:
+def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
     """The folder of ``--export``, checked before anything is computed.
 
     Raises:
@@ -233,10 +268,12 @@ def _export_folder(setup: Any, target: Path, force: bool) -> run_folder.RunFolde
     if "measured" in type(setup.test).model_fields:
         text = "measurements are files already; --export writes those of a simulated bench"
         raise setup.test.error(text, ("measured",), allowed="the file of a simulated test")
+    from twin.run.run_folder import RunFolder, RunFolderError
+
     try:
-        return run_folder.RunFolder(target, force)
-    except run_folder.RunFolderError as error:
-        raise run_folder.RunFolderError(str(error).replace("--out", "--export")) from None
+        return RunFolder(target, force)
+    except RunFolderError as error:
+        raise RunFolderError(str(error).replace("--out", "--export")) from None
 
 
 def print_report(report: Report, console: Console) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 import tifffile
 
 from optics.numerics.frozen_map import FrozenMap
+from twin.run.frame_store import FileRoom, in_file, mean_of, parts
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -188,7 +189,7 @@ _RATIONAL = 10**6
 """Denominator of exposure times in tags."""
 
 
-def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes:
+def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes | memoryview:
     """Frames (N, H, W) as a TIFF file of N pages, each with what is known of it in its tags.
 
     ImageDescription holds all as JSON; XResolution and YResolution are pixels per centimetre; Model is the camera,
@@ -199,7 +200,7 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes:
         facts: what is known of them.
     """
     # made in memory: on a full disk NumPy's writer does not say why it failed
-    stream = io.BytesIO()
+    stream = FileRoom(frames.nbytes) if in_file(frames) else io.BytesIO()
     tags: list[tuple[Any, ...]] = []
     if facts.camera:
         tags.append((_MODEL, "s", 0, facts.camera, True))
@@ -211,7 +212,7 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes:
     if facts.pitch is not None:
         scale = {"resolution": (1e-2 / facts.pitch,) * 2, "resolutionunit": "CENTIMETER"}
     with tifffile.TiffWriter(stream) as file:
-        for k, frame in enumerate(frames):
+        for k, frame in enumerate(frame for _, some in parts(frames) for frame in some):
             about = json.dumps(facts.page(k))
             file.write(
                 frame,
@@ -223,10 +224,10 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes:
                 extratags=tags,
                 **scale,
             )
-    return stream.getvalue()
+    return stream.contents() if isinstance(stream, FileRoom) else stream.getvalue()
 
 
-FRAME_FORMATS: dict[str, Callable[[np.ndarray, FrameFacts], bytes]] = {"tiff": tiff}
+FRAME_FORMATS: dict[str, Callable[[np.ndarray, FrameFacts], bytes | memoryview]] = {"tiff": tiff}
 """Ending of a file of recorded frames -> its contents, of frames uint16 (N, H, W) and what is known of them. A new one
 is added here.
 """
@@ -234,7 +235,7 @@ is added here.
 
 def frame_files(
     name: str, frames: np.ndarray, facts: FrameFacts, stretch: float | None = SPOT_STRETCH
-) -> Iterator[tuple[str, bytes]]:
+) -> Iterator[tuple[str, bytes | memoryview]]:
     """(file, contents) of everything that a run folder has of recorded frames: all formats, and a picture to look at.
 
     Args:
@@ -250,7 +251,7 @@ def frame_files(
 
 def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndarray:
     """Eight-bit picture of the mean of frames (N, H, W), enlarged; ``stretch`` None keeps grey values in proportion."""
-    mean = frames.mean(axis=0)
+    mean = mean_of(frames) if in_file(frames) else frames.mean(axis=0)
     low, high = (np.percentile(mean, 5) if stretch else mean.min()), mean.max()
     level = np.clip((mean - low) / max(high - low, 1.0), 0.0, 1.0)
     if stretch:

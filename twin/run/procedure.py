@@ -7,13 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError
-from scenes.specs.procedures import Procedure
-from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
 if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+    from scenes.specs.procedures import Procedure
+    from scenes.specs.resolved import ExperimentSetup
     from twin.run.run_folder import RunFolder
 
 Advance = Callable[[str, int, int], None]

@@ -16,7 +16,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from itertools import chain
 from typing import IO, Any
 
 from optics.numerics.threads import cores
@@ -52,12 +53,14 @@ class SecondProcess:
             self._ended(0.0)
             self._from_child.close()
 
-    def start(self, tasks: Mapping[str, Callable[[], Any]]) -> None:
+    def start(self, tasks: Mapping[str, Callable[[], Any]], apart: Collection[str] = ()) -> None:
         """Let it begin. Tasks that cannot be pickled, because of what a user has added, are left to this process.
 
         Args:
             tasks: name -> what is to be done; the longest first, at most ``MOST_TASKS``. They see the values that they
                 hold as they are now.
+            apart: names of tasks that the second process does first and alone where there is one: what they import it
+                has imported already, and this process need not import it as well.
         """
         if len(tasks) > MOST_TASKS:
             raise ValueError(f"more than {MOST_TASKS} tasks: {len(tasks)}")
@@ -65,11 +68,12 @@ class SecondProcess:
         if not self._child:
             return
         try:
-            content = pickle.dumps(list(tasks.values()), pickle.HIGHEST_PROTOCOL)
+            alone = [number for number, name in enumerate(tasks) if name in apart]
+            content = pickle.dumps((alone, list(tasks.values())), pickle.HIGHEST_PROTOCOL)
         except (pickle.PicklingError, TypeError, AttributeError):
             content = b""
         try:
-            os.write(self._turns[1], bytes(range(len(tasks))))
+            os.write(self._turns[1], bytes(number for number, name in enumerate(tasks) if name not in apart))
             sent = 0
             while sent < len(content):
                 sent += os.write(self._to_child, content[sent:])
@@ -125,8 +129,8 @@ class SecondProcess:
         self._prepare()
         with os.fdopen(given, "rb") as file:
             content = file.read()
-        tasks = pickle.loads(content) if content else []
-        for number in _turns(self._turns[0]) if tasks else ():
+        alone, tasks = pickle.loads(content) if content else ((), [])
+        for number in chain(alone, _turns(self._turns[0])) if tasks else ():
             pickle.dump((number, tasks[number]()), self._from_child)
             self._from_child.flush()
 

@@ -16,7 +16,7 @@ every mean (``twin.sensors.poisson_numbers``); no normal approximation is made a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -34,7 +34,9 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.yaml.errors import Problem, names_text, nearest
 from scenes.yaml.spec import Spec
+from twin.run.frame_store import frame_room, largest_of, let_go
 from twin.run.random_streams import stream
+from twin.sensors.exposure_kernel import FEWEST, Reading, exposing_bytes, kernels_there
 from twin.sensors.poisson_numbers import poisson_pieces
 
 
@@ -296,7 +298,7 @@ class EmvaDetector:
         pattern: FixedPattern,
         frames: int,
         exposure_s: float,
-        seed: Seed,
+        seed: Seed | Sequence[Seed],
         threads: int | None = None,
     ) -> NDArray[np.uint16]:
         """Record `frames` frames of each image.
@@ -307,7 +309,7 @@ class EmvaDetector:
         exposure_s: exposure of one frame, s (it sets the dark signal; photons are given per frame).
         seed: integer or SeedSequence. Each image draws from its own stream, numbered by its place in the flattened
             leading axes, so the result does not depend on `threads`, and image i does not depend on how many follow
-            it.
+            it. Several seeds, one for each entry of the first axis, expose these as calls of their own would.
         threads: worker threads (numpy's generators release the GIL); default: the cores this process may use, at most
             8.
         Returns uint16 (..., frames, H, W) grey values. Raises ValueError for bad input.
@@ -324,25 +326,43 @@ class EmvaDetector:
             raise ValueError(
                 f"detector: fixed pattern {pattern.gain.shape} does not fit photons {light.shape}"
             ) from error
-        out = np.empty((*lead, int(frames), height, width), dtype=np.uint16)
-        root = _sequence(seed)
+        out = frame_room((*lead, int(frames), height, width))
+        indices = list(np.ndindex(*lead))
+        streams = _streams(seed, lead)
+        together = self.frames_at_once(int(frames), height * width)
+        threads = min(cores(), 8) if threads is None else threads
+        if threads < 1:
+            raise ValueError(f"detector: threads must be >= 1, found {threads!r}")
         scale = self.system_gain_dn_per_e
 
-        together = self.frames_at_once(int(frames), height * width)
-
-        def image(index: tuple[int, ...], number: int) -> None:
-            rng = np.random.Generator(np.random.SFC64(stream(root, number)))
+        def expected(index: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
             mean_e = light[index] * gain[index]
             mean_e *= self.quantum_efficiency
             mean_e += dark_e
             shift = offset_e[index] * scale
             shift += self.offset_dn
+            return mean_e, shift
+
+        if not self.noise and out.size >= FEWEST and kernels_there():
+            images = out.reshape(len(indices), int(frames), -1)
+            self._reading.frames(lambda number: expected(indices[number]), streams, images, together, threads)
+            return out
+
+        def image(index: tuple[int, ...], own: np.random.SeedSequence) -> None:
+            rng = np.random.Generator(np.random.SFC64(own))
+            mean_e, shift = expected(index)
             start = 0
             for collected in poisson_pieces(mean_e, int(frames), rng, together):
                 out[index][start : start + together] = self._read_out(collected, shift, rng)
+                let_go(out)
                 start += together
 
-        _run(image, list(np.ndindex(*lead)), threads)
+        if threads == 1 or len(indices) == 1:
+            for index, own in zip(indices, streams, strict=True):
+                image(index, own)
+            return out
+        with ThreadPoolExecutor(max_workers=threads) as pool:
+            list(pool.map(image, indices, streams))
         return out
 
     def frames_at_once(self, frames: int, pixels: int) -> int:
@@ -356,28 +376,28 @@ class EmvaDetector:
         several = any(not isinstance(term, FixedOffsets) for term in self.noise)
         return frames if several else min(frames, max(1, _FRAMES_PIXELS // pixels))
 
-    def exposing_bytes(self, frames: int, pixels: int) -> int:
-        """Memory that the exposure of one image takes for a while, beside the frames that it gives, bytes.
+    def exposing_bytes(self, frames: int, pixels: int, threads: int) -> int:
+        """Memory that the exposure of images takes for a while, beside the frames that it gives, bytes.
 
         Args:
-            frames: of the image.
+            frames: of an image.
             pixels: of a frame.
+            threads: that expose.
         """
+        together = self.frames_at_once(frames, pixels)
         # electrons, read noise, and electrons as they were collected for noise that depends on them
-        return pixels * self.frames_at_once(frames, pixels) * 8 * (3 if self.noise else 2)
+        return threads * pixels * together * 24 if self.noise else exposing_bytes(together, pixels)
+
+    @property
+    def _reading(self) -> Reading:
+        return Reading(self.dark_noise_e, self.system_gain_dn_per_e, self.full_well_e, self.max_dn)
 
     def _read_out(self, level: np.ndarray, shift: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Grey values of frames (N, H, W) from electrons, whose array they take over."""
         np.minimum(level, self.full_well_e, out=level)
         before = level.copy() if self.noise else level
-        for term in (ReadNoise(self.dark_noise_e), *self.noise):
-            added = term.temporal_e(before, rng)
-            if added is not None:
-                level += added
-        level *= self.system_gain_dn_per_e
-        level += shift
-        np.rint(level, out=level)
-        return np.clip(level, 0, self.max_dn, out=level)
+        added = [term.temporal_e(before, rng) for term in (ReadNoise(self.dark_noise_e), *self.noise)]
+        return self._reading.read_out(level, [one for one in added if one is not None], shift)
 
     def saturated(self, frames: NDArray[np.uint16]) -> SaturationReport:
         """Count saturated pixels in recorded frames (..., frames, H, W); counts have shape (...,).
@@ -389,7 +409,7 @@ class EmvaDetector:
             raise ValueError(f"detector: frames must be (..., frames, H, W), found shape {frames.shape}")
         well = self.offset_dn + self.system_gain_dn_per_e * (self.full_well_e - _SATURATION_SIGMAS * self._read_sigma_e)
         level = float(min(self.max_dn, well))
-        return SaturationReport(level_dn=level, pixels=np.sum(np.max(frames, axis=-3) >= level, axis=(-2, -1)))
+        return SaturationReport(level_dn=level, pixels=np.sum(largest_of(frames) >= level, axis=(-2, -1)))
 
     @property
     def _read_sigma_e(self) -> float:
@@ -400,19 +420,14 @@ class EmvaDetector:
         return math.sqrt(self.dark_noise_e**2 + further)
 
 
-def _run(work: Callable[[tuple[int, ...], int], None], indices: list[tuple[int, ...]], threads: int | None) -> None:
-    """Call work(index, number) for all indices on `threads` threads; the first error is raised here."""
-    if threads is None:
-        threads = min(cores(), 8)
-    if threads < 1:
-        raise ValueError(f"detector: threads must be >= 1, found {threads!r}")
-    if threads == 1 or len(indices) == 1:
-        for number, index in enumerate(indices):
-            work(index, number)
-        return
-    with ThreadPoolExecutor(max_workers=threads) as pool:
-        for _ in pool.map(work, indices, range(len(indices))):
-            pass
+def _streams(seed: Seed | Sequence[Seed], lead: tuple[int, ...]) -> list[np.random.SeedSequence]:
+    """Stream of each image of some leading axes."""
+    if not isinstance(seed, Sequence):
+        root = _sequence(seed)
+        return [stream(root, number) for number in range(math.prod(lead))]
+    if len(seed) != lead[0]:
+        raise ValueError(f"detector: {len(seed)} seeds for {lead[0]} exposures")
+    return [own for one in seed for own in _streams(one, lead[1:])]
 
 
 def _sequence(seed: Seed) -> np.random.SeedSequence:

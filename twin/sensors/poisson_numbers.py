@@ -31,23 +31,35 @@ from functools import cache
 import numpy as np
 from scipy.special import gammainc, gammaincc, ndtri
 
-__all__ = ["SERIES_END", "TABLE_END", "poisson_numbers", "poisson_pieces", "poisson_quantile"]
+__all__ = [
+    "CELLS_PER_UNIT",
+    "MOST_IN_TABLE",
+    "SERIES_END",
+    "TABLE_BITS",
+    "TABLE_END",
+    "poisson_numbers",
+    "poisson_pieces",
+    "poisson_quantile",
+    "quantile_table",
+    "split_stream",
+    "words_of",
+]
 
 TABLE_END = 32.0
 """Mean from which no table is used."""
 SERIES_END = 65536.0
 """Mean from which NumPy draws; SciPy's incomplete gamma functions keep all their digits in the tails up to 1e5."""
 
-_CELLS_PER_UNIT = 32
+CELLS_PER_UNIT = 32
 """Cells of the mean, per electron."""
-_BITS = 10
+TABLE_BITS = 10
 """Bits of u that choose a cell of the table."""
-_SHIFT = np.uint64(64 - _BITS)
-_MOST = 120
+_SHIFT = np.uint64(64 - TABLE_BITS)
+MOST_IN_TABLE = 120
 """Numbers in the table: beyond it lies 1e-31 of the largest mean's distribution, less than the last cell of u."""
 _UNDECIDED = 255
 _LAST = 2**64 - 1
-_INTERPOLATED = 1.01 * (1.0 / _CELLS_PER_UNIT) ** 2 / 8.0
+_INTERPOLATED = 1.01 * (1.0 / CELLS_PER_UNIT) ** 2 / 8.0
 """Largest error of a linear interpolation of F between two means of the table: dF/dm = -p(n), the second derivative is
 p(n) - p(n - 1) and so nowhere larger than 1."""
 _ROOM = 1 << 17
@@ -61,7 +73,7 @@ class _Guide:
     Attributes:
         known: the quantile where the cell has one, else ``_UNDECIDED``, uint8.
         least: the smallest in the cell, uint8.
-        law: F of the numbers below ``_MOST`` at the cells' means and at the table's end.
+        law: F of the numbers below ``MOST_IN_TABLE`` at the cells' means and at the table's end.
     """
 
     known: np.ndarray
@@ -71,9 +83,9 @@ class _Guide:
 
 @cache
 def _guide() -> _Guide:
-    means = np.arange(round(TABLE_END * _CELLS_PER_UNIT) + 1) / _CELLS_PER_UNIT
-    buckets = 1 << _BITS
-    law = gammaincc(np.arange(1.0, _MOST + 1.0), means[:, None])
+    means = np.arange(round(TABLE_END * CELLS_PER_UNIT) + 1) / CELLS_PER_UNIT
+    buckets = 1 << TABLE_BITS
+    law = gammaincc(np.arange(1.0, MOST_IN_TABLE + 1.0), means[:, None])
     # n is passed from the first edge j / 2^10 on that lies beyond F(n); at an edge the quantile is how many are passed
     first = np.floor(law * buckets).astype(np.int64) + 1
     passed = np.zeros((len(means), buckets + 2), np.int64)
@@ -85,6 +97,27 @@ def _guide() -> _Guide:
     for table in tables:
         table.flags.writeable = False
     return _Guide(*tables)
+
+
+@cache
+def quantile_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The guide table as kernels read it.
+
+    Returns:
+        The least quantile in each cell of mean and u, row-major, with the highest bit set where the cell has others,
+        uint8; F of the numbers below ``MOST_IN_TABLE`` at the cells' means, one after the other; and for each row a
+        bound of what a linear interpolation of F between its mean and the next is off. The second derivative of F by
+        the mean is p(n) - p(n - 1), whose own derivative is a difference of two such.
+    """
+    guide = _guide()
+    cells = np.where(guide.known == _UNDECIDED, guide.least | 128, guide.known).astype(np.uint8)
+    step = 1.0 / CELLS_PER_UNIT
+    chance = np.diff(guide.law.reshape(-1, MOST_IN_TABLE), axis=1, prepend=0.0)
+    bend = np.abs(np.diff(chance, axis=1, prepend=0.0)).max(axis=1)
+    bound = 1.01 * np.maximum(bend[:-1], bend[1:]) * (1.0 + 2.0 * step) * step**2 / 8.0
+    for table in (cells, bound):
+        table.flags.writeable = False
+    return cells, guide.law, bound
 
 
 def poisson_numbers(mean: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -117,18 +150,11 @@ def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, toget
     """
     flat = np.ascontiguousarray(mean, dtype=np.float64).reshape(-1)
     plan, huge = _Plan.of(flat), np.flatnonzero(flat >= SERIES_END)
-    words = second = rng
-    if together < count:
-        words = deepcopy(rng)
-        for start, end in _steps(0, count, flat.size):
-            _words(rng, end - start, flat.size)
-        second = deepcopy(rng)
-        for start, end in _steps(0, count if huge.size else 0, huge.size):
-            rng.poisson(flat[huge], (end - start, huge.size))
+    words, second = split_stream(rng, flat[huge], count, flat.size, together)
     for first in range(0, count, together):
         out = np.empty((min(together, count - first), flat.size))
         for start, end in _steps(0, len(out), flat.size):
-            plan.fill(out[start:end], _words(words, end - start, flat.size))
+            plan.fill(out[start:end], words_of(words, end - start, flat.size))
         if huge.size:
             out[:, huge] = second.poisson(flat[huge], (len(out), huge.size))
         yield out.reshape(len(out), *np.shape(mean))
@@ -140,8 +166,37 @@ def _steps(first: int, last: int, size: int) -> Iterator[tuple[int, int]]:
     return ((start, min(start + step, last)) for start in range(first, last, step))
 
 
-def _words(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
-    """Words of 64 bits; not the raw ones, which some bit generators have of 32."""
+def split_stream(
+    rng: np.random.Generator, huge: np.ndarray, count: int, size: int, together: int
+) -> tuple[np.random.Generator, np.random.Generator]:
+    """Generators of the words and of the numbers of huge means, whose streams follow each other in that of ``rng``.
+
+    Args:
+        rng: stands after both when this returns, where not all numbers are drawn together; else it is both.
+        huge: means from ``SERIES_END`` on, (H,).
+        count: numbers of each mean.
+        size: number of all means.
+        together: numbers of each mean that are drawn at once.
+    """
+    if together >= count:
+        return rng, rng
+    words = deepcopy(rng)
+    for start, end in _steps(0, count, size):
+        words_of(rng, end - start, size)
+    second = deepcopy(rng)
+    for start, end in _steps(0, count if huge.size else 0, huge.size):
+        rng.poisson(huge, (end - start, huge.size))
+    return words, second
+
+
+def words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
+    """Words of 64 bits, (count, size); not the raw ones, which some bit generators have of 32.
+
+    Args:
+        rng: is asked for them.
+        count: of each mean.
+        size: number of means.
+    """
     return rng.integers(0, _LAST, (count, size), dtype=np.uint64, endpoint=True)
 
 
@@ -178,7 +233,7 @@ class _Plan:
     @classmethod
     def of(cls, mean: np.ndarray) -> _Plan:
         small = np.where(mean < TABLE_END, mean, 0.0)
-        row = (small * _CELLS_PER_UNIT).astype(np.int64) << _BITS
+        row = (small * CELLS_PER_UNIT).astype(np.int64) << TABLE_BITS
         return cls(mean, row, np.flatnonzero((mean >= TABLE_END) & (mean < SERIES_END)))
 
     def fill(self, out: np.ndarray, word: np.ndarray) -> None:
@@ -200,12 +255,12 @@ class _Plan:
         mean = self.mean[which]
         mean[mean >= TABLE_END] = 0.0
         number = guide.least.take(place).astype(np.int64)
-        row = place >> _BITS
-        u, share, at = word * 2.0**-64, mean * _CELLS_PER_UNIT - row, row * _MOST + number
+        row = place >> TABLE_BITS
+        u, share, at = word * 2.0**-64, mean * CELLS_PER_UNIT - row, row * MOST_IN_TABLE + number
         left, close = np.arange(number.size), []
         while left.size:
             law = guide.law.take(at)
-            law += share * (guide.law.take(at + _MOST) - law)
+            law += share * (guide.law.take(at + MOST_IN_TABLE) - law)
             ahead = u - law
             close.append(left[np.abs(ahead) <= _INTERPOLATED])
             on = np.flatnonzero(ahead > _INTERPOLATED)

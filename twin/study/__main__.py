@@ -9,7 +9,7 @@ if __name__ == "__main__":
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -18,11 +18,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run import cli
 from twin.study.progress_bar import Told, tell_through
-from twin.study.runs.cluster import ClusterError
-from twin.study.runs.engine import Estimate, IncompleteError, ProgramFault
-from twin.study.runs.engine import Progress as EngineProgress
-from twin.study.runs.study_folder import StudyFolder
-from twin.study.study_command import Broken, StudyOptions, StudyRun, run_study
+
+if TYPE_CHECKING:  # help waits for nothing that computes
+    from twin.study.runs.engine import Estimate
+    from twin.study.runs.engine import Progress as EngineProgress
+    from twin.study.runs.study_folder import StudyFolder
+    from twin.study.study_command import StudyOptions, StudyRun
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -78,8 +79,12 @@ def main(
     Exit codes: 0 success, 2 bad input (nothing is lost), 129, 130 or 143 interrupted, 1 anything else: all runs failed,
     the program did, or a figure could not be drawn.
     """
+    from twin.study import study_command
+    from twin.study.runs.cluster import ClusterError
+    from twin.study.runs.engine import IncompleteError, ProgramFault
+
     errors = Console(stderr=True)
-    options = StudyOptions(out, workers, scheduler, resume, force, yes, backend)
+    options = study_command.StudyOptions(out, workers, scheduler, resume, force, yes, backend)
     place: list[StudyFolder] = []
     if gradient:
         _refuse_with_gradient(errors, options)
@@ -93,13 +98,13 @@ def main(
         display = _Display(errors, quiet or as_json, told)
         try:
             with display.bar, display.heartbeat:
-                run = run_study(file, options, display.progress(), place.append)
-        except (Broken, ProgramFault, IncompleteError, ClusterError, OSError) as error:
+                run = study_command.run_study(file, options, display.progress(), place.append)
+        except (study_command.Broken, ProgramFault, IncompleteError, ClusterError, OSError) as error:
             if isinstance(error, ProgramFault):
                 errors.print(error.trace, markup=False, highlight=False, soft_wrap=True)
             said = (error.strerror or error) if isinstance(error, OSError) else error
             print_error(errors, f"{said}{_how_to_go_on(file, place)}")
-            raise typer.Exit(error.code if isinstance(error, Broken) else FAILURE) from None
+            raise typer.Exit(error.code if isinstance(error, study_command.Broken) else FAILURE) from None
     with to_stdout(errors, f"the study is complete in {run.folder}"):
         if as_json:
             print_json(run.numbers)
@@ -159,6 +164,8 @@ class _Display:
 
     def progress(self) -> EngineProgress:
         """What the engine calls."""
+        from twin.study.runs.engine import Progress as EngineProgress
+
         return EngineProgress(start=self._start, done=self._done, warn=self._warn)
 
     def _say(self, text: str) -> None:

@@ -9,16 +9,19 @@ if __name__ == "__main__":
 
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from optics.numerics.threads import cores
 from scenes.kinds.file_kinds import read_for
-from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
+
+if TYPE_CHECKING:
+    from scenes.specs.tolerance import ToleranceSetup
 
 PROGRAM = "twin.tolerance"
 
@@ -72,7 +75,7 @@ def main(
     journal = Path(f"{out if out is not None else Path('runs') / file.stem}.samples")
 
     def resolve() -> ToleranceSetup:
-        setup = read_for(PROGRAM, file, resolve_tolerance)
+        setup: ToleranceSetup = read_for(PROGRAM, file, Named("scenes.specs.tolerance:resolve_tolerance"))
         changed = {name: value for name, value in (("samples", samples), ("seed", seed)) if value is not None}
         return setup.model_copy(update={"test": setup.test.model_copy(update=changed)}) if changed else setup
 

@@ -8,14 +8,17 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scenes.specs.resolved import ResolvedJob, resolve_with
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
+
+if TYPE_CHECKING:
+    from scenes.specs.resolved import ResolvedJob
+    from twin.run.cost import Cost
 
 PROGRAM, KIND = "twin.uncertainty", "uncertainty"
 _MOST_STATES = 100_000
@@ -73,9 +76,16 @@ def main(
     """
 
     def resolve() -> ResolvedJob:
+        from scenes.specs.resolved import resolve_with
+
         resolved = resolve_with(file, disturbances)
         chosen = resolved.job.render.seed if seed is None else seed
         return resolved.with_render(resolved.frames, chosen)
+
+    def cost(resolved: ResolvedJob) -> Cost:
+        from twin.uncertainty.coverage_cost import coverage_cost
+
+        return coverage_cost(resolved, states)
 
     def work(resolved: ResolvedJob, session: Session) -> Result:
         from twin.run.provenance import checks_in
@@ -91,7 +101,7 @@ def main(
         facts |= {"seed": run.seed if states else None, "checks": (*run.images.told(), *checks_in(numbers))}
         return finished(session, KIND, uncertainty_report(run), numbers, program=PROGRAM, **facts)
 
-    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work)
+    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work, cost)
 
 
 if __name__ == "__main__":

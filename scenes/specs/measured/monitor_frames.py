@@ -125,7 +125,7 @@ class MeasurementSpec(Spec):
     bad_pixels: PerChannel | None = None
     corrections: Literal["automatic", "none"] = "automatic"
     vibration: Literal["none", "fitted"] = "none"
-    analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec()
+    analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec.model_construct()
 
     @model_validator(mode="after")
     def _model_or_geometry(self) -> MeasurementSpec:

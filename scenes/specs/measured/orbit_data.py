@@ -147,7 +147,7 @@ class AttitudeReadingsSpec(Spec):
     """
 
     noise: AngleSigmas
-    slow: SlowErrorsSpec = SlowErrorsSpec()
+    slow: SlowErrorsSpec = SlowErrorsSpec.model_construct()
     drift: AngleSigmas | None = None
     walk: AngleSigmas = (0.0, 0.0, 0.0)
     interval: Interval | None = None
@@ -202,7 +202,7 @@ class MeasuredTestSpec(FixedTestSpec):
     data: Reference | None = None
     conventions: ConventionsSpec | None = None
     passes: Passes | None = None
-    effects: EffectsSpec = EffectsSpec()
+    effects: EffectsSpec = EffectsSpec.model_construct()
 
     @model_validator(mode="before")
     @classmethod
@@ -241,8 +241,8 @@ class MeasuredCalibrationSpec(MeasuredTestSpec):
     screening: Literal["robust", "none"] = "robust"
     ties: Literal["with_control", "apart"] = "with_control"
     strip: Flag = False
-    launch: LaunchSpec = LaunchSpec()
-    limits: MapLimitsSpec = MapLimitsSpec()
+    launch: LaunchSpec = LaunchSpec.model_construct()
+    limits: MapLimitsSpec = MapLimitsSpec.model_construct()
 
 
 class MeasuredAngleSpec(MeasuredTestSpec):
@@ -367,8 +367,8 @@ class OrbitCheckSpec(FixedTestSpec):
     lines: LineTimesFileSpec
     ground: pass_files.GroundFileSpec
     image_points: ImagePointsFileSpec
-    effects: LightEffectsSpec = LightEffectsSpec()
-    uncertainty: UncertaintySpec = UncertaintySpec()
+    effects: LightEffectsSpec = LightEffectsSpec.model_construct()
+    uncertainty: UncertaintySpec = UncertaintySpec.model_construct()
     points: Annotated[Whole, Field(ge=4, le=1000)] = 60
     shown: Annotated[Whole, Field(ge=1, le=20)] = 3
 
@@ -430,5 +430,5 @@ class OrbitMatchSpec(FixedTestSpec):
     orthophoto: pass_files.RasterFileSpec
     dem: pass_files.RasterFileSpec
     control_sigma: tuple[pass_files.PointSigma, pass_files.PointSigma]
-    effects: LightEffectsSpec = LightEffectsSpec()
+    effects: LightEffectsSpec = LightEffectsSpec.model_construct()
     points: ImagePointsSpec

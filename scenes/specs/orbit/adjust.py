@@ -211,9 +211,9 @@ class CameraChangeSpec(Spec):
         walk: what it gains in a day, as a random walk from the first pass on.
     """
 
-    lasting: CameraDriftSpec = CameraDriftSpec()
-    each_pass: CameraDriftSpec = CameraDriftSpec()
-    walk: CameraDriftSpec = CameraDriftSpec()
+    lasting: CameraDriftSpec = CameraDriftSpec.model_construct()
+    each_pass: CameraDriftSpec = CameraDriftSpec.model_construct()
+    walk: CameraDriftSpec = CameraDriftSpec.model_construct()
 
     @model_validator(mode="after")
     def _may_change(self) -> CameraChangeSpec:
@@ -260,14 +260,14 @@ class OrbitAdjustSpec(TitledSpec):
 
     camera: Reference
     lines: tuple[Name, ...] = ("forward", "nadir", "backward")
-    earth: EarthSpec = EarthSpec()
+    earth: EarthSpec = EarthSpec.model_construct()
     altitude: Altitude = 500e3
     span: Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")] = 60.0
     line_time: LineTime = 0.7e-3
-    attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
+    attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")
     area: AreaSpec
     passes: Annotated[Named[BlockPassSpec], not_empty("no passes", "at least one pass")]
-    points: BlockPointsSpec = BlockPointsSpec()
+    points: BlockPointsSpec = BlockPointsSpec.model_construct()
     errors: ReadingLawsSpec
     truth: ReadingLawsSpec | None = None
     angles: tuple[TrackerAngleSpec, ...] = ()

@@ -188,14 +188,14 @@ class OrbitAngleSpec(TitledSpec):
     camera: Reference
     angles: Angles = None
     perturb: Paths[Change] = Field(default_factory=dict, validate_default=True)
-    earth: EarthSpec = EarthSpec()
+    earth: EarthSpec = EarthSpec.model_construct()
     orbit: OrbitSpec
-    attitude: AttitudeSpec = AttitudeSpec()
+    attitude: AttitudeSpec = AttitudeSpec.model_construct()
     time: Moment = 0.0
     strips: StripsSpec
-    terrain: TerrainSpec = TerrainSpec()
-    effects: EffectsSpec = EffectsSpec()
-    errors: AngleErrorsSpec = AngleErrorsSpec()
+    terrain: TerrainSpec = TerrainSpec.model_construct()
+    effects: EffectsSpec = EffectsSpec.model_construct()
+    errors: AngleErrorsSpec = AngleErrorsSpec.model_construct()
     passes: Passes = 200
     seed: Seed = 0
 

@@ -181,9 +181,9 @@ class CalibrationImagesSpec(Spec):
     patches: tuple[PatchPlaceSpec, ...]
     lines: Side = 500
     pixels: Side = 500
-    ground: GroundSpec = GroundSpec()
-    control: ControlSpec = ControlSpec()
-    points: ImagePointsSpec = ImagePointsSpec()
+    ground: GroundSpec = GroundSpec.model_construct()
+    control: ControlSpec = ControlSpec.model_construct()
+    points: ImagePointsSpec = ImagePointsSpec.model_construct()
     oversampling: Annotated[Whole, Field(ge=2, le=8)] = 3
 
     @model_validator(mode="after")
@@ -295,22 +295,22 @@ class OrbitCalibrationSpec(TitledSpec):
 
     camera: Reference
     perturb: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
-    earth: EarthSpec = EarthSpec()
+    earth: EarthSpec = EarthSpec.model_construct()
     altitude: Altitude = 500e3
     span: Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")] = 60.0
     line_time: LineTime = 0.7e-3
-    attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
+    attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")
     fields: Annotated[Named[FieldSpec], not_empty("no fields", "at least one test field")]
     schemes: tuple[tuple[Name, ...], ...]
     points: PointsSpec | None = None
     images: CalibrationImagesSpec | None = None
-    effects: EffectsSpec = EffectsSpec()
-    errors: CalibrationErrorsSpec = CalibrationErrorsSpec()
+    effects: EffectsSpec = EffectsSpec.model_construct()
+    errors: CalibrationErrorsSpec = CalibrationErrorsSpec.model_construct()
     drift: CameraDrifts = Field(default_factory=dict, validate_default=True)
     monitor: MonitorReadingSpec | None = None
     strip: StripSpec | None = None
-    launch: LaunchSpec = LaunchSpec()
-    limits: MapLimitsSpec = MapLimitsSpec()
+    launch: LaunchSpec = LaunchSpec.model_construct()
+    limits: MapLimitsSpec = MapLimitsSpec.model_construct()
     repeats: Repeats = 0
     seed: Seed = 0
 

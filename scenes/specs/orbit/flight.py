@@ -255,8 +255,8 @@ class StarTrackerErrorsSpec(Spec):
     interval: Interval = 0.125
     noise: AngleSigmas = _ZERO
     bias: AngleErrors = _ZERO
-    thermal: ThermalDriftSpec = ThermalDriftSpec()
-    slow: SlowErrorsSpec = SlowErrorsSpec()
+    thermal: ThermalDriftSpec = ThermalDriftSpec.model_construct()
+    slow: SlowErrorsSpec = SlowErrorsSpec.model_construct()
     drift: AngleSigmas = _ZERO
     walk: AngleSigmas = _ZERO
 
@@ -269,8 +269,8 @@ class ErrorsSpec(Spec):
         star_tracker: of the attitude.
     """
 
-    gps: GpsErrorsSpec = GpsErrorsSpec()
-    star_tracker: StarTrackerErrorsSpec = StarTrackerErrorsSpec()
+    gps: GpsErrorsSpec = GpsErrorsSpec.model_construct()
+    star_tracker: StarTrackerErrorsSpec = StarTrackerErrorsSpec.model_construct()
 
 
 class PayloadTestSpec(TitledSpec):

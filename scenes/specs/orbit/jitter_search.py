@@ -121,14 +121,14 @@ class OrbitJitterSpec(PayloadTestSpec):
     """
 
     lines: SomeLines = None
-    earth: EarthSpec = EarthSpec()
+    earth: EarthSpec = EarthSpec.model_construct()
     orbit: OrbitSpec
-    attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
-    effects: LightEffectsSpec = LightEffectsSpec()
+    attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")
+    effects: LightEffectsSpec = LightEffectsSpec.model_construct()
     line_time: LineTime = 0.7e-3
     time: Moment = 0.0
     points: BandPointsSpec
-    errors: ErrorsSpec = ErrorsSpec()
+    errors: ErrorsSpec = ErrorsSpec.model_construct()
     search: JitterSearchSpec
     seed: Seed = 0
 

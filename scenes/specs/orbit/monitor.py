@@ -166,14 +166,14 @@ class OrbitMonitorSpec(TitledSpec):
     intervals: tuple[Interval, ...] | None = None
     apply: Annotated[tuple[Parameter, ...], AfterValidator(_once)] = PARAMETERS
     frames: Frames | None = None
-    analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec()
+    analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec.model_construct()
     repeats: Repeats = 40
-    earth: EarthSpec = EarthSpec()
+    earth: EarthSpec = EarthSpec.model_construct()
     orbit: OrbitSpec
-    attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
+    attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")
     line_time: LineTime = 0.09e-3
     ground: GroundSpec
-    errors: MonitorErrorsSpec = MonitorErrorsSpec()
+    errors: MonitorErrorsSpec = MonitorErrorsSpec.model_construct()
     seed: Seed = 0
 
     @model_validator(mode="after")

@@ -91,7 +91,7 @@ class LineImageSpec(Spec):
     spectrum: WavelengthRange
     detector: Reference
     diffusion: Diffusion = 0.0
-    tdi: TdiSpec = TdiSpec()
+    tdi: TdiSpec = TdiSpec.model_construct()
 
     @model_validator(mode="after")
     def _spectrum_rises(self) -> "LineImageSpec":
@@ -182,9 +182,9 @@ class GroundSpec(Spec):
         light: Sun and air.
     """
 
-    terrain: TerrainSpec = TerrainSpec()
-    texture: TextureSpec = TextureSpec()
-    light: LightSpec = LightSpec()
+    terrain: TerrainSpec = TerrainSpec.model_construct()
+    texture: TextureSpec = TextureSpec.model_construct()
+    light: LightSpec = LightSpec.model_construct()
 
 
 class DemSpec(Spec):
@@ -224,7 +224,7 @@ class ControlSpec(Spec):
     shift: Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="1 km"), 2)] = (0.0, 0.0)
     sigma: GroundSigma = 0.5
     correlation: GroundLength = 5000.0
-    dem: DemSpec = DemSpec()
+    dem: DemSpec = DemSpec.model_construct()
 
 
 LEAST_TEMPLATE = 13

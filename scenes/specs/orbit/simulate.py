@@ -64,15 +64,15 @@ class OrbitSimulateSpec(TitledSpec):
     camera: Reference
     lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "backward")
     perturb: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
-    earth: EarthSpec = EarthSpec()
+    earth: EarthSpec = EarthSpec.model_construct()
     orbit: OrbitSpec
-    attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
-    effects: LightEffectsSpec = LightEffectsSpec()
+    attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")
+    effects: LightEffectsSpec = LightEffectsSpec.model_construct()
     line_time: LineTime = 0.7e-3
     patch: PatchSpec
-    ground: GroundSpec = GroundSpec()
-    control: ControlSpec = ControlSpec()
+    ground: GroundSpec = GroundSpec.model_construct()
+    control: ControlSpec = ControlSpec.model_construct()
     points: ImagePointsSpec | None = None
-    errors: ErrorsSpec = ErrorsSpec()
+    errors: ErrorsSpec = ErrorsSpec.model_construct()
     oversampling: Annotated[Whole, Field(ge=2, le=8)] = 3
     seed: Seed = 0

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
 from scenes.specs.samplers import GRID, unit_cube
 from scenes.specs.study import FactorSpec, StudySpec
@@ -71,6 +70,9 @@ def _level(factor: FactorSpec, place: np.ndarray) -> np.ndarray:
 
 def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
     """Values of a factor where its distribution function is ``u``."""
+    # a bad file of a study is told before scipy is imported
+    from scipy.special import ndtr, ndtri
+
     if factor.kind in _LISTS:
         return np.minimum((u * levels(factor)).astype(np.int64), levels(factor) - 1)
     numbers: Sequence[float] = factor.numbers().values
@@ -99,6 +101,9 @@ its logarithm does."""
 
 def _far(a: float, b: float, u: np.ndarray) -> np.ndarray:
     """Quantiles of a normal distribution of sigma 1 between limits far in one of its tails."""
+    # as in ``_quantile``
+    from scipy.special import log_ndtr, ndtri_exp
+
     if a > 0.0:
         return -_far(-b, -a, 1.0 - u)
     # both limits below the mean: log of Phi(a) + u (Phi(b) - Phi(a)), taken from the larger one

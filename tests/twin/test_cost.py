@@ -1,0 +1,108 @@
+"""What a command says of memory and time before it starts; that it takes so much is in tests/limits/test_costs.py."""
+
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from scenes.specs.load import ORBIT, SCENES, load_named
+from scenes.specs.orbit.adjust import OrbitAdjustSpec
+from scenes.specs.orbit.setup import resolve_simulate
+from scenes.specs.procedures import PROCEDURES
+from scenes.specs.resolved import resolve, resolve_with
+from scenes.yaml.errors import InputError
+from tests.twin.commands import invoke
+from tests.twin.study_bench import ROOT
+from twin.main_job.render_cost import render_cost
+from twin.orbit.__main__ import app as orbit
+from twin.run import cost
+from twin.run.cli import time_text
+from twin.run.command import tell_cost
+from twin.run.cost import LONG, MUCH_MEMORY, Cost, Lowered, require_memory, told
+from twin.run.memory import LIMIT
+from twin.uncertainty.coverage_cost import coverage_cost
+
+
+@pytest.fixture
+def measured_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cost, "pace", lambda: 2.0)
+
+
+@pytest.mark.usefixtures("measured_machine")
+def test_much_is_told_and_little_is_not() -> None:
+    """Seconds are of this machine, here half as fast as the measured one."""
+    assert told(Cost(MUCH_MEMORY, LONG / 2.0), time_text) == ""
+    assert told(Cost(3.2e9, 1.0), time_text) == "this takes about 3.2 GB of memory"
+    assert told(Cost(1e9, 0.51 * LONG), time_text) == "this takes about 5 min"
+    assert told(Cost(3.2e9, 3000.0), time_text) == "this takes about 3.2 GB of memory and 100 min"
+
+
+@pytest.mark.usefixtures("measured_machine")
+def test_it_is_said_before_the_work_begins() -> None:
+    for quiet, text in ((False, "note: this takes about 17 min\n"), (True, "")):
+        errors = StringIO()
+        tell_cost(Cost(0.0, 510.0), Console(file=errors), quiet)
+        assert errors.getvalue() == text
+
+
+def test_the_pace_of_this_machine() -> None:
+    """Any machine that runs these tests is within a factor of ten of the measured one, and the pace is a matter of a
+    moment.
+    """
+    assert 0.1 < cost.pace() < 10.0
+
+
+def test_more_memory_than_there_is_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = load_named(OrbitAdjustSpec, ORBIT, "adjust")
+    lower = Lowered(spec, ("points", "tie"), 120, "tie points", lambda number: 1e7 * number, 0)
+    monkeypatch.setenv(LIMIT, "1 GB")
+    require_memory(Cost(1e9, 1.0, lower))
+    with pytest.raises(InputError) as caught:
+        require_memory(Cost(1.2e9, 1.0, lower))
+    (issue,) = caught.value.issues
+    assert (issue.key, issue.found) == (("points", "tie"), "120")
+    assert issue.line is not None
+    assert "this needs about 1.2 GB of memory, and 1 GB may be taken" in issue.problem
+    assert (issue.allowed or "").startswith("at most 100 tie points, or more memory")
+    # so little is always there, whatever is said to be
+    monkeypatch.setenv(LIMIT, "100 MB")
+    require_memory(Cost(0.5e9, 1.0, lower))
+
+
+@pytest.mark.parametrize(
+    ("command", "old", "new", "key"),
+    [
+        ("simulate", "lines: 1000, pixels: 1000", "lines: 9000, pixels: 9000", "patch.lines"),
+        ("adjust", "tie: 120", "tie: 90000", "points.tie"),
+    ],
+)
+def test_a_command_refuses_before_it_starts(
+    command: str, old: str, new: str, key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (SCENES / f"orbit/{command}.yaml").read_text("utf-8")
+    assert old in text
+    file = tmp_path / "test.yaml"
+    file.write_text(text.replace(old, new), "utf-8")
+    monkeypatch.setenv(LIMIT, "1 GB")
+    done = invoke(orbit, command, file, "--out", tmp_path / "run")
+    assert done.exit_code == 2
+    assert f": {key}: this needs about " in done.stderr
+    assert "allowed: at most " in done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.second
+def test_what_grows_costs_more() -> None:
+    """In proportion to the number that the file states, where that decides the cost."""
+    resolved = resolve_with("gf7_pair")
+    few, many, more = (coverage_cost(resolved, states).seconds for states in (0, 1000, 2000))
+    assert more - many == pytest.approx(many - few)
+    assert render_cost(resolved, 2000).seconds > 1.5 * render_cost(resolved, 9).seconds
+    course = resolve(ROOT / "scenes/examples/orbit.yaml")
+    assert render_cost(course).seconds > render_cost(resolved).seconds
+    setup = resolve_simulate(SCENES / "orbit/simulate.yaml")
+    simulated = PROCEDURES["orbit simulate"].cost
+    patch = setup.test.patch.model_copy(update={"lines": 2000})
+    long = setup.model_copy(update={"test": setup.test.model_copy(update={"patch": patch})})
+    assert simulated(long).bytes > 1.2 * simulated(setup).bytes

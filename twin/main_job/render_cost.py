@@ -1,0 +1,54 @@
+"""What the main job takes of memory and time, from what its files say, before its instrument is built."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from twin.monitor.monitor_memory import MonitorSize
+from twin.run.cost import Cost
+from twin.sensors.area_detector import EmvaDetector
+from twin.targets.target_measurement import target_pixels
+
+if TYPE_CHECKING:
+    from scenes.specs.instrument import MonitorSpec
+    from scenes.specs.resolved import ResolvedJob
+
+STARTED, STARTED_SECONDS = 400e6, 16.0
+"""Of a job of one small state: kernels, and what draws its report; bytes and seconds."""
+STATE_SECONDS = 0.05
+"""Seconds of a time of a course beside its frames: light, fits, estimators, truth."""
+EXPOSED_SECONDS = 1e-7
+"""Seconds per pixel of a frame."""
+PATH_SECONDS = 4.6e-6
+"""Seconds per path of stray light, of each channel."""
+
+
+def render_cost(resolved: ResolvedJob, frames: int | None = None) -> Cost:
+    """What `render_job` and the run folder take. More memory than there is the job itself refuses, at the key that
+    decides it (`twin.monitor.monitor_memory`).
+
+    Args:
+        resolved: the job.
+        frames: of each state, None for as many as the job says.
+    """
+    monitor, job = resolved.instrument.monitor, resolved.job
+    if monitor is None:
+        return Cost(STARTED, STARTED_SECONDS)
+    count, course = resolved.frames if frames is None else frames, job.course
+    times = 0 if course is None else len(course.times)
+    spots = 2 * len(resolved.instrument.cameras)
+    ccd = monitor.area_ccd
+    size = MonitorSize(spots, ccd.rows, ccd.columns, _phase(resolved, monitor), count, times, target_pixels(resolved))
+    exposed = spots * ccd.rows * ccd.columns * count * EXPOSED_SECONDS
+    stray = 0.0 if job.render.stray is None else job.render.stray.paths * spots * PATH_SECONDS
+    seconds = STARTED_SECONDS + 2.0 * exposed + times * (STATE_SECONDS + exposed) + stray
+    return Cost(size.bytes(EmvaDetector.from_sheet(resolved.area_detector, ccd.exposure)), seconds)
+
+
+def _phase(resolved: ResolvedJob, monitor: MonitorSpec) -> float:
+    """From the middle to the edge of the pupil for one pixel, radians, of a beam that fills its aperture."""
+    focal_length = min(camera.focal_length for camera in resolved.cameras.values())
+    aperture = 0.5 * monitor.return_face.aperture / focal_length
+    return float(2.0 * np.pi * aperture * monitor.area_ccd.pitch / monitor.wavelength)

@@ -1,0 +1,131 @@
+"""What a command will take of memory and time: told before it starts where it is much, refused where it is more memory
+than there is.
+
+Each subject has a model of its own, a function of the numbers that its file states (pixels, points, states), with rates
+that were measured once: bytes are those of the largest resident memory above that of the imported program, seconds
+those of one core of the machine whose `PACE_SECONDS` stand here. Both are within a factor of 1.5 of what a run takes
+(tests/limits). Time is told on the scale of the machine that is there: `pace` measures how fast it is in the time of a
+blink. How far a run is and what is left, the progress says.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.yaml.errors import InputError, KeyPath
+from scenes.yaml.spec import Spec
+from twin.run.memory import LIMIT, amount_text, free_memory, largest
+
+MUCH_MEMORY, LONG = 2.0 * 2**30, 300.0
+"""Bytes and seconds above which a command says beforehand what it takes."""
+ORDINARY = 600e6
+"""A job that needs no more is never refused, bytes: what is free changes while other processes start."""
+PACE_SECONDS = 0.0041
+"""What the calculation of `pace` takes on the machine on which the rates were measured, seconds of one core."""
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """A number of a file with which a command takes less memory.
+
+    Attributes:
+        owner, key: the file and where in it the number stands.
+        number: as it is.
+        unit: of the number, in words.
+        bytes: memory with another number.
+        least: that it may be.
+    """
+
+    owner: Spec
+    key: KeyPath
+    number: int
+    unit: str
+    bytes: Callable[[int], float]
+    least: int = 1
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a command takes.
+
+    Attributes:
+        bytes: memory, largest resident, above that of the imported program.
+        seconds: of one core of the machine of `PACE_SECONDS`.
+        lower: what decides most of the memory; None where no number of the file does.
+    """
+
+    bytes: float
+    seconds: float
+    lower: Lowered | None = None
+
+    @property
+    def much(self) -> bool:
+        """Whether it is said beforehand, on any machine that is not ten times as fast as the one that was measured."""
+        return self.bytes > MUCH_MEMORY or self.seconds > 0.1 * LONG
+
+
+def pace() -> float:
+    """How many times as long as on the measured machine this one takes, for one core.
+
+    The least of several tries of linear algebra, of functions of arrays and of Python's own arithmetic, in time of this
+    thread alone: other programs on the machine make little of it.
+    """
+    matrix, numbers = np.full((160, 160), 0.5), np.linspace(0.0, 1.0, 60_000)
+    least = np.inf
+    for _ in range(5):
+        begun = time.thread_time()
+        for _ in range(4):
+            matrix @ matrix
+            np.sin(numbers) * numbers + np.sqrt(numbers)
+            sum(k * k for k in range(5000))
+        least = min(least, time.thread_time() - begun)
+    return float(least / PACE_SECONDS)
+
+
+def require_memory(cost: Cost) -> None:
+    """See whether a command fits into the memory that is free.
+
+    Raises:
+        InputError: it does not; at the key of what takes most, with the number that would fit.
+    """
+    free = free_memory()
+    if cost.bytes <= max(ORDINARY, free) or cost.lower is None:
+        return
+    raise beyond(cost.bytes, free, cost.lower)
+
+
+def beyond(need: float, free: float, lower: Lowered) -> InputError:
+    """More memory is needed than there is: the error that says so, for the caller to raise.
+
+    Args:
+        need: bytes that are needed.
+        free: bytes that may be taken.
+        lower: the number that could be smaller.
+    """
+    most = largest(lambda number: lower.bytes(number) <= max(ORDINARY, free), lower.number, lower.least - 1)
+    more = f"more memory (the environment variable {LIMIT}, as 8 GB, says how much may be taken)"
+    return lower.owner.error(
+        f"this needs about {amount_text(need)} of memory, and {amount_text(free)} may be taken",
+        lower.key,
+        found=lower.number,
+        allowed=f"at most {most} {lower.unit}, or {more}" if most >= lower.least else more,
+    )
+
+
+def told(cost: Cost, seconds_text: Callable[[float], str]) -> str:
+    """What a command takes, in words; empty where it is not much.
+
+    Args:
+        cost: of the command.
+        seconds_text: a time for people.
+    """
+    if not cost.much:
+        return ""
+    seconds = cost.seconds * pace()
+    parts = [f"{amount_text(cost.bytes)} of memory"] if cost.bytes > MUCH_MEMORY else []
+    parts += [seconds_text(seconds)] if seconds > LONG else []
+    return f"this takes about {' and '.join(parts)}" if parts else ""
