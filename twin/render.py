@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 
 from scenes.kinds.file_kinds import read_for
-from scenes.specs.procedures import Named
+from scenes.yaml.named import Named
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.run import cli
 from twin.run.command import Result, run_command

@@ -9,38 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.named import Named
 
 if TYPE_CHECKING:
     from scenes.yaml.spec import Spec
-
-_BEFORE = __name__.removesuffix("scenes.specs.procedures")
-_OURS = ("analysis", "optics", "scenes", "twin")
-"""The packages that a wheel holds within one, and what stands before their names there (docs/wheel)."""
-
-
-@dataclass(frozen=True)
-class Named:
-    """A function or a class that is imported when it is used.
-
-    Attributes:
-        path: module and name, ``twin.laboratory.export:export_focus``.
-    """
-
-    path: str
-
-    def get(self) -> Any:
-        """The function or the class."""
-        module, _, name = self.path.partition(":")
-        before = _BEFORE if module.partition(".")[0] in _OURS else ""
-        return getattr(import_module(before + module), name)
-
-    def __call__(self, *values: Any, **named: Any) -> Any:
-        """Import the function and call it."""
-        return self.get()(*values, **named)
 
 
 @dataclass(frozen=True)
@@ -425,15 +400,20 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.orbit.loop.loop_run:run_loop",
         numbers="twin.orbit.loop.loop_numbers:LOOP",
         report="twin.orbit.loop.loop_report:loop_report",
-        files=(FileKind("orbit_loop", "scenes.specs.orbit.loop:OrbitLoopSpec", "a monitor in a loop"),),
+        files=(
+            FileKind(
+                "orbit_loop",
+                "scenes.specs.orbit.loop:OrbitLoopSpec",
+                "a monitor in a loop",
+                needs=("readings", "corrections"),
+            ),
+        ),
         varied=True,
         about="""
-    The monitor in a loop along one orbit: heat and mounts move the cameras, spots are rendered and read, and what the
-    posterior says goes to mechanisms that point and refocus, with gain, delay and steps; heights with the loop open and
-    closed.
+    The monitor in a loop along one orbit: heat and mounts move the cameras, rendered spots are read, and the posterior
+    moves mechanisms that point and refocus, with gain, delay and steps; heights with the loop open and closed.
 
-    loop.json holds what is left of angle, focus and height with the loop open and closed, with sigmas, gain and phase
-    margins, limit cycles, and the motions that no spot shows with what they cost in metres.
+    loop.json holds what is left of angle, focus and height with sigmas, gain and phase margins, and what no spot shows.
 
     Example: `python -m twin.orbit loop scenes/orbit/loop.yaml`
     """,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from scenes.kinds.file_kinds import read_for
-from scenes.specs.procedures import Named
+from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session

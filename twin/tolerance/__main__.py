@@ -15,7 +15,7 @@ import typer
 
 from optics.numerics.threads import cores
 from scenes.kinds.file_kinds import read_for
-from scenes.specs.procedures import Named
+from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
