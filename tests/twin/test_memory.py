@@ -20,6 +20,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import MonitorSize, require_memory
 from twin.run import memory
 from twin.run.memory import LIMIT, amount_text, free_memory, largest
+from twin.sensors.area_detector import ReadNoise
 from twin.study.runs.plan import require_study_memory, study_bytes
 from twin.study.runs.setup import resolve_study
 
@@ -74,10 +75,13 @@ def experiment(backend: Backend) -> MonitorExperiment:
     ids=["frames", "ccd"],
 )
 def test_what_would_fit_is_told(changes, key, unit, experiment, monkeypatch) -> None:
-    """The number that is told fits, and the next one does not."""
+    """The number that is told fits, and the next one does not.
+
+    Frames that lie in a file take no memory, but temporal noise of further terms is drawn for all of an image at once.
+    """
     monkeypatch.setenv(LIMIT, "1 GB")
     monkeypatch.setattr(monitor_memory, "taken_already", lambda: 0.0)
-    resolved, detector = experiment.resolved, experiment.detector
+    resolved, detector = experiment.resolved, replace(experiment.detector, noise=(ReadNoise(1.0),))
     size = replace(experiment.size(), **changes)
     with pytest.raises(InputError, match=r"needs about \d.* and 1 GB may be taken") as caught:
         require_memory(resolved, size, detector)
@@ -97,12 +101,22 @@ def test_what_would_fit_is_told(changes, key, unit, experiment, monkeypatch) -> 
 def test_frames_are_counted_before_anything_is_rendered(experiment, backend, monkeypatch) -> None:
     monkeypatch.setenv(LIMIT, "500 MB")
     done: list[str] = []
+    monkeypatch.setattr(experiment, "detector", replace(experiment.detector, noise=(ReadNoise(1.0),)))
     with pytest.raises(InputError, match="10000 frames of area CCDs") as caught:
         render_job(
             experiment.resolved, backend, 10_000, advance=lambda part, *_: done.append(part), experiment=experiment
         )
     assert caught.value.key == ("render", "frames")
     assert set(done) == {"build the instrument"}
+
+
+def test_frames_in_a_file_take_no_more_than_a_gibibyte(experiment, monkeypatch) -> None:
+    """However many they are, and on the way there: what is kept in memory is small against what a job takes anyway."""
+    monkeypatch.setenv(LIMIT, "1 GB")
+    for frames in (100, 900, 1000, 3600, 10_000):
+        size = replace(experiment.size(), frames=frames)
+        require_memory(experiment.resolved, size, experiment.detector)
+        assert size.bytes(experiment.detector) < 2**30
 
 
 def test_a_large_ccd_is_refused_wherever_an_instrument_is_used(tmp_path, backend, monkeypatch) -> None:

@@ -21,10 +21,8 @@ from numpy.typing import NDArray
 
 from analysis.spots.centroid import mean_frames
 
-IN_MEMORY = 1 << 28
-"""Bytes of the frames of a state that are kept in memory; more of them are in a file."""
-PART = 1 << 26
-"""Bytes of frames that a pass holds at a time."""
+IN_MEMORY = PART = 1 << 26
+"""Bytes of a state's frames that are kept in memory (more of them are in a file), and that a pass holds at a time."""
 
 
 def kept_bytes(size: float) -> float:
