@@ -247,7 +247,7 @@ def test_more_detections_than_expected_are_all_kept(backend) -> None:
 def test_paths_that_are_drawn_for_faint_light_find_what_plain_ones_find(backend) -> None:
     """Energies of all families of a scattering plate, drawn for faint light and as the power goes: chi-square with a
     false-alarm rate of 1e-3. Floors, what they are after a weak way, distances drawn near the specular direction and
-    roulette are all in it; each of them, forgotten in the weights, moves it beyond 1e-12.
+    roulette are all in it.
     """
     coated = Finish(reflectance=0.06, transmission=0.9, diffuse=0.01, scatter=ABg(2e-4, 1e-3, 2.0))
     scenery = glass_scene(slab(0.3, THICKNESS), INDEX, coated)
