@@ -157,9 +157,10 @@ def spot_statistic(counts: np.ndarray, shares: np.ndarray, paths: int) -> tuple[
     return float(np.sum((found - expected) ** 2 / expected)), len(found) - 1
 
 
-@pytest.mark.second
 @pytest.mark.parametrize(
-    ("paths", "fine"), [(400_000, 1000), pytest.param(10_000_000, 5000, marks=pytest.mark.slow)], ids=["fast", "1e7"]
+    ("paths", "fine"),
+    [pytest.param(400_000, 1000, marks=pytest.mark.second), pytest.param(10_000_000, 5000, marks=pytest.mark.slow)],
+    ids=["fast", "1e7"],
 )
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_spot_has_the_shape_of_the_sequential_trace(backend, instrument, name: str, paths: int, fine: int) -> None:
@@ -177,8 +178,11 @@ def test_spot_has_the_shape_of_the_sequential_trace(backend, instrument, name: s
     assert spot_statistic(counts, wrong, paths)[0] > chi2.ppf(0.999, freedom)
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("paths", [200_000, pytest.param(10_000_000, marks=pytest.mark.slow)], ids=["fast", "1e7"])
+@pytest.mark.parametrize(
+    "paths",
+    [pytest.param(200_000, marks=pytest.mark.second), pytest.param(10_000_000, marks=pytest.mark.slow)],
+    ids=["fast", "1e7"],
+)
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, name: str, paths: int) -> None:
     """Within three standard errors in x and y (false alarm 0.5 %)."""

@@ -260,12 +260,13 @@ class _Drawn:
 def _aligned(kind: type, rows: int, columns: int) -> np.ndarray:
     """An array (rows, columns) of zeros at an address that kernels expect."""
     room: np.ndarray = np.zeros(rows * columns + _LANES, kind)
-    start = (-room.ctypes.data % 128) // room.itemsize
+    start = (-room.__array_interface__["data"][0] % 128) // room.itemsize
     return room[start : start + rows * columns].reshape(rows, columns)
 
 
+@cache
 def kernels_there() -> bool:
-    """Whether there are kernels for the processor."""
+    """Whether there are kernels for the processor; looked for once in a process."""
     ensure_llvm()
     import drjit as dr
 
