@@ -19,7 +19,7 @@ SIZES: dict[str, tuple[str, str, str]] = {
     "patch of 300 x 300 pixels": ("simulate", "lines: 1000, pixels: 1000", "lines: 300, pixels: 300"),
     "patch of 700 x 700 pixels": ("simulate", "lines: 1000, pixels: 1000", "lines: 700, pixels: 700"),
     "120 tie points": ("adjust", "tie: 120", "tie: 120"),
-    "1000 tie points": ("adjust", "tie: 120", "tie: 1000"),
+    "8000 tie points": ("adjust", "tie: 120", "tie: 8000"),
 }
 """Name -> the command, whose test stands in scenes/orbit, and a text of it with what stands in its place."""
 
