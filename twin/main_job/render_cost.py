@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from scenes.specs.instrument import MonitorSpec
     from scenes.specs.resolved import ResolvedJob
 
-STARTED, STARTED_SECONDS = 400e6, 16.0
+STARTED, STARTED_SECONDS = 400e6, 11.6
 """Of a job of one small state: kernels, and what draws its report; bytes and seconds."""
 STATE_SECONDS = 0.05
 """Seconds of a time of a course beside its frames: light, fits, estimators, truth."""
 EXPOSED_SECONDS = 1e-7
 """Seconds per pixel of a frame."""
-PATH_SECONDS = 4.6e-6
+PATH_SECONDS = 1.2e-6
 """Seconds per path of stray light, of each channel."""
 
 
