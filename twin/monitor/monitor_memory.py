@@ -7,7 +7,7 @@ of the pupil grow with the square of the CCD's diagonal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from optics.numerics.threads import cores
@@ -17,8 +17,9 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.spec import Spec
 from twin.monitor.image_sampling import NodeClasses
+from twin.run.cost import ORDINARY, Lowered, beyond
 from twin.run.frame_store import IN_MEMORY, kept_bytes
-from twin.run.memory import LIMIT, amount_text, free_memory, largest, taken_already
+from twin.run.memory import amount_text, free_memory, taken_already
 from twin.sensors.area_detector import EmvaDetector
 
 CHUNK = 25
@@ -69,11 +70,6 @@ WRITTEN = 60.0
 """Bytes per pixel of a spot's image while it is drawn and written: photons, their file, means."""
 _OF_STATE = 24.0
 """Bytes per pixel of each state that is rendered at once: photons, and the effect of their noise on the spot."""
-
-_ORDINARY = 600e6
-"""A job that needs no more is never refused, bytes: what is free changes while other processes start, and what a study
-gives must not depend on that.
-"""
 
 
 @dataclass(frozen=True)
@@ -146,77 +142,49 @@ def require_memory(resolved: ResolvedJob, size: MonitorSize, detector: EmvaDetec
     Raises:
         InputError: it does not; at the key of what takes most, with the number that would fit.
     """
-    free, there = free_memory(), min(taken_already(), STARTED)
-
-    def fits(other: MonitorSize) -> bool:
-        need = other.bytes(detector)
-        return need <= _ORDINARY or need - there <= free
-
-    if fits(size):
+    free, there, need = free_memory(), min(taken_already(), STARTED), size.bytes(detector)
+    if need <= max(ORDINARY, free + there):
         return
     parts = size.parts(detector)
     worst = max(parts, key=lambda name: parts[name])
-    one = _lowered(resolved, size, worst)
-    most = largest(lambda n: fits(one.at(n)), one.number, one.least - 1)
-    more = f"more memory (the environment variable {LIMIT}, as 8 GB, says how much may be taken)"
-    raise one.owner.error(
-        f"this needs about {amount_text(size.bytes(detector))} of memory, "
-        f"{amount_text(parts[worst])} of it {one.what}, and {amount_text(free)} may be taken",
-        one.key,
-        found=str(one.number),
-        allowed=f"at most {most} {one.unit}, or {more}" if most >= one.least else more,
-    )
+    what, lower = _lowered(resolved, size, worst, detector)
+    raise beyond(need, free, lower, there, f"{amount_text(parts[worst])} of it {what}")
 
 
-@dataclass(frozen=True)
-class _Lowered:
-    """A number of a job that can be made smaller.
-
-    Attributes:
-        owner, key: the file and where in it the number stands.
-        number: as it is.
-        least: that it may be.
-        at: the job's size with another number.
-        what: the memory is for, for messages.
-        unit: of the number, for messages.
-    """
-
-    owner: Spec
-    key: KeyPath
-    number: int
-    least: int
-    at: Callable[[int], MonitorSize]
-    what: str
-    unit: str
-
-
-def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str) -> _Lowered:
-    """What decides one of the ``parts``."""
-    job, rows, columns = resolved.job, size.rows, size.columns
+def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str, detector: EmvaDetector) -> tuple[str, Lowered]:
+    """What one of the ``parts`` is for, in words, and the number that decides it."""
+    job, rows, columns, frames = resolved.job, size.rows, size.columns, size.frames
+    owner: Spec = job
+    least = 1
     if part == "ccd":
-        return _Lowered(
-            resolved.instrument,
-            ("monitor", "area_ccd", "rows" if rows >= columns else "columns"),
-            max(rows, columns),
-            LEAST_SIDE,
-            lambda n: replace(size, rows=min(rows, n), columns=min(columns, n)),
-            f"for the images of area CCDs of {rows} x {columns} pixels",
-            "rows and columns",
-        )
-    if part == "times":
+        what, unit = f"for the images of area CCDs of {rows} x {columns} pixels", "rows and columns"
+        owner, least, number = resolved.instrument, LEAST_SIDE, max(rows, columns)
+        key: KeyPath = ("monitor", "area_ccd", "rows" if rows >= columns else "columns")
+
+        def at(n: int) -> MonitorSize:
+            return replace(size, rows=min(rows, n), columns=min(columns, n))
+
+    elif part == "times":
         assert job.course is not None
-        times = size.times
-        what = f"for {times} times of the course"
-        return _Lowered(job.course, ("times",), times, FEWEST, lambda n: replace(size, times=n), what, "times")
-    frames = size.frames
-    if part == "pictures":
-        recorded = resolved.targets.frames or frames
-        each, what = size.pictures // recorded, f"for {recorded} frames of test targets"
-        key: KeyPath = ("render", "targets", "frames")
-        return _Lowered(job, key, recorded, 1, lambda n: replace(size, pictures=n * each), what, "frames")
-    what = f"for {frames} frames of area CCDs of {rows} x {columns} pixels"
-    own = job.render.frames is not None
-    owner: Spec = job if own else resolved.instrument
-    return _Lowered(
-        owner, ("render" if own else "monitor", "frames"), frames, 1, lambda n: replace(size, frames=n), what, "frames"
-    )
+        what, unit = f"for {size.times} times of the course", "times"
+        owner, least, number, key = job.course, FEWEST, size.times, ("times",)
+
+        def at(n: int) -> MonitorSize:
+            return replace(size, times=n)
+
+    elif part == "pictures":
+        number, unit, key = resolved.targets.frames or frames, "frames", ("render", "targets", "frames")
+        each, what = size.pictures // number, f"for {number} frames of test targets"
+
+        def at(n: int) -> MonitorSize:
+            return replace(size, pictures=n * each)
+
+    else:
+        what, unit, number = f"for {frames} frames of area CCDs of {rows} x {columns} pixels", "frames", frames
+        own = job.render.frames is not None
+        owner, key = (job if own else resolved.instrument), ("render" if own else "monitor", "frames")
+
+        def at(n: int) -> MonitorSize:
+            return replace(size, frames=n)
+
+    return what, Lowered(owner, key, number, unit, lambda n: at(n).bytes(detector), least)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # it takes half a second, and a study's file is read before w
 REACH_SECONDS = 5.0
 """How long a scheduler may take to answer before the user is told that it does not."""
 LOST_SECONDS = 10.0
-"""How long a scheduler may be away before the study is broken off."""
+"""How long a scheduler may be away before the command breaks off."""
 WORKER_SECONDS = 60.0
 """How long to wait for the first worker."""
 LEAST_MEMORY = 0.5e9
@@ -106,7 +106,7 @@ def local_workers(count: int) -> Iterator[Workers]:
     """Worker processes on this machine with one thread each; they, and what they leave on disk, end with the block.
 
     Whoever may send a task to a worker runs programs as its user, and a port of this machine is open to all its users.
-    So all speak TLS with a key that is made for the study and kept in memory, and a peer without it is refused.
+    So all speak TLS with a key that is made for the command and kept in memory, and a peer without it is refused.
     """
     with owned_files.scratch(SCRATCH) as place, _cluster(count, place) as workers:
         yield workers
@@ -227,6 +227,16 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
             yield workers
         finally:
             client.close(timeout=2)
+
+
+def refuse_both(workers: int | None, scheduler: str | None) -> None:
+    """See that not both are asked for: processes of this machine, and a running cluster.
+
+    Raises:
+        InputErrorText: both are.
+    """
+    if workers is not None and scheduler is not None:
+        raise cli.InputErrorText("--workers and --scheduler exclude each other: a cluster has its own workers")
 
 
 def _check_address(address: str) -> None:

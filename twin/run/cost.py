@@ -24,7 +24,9 @@ from twin.run.memory import LIMIT, amount_text, free_memory, largest
 MUCH_MEMORY, LONG = 2.0 * 2**30, 300.0
 """Bytes and seconds above which a command says beforehand what it takes."""
 ORDINARY = 600e6
-"""A job that needs no more is never refused, bytes: what is free changes while other processes start."""
+"""A job that needs no more is never refused, bytes: what is free changes while other processes start, and what a study
+gives must not depend on that.
+"""
 PACE_SECONDS = 0.0041
 """What the calculation of `pace` takes on the machine on which the rates were measured, seconds of one core."""
 
@@ -100,18 +102,21 @@ def require_memory(cost: Cost) -> None:
     raise beyond(cost.bytes, free, cost.lower)
 
 
-def beyond(need: float, free: float, lower: Lowered) -> InputError:
+def beyond(need: float, free: float, lower: Lowered, there: float = 0.0, most_of_it: str = "") -> InputError:
     """More memory is needed than there is: the error that says so, for the caller to raise.
 
     Args:
         need: bytes that are needed.
         free: bytes that may be taken.
         lower: the number that could be smaller.
+        there: bytes of the need that the process has already, and which are not free any more.
+        most_of_it: how much of the need is for what, as a part of the message.
     """
-    most = largest(lambda number: lower.bytes(number) <= max(ORDINARY, free), lower.number, lower.least - 1)
+    most = largest(lambda number: lower.bytes(number) <= max(ORDINARY, free + there), lower.number, lower.least - 1)
     more = f"more memory (the environment variable {LIMIT}, as 8 GB, says how much may be taken)"
+    of_it = f", {most_of_it}," if most_of_it else ","
     return lower.owner.error(
-        f"this needs about {amount_text(need)} of memory, and {amount_text(free)} may be taken",
+        f"this needs about {amount_text(need)} of memory{of_it} and {amount_text(free)} may be taken",
         lower.key,
         found=lower.number,
         allowed=f"at most {most} {lower.unit}, or {more}" if most >= lower.least else more,

@@ -94,8 +94,7 @@ def run_study(
         Broken: SIGINT, SIGTERM or SIGHUP; what is done stays.
     """
     cli.check_backend(options.backend)
-    if options.workers is not None and options.scheduler is not None:
-        raise cli.InputErrorText("--workers and --scheduler exclude each other: a cluster has its own workers")
+    cluster.refuse_both(options.workers, options.scheduler)
     if options.resume and options.force:
         raise cli.InputErrorText("--resume goes on with a folder, --force replaces it; choose one of them")
     if options.resume and options.out is None:

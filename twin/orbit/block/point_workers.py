@@ -9,8 +9,7 @@ from typing import Any
 
 from analysis.measurement_error import MeasurementError
 from optics.numerics.threads import one_blas_thread
-from twin.run import cli
-from twin.run.cluster import ClusterError, Workers, local_workers, remote_workers
+from twin.run.cluster import ClusterError, Workers, local_workers, refuse_both, remote_workers
 
 _LOST = "a worker was lost with its share of the points; adjust the block again"
 
@@ -80,8 +79,7 @@ def point_workers(
         InputErrorText: both are given, or a cluster that cannot be used.
         ClusterError: a cluster without workers.
     """
-    if count is not None and scheduler is not None:
-        raise cli.InputErrorText("--workers and --scheduler exclude each other: a cluster has its own workers")
+    refuse_both(count, scheduler)
     who: AbstractContextManager[Workers]
     if scheduler is not None:
         who = remote_workers(scheduler, warn)
