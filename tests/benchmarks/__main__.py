@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from scenes.yaml.standard_output import FAILURE
+from tests.benchmarks.beside import compared, print_pairs, sources_of
 from tests.benchmarks.machine import Machine
 from tests.benchmarks.number import Speed
 from tests.benchmarks.page import Page
@@ -30,7 +31,8 @@ Examples:
   python -m tests.benchmarks --list                 what there is\n
   python -m tests.benchmarks --only trace,psf       some of it\n
   python -m tests.benchmarks --quick                small sizes: does everything run?\n
-  python -m tests.benchmarks --json > speed.json    numbers on stdout, progress on stderr
+  python -m tests.benchmarks --json > speed.json    numbers on stdout, progress on stderr\n
+  python -m tests.benchmarks --beside v1.0 --only monitor    an older commit in turns with these sources: ratios
 
 Exit code: 0 all limits are met (a quick run judges none), 1 one is missed, 2 bad input.
 """
@@ -70,11 +72,36 @@ def run(todo: list[Benchmark], quick: bool, errors: Console) -> dict[str, Speed]
     return {one.name: found[one.name] for one in todo}
 
 
+def against(
+    commit: str, names: list[str], rounds: int, quick: bool, as_json: bool, consoles: tuple[Console, Console]
+) -> None:
+    """Run an older commit in turns with these sources, and print the ratios."""
+    console, errors = consoles
+
+    def tell(text: str) -> None:
+        errors.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    with sources_of(commit) as (name, old):
+        pairs, remarks = compared(names, old, rounds, quick, tell)
+    if as_json:
+        numbers = {pair.key: pair.data for pair in pairs}
+        data = {"old": name, "numbers": numbers, "notes": remarks, "machine": Machine.here().data, "quick": quick}
+        json.dump(data, sys.stdout, indent=2, allow_nan=False)
+        sys.stdout.write("\n")
+    else:
+        print_pairs(console, name, pairs, remarks)
+
+
 @app.command(help=HELP)
 def main(
     only: Annotated[str | None, typer.Option(help="Names with commas between them; see --list.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small sizes, about a second or some each.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and nothing else.")] = False,
+    beside: Annotated[
+        str | None,
+        typer.Option(metavar="COMMIT", help="Run these sources and a commit's in turns; no limit is judged."),
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Of both, with --beside.")] = 3,
     show: Annotated[bool, typer.Option("--list", help="Print the names and what they measure.")] = False,
 ) -> None:
     """Measure, print, judge."""
@@ -84,6 +111,9 @@ def main(
         if show:
             for one in todo:
                 console.print(f"{one.name:12} {one.text}, about {one.seconds:.0f} s", highlight=False, soft_wrap=True)
+            return
+        if beside is not None:
+            against(beside, [one.name for one in todo], rounds, quick, as_json, (console, errors))
             return
         machine = Machine.here()
         page = Page(machine, run(todo, quick, errors), quick)
