@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
+from itertools import count
 from typing import Any, TypeVar
 
 Path = tuple[str | int, ...]
@@ -35,6 +36,29 @@ def _collect(tree: Any, path: Path, found: dict[Path, Any]) -> None:
         return
     for name in names:
         _collect(getattr(tree, name), (*path, name), found)
+
+
+def form_of(tree: Tree) -> Tree:
+    """The form of a tree: in the place of each number its place in ``numbers_in``."""
+    places = count()
+    return map_leaves(lambda number: next(places), tree)
+
+
+def numbers_in(tree: Any) -> list[Any]:
+    """All numbers of a tree, in the order of its fields."""
+    numbers: list[Any] = []
+    _append_numbers(tree, numbers)
+    return numbers
+
+
+def _append_numbers(tree: Any, numbers: list[Any]) -> None:
+    for branch in tree if isinstance(tree, tuple) else vars(tree).values():
+        if branch is None:
+            continue
+        if isinstance(branch, tuple) or _names(branch.__class__) is not None:
+            _append_numbers(branch, numbers)
+        else:
+            numbers.append(branch)
 
 
 def map_leaves(function: Callable[..., Any], tree: Tree, *others: Any) -> Tree:

@@ -9,8 +9,8 @@ order) can be batched together: the two cameras of an instrument, left and right
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -29,7 +29,7 @@ from optics.geometry.surface import (
 )
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State
 from optics.numerics.backend import Backend
-from optics.numerics.number_tree import map_leaves
+from optics.numerics.number_tree import form_of, map_leaves, numbers_in
 from optics.raytrace.assembly import Assembly, Element, Interaction
 
 
@@ -100,6 +100,16 @@ class ElementNumbers:
     after: IndexNumbers
 
 
+@dataclass(frozen=True, eq=False)
+class OwnNumbers:
+    """Numbers of an element that do not depend on where it stands; as of ``ElementNumbers``."""
+
+    surface: SurfaceNumbers
+    aperture: ApertureNumbers | None
+    before: IndexNumbers
+    after: IndexNumbers
+
+
 @dataclass(frozen=True)
 class Medium:
     """What light travels in: a glass body of the assembly, or something homogeneous of a given index."""
@@ -122,8 +132,12 @@ def media_along(chain: Sequence[Element]) -> list[Medium]:
     return out
 
 
-def structure_of(elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool]) -> Structure:
+def structure_of(
+    elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool], reshaped: set[str]
+) -> Structure:
     """Common structure of the i-th elements of all chains."""
+    if reshaped.isdisjoint(e.body for e in elements):
+        states = ()  # no figure comes from them
     grid = any(_has_grid(e, states) for e in elements)
     apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
     kinds = {(e.interaction, e.surface.is_plane, own) for e, own in zip(elements, apertures, strict=True)}
@@ -170,13 +184,31 @@ def touched_bodies(assembly: Assembly, states: Sequence[State], placed: PlacedBo
     return {path for path, i in placed.index.items() if other[i]}.union(*states)
 
 
-def bodies_of(chain: Sequence[Element], i: int, media: Sequence[Medium]) -> set[str]:
-    """Bodies on which the numbers of element i of a chain depend."""
-    bodies = {chain[i].body, *(medium.solid for medium in media[i : i + 2] if medium.solid is not None)}
-    return bodies | {chain[i - 1].body} if i else bodies
+def reshaped_bodies(states: Sequence[State], placed: PlacedBodies) -> set[str]:
+    """Bodies that have another size, shape or refractive index than designed in some state."""
+    other = np.any(placed.scale != 1.0, axis=0)
+    found = {path for path, i in placed.index.items() if other[i]}
+    return found.union(path for state in states for path, motion in state.items() if motion.reshapes)
 
 
-def numbers_of(
+def frames_of(placed: PlacedBodies, chains: Sequence[Sequence[Element]]) -> list[FrameNumbers]:
+    """Per element of chains, the transform into its frame from that of the element before, each number (C * S,), chain
+    by chain.
+    """
+    bodies = np.array([[placed.index[element.body] for element in chain] for chain in chains])
+    rotation, translation = placed.rotation[:, bodies], placed.translation[:, bodies]
+    turn, offset = np.empty_like(rotation), np.empty_like(translation)
+    turn[:, :, 0] = np.swapaxes(rotation[:, :, 0], -1, -2)
+    offset[:, :, 0] = -np.einsum("scij,sci->scj", rotation[:, :, 0], translation[:, :, 0])
+    turn[:, :, 1:] = np.einsum("sckmi,sckmj->sckij", rotation[:, :, 1:], rotation[:, :, :-1])
+    away = translation[:, :, :-1] - translation[:, :, 1:]
+    offset[:, :, 1:] = np.einsum("sckmi,sckm->scki", rotation[:, :, 1:], away)
+    numbers = np.concatenate([offset[..., None], turn], axis=-1).transpose(2, 3, 4, 1, 0)
+    rows = np.ascontiguousarray(numbers).reshape(*numbers.shape[:3], -1)
+    return [FrameNumbers(*(CoordinateNumbers(c[0], (c[1], c[2], c[3])) for c in element)) for element in rows]
+
+
+def own_numbers_of(
     assembly: Assembly,
     chain: Sequence[Element],
     i: int,
@@ -185,23 +217,13 @@ def numbers_of(
     states: Sequence[State],
     placed: PlacedBodies,
     step: Sequence[tuple[str, str, int]] | None,
-) -> ElementNumbers:
-    """Numbers of element i of a chain, each of shape (S,), complex when a derivative is carried."""
+) -> OwnNumbers:
+    """Shape, aperture and indices of element i of a chain, each number (S,), complex when a derivative is carried."""
     element = chain[i]
-    body = placed.index[element.body]
-    rotation, translation = placed.rotation[:, body], placed.translation[:, body]
-    if i == 0:
-        relative = np.swapaxes(rotation, -1, -2)
-        offset = -np.einsum("sij,si->sj", rotation, translation)
-    else:
-        before = placed.index[chain[i - 1].body]
-        relative = np.einsum("ski,skj->sij", rotation, placed.rotation[:, before])
-        offset = np.einsum("ski,sk->si", rotation, placed.translation[:, before] - translation)
-    scale = placed.scale[:, body]
+    scale = placed.scale[:, placed.index[element.body]]
     sides = zip(media[i : i + 2], structure.graded, strict=True)
     outer, inner = (_index_numbers(assembly, element, medium, graded, states, placed) for medium, graded in sides)
-    return ElementNumbers(
-        FrameNumbers.of(relative, offset),
+    return OwnNumbers(
         _surface_numbers(element, structure, scale, states, step),
         # an edge has no derivative: it lets a ray pass or stops it
         None if element.aperture is None else element.aperture.numbers(scale.real),
@@ -296,8 +318,7 @@ def grid_numbers(elements: Sequence[Element], states: Sequence[State]) -> tuple[
     return map_leaves(lambda *values: np.array(values), numbers[0], *numbers[1:]), np.concatenate(tables)
 
 
-Numbers = TypeVar("Numbers", ElementNumbers, FrameNumbers)
-Tree = TypeVar("Tree")
+Numbers = TypeVar("Numbers", ElementNumbers, OwnNumbers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +335,7 @@ class SystemBatch:
         grids: per element, the spline tables of all systems' grid figures, one after the other; None without any.
         count: B.
         states: number of states S; systems are ordered sequence by sequence, B = sequences * S.
-        kept: per element, what keeps its numbers in a backend's memory, where no state touches it, else None.
+        form: of ``values`` and the pose of the last element, with the place of each number.
     """
 
     structure: tuple[Structure, ...]
@@ -326,28 +347,23 @@ class SystemBatch:
     grids: tuple[np.ndarray | None, ...]
     count: int
     states: int
-    kept: tuple[KeptNumbers | None, ...]
+    form: tuple[tuple[ElementNumbers, ...], FrameNumbers]
 
     def upload(self, backend: Backend, own: bool = False) -> UploadedSystems:
         """Copy to the backend's memory as kernel inputs; derivatives, if any, become forward-mode gradients.
 
         Args:
             backend: where to.
-            own: all arrays are this upload's own, so that they may be differentiated by; else those of elements that no
-                state touches are shared with other uploads.
+            own: each number of the systems is an array of its own, so that it may be differentiated by; else those of
+                several systems lie in one.
         """
         if self.tangents is None:
-            # numbers that were replaced since are no longer those that are kept
-            known = [
-                kept.on(backend) if kept is not None and kept.numbers is values and not own else None
-                for kept, values in zip(self.kept, self.values, strict=True)
-            ]
-            new = tuple(values for values, there in zip(self.values, known, strict=True) if there is None)
-            uploaded, world = _uploaded(backend, (new, self.world.last()))
-            others = iter(uploaded)
-            values = tuple(next(others) if there is None else there for there in known)
             grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
-            return UploadedSystems(self.structure, values, world, grids, self.count, False)
+            parts = numbers_in((self.values, self.world.last()))
+            # of a single system each number is one for all rays, which no ray needs to look up
+            alone = own or self.count == 1
+            numbers = tuple(backend.opaque_each(parts)) if alone else backend.opaque(np.array(parts))
+            return UploadedSystems(backend, self.structure, self.form, numbers, grids, self.count, False)
         import drjit as dr
 
         def copied(value: np.ndarray, tangent: np.ndarray | None = None) -> Any:
@@ -361,7 +377,8 @@ class SystemBatch:
         last = None if self.world_tangents is None else self.world_tangents.last()
         world = map_leaves(copied, self.world.last(), last)
         grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
-        return UploadedSystems(self.structure, values, world, grids, self.count, self.tangents is not None)
+        numbers = tuple(numbers_in((values, world)))
+        return UploadedSystems(backend, self.structure, self.form, numbers, grids, self.count, True)
 
     def take(self, systems: np.ndarray) -> SystemBatch:
         """The systems of the given indices."""
@@ -381,7 +398,7 @@ class SystemBatch:
             self.grids,
             len(systems),
             len(systems),
-            (None,) * len(self.values),
+            self.form,
         )
 
 
@@ -402,48 +419,46 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False)
-class KeptNumbers:
-    """Numbers of elements as designed, (B,) each, which many states share; what was uploaded of them stays.
+class UploadedSystems:
+    """A ``SystemBatch`` in the memory of a backend.
 
     Attributes:
-        numbers: of the i-th elements of some chains, one after the other.
+        backend: whose arrays they are.
+        structure: per element.
+        form: as of ``SystemBatch``.
+        numbers: L Dr.Jit arrays (B,); or one of all of them, (L * B,), number by number.
+        grids: as of ``SystemBatch``.
+        count: B.
+        differentiable: whether numbers carry derivatives.
     """
 
-    numbers: ElementNumbers
-    _uploaded: dict[str, ElementNumbers] = field(default_factory=dict)
-
-    def on(self, backend: Backend) -> ElementNumbers:
-        """The numbers in a backend's memory."""
-        if backend.name not in self._uploaded:
-            self._uploaded[backend.name] = _uploaded(backend, self.numbers)
-        return self._uploaded[backend.name]
-
-
-def _uploaded(backend: Backend, tree: Tree) -> Tree:
-    """A tree of arrays of one size in a backend's memory."""
-    parts: list[np.ndarray] = []
-    map_leaves(parts.append, tree)
-    arrays = iter(backend.opaque_each(parts))
-    return map_leaves(lambda value: next(arrays), tree)
-
-
-@dataclass(frozen=True, eq=False)
-class UploadedSystems:
-    """A ``SystemBatch`` in the memory of a backend (Dr.Jit arrays); ``world`` is the last element's pose."""
-
+    backend: Backend
     structure: tuple[Structure, ...]
-    values: tuple[ElementNumbers, ...]
-    world: FrameNumbers
+    form: tuple[tuple[ElementNumbers, ...], FrameNumbers]
+    numbers: Any
     grids: tuple[Any, ...]
     count: int
     differentiable: bool
 
+    @cached_property
+    def values(self) -> tuple[ElementNumbers, ...]:
+        """Per element its numbers, Dr.Jit arrays (B,)."""
+        import drjit as dr
+
+        if isinstance(self.numbers, tuple):
+            return map_leaves(lambda place: self.numbers[place], self.form[0])
+        system = dr.arange(self.backend.UInt, self.count)
+        return map_leaves(
+            lambda place: dr.gather(self.backend.Float, self.numbers, system + place * self.count), self.form[0]
+        )
+
     def section(self, first: int, last: int) -> UploadedSystems:
-        """Elements ``first`` to ``last - 1`` alone, for rays in the frame of the element before them; ``world`` remains
+        """Elements ``first`` to ``last - 1`` alone, for rays in the frame of the element before them; the pose remains
         the last element's of all.
         """
         part = slice(first, last)
-        return replace(self, structure=self.structure[part], values=self.values[part], grids=self.grids[part])
+        form = self.form[0][part], self.form[1]
+        return replace(self, structure=self.structure[part], form=form, grids=self.grids[part])
 
 
 def assemble(
@@ -478,49 +493,48 @@ def assemble(
         raise ValueError(f"sequences of different lengths cannot be batched: {sorted(lengths)}")
     media = [media_along(chain) for chain in chains]
     graded = {path for state in states for path, motion in state.items() if any(motion.index_gradient)}
+    real = step is None and not np.iscomplexobj(placed.rotation)
+    reshaped = reshaped_bodies(states, placed) if real else set(placed.index)
     structures = []
     for i in range(len(chains[0])):
         before, after = (any(m[k].solid in graded for m in media) for k in (i, i + 1))
-        structures.append(structure_of([chain[i] for chain in chains], states, (before, after)))
-    real = step is None and not np.iscomplexobj(placed.rotation)
-    touched = touched_bodies(assembly, states, placed) if real else None
+        structures.append(structure_of([chain[i] for chain in chains], states, (before, after), reshaped))
+    known = _known_numbers(assembly)
+    names = tuple(tuple(element.name for element in chain) for chain in chains)
 
-    parts = list(zip(chains, media, strict=True))
-
-    def known_of(i: int) -> KeptNumbers | None:
-        """The numbers of the i-th elements of all chains if no state touches them, as they are kept."""
-        if touched is None or any(not touched.isdisjoint(bodies_of(chain, i, along)) for chain, along in parts):
-            return None
-        key = (i, tuple(tuple(element.name for element in chain[: i + 2]) for chain in chains), structures[i])
-        known = _known_numbers(assembly)
+    def own_of(i: int) -> OwnNumbers:
+        """Shapes and indices of the i-th elements of all chains, each number (C * S,)."""
+        depends = {chain[i].body for chain in chains}
+        depends |= {m.solid for along in media for m in along[i : i + 2] if m.solid is not None}
+        parts = zip(chains, media, strict=True)
+        if not depends.isdisjoint(reshaped):
+            return _joined([own_numbers_of(assembly, c, i, m, structures[i], states, placed, step) for c, m in parts])
+        # as designed: each system's number for all its states
+        key = (i, names, structures[i])
         if key not in known:
             nominal = assembly.place()
-            own = [numbers_of(assembly, c, i, m, structures[i], ({},), nominal, None) for c, m in parts]
-            known[key] = KeptNumbers(_joined(own))
-        return known[key]
-
-    def joined(i: int, known: KeptNumbers | None) -> ElementNumbers:
-        """The numbers of the i-th elements of all chains."""
-        if known is None:
-            return _joined([numbers_of(assembly, c, i, m, structures[i], states, placed, step) for c, m in parts])
-        # each system's number for all its states
-        one = known.numbers
+            designed = [own_numbers_of(assembly, c, i, m, structures[i], ({},), nominal, None) for c, m in parts]
+            known[key] = _joined(designed)
+        one: OwnNumbers = known[key]
         return one if len(states) == 1 else map_leaves(lambda value: np.repeat(value, len(states)), one)
 
-    kept = [known_of(i) for i in range(len(chains[0]))]
-    values = [joined(i, known) for i, known in enumerate(kept)]
-    tables: list[np.ndarray | None] = [None] * len(values)
-    for i, structure in enumerate(structures):
+    values = []
+    tables: list[np.ndarray | None] = []
+    for i, (structure, frame) in enumerate(zip(structures, frames_of(placed, chains), strict=True)):
+        own, spline = own_of(i), None
         if structure.grid:
-            grid, tables[i] = grid_numbers([chain[i] for chain in chains], states)
-            values[i] = replace(values[i], surface=replace(values[i].surface, grid=grid))
-            kept[i] = None
+            grid, spline = grid_numbers([chain[i] for chain in chains], states)
+            own = replace(own, surface=replace(own.surface, grid=grid))
+        tables.append(spline)
+        values.append(ElementNumbers(frame, own.surface, own.aperture, own.before, own.after))
     bodies = [[placed.index[element.body] for element in chain] for chain in chains]
     world = Poses(*(np.concatenate([a[:, own] for own in bodies]) for a in (placed.rotation, placed.translation)))
     size = np.concatenate([placed.size(chain[-1].body) for chain in chains])
+    form = known.get(tuple(structures))
+    if form is None:
+        form = known[tuple(structures)] = form_of((tuple(values), world.last()))
     return SystemBatch(
         tuple(structures),
-        # joined arrays are contiguous
         tuple(values) if real else tuple(map_leaves(_real, value) for value in values),
         world if real else map_leaves(_real, world),
         tuple(map_leaves(_tangent, value) for value in values) if step is not None else None,
@@ -529,13 +543,15 @@ def assemble(
         tuple(tables),
         len(chains) * len(states),
         len(states),
-        tuple(known if len(states) == 1 else None for known in kept),
+        form,
     )
 
 
 @lru_cache(maxsize=16)
-def _known_numbers(assembly: Assembly) -> dict[Any, KeptNumbers]:
-    """What ``assemble`` has worked out of the elements of an assembly as designed; kept for those used last."""
+def _known_numbers(assembly: Assembly) -> dict[Any, Any]:
+    """What ``assemble`` has worked out of the elements of an assembly as designed, and the forms of numbers by their
+    structures; kept for those used last.
+    """
     return {}
 
 

@@ -15,7 +15,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import cosh
+from threading import local
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,7 @@ from optics.raytrace.system import (
     ElementNumbers,
     FrameNumbers,
     IndexNumbers,
+    Structure,
     SystemBatch,
     UploadedSystems,
 )
@@ -257,51 +260,114 @@ def trace(
     import drjit as dr
 
     uploaded = systems.upload(backend) if isinstance(systems, SystemBatch) else systems
-    rays, lookup = _spread(backend, rays, uploaded.count)
-    p, d, path, valid = rays.position, rays.direction, rays.path, rays.valid
-    hits: dict[int, Any] = {}
-    differentiable = uploaded.differentiable or dr.grad_enabled(p) or dr.grad_enabled(d)
-    for i, structure in enumerate(uploaded.structure):
-        element, table = lookup(uploaded.values[i]), uploaded.grids[i]
-        surface = element.surface
-        p, d = _into_frame(backend, p, d, element.frame)
-        steps = _steps(surface, structure.interaction)
-        t, ok = _distance(p, d, surface, table, differentiable, steps)
-        if element.before.gradient is None:
-            p = backend.Vector3(dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z))
-            path = dr.fma(element.before.index, t, path)
-        else:
-            curve = GradedRay.start(p, d, element.before.index, element.before.gradient)
-            tau = _solve(curve, t / curve.index, surface, table, differentiable, steps)
-            p, d, path = curve.position(tau), curve.direction(tau), path + curve.optical_path(tau)
-            ok = _reached(p, surface, table)
-        valid = valid & ok
-        if element.aperture is not None:
-            valid = valid & element.aperture.contains(p.x, p.y)
-        if structure.interaction is not Interaction.PASS:
-            d, ok = _redirect(backend, p, d, element, structure.interaction, table)
-            valid = valid & ok
-        if i in keep:
-            hits[i] = p
-        if not differentiable and i % SECTION == SECTION - 1 and i + 1 < len(uploaded.structure):
-            dr.eval(p, d, path, valid)
-    d = d + dr.zeros(backend.Float, dr.width(p))  # nothing may have turned a shared direction
+    rays, shared = _spread(backend, rays, uploaded.count)
+    differentiable = uploaded.differentiable or dr.grad_enabled(rays.position) or dr.grad_enabled(rays.direction)
+    how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate)
+    stride = None if uploaded.count == 1 else dr.opaque(backend.UInt, uploaded.count)
+    through = _frozen(how, uploaded.form) if evaluate and not differentiable else partial(how.through, uploaded.form)
+    (p, d, path, valid), hits, outside = through(
+        (uploaded.numbers, uploaded.grids, stride), (rays.position, rays.direction, rays.path, rays.valid), shared
+    )
     local = Rays(p, d, path, valid, uploaded.count)
-    outside = None
-    if world:
-        to_world = lookup(uploaded.world).coordinates
-        outside = Rays(
-            backend.Vector3(*(c.turn[0] * p.x + c.turn[1] * p.y + c.turn[2] * p.z + c.shift for c in to_world)),
-            backend.Vector3(*(c.turn[0] * d.x + c.turn[1] * d.y + c.turn[2] * d.z for c in to_world)),
-            path,
-            valid,
-            uploaded.count,
-        )
-    if evaluate:
-        dr.eval(
-            p, d, path, valid, list(hits.values()), [] if outside is None else [outside.position, outside.direction]
-        )
-    return Traced(local, outside, hits, uploaded.count)
+    seen = Rays(*outside, path, valid, uploaded.count) if world else None
+    return Traced(local, seen, dict(zip(how.keep, hits, strict=True)), uploaded.count)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """What the instructions of a trace depend on; all else is numbers that they read.
+
+    Attributes:
+        backend: where to compute.
+        structure: of the elements.
+        keep: elements whose hit points are wanted, ascending.
+        world: whether the final rays in the world frame are.
+        differentiable: whether numbers or rays carry derivatives.
+        evaluate: whether kernels are launched.
+    """
+
+    backend: Backend
+    structure: tuple[Structure, ...]
+    keep: tuple[int, ...]
+    world: bool
+    differentiable: bool
+    evaluate: bool
+
+    def through(self, form: Any, numbers: Any, rays: Any, shared: Any) -> Any:
+        """Rays after the last element, hit points, and the former in the world frame.
+
+        Args:
+            form: as of ``UploadedSystems``.
+            numbers: likewise, the grids, and how many systems there are, as an array of width 1 or None for one.
+            rays: position, direction, path and whether they are alive.
+            shared: rays of each system, as an array of width 1; None for a single system.
+        """
+        import drjit as dr
+
+        backend, differentiable = self.backend, self.differentiable
+        (table, grids, stride), (p, d, path, valid) = numbers, rays
+        lookup = _lookup(backend, p, table, stride, shared)
+        hits: list[Any] = []
+        for i, structure in enumerate(self.structure):
+            element, table = lookup(form[0][i]), grids[i]
+            surface = element.surface
+            p, d = _into_frame(backend, p, d, element.frame)
+            steps = _steps(surface, structure.interaction)
+            t, ok = _distance(p, d, surface, table, differentiable, steps)
+            if element.before.gradient is None:
+                p = backend.Vector3(dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z))
+                path = dr.fma(element.before.index, t, path)
+            else:
+                curve = GradedRay.start(p, d, element.before.index, element.before.gradient)
+                tau = _solve(curve, t / curve.index, surface, table, differentiable, steps)
+                p, d, path = curve.position(tau), curve.direction(tau), path + curve.optical_path(tau)
+                ok = _reached(p, surface, table)
+            valid = valid & ok
+            if element.aperture is not None:
+                valid = valid & element.aperture.contains(p.x, p.y)
+            if structure.interaction is not Interaction.PASS:
+                d, ok = _redirect(backend, p, d, element, structure.interaction, table)
+                valid = valid & ok
+            if i in self.keep:
+                hits.append(p)
+            if not differentiable and i % SECTION == SECTION - 1 and i + 1 < len(self.structure):
+                dr.eval(p, d, path, valid)
+        d = d + dr.zeros(backend.Float, dr.width(p))  # nothing may have turned a shared direction
+        outside = None
+        if self.world:
+            to_world = lookup(form[1]).coordinates
+            outside = (
+                backend.Vector3(*(c.turn[0] * p.x + c.turn[1] * p.y + c.turn[2] * p.z + c.shift for c in to_world)),
+                backend.Vector3(*(c.turn[0] * d.x + c.turn[1] * d.y + c.turn[2] * d.z for c in to_world)),
+            )
+        if self.evaluate:
+            dr.eval(p, d, path, valid, hits, [] if outside is None else list(outside))
+        return (p, d, path, valid), hits, outside
+
+
+_threads = local()
+
+
+def _frozen(way: _Way, form: Any) -> Any:
+    """The instructions of a trace, recorded when they run for the first time and launched without Python after that.
+
+    A recording is of one thread.
+    """
+    import drjit as dr
+
+    known = getattr(_threads, "known", None)
+    if known is None:
+        known = _threads.known = {}
+    if way not in known:
+        recorded = partial(way.through, form)
+
+        # what a frozen function closes over is compared at each call; a default is not
+        @dr.freeze
+        def through(numbers: Any, rays: Any, shared: Any, run: Any = recorded) -> Any:
+            return run(numbers, rays, shared)
+
+        known[way] = through
+    return known[way]
 
 
 def require_some(valid: np.ndarray, what: str) -> None:
@@ -315,29 +381,38 @@ def require_some(valid: np.ndarray, what: str) -> None:
 
 
 def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
-    """Bring rays to full width and make the function that looks a system's numbers up for each ray."""
+    """Bring rays to full width; how many each system has, as an array of width 1, or None for a single system."""
     import drjit as dr
 
     if count == 1:
-        return rays, lambda numbers: numbers
+        return rays, None
     width = dr.width(rays.position)
     if rays.systems not in (1, count):
         raise ValueError(f"rays for {rays.systems} systems cannot go through {count}")
-    if rays.systems == 1:
-        shared = width
-        index = dr.arange(backend.UInt, count * shared)
-        ray = index % dr.opaque(backend.UInt, shared)
-        rays = Rays(
-            dr.gather(backend.Vector3, rays.position, ray),
-            rays.direction if dr.width(rays.direction) == 1 else dr.gather(backend.Vector3, rays.direction, ray),
-            dr.gather(backend.Float, rays.path, ray),
-            dr.gather(backend.Bool, rays.valid, ray),
-        )
-    else:
-        shared = width // count
-        index = dr.arange(backend.UInt, width)
-    system = index // dr.opaque(backend.UInt, shared)
-    return rays, lambda numbers: map_leaves(lambda array: dr.gather(backend.Float, array, system), numbers)
+    if rays.systems != 1:
+        return rays, dr.opaque(backend.UInt, width // count)
+    ray = dr.arange(backend.UInt, count * width) % dr.opaque(backend.UInt, width)
+    rays = Rays(
+        dr.gather(backend.Vector3, rays.position, ray),
+        rays.direction if dr.width(rays.direction) == 1 else dr.gather(backend.Vector3, rays.direction, ray),
+        dr.gather(backend.Float, rays.path, ray),
+        dr.gather(backend.Bool, rays.valid, ray),
+    )
+    return rays, dr.opaque(backend.UInt, width)
+
+
+def _lookup(backend: Backend, position: Any, numbers: Any, stride: Any, shared: Any) -> Any:
+    """Function: a form of numbers -> those of each ray's system."""
+    import drjit as dr
+
+    if shared is None:
+        return lambda form: map_leaves(lambda place: numbers[place], form)
+    system = dr.arange(backend.UInt, dr.width(position)) // shared
+    if isinstance(numbers, tuple):
+        return lambda form: map_leaves(lambda place: dr.gather(backend.Float, numbers[place], system), form)
+    return lambda form: map_leaves(
+        lambda place: dr.gather(backend.Float, numbers, system + backend.UInt(place) * stride), form
+    )
 
 
 def _into_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[Any, Any]:
