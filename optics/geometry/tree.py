@@ -353,9 +353,6 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
     Raises:
         ValueError: both have a grid figure of the same body, on different samples.
     """
-    # messages about files and help wait for this module, and scipy takes a quarter of a second
-    from scipy.spatial.transform import Rotation
-
     out = dict(first)
     for path, motion in then.items():
         before = out.get(path)
@@ -366,9 +363,10 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
         turn_1, offset_1 = _affine(before, body)
         turn_2, offset_2 = _affine(motion, body)
         growth = (1.0 + before.stretch) * (1.0 + before.scale)
+        turning = before if any(before.rotate) else motion
         turn, offset = product(turn_1, turn_2), turned(turn_1, growth * offset_2) + offset_1
         out[path] = Motion(
-            rotate=triple(Rotation.from_matrix(turn).as_rotvec()),
+            rotate=_rotation_of(turn) if any(before.rotate) and any(motion.rotate) else turning.rotate,
             shift=triple(offset),
             scale=(1.0 + before.scale) * (1.0 + motion.scale) - 1.0,
             figure={j: before.figure.get(j, 0.0) + motion.figure.get(j, 0.0) for j in {*before.figure, *motion.figure}},
@@ -383,6 +381,13 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
     return out
 
 
+def _rotation_of(turn: np.ndarray) -> tuple[float, float, float]:
+    # messages about files and help wait for this module, and scipy takes a quarter of a second
+    from scipy.spatial.transform import Rotation
+
+    return triple(Rotation.from_matrix(turn).as_rotvec())
+
+
 def _sum(first: GridFigure | None, then: GridFigure | None) -> GridFigure | None:
     if first is None or then is None:
         return then if first is None else first
@@ -391,7 +396,9 @@ def _sum(first: GridFigure | None, then: GridFigure | None) -> GridFigure | None
 
 def _affine(motion: Motion, body: Body) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) and offset (3,) of x -> R growth x + offset, as ``RigidTree.place`` has it."""
-    turn = rotation_matrix(np.array(motion.rotate))
     pivot = np.array(body.pivots[motion.pivot])
     growth = (1.0 + motion.scale) * (1.0 + motion.stretch)
+    if not any(motion.rotate):  # most motions of bodies that warm up
+        return np.eye(3), pivot + np.array(motion.shift) - growth * pivot
+    turn = rotation_matrix(np.array(motion.rotate))
     return turn, pivot + np.array(motion.shift) - growth * turned(turn, pivot)

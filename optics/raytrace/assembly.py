@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -135,6 +137,11 @@ class Assembly:
         object.__setattr__(self, "media", FrozenMap(self.media))
         object.__setattr__(self, "above_d", FrozenMap(self.above_d))
         object.__setattr__(self, "sequences", FrozenMap({k: tuple(v) for k, v in self.sequences.items()}))
+
+    @cached_property
+    def worked_out(self) -> dict[Any, Any]:
+        """What ``optics.raytrace.system.assemble`` keeps of the elements as designed, by its own keys."""
+        return {}
 
     def index(self, solid: str, motion: Motion = AT_REST) -> float:
         """Refractive index of a glass body with a motion, where its own frame begins."""

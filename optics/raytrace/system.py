@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -132,12 +132,8 @@ def media_along(chain: Sequence[Element]) -> list[Medium]:
     return out
 
 
-def structure_of(
-    elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool], reshaped: set[str]
-) -> Structure:
+def structure_of(elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool]) -> Structure:
     """Common structure of the i-th elements of all chains."""
-    if reshaped.isdisjoint(e.body for e in elements):
-        states = ()  # no figure comes from them
     grid = any(_has_grid(e, states) for e in elements)
     apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
     kinds = {(e.interaction, e.surface.is_plane, own) for e, own in zip(elements, apertures, strict=True)}
@@ -210,18 +206,18 @@ def frames_of(placed: PlacedBodies, chains: Sequence[Sequence[Element]]) -> list
 
 def own_numbers_of(
     assembly: Assembly,
-    chain: Sequence[Element],
-    i: int,
-    media: Sequence[Medium],
+    element: Element,
+    media: tuple[Medium, Medium],
     structure: Structure,
     states: Sequence[State],
     placed: PlacedBodies,
     step: Sequence[tuple[str, str, int]] | None,
 ) -> OwnNumbers:
-    """Shape, aperture and indices of element i of a chain, each number (S,), complex when a derivative is carried."""
-    element = chain[i]
+    """Shape, aperture and indices of an element between two media, each number (S,), complex when a derivative is
+    carried.
+    """
     scale = placed.scale[:, placed.index[element.body]]
-    sides = zip(media[i : i + 2], structure.graded, strict=True)
+    sides = zip(media, structure.graded, strict=True)
     outer, inner = (_index_numbers(assembly, element, medium, graded, states, placed) for medium, graded in sides)
     return OwnNumbers(
         _surface_numbers(element, structure, scale, states, step),
@@ -495,34 +491,52 @@ def assemble(
     graded = {path for state in states for path, motion in state.items() if any(motion.index_gradient)}
     real = step is None and not np.iscomplexobj(placed.rotation)
     reshaped = reshaped_bodies(states, placed) if real else set(placed.index)
-    structures = []
-    for i in range(len(chains[0])):
-        before, after = (any(m[k].solid in graded for m in media) for k in (i, i + 1))
-        structures.append(structure_of([chain[i] for chain in chains], states, (before, after), reshaped))
-    known = _known_numbers(assembly)
+    known = assembly.worked_out
     names = tuple(tuple(element.name for element in chain) for chain in chains)
+
+    def structure(i: int) -> Structure:
+        """Of the i-th elements of all chains."""
+        before, after = (any(m[k].solid in graded for m in media) for k in (i, i + 1))
+        elements = [chain[i] for chain in chains]
+        if not reshaped.isdisjoint(e.body for e in elements):
+            return structure_of(elements, states, (before, after))
+        key = ("structure", i, names, before, after)
+        if key not in known:
+            known[key] = structure_of(elements, (), (before, after))
+        found: Structure = known[key]
+        return found
+
+    structures = tuple(structure(i) for i in range(len(chains[0])))
 
     def own_of(i: int) -> OwnNumbers:
         """Shapes and indices of the i-th elements of all chains, each number (C * S,)."""
         depends = {chain[i].body for chain in chains}
         depends |= {m.solid for along in media for m in along[i : i + 2] if m.solid is not None}
-        parts = zip(chains, media, strict=True)
         if not depends.isdisjoint(reshaped):
-            return _joined([own_numbers_of(assembly, c, i, m, structures[i], states, placed, step) for c, m in parts])
+            return joined(i, states, placed, step)
         # as designed: each system's number for all its states
         key = (i, names, structures[i])
         if key not in known:
-            nominal = assembly.place()
-            designed = [own_numbers_of(assembly, c, i, m, structures[i], ({},), nominal, None) for c, m in parts]
-            known[key] = _joined(designed)
+            known[key] = joined(i, ({},), assembly.place(), None)
         one: OwnNumbers = known[key]
         return one if len(states) == 1 else map_leaves(lambda value: np.repeat(value, len(states)), one)
 
+    def joined(i: int, states: Sequence[State], placed: PlacedBodies, step: Any) -> OwnNumbers:
+        """The same worked out; once for an element that several chains share."""
+        found: dict[tuple[str, Medium, Medium], OwnNumbers] = {}
+        keys = [(chain[i].name, *along[i : i + 2]) for chain, along in zip(chains, media, strict=True)]
+        for key in keys:
+            if key not in found:
+                found[key] = own_numbers_of(
+                    assembly, assembly.elements[key[0]], key[1:], structures[i], states, placed, step
+                )
+        return _joined([found[key] for key in keys])
+
     values = []
     tables: list[np.ndarray | None] = []
-    for i, (structure, frame) in enumerate(zip(structures, frames_of(placed, chains), strict=True)):
+    for i, frame in enumerate(frames_of(placed, chains)):
         own, spline = own_of(i), None
-        if structure.grid:
+        if structures[i].grid:
             grid, spline = grid_numbers([chain[i] for chain in chains], states)
             own = replace(own, surface=replace(own.surface, grid=grid))
         tables.append(spline)
@@ -530,11 +544,11 @@ def assemble(
     bodies = [[placed.index[element.body] for element in chain] for chain in chains]
     world = Poses(*(np.concatenate([a[:, own] for own in bodies]) for a in (placed.rotation, placed.translation)))
     size = np.concatenate([placed.size(chain[-1].body) for chain in chains])
-    form = known.get(tuple(structures))
+    form = known.get(structures)
     if form is None:
-        form = known[tuple(structures)] = form_of((tuple(values), world.last()))
+        form = known[structures] = form_of((tuple(values), world.last()))
     return SystemBatch(
-        tuple(structures),
+        structures,
         tuple(values) if real else tuple(map_leaves(_real, value) for value in values),
         world if real else map_leaves(_real, world),
         tuple(map_leaves(_tangent, value) for value in values) if step is not None else None,
@@ -545,14 +559,6 @@ def assemble(
         len(states),
         form,
     )
-
-
-@lru_cache(maxsize=16)
-def _known_numbers(assembly: Assembly) -> dict[Any, Any]:
-    """What ``assemble`` has worked out of the elements of an assembly as designed, and the forms of numbers by their
-    structures; kept for those used last.
-    """
-    return {}
 
 
 def _joined(parts: Sequence[Numbers]) -> Numbers:

@@ -144,6 +144,9 @@ SECTION = 6
 """Elements that one kernel traces, and differentiates: the time to compile it grows faster than its length, and
 sequences that begin alike share the kernels of their beginning. Between them rays pass through memory."""
 
+MOST_RECORDINGS = 16
+"""Of one trace in one thread: it is recorded anew where a bundle has other numbers in common, such as a direction."""
+
 CONVERGED = 1e-12
 """Largest distance to the surface of a valid hit, metres."""
 
@@ -362,7 +365,7 @@ def _frozen(way: _Way, form: Any) -> Any:
         recorded = partial(way.through, form)
 
         # what a frozen function closes over is compared at each call; a default is not
-        @dr.freeze
+        @dr.freeze(limit=MOST_RECORDINGS, warn_after=10 * MOST_RECORDINGS)
         def through(numbers: Any, rays: Any, shared: Any, run: Any = recorded) -> Any:
             return run(numbers, rays, shared)
 
