@@ -524,11 +524,12 @@ def assemble(
     def joined(i: int, states: Sequence[State], placed: PlacedBodies, step: Any) -> OwnNumbers:
         """The same worked out; once for an element that several chains share."""
         found: dict[tuple[str, Medium, Medium], OwnNumbers] = {}
-        keys = [(chain[i].name, *along[i : i + 2]) for chain, along in zip(chains, media, strict=True)]
+        keys = [(chain[i].name, along[i], along[i + 1]) for chain, along in zip(chains, media, strict=True)]
         for key in keys:
             if key not in found:
+                name, before, after = key
                 found[key] = own_numbers_of(
-                    assembly, assembly.elements[key[0]], key[1:], structures[i], states, placed, step
+                    assembly, assembly.elements[name], (before, after), structures[i], states, placed, step
                 )
         return _joined([found[key] for key in keys])
 

@@ -272,7 +272,7 @@ def trace(
         (uploaded.numbers, uploaded.grids, stride), (rays.position, rays.direction, rays.path, rays.valid), shared
     )
     local = Rays(p, d, path, valid, uploaded.count)
-    seen = Rays(*outside, path, valid, uploaded.count) if world else None
+    seen = Rays(outside[0], outside[1], path, valid, uploaded.count) if world else None
     return Traced(local, seen, dict(zip(how.keep, hits, strict=True)), uploaded.count)
 
 

@@ -1,11 +1,14 @@
 """Many states in one launch, and one compilation for all numbers."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import drjit as dr
 import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
+from optics.raytrace import trace as trace_module
 from optics.raytrace.aim import AimError, RayFan, aim, transverse_axes
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
@@ -60,6 +63,45 @@ def test_each_system_may_have_its_own_rays(backend, gf7) -> None:
         trace(backend, systems, make_rays(backend, np.tile(position, (2, 1, 1)), direction))
     for a, b in zip(shared, own, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("order", [(60, 200), (200, 60)], ids=["first fewer rays", "first more rays"])
+def test_what_is_recorded_of_a_trace_holds_for_any_number_of_rays_and_systems(backend, gf7, order) -> None:
+    """Of each pair the second is launched as the first one was recorded; both are what a new graph gives."""
+    trace_module._threads.__dict__.pop("known", None)
+    for count, rays in zip((3, 7), order, strict=True):
+        systems = assemble(gf7.bare_assembly(), ["imaging"], some_states(count, count, ("M1", "M2", "M3", "image")))
+        position, direction = launch(gf7, rays)
+        for start in (position, np.tile(position, (count, 1, 1)) + 1e-3 * np.arange(count)[:, None, None]):
+            bundle = make_rays(backend, start, direction)
+            recorded = trace(backend, systems, bundle, keep=(2, 1), world=True)
+            fresh = trace(backend, systems, bundle, keep=(2, 1), world=True, evaluate=False)
+            assert recorded.world is not None
+            assert fresh.world is not None
+            pairs = [
+                *zip(recorded.numpy(), fresh.numpy(), strict=True),
+                *zip(recorded.numpy(recorded.world), fresh.numpy(fresh.world), strict=True),
+                *((recorded.hit(k), fresh.hit(k)) for k in (1, 2)),
+            ]
+            assert pairs[0][0].shape == (count, rays, 3)
+            for one, other in pairs:
+                # the same operations; a kernel of more of them may contract other products into fma
+                np.testing.assert_allclose(one, other, rtol=0, atol=1e-14)
+
+
+def test_threads_have_recordings_of_their_own(backend, gf7) -> None:
+    systems = assemble(gf7.bare_assembly(), ["imaging"], some_states(3, 1, ("M2",)))
+    bundles = [launch(gf7, n) for n in (50, 60, 70, 80)]
+
+    def positions(bundle) -> list[np.ndarray]:
+        return [trace(backend, systems, make_rays(backend, *bundle)).numpy()[0] for _ in range(20)]
+
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(positions, bundles))
+    for bundle, several in zip(bundles, together, strict=True):
+        alone = trace(backend, systems, make_rays(backend, *bundle)).numpy()[0]
+        for one in several:
+            np.testing.assert_array_equal(one, alone)
 
 
 def test_part_of_a_batch(backend, gf7) -> None:
