@@ -207,6 +207,7 @@ class PathTracer:
         scenery: the surfaces.
         nominal: detector -> codes of the events of its nominal family.
         sampling: how paths are drawn.
+        ways: paths take clear ways; without, every flight is a search. The paths are the same.
     """
 
     def __init__(
@@ -215,6 +216,7 @@ class PathTracer:
         scenery: Scenery,
         nominal: Mapping[str, tuple[int, ...]] | None = None,
         sampling: Sampling = BALANCED,
+        ways: bool = True,
     ) -> None:
         self.backend = backend
         self.scenery = scenery
@@ -223,7 +225,7 @@ class PathTracer:
         self.integrator = make_integrator(backend, sampling)
         mi = load_mitsuba(backend)
         signatures = {name: signature(codes) for name, codes in self.nominal.items()}
-        self._clear = ClearWays(scenery, self.nominal)
+        self._clear = ClearWays(scenery, self.nominal if ways else {})
         tables = upload(backend, scenery, signatures, self._clear.ways)
         self.prepared = PreparedScene(backend, mi, build_scene(mi, scenery), tables)
         self._signatures = [signatures.get(d.name, 0) for d in scenery.detectors]
