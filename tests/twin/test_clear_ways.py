@@ -9,10 +9,10 @@ import pytest
 
 from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.materials.finish import BLACK, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from optics.geometry.surface import plane
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.models.scenery_parts import Finishes, mirror_surface
 from scenes.specs.baffle import Plate
@@ -88,14 +88,19 @@ def test_a_baffle_in_the_way_closes_it(backend, gf7_pair) -> None:
     pairs = [[{way.start, way.end.surface} for way in ClearWays(s, families).ways] for s in (bare, scenery)]
     assert [numbers in found for found in pairs] == [True, False]
     source = pinhole(gf7_pair, backend, {}, gf7_pair.channels[0])
-    runs = [PathTracer(backend, scenery, families, ways=ways).run(source, PATHS, 1, keep=True) for ways in (True, False)]
+    runs = [
+        PathTracer(backend, scenery, families, ways=ways).run(source, PATHS, 1, keep=True) for ways in (True, False)
+    ]
     assert runs[0].balance.absorbed["rod"] > 1e-3
     same(*runs)
 
 
 def two_mirrors(*more: tuple[float, float]) -> Scenery:
     """A mirror at z = 0 of 10 mm radius, a screen of 20 mm at z = 0.2, and small mirrors of 1 mm at given x and z."""
-    bodies, elements = [Body("mirror")], {"mirror": Element("mirror", "mirror", plane(), Interaction.REFLECT, Circle(0.01))}
+    bodies, elements = (
+        [Body("mirror")],
+        {"mirror": Element("mirror", "mirror", plane(), Interaction.REFLECT, Circle(0.01))},
+    )
     for number, (x, z) in enumerate(more):
         name = f"more{number}"
         bodies.append(Body(name, Pose(rotation_matrix(np.array([0.3, 0.0, 0.0])), np.array([x, 0.0, z]))))

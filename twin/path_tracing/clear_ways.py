@@ -51,7 +51,14 @@ class Patch:
     solid: str | None
 
     @classmethod
-    def flat(cls, surface: int, aperture: int, pose: Pose, bounds: tuple[float, float, float, float], solid: str | None = None) -> Patch:
+    def flat(
+        cls,
+        surface: int,
+        aperture: int,
+        pose: Pose,
+        bounds: tuple[float, float, float, float],
+        solid: str | None = None,
+    ) -> Patch:
         """An aperture in the plane z = 0 of a frame; bounds: x_min, x_max, y_min, y_max there."""
         x0, x1, y0, y1 = bounds
         room = LEAST_CLEARANCE
@@ -222,7 +229,9 @@ def _patch(number: int, index: int, surface: SceneSurface, aperture: Aperture) -
     low, high = place.min(axis=0) - surface.clearance, place.max(axis=0) + surface.clearance
     corners = np.array([[a, b, c] for a in (low[0], high[0]) for b in (low[1], high[1]) for c in (low[2], high[2])])
     world = pose.apply(middle + corners @ frame)
-    return Patch(number, index, pose.apply(middle), pose.rotation @ normal, world, normals @ pose.rotation.T, surface.solid)
+    return Patch(
+        number, index, pose.apply(middle), pose.rotation @ normal, world, normals @ pose.rotation.T, surface.solid
+    )
 
 
 class _Obstacles:

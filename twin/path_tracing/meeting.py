@@ -206,6 +206,8 @@ def locate(
                 s = newton_step(local, toward, s, shape, tables.samples, curved)
             u, v, z = along(local, toward, s)
             value, nx, ny, nz = level(u, v, z, shape, tables.samples, curved)
+            # the conic's other sheet is no surface
+            value = dr.select(nz > 0.0, value, dr.inf)
             unit = dr.rsqrt(dr.fma(nx, nx, dr.fma(ny, ny, nz * nz)))
             nx, ny, nz = nx * unit, ny * unit, nz * unit
             c = dr.fma(nx, toward.x, dr.fma(ny, toward.y, nz * toward.z))

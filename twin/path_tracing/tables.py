@@ -189,8 +189,8 @@ BLOCK = 4
 BLOCKS = 8
 ROW = BLOCK * BLOCKS
 """Numbers of a geometry row: 0-8 rotation world to local, 9-11 its shift, 12 clearance, 13 refractive index behind, 14
-number of the part plus one, 15 reciprocal of the index, 16-25 two clear apertures, 26 bits of the kind, 28-31 rows of the
-first way from each of the surface's places, 0 for none."""
+number of the part plus one, 15 reciprocal of the index, 16-25 two clear apertures, 26 bits of the kind, 28-31 rows of
+the first way from each of the surface's places, 0 for none."""
 
 CLEARANCE, INDEX, PART, INVERSE, APERTURES, KIND, WAYS = 12, 13, 14, 15, 16, 26, 28
 
@@ -276,7 +276,7 @@ class SceneTables:
         detectors: (detectors * 8) pixels per metre in x and y, columns, rows, first pixel.
         nominal: (detectors,) signature of the nominal family.
         pixels: of all detectors together.
-        ways: (ways * WAY) see ``way_table``.
+        ways: ((2 + ways) * WAY) see ``way_table``.
         measured: tables of measured finishes, None where there are none.
     """
 
@@ -349,9 +349,7 @@ class SceneTables:
         return out
 
 
-def upload(
-    backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways: Sequence[Way] = ()
-) -> SceneTables:
+def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways: Sequence[Way] = ()) -> SceneTables:
     """Tables of a scene.
 
     Args:
