@@ -225,5 +225,5 @@ def locate(
             mode="symbolic",
         )
     first, size = layout.APERTURES, layout.APERTURE
-    within = [layout.within(x, y, g[k : k + size]) for k in (first, first + size)]
-    return Place(t, x, y, normal, cosine, *within, dr.abs(rest) < EXACT, kind, g)
+    within, again = (layout.within(x, y, g[k : k + size]) for k in (first, first + size))
+    return Place(t, x, y, normal, cosine, within, again, dr.abs(rest) < EXACT, kind, g)
