@@ -15,6 +15,7 @@ from typing import Any
 
 from optics.materials import finish
 from optics.numerics.backend import Backend
+from twin.path_tracing import clear_ways
 from twin.path_tracing import tables as layout
 from twin.path_tracing.families import BITS, FACTOR, OUTSIDE, START, Event
 from twin.path_tracing.meeting import Flight, Place, locate, next_surface
@@ -35,6 +36,7 @@ class Features:
 
     Attributes:
         form: what the surfaces' shapes consist of.
+        ways: there are clear ways.
         glass: there are glass bodies.
         branching: some finish does more than one thing with light that goes on.
         bare: some glass is bare.
@@ -48,6 +50,7 @@ class Features:
     form: layout.SurfaceForm
     glass: bool
     branching: bool
+    ways: bool = False
     bare: bool = False
     measured: bool = False
     roulette: bool = False
@@ -80,8 +83,8 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Launch:
-    """Paths at their start: ``Vector3`` position and direction, weight, number of the path, random generator.
-    Neighbours start alike.
+    """Paths at their start: ``Vector3`` position and direction, weight, number of the path, random generator, and the
+    number of the way that they are on. Neighbours start alike.
     """
 
     position: Any
@@ -89,6 +92,7 @@ class Launch:
     weight: Any
     path: Any
     rng: Any
+    way: Any = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,16 +121,17 @@ def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: 
         dr.zeros(backend.Float, n),  # optical path
         dr.zeros(backend.UInt, n),  # glass body that the path is in, 0 for none
         dr.zeros(backend.Float, n),  # how far ahead the search for the next surface starts
+        dr.zeros(backend.UInt, n) + launch.way,
         dr.full(dr.uint64_array_t(backend.Float), START, n),
         dr.zeros(backend.UInt, n),  # what has happened to it, in bits
         dr.zeros(backend.UInt, n),  # steps
         dr.full(backend.Bool, True, n),
         launch.rng,
     )
-    labels = "position direction weight length body ahead signature history steps active rng".split()
+    labels = "position direction weight length body ahead way signature history steps active rng".split()
     body = _step(prepared, features, limits, launch.path, sinks)
-    out = dr.while_loop(state, lambda *s: s[9], body, labels=labels, label="paths", mode="symbolic")
-    escaped = out[7] & GONE != 0
+    out = dr.while_loop(state, lambda *s: s[10], body, labels=labels, label="paths", mode="symbolic")
+    escaped = out[8] & GONE != 0
     dr.scatter_add(sinks.left, out[2], backend.UInt(0), escaped)
     dr.scatter_add(sinks.left, out[2], backend.UInt(1), ~escaped & (out[2] > 0.0))
 
@@ -143,13 +148,14 @@ def _step(
     glass = features.glass
 
     def body(*state: Any) -> tuple[Any, ...]:
-        p, d, weight, length, medium, ahead, signature, history, steps, active, rng = state
+        p, d, weight, length, medium, ahead, way, signature, history, steps, active, rng = state
         inside = active & (medium != 0) if glass else active & False
-        flight = Flight(p, d, medium if glass else None, ahead, active, history == 0)
-        near, surface, hit = next_surface(backend, prepared.mi, prepared.scene, tables, flight)
-        history = dr.select(active & ~hit, history | GONE, history)
-        active = hit
-        place = locate(backend, tables, features.form, replace(flight, active=active), near, surface)
+        flight = Flight(p, d, medium if glass else None, ahead, active, history == 0, way, features.ways)
+        found = next_surface(backend, prepared.mi, prepared.scene, tables, flight)
+        surface = found.surface
+        history = dr.select(active & ~found.hit, history | GONE, history)
+        active = found.hit
+        place = locate(backend, tables, features.form, replace(flight, active=active), found.near, surface)
         front = place.cosine < 0.0
         clear, kind = place.clear, place.kind
         # what is there only by rounding and faceting
@@ -159,8 +165,15 @@ def _step(
             skip |= (again | (~front & (kind & layout.Kind.SOLID != 0))) & ~inside
         else:
             skip |= again
+        passed = found.near + STEP_BACK
+        wrong: Any = None
+        if features.ways:
+            arrives = place.exact & (place.distance > 0.0) & dr.select(found.way[1] & 2 == 0, place.first, place.second)
+            wrong = found.tried & (skip | ~arrives)
+            skip |= wrong
+            passed = dr.select(wrong, ahead, passed)
         met = active & ~skip
-        ahead = dr.select(met, place.row[layout.CLEARANCE], near + STEP_BACK)
+        ahead = dr.select(met, place.row[layout.CLEARANCE], passed)
         flown = dr.select(met, place.distance, 0.0)
         before = dr.select(inside, place.row[layout.INDEX], 1.0) if glass else Float(1.0)
         p = dr.fma(d, flown, p)
@@ -186,7 +199,7 @@ def _step(
             shares = (shared.reflected, shared.transmitted, shared.diffused)
             chances = [dr.select(s > 0.0, dr.maximum(s * whole, floor), 0.0) for s in shares]
             every = chances[0] + chances[1] + chances[2]
-            u = rng.next_float64() * every
+            u = rng.next_float64(met) * every
             reflecting = u < chances[0]
             through = ~reflecting & (u < chances[0] + chances[1])
             diffusing = ~reflecting & ~through & (chances[2] > 0.0)
@@ -220,20 +233,27 @@ def _step(
             history = dr.select(met, dr.select(spreading, STRAY + 2 * UNLIKELY, history + more), history)
         else:
             onward = weight * going_on
+        if features.ways:
+            behind = dr.dot(turned, place.normal) < 0.0
+            a, b, c, e = place.row[layout.WAYS : layout.WAYS + clear_ways.PLACES]
+            way = UInt(dr.select(place.first, dr.select(behind, b, a), dr.select(behind, e, c)))
+            goes_on = found.tried & (behind == (found.way[1] & 1 != 0))
+            way = dr.select(met & clear, dr.select(goes_on, found.way[0], way), 0)
         d = dr.select(met, turned, d)
         weight = dr.select(met, onward, weight)
         code = UInt(place.row[layout.PART]) << BITS | (event + dr.select(clear, UInt(0), OUTSIDE))
         signature = dr.select(met, (signature ^ UInt64(code)) * UInt64(FACTOR), signature)
         if features.log:
             dr.scatter(sinks.log, dr.select(met, code, 0), path * limits.steps + steps, active)
-        steps = steps + 1
+        # a path that has met nothing yet where it was thought to tries again
+        steps = steps + (dr.select(wrong, UInt(0), 1) if features.ways else 1)
         active &= (weight > 0.0) & (steps < limits.steps)
         if features.roulette:
             weak = active & met & (weight < limits.weak)
-            survives = rng.next_float64() * limits.weak < weight
+            survives = rng.next_float64(weak) * limits.weak < weight
             weight = dr.select(weak, dr.select(survives, limits.weak, 0.0), weight)
             active &= ~weak | survives
-        return p, d, weight, length, medium, ahead, signature, history, steps, active, rng
+        return p, d, weight, length, medium, ahead, way, signature, history, steps, active, rng
 
     return body
 

@@ -16,10 +16,14 @@ from typing import Any
 from optics.geometry.surface import along, level, newton_step
 from optics.numerics.backend import Backend
 from twin.path_tracing import tables as layout
+from twin.path_tracing.clear_ways import PLACES
 
 REFINEMENTS = 3
 """Newton steps from the triangle to the surface: from below a millimetre to 1e-7 and 1e-13 m and to rounding, also at
 grazing incidence."""
+
+EXACT = 1e-12
+"""Largest value of the level function, metres, at which a surface is met: some hundred roundings of ten metres."""
 
 AHEAD = 1e-12
 """Smallest cosine with its normal at which a face of a glass body is met."""
@@ -38,26 +42,72 @@ class Flight:
     ahead: Any
     active: Any
     together: Any
+    way: Any
+    ways: bool
 
 
-def next_surface(
-    backend: Backend, mi: Any, scene: Any, tables: layout.SceneTables, flight: Flight
-) -> tuple[Any, Any, Any]:
-    """About how far it is to the next surface, its number, and which paths meet one."""
+@dataclass(frozen=True, eq=False)
+class Next:
+    """The surfaces that paths meet next: Dr.Jit arrays.
+
+    Attributes:
+        near: about how far it is; surface: its number.
+        hit: which paths meet one.
+        tried: which paths are only thought to meet it, by the way that they take; way: the way after it and where it
+            ends, see ``tables.way_table``.
+    """
+
+    near: Any
+    surface: Any
+    hit: Any
+    tried: Any
+    way: list[Any]
+
+
+def next_surface(backend: Backend, mi: Any, scene: Any, tables: layout.SceneTables, flight: Flight) -> Next:
+    """What paths meet next: the end of a clear way, or what a search finds."""
     import drjit as dr
 
     p, d, active = flight.position, flight.direction, flight.active
-    inside = None if flight.body is None else active & (flight.body != 0)
-    outside = active if inside is None else active & ~inside
-    ray = mi.Ray3f(mi.Point3f(dr.fma(d, flight.ahead, p)), mi.Vector3f(d))
-    found = scene.ray_intersect_preliminary(ray, coherent=flight.together | ~outside, active=outside)
-    hit = found.is_valid() & outside
-    surface = dr.select(hit, backend.UInt(found.shape_index), 0)
-    near = backend.Float(found.t) + flight.ahead
+    tried: Any = active & False
+    way: list[Any] = []
+    near, surface = 0.0 * p.x, 0 * flight.way
+    if flight.ways:
+        near, tried, way = _end(backend, tables, flight)
+        surface = dr.select(tried, way[1] // PLACES, 0)
+    search = active & ~tried
+    inside = None if flight.body is None else search & (flight.body != 0)
+    outside = search if inside is None else search & ~inside
+
+    def look(near: Any, surface: Any, hit: Any) -> tuple[Any, Any, Any]:
+        ray = mi.Ray3f(mi.Point3f(dr.fma(d, flight.ahead, p)), mi.Vector3f(d))
+        found = scene.ray_intersect_preliminary(ray, coherent=flight.together | ~outside, active=outside)
+        hits = found.is_valid() & outside
+        surface = dr.select(hits, backend.UInt(found.shape_index), surface)
+        return dr.select(outside, backend.Float(found.t) + flight.ahead, near), surface, hit | hits
+
+    near, surface, hit = dr.if_stmt(
+        (near, surface, tried), outside, look, lambda *same: same, label="search", mode="symbolic"
+    )
     if inside is not None:
         t, face = _nearest_face(backend, tables, p, d, flight.body, inside)
         near, surface, hit = dr.select(inside, t, near), dr.select(inside, face, surface), hit | inside
-    return near, surface, hit
+    return Next(near, surface, hit, tried, way)
+
+
+def _end(backend: Backend, tables: layout.SceneTables, flight: Flight) -> tuple[Any, Any, list[Any]]:
+    """About how far it is to the ends of the ways that paths are on, which paths can meet them, and the ways."""
+    import drjit as dr
+
+    p, d = flight.position, flight.direction
+    on_one = flight.active & (flight.way != 0)
+    x, y, z, after, *normal, code = tables.way(flight.way, on_one)
+    v, n = backend.Vector3(x, y, z) - p, backend.Vector3(*normal)
+    along = dr.dot(v, d)
+    aside = dr.fma(-along, along, dr.dot(v, v))
+    # the normal is as long as the reciprocal of the radius
+    possible = on_one & (along > 0.0) & (aside * dr.dot(n, n) < 1.0)
+    return dr.dot(v, n) / dr.dot(d, n), possible, [backend.UInt(after), backend.UInt(code)]
 
 
 def _nearest_face(
@@ -96,7 +146,8 @@ class Place:
         x, y: in the surface's frame.
         normal: unit vector in the world, toward +z of the surface.
         cosine: of the path's direction with it.
-        clear: whether inside the clear apertures.
+        first, second: whether inside the first and the second clear aperture.
+        exact: whether the surface is there, to rounding.
         kind: bits of the surface.
         row: numbers of its geometry.
     """
@@ -106,9 +157,16 @@ class Place:
     y: Any
     normal: Any
     cosine: Any
-    clear: Any
+    first: Any
+    second: Any
+    exact: Any
     kind: Any
     row: list[Any]
+
+    @property
+    def clear(self) -> Any:
+        """Whether inside the clear apertures."""
+        return self.first | self.second
 
 
 def locate(
@@ -129,7 +187,7 @@ def locate(
     Vector3 = backend.Vector3
     p, d, active = flight.position, flight.direction, flight.active
     g = tables.geometry(surface, active)
-    kind = dr.gather(backend.UInt, tables.kind, surface, active)
+    kind = backend.UInt(g[layout.KIND])
     local = Vector3(
         *(dr.fma(g[3 * a], p.x, dr.fma(g[3 * a + 1], p.y, dr.fma(g[3 * a + 2], p.z, g[9 + a]))) for a in range(3))
     )
@@ -137,33 +195,35 @@ def locate(
     t = -local.z / toward.z
     x, y = dr.fma(t, toward.x, local.x), dr.fma(t, toward.y, local.y)
     cosine, normal = toward.z, Vector3(g[6], g[7], g[8])
+    rest: Any = 0.0 * x
     if not form.flat:
         curved = active & (kind & layout.Kind.CURVED != 0)
 
-        def refine(t: Any, x: Any, y: Any, cosine: Any, normal: Any) -> tuple[Any, ...]:
+        def refine(t: Any, x: Any, y: Any, cosine: Any, normal: Any, rest: Any) -> tuple[Any, ...]:
             shape = tables.surface(surface, form, curved)
             s = near
             for _ in range(REFINEMENTS):
                 s = newton_step(local, toward, s, shape, tables.samples, curved)
             u, v, z = along(local, toward, s)
-            _, nx, ny, nz = level(u, v, z, shape, tables.samples, curved)
+            value, nx, ny, nz = level(u, v, z, shape, tables.samples, curved)
+            # the conic's other sheet is no surface
+            value = dr.select(nz > 0.0, value, dr.inf)
             unit = dr.rsqrt(dr.fma(nx, nx, dr.fma(ny, ny, nz * nz)))
             nx, ny, nz = nx * unit, ny * unit, nz * unit
             c = dr.fma(nx, toward.x, dr.fma(ny, toward.y, nz * toward.z))
             n = Vector3(*(dr.fma(g[a], nx, dr.fma(g[3 + a], ny, g[6 + a] * nz)) for a in range(3)))
-            new, old = (s, u, v, c, n), (t, x, y, cosine, normal)
+            new, old = (s, u, v, c, n, value), (t, x, y, cosine, normal, rest)
             return tuple(dr.select(curved, a, b) for a, b in zip(new, old, strict=True))
 
-        t, x, y, cosine, normal = dr.if_stmt(
-            (t, x, y, cosine, normal),
+        t, x, y, cosine, normal, rest = dr.if_stmt(
+            (t, x, y, cosine, normal, rest),
             curved,
             refine,
             lambda *same: same,
-            arg_labels=("distance", "x", "y", "cosine", "normal"),
+            arg_labels=("distance", "x", "y", "cosine", "normal", "rest"),
             label="curved",
             mode="symbolic",
         )
     first, size = layout.APERTURES, layout.APERTURE
-    clear = layout.within(x, y, g[first : first + size])
-    clear |= layout.within(x, y, g[first + size : first + 2 * size])
-    return Place(t, x, y, normal, cosine, clear, kind, g)
+    within, again = (layout.within(x, y, g[k : k + size]) for k in (first, first + size))
+    return Place(t, x, y, normal, cosine, within, again, dr.abs(rest) < EXACT, kind, g)

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from optics.geometry.pose import Pose
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import transverse_axes
+from twin.path_tracing.clear_ways import Patch
 from twin.path_tracing.kernel import Launch
 
 
@@ -71,6 +73,13 @@ class DiskSource:
         middle = 0.5 * (place.min(axis=0) + place.max(axis=0))
         reach = room * float(np.max(np.linalg.norm(place - middle, axis=-1)))
         return replace(self, narrow=(float(middle[0]), float(middle[1]), reach), share=share)
+
+    @property
+    def patch(self) -> Patch:
+        """Where its light starts."""
+        pose = Pose(np.column_stack([*self.across, self.axis]), self.centre)
+        r = self.radius
+        return Patch.flat(-1, 0, pose, (-r, r, -r, r))
 
     @property
     def numbers(self) -> np.ndarray:

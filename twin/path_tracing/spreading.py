@@ -94,7 +94,7 @@ def spread(
     import drjit as dr
 
     chance = dr.select(share > 0.0, dr.maximum(share, floor), 0.0)
-    scattering = met & ~leaving.diffusing & (rng.next_float64() < chance)
+    scattering = met & ~leaving.diffusing & (rng.next_float64(met) < chance)
     plain = met & ~leaving.diffusing & ~scattering
     weight = dr.select(scattering, leaving.weight * share / chance, leaving.weight)
     # no path stays plain where all is scattered

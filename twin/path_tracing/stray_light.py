@@ -185,7 +185,7 @@ def trace_stray(
             if progress is not None:
                 progress(before * paths + done, len(chosen) * paths)
 
-        run = tracer.run(source, paths, own, chunk=chunk, progress=tell)
+        run = tracer.run(source, paths, own, chunk=chunk, progress=tell, toward=f"{channel.key}/area_ccd")
         found = run.of(f"{channel.key}/area_ccd", "nominal")
         if not found:
             raise NominalPathLost(

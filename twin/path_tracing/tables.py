@@ -20,6 +20,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
 from scenes.models.scenery import Scenery
 from scenes.models.scenery_parts import SceneSurface
+from twin.path_tracing.clear_ways import PLACES, Way
 
 _HEADER = 8
 """Numbers of a scatter table: rings, sectors, first share, first of the rings' sums, first of the sectors' sums, first
@@ -185,12 +186,13 @@ def _header(drawn: DrawnScatter, first: int) -> list[float]:
 
 
 BLOCK = 4
-BLOCKS = 7
+BLOCKS = 8
 ROW = BLOCK * BLOCKS
 """Numbers of a geometry row: 0-8 rotation world to local, 9-11 its shift, 12 clearance, 13 refractive index behind, 14
-number of the part plus one, 15 reciprocal of the index, 16-25 two clear apertures."""
+number of the part plus one, 15 reciprocal of the index, 16-25 two clear apertures, 26 bits of the kind, 28-31 rows of
+the first way from each of the surface's places, 0 for none."""
 
-CLEARANCE, INDEX, PART, INVERSE, APERTURES = 12, 13, 14, 15, 16
+CLEARANCE, INDEX, PART, INVERSE, APERTURES, KIND, WAYS = 12, 13, 14, 15, 16, 26, 28
 
 CURVES = 2
 """Blocks of a curved surface: curvature, conic, A4, A6, A8."""
@@ -208,6 +210,9 @@ FINISH_ROW = 8
 kind of the lobe, and its area."""
 ROWS_PER_SURFACE = 3
 """Finishes of a surface: met from +z, met from -z, outside its clear apertures."""
+
+WAY = 8
+"""Numbers of a way."""
 
 MOST_EVEN = 3
 MOST_BODIES = 255
@@ -266,11 +271,12 @@ class SceneTables:
         terms: (surfaces * 4 * blocks) numbers of all kinds of further terms; width 1 when there are none.
         figures: (surfaces * 4 * blocks) centre and coefficients of polynomial figures; width 1 when there are none.
         grids, samples: (surfaces * GRID_ROW) numbers of grid figures and the coefficients of all; likewise.
-        kind: (surfaces,) bits; planes: (surfaces * 4) world normal and offset of flat faces.
+        planes: (surfaces * 4) world normal and offset of flat faces.
         body_first, body_faces: (bodies + 1,) first surface and number of faces of each glass body.
         detectors: (detectors * 8) pixels per metre in x and y, columns, rows, first pixel.
         nominal: (detectors,) signature of the nominal family.
         pixels: of all detectors together.
+        ways: ((2 + ways) * WAY) see ``way_table``.
         measured: tables of measured finishes, None where there are none.
     """
 
@@ -281,13 +287,13 @@ class SceneTables:
     grids: Any
     samples: Any
     finishes: Any
-    kind: Any
     planes: Any
     body_first: Any
     body_faces: Any
     detectors: Any
     nominal: Any
     pixels: Any
+    ways: Any
     block: Any
     measured: FinishTables | None = None
 
@@ -330,6 +336,10 @@ class SceneTables:
         """World normal (3) and offset of a flat face."""
         return self._row(self.planes, surface, 1, active)
 
+    def way(self, number: Any, active: Any) -> list[Any]:
+        """Where a way ends."""
+        return self._row(self.ways, number, WAY // BLOCK, active)
+
     def _row(self, source: Any, index: Any, blocks: int, active: Any) -> list[Any]:
         import drjit as dr
 
@@ -339,13 +349,14 @@ class SceneTables:
         return out
 
 
-def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> SceneTables:
+def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways: Sequence[Way] = ()) -> SceneTables:
     """Tables of a scene.
 
     Args:
         backend: where to.
         scenery: the surfaces.
         nominal: detector name -> signature of its nominal family.
+        ways: that light can take without a search.
 
     Raises:
         ValueError: too many bodies, detectors or aspheric terms.
@@ -368,7 +379,6 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> Sc
     parts = scenery.parts
     for i, s in enumerate(surfaces):
         rows[i] = _geometry(s)
-        rows[i, PART] = parts.index(s.part) + 1
         normal = s.pose.rotation[:, 2]
         planes[i] = [*normal, normal @ s.pose.translation]
         curves[i] = _curves(s)
@@ -379,6 +389,9 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> Sc
         if s.detector is not None:
             kind[i] |= numbers[s.detector] << Kind.DETECTOR_SHIFT
         finishes[i] = [_finish(finish) for finish in (s.front, s.back, s.outside)]
+        rows[i, PART], rows[i, KIND] = parts.index(s.part) + 1, kind[i]
+    for number, way in reversed(list(enumerate(ways))):
+        rows[way.start, WAYS + way.place] = number + 2
     first, count = np.zeros(len(bodies) + 1, np.uint32), np.zeros(len(bodies) + 1, np.uint32)
     for b, body in enumerate(bodies):
         own = [i for i, s in enumerate(surfaces) if s.solid == body]
@@ -401,17 +414,31 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> Sc
         backend.opaque(placements),
         backend.opaque(samples),
         backend.opaque(finishes),
-        backend.UInt(kind),
         backend.opaque(planes),
         backend.UInt(first),
         backend.UInt(count),
         backend.opaque(grids),
         dr.uint64_array_t(backend.Float)(signatures),
         backend.UInt(place),
+        backend.opaque(way_table(ways)),
         import_module(f"drjit.{backend.name}.ad").Array4f64,
         upload_finishes(backend, surfaces),
     )
-    dr.make_opaque(out.kind, out.body_first, out.body_faces, out.nominal, out.pixels)
+    dr.make_opaque(out.body_first, out.body_faces, out.nominal, out.pixels)
+    return out
+
+
+def way_table(ways: Sequence[Way], source: Way | None = None) -> np.ndarray:
+    """Rows of ways, (2 + ways, WAY): none, that of the source, and all others.
+
+    A row is the middle of the aperture at the end and the row of the way after it; and its normal, as long as the
+    reciprocal of its radius, and a number: 4 * surface + 2 * aperture + side to which light leaves for the way after.
+    """
+    out = np.zeros((2 + len(ways), WAY))
+    for row, way in zip(out[1:], (source, *ways), strict=True):
+        if way is not None:
+            row[:4] = [*way.end.middle, way.after + 2 if way.after >= 0 else 0]
+            row[4:] = [*way.end.normal / way.end.radius, PLACES * way.end.surface + 2 * way.end.aperture + way.behind]
     return out
 
 

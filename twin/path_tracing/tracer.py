@@ -11,12 +11,13 @@ import numpy as np
 
 from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
+from twin.path_tracing.clear_ways import ClearWays
 from twin.path_tracing.families import Touch, signature, touches
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, follow
 from twin.path_tracing.path_result import Collector, Key, PathResult, event_lists
 from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
 from twin.path_tracing.source import DiskSource, Source, pieces, start
-from twin.path_tracing.tables import ROWS_PER_SURFACE, SurfaceForm, upload
+from twin.path_tracing.tables import ROWS_PER_SURFACE, SurfaceForm, upload, way_table
 
 VARIANTS = {"llvm": "llvm_ad_mono", "cuda": "cuda_ad_mono"}
 """Mitsuba's variant whose arrays are those of the backend; triangles are float32 in all of them."""
@@ -206,6 +207,7 @@ class PathTracer:
         scenery: the surfaces.
         nominal: detector -> codes of the events of its nominal family.
         sampling: how paths are drawn.
+        ways: paths take clear ways; without, every flight is a search. The paths are the same.
     """
 
     def __init__(
@@ -214,6 +216,7 @@ class PathTracer:
         scenery: Scenery,
         nominal: Mapping[str, tuple[int, ...]] | None = None,
         sampling: Sampling = BALANCED,
+        ways: bool = True,
     ) -> None:
         self.backend = backend
         self.scenery = scenery
@@ -222,7 +225,8 @@ class PathTracer:
         self.integrator = make_integrator(backend, sampling)
         mi = load_mitsuba(backend)
         signatures = {name: signature(codes) for name, codes in self.nominal.items()}
-        tables = upload(backend, scenery, signatures)
+        self._clear = ClearWays(scenery, self.nominal if ways else {})
+        tables = upload(backend, scenery, signatures, self._clear.ways)
         self.prepared = PreparedScene(backend, mi, build_scene(mi, scenery), tables)
         self._signatures = [signatures.get(d.name, 0) for d in scenery.detectors]
 
@@ -233,6 +237,7 @@ class PathTracer:
         return Features(
             form=SurfaceForm.of(surfaces),
             glass=any(s.solid is not None for s in surfaces),
+            ways=bool(self._clear.ways),
             branching=any(f.bare or f.transmission or f.diffuse or f.scatter or f.table for f in finishes),
             bare=any(f.bare for f in finishes),
             measured=any(f.coating or f.table for f in finishes),
@@ -250,6 +255,7 @@ class PathTracer:
         keep: bool = False,
         chunk: int = CHUNK,
         progress: Progress | None = None,
+        toward: str | None = None,
     ) -> PathResult:
         """Trace paths from a source.
 
@@ -260,16 +266,20 @@ class PathTracer:
             keep: keep the single detections (memory grows with the number of paths).
             chunk: paths of one launch; bounds the memory.
             progress: told after each launch.
+            toward: detector whose nominal family the source's light mostly belongs to, which saves time; by default
+                the first one.
         """
         total = self._total(source, paths)
         features = self.features(keep)
         collector = Collector(self.scenery, self._signatures, keep)
+        prepared, way = self._on_its_way(source, toward)
         room = max(LEAST_ROOM, min(chunk, total) // (1 if keep else 2))
         for first, count in pieces(total, chunk):
             while True:
                 sinks = self._sinks(room)
-                light = start(self.backend, source, np.arange(first, first + count), total, seed)
-                emitted = self.integrator.launch(self.prepared, features, light, 1.0 / total, sinks)
+                numbers = np.arange(first, first + count)
+                light = replace(start(self.backend, source, numbers, total, seed), way=way)
+                emitted = self.integrator.launch(prepared, features, light, 1.0 / total, sinks)
                 wanted = int(sinks.counter.numpy()[0])
                 if wanted <= sinks.room:
                     break
@@ -278,6 +288,14 @@ class PathTracer:
             if progress is not None:
                 progress(first + count, total)
         return collector.result(self._ways(source, collector, total, seed))
+
+    def _on_its_way(self, source: Source, toward: str | None) -> tuple[PreparedScene, Any]:
+        """The scene with the way that a source's light takes first, and its number for all paths, 0 for none."""
+        import drjit as dr
+
+        way = self._clear.from_source(source.patch, toward) if isinstance(source, DiskSource) else None
+        tables = replace(self.prepared.tables, ways=self.backend.opaque(way_table(self._clear.ways, way)))
+        return replace(self.prepared, tables=tables), dr.opaque(self.backend.UInt, 0 if way is None else 1)
 
     def _total(self, source: Source, paths: int | None) -> int:
         if isinstance(source, DiskSource):
