@@ -251,4 +251,5 @@ def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: Sy
         deep = abs(float(norm(value)) - 0.5) * 2.0
         colour = "white" if deep > _STRONG else svg.INK
         text = significant(float(value), 2, floor=SAME)
-        axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
+        # inside its panel, which is arranged without looking at it
+        axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour, in_layout=False)

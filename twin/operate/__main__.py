@@ -23,7 +23,7 @@ from twin.operate.followed import PlanFile
 from twin.operate.life_commands import judge, simulate
 from twin.operate.products_command import products
 from twin.operate.shown_commands import report, serve
-from twin.operate.terminal import Place, line, tell, told
+from twin.operate.terminal import NewPlace, Place, line, tell, told
 from twin.run import durable
 from twin.run.cli import (
     BAD_INPUT,
@@ -65,7 +65,7 @@ def main() -> None:
 
 @app.command("init")
 def init(
-    record: Place,
+    record: NewPlace,
     instrument: Annotated[str, typer.Argument(help="Name of an instrument in the library, or path of its file.")],
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Readings are simulated: their times may be still to come.")
