@@ -57,7 +57,7 @@ def motion_models(
     return out
 
 
-# What a model calls are functions of modules, not of calls: a run is sent to the process that draws it with all it holds.
+# What a model calls are functions of the module: a run is sent to the process that draws it, with all that it holds.
 
 
 def _stated_state(stated: StatedMotions, thermal: ThermalModel, row: np.ndarray) -> State:
