@@ -212,6 +212,19 @@ def test_import_twin_imports_nothing() -> None:
     assert packages(found) & (HEAVY | {"numpy", "pydantic", "rich", "ruamel", "typer"}) == set()
 
 
+@pytest.mark.second
+def test_the_main_job_imports_only_what_it_uses() -> None:
+    """The first process nothing that draws, the second one neither data frames nor a scheduler; xarray brings both."""
+    first = loaded("import twin.main_job.render_command, twin.main_job.render_cost")["modules"]
+    assert "twin.main_job.render_folder" in first
+    assert packages(first) & {*DRAWS, "dask", "distributed", "h5netcdf", "networkx", "pandas", "sqlalchemy"} == set()
+    assert "scipy.stats" not in first
+    second = loaded("from twin.main_job.render_drawings import load_drawing\nload_drawing()")["modules"]
+    assert {"h5netcdf", "matplotlib", "trimesh"} <= packages(second)
+    assert packages(second) & {"dask", "distributed", "mitsuba", "pandas", "pyarrow", "xarray"} == set()
+    assert "scipy.stats" not in second
+
+
 def test_a_kind_is_told_by_keys_that_its_model_requires() -> None:
     """`FileKind.needs` is looked at before the model is imported, so it must say no more than the model does."""
     for kind in FILE_KINDS:
