@@ -13,23 +13,23 @@ from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_js
 from twin.operate.record.place import NotARecord, RecordFailed, file_of, require_file
 from twin.run.cli import InputErrorText, explained
 
-_WHERE: dict[str, Any] = {
-    "metavar": "DIR_OR_URL",
-    "help": "Folder of the record, or address of a database: postgresql://host/name.",
-}
+Place = Annotated[
+    str,
+    typer.Argument(
+        metavar="DIR_OR_URL", help="Folder of the record, or address of a database: postgresql://host/name."
+    ),
+]
 
 
-def _there(context: typer.Context, place: str) -> str:
-    """A folder without a record is told before what reads a record is imported."""
-    if not context.resilient_parsing and (file := file_of(place)) is not None:
+def require_record(place: str) -> None:
+    """Tell that a folder holds no record, before what reads a record is imported.
+
+    Raises:
+        typer.Exit: it holds none, which has been told.
+    """
+    if (file := file_of(place)) is not None:
         with told():
             require_file(file)
-    return place
-
-
-NewPlace = Annotated[str, typer.Argument(**_WHERE)]
-Place = Annotated[str, typer.Argument(**_WHERE, callback=_there)]
-"""Where a record is that was made before."""
 
 
 @contextmanager
