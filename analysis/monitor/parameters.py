@@ -66,22 +66,32 @@ class Parameter:
         return _PER_SI[self.file_unit]
 
 
+@dataclass(frozen=True)
+class _Alone:
+    """One of the four that are estimated, by itself; what is sent to another process is no lambda."""
+
+    number: int
+
+    def __call__(self, camera: CameraCalibration) -> ArrayLike:
+        return tuple(float(k == self.number) for k in range(4))
+
+
 CAMERA_PARAMETERS = (
     Parameter(
         "d_alpha_arcsec", "Δα", "turn of the camera about its Y, right-handed, perturbed minus nominal", 4,
-        lambda camera: (1.0, 0.0, 0.0, 0.0),
+        _Alone(0),
     ),
     Parameter(
         "d_beta_arcsec", "Δβ", "turn of the camera about its X, right-handed, perturbed minus nominal", 4,
-        lambda camera: (0.0, 1.0, 0.0, 0.0),
+        _Alone(1),
     ),
     Parameter(
         "d_gamma_arcsec", "Δγ", "turn of the camera about its Z, the line of sight, perturbed minus nominal", 3,
-        lambda camera: (0.0, 0.0, 1.0, 0.0),
+        _Alone(2),
     ),
     Parameter(
         "d_f_um", "Δf", "change of the principal distance, in pixels of the line CCD, longer positive", 2,
-        lambda camera: (0.0, 0.0, 0.0, 1.0),
+        _Alone(3),
     ),
 )  # fmt: skip
 """What is read of every camera. The first four are what estimators estimate; a further one is a combination of them."""

@@ -30,8 +30,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
+from analysis.chi_square import chance_beyond
 from analysis.measurement_error import MeasurementError
 from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
 from analysis.mtf.edge_pages import different_pages, left_over, mean_page
@@ -466,7 +466,7 @@ def _check_drift(pages: Array, mean: Array, found: BarMtf, step: float) -> None:
     noise = max(noise, left_over(noise, step), 1e-12 * found.amplitude)
     phase = parts[:, 2] / found.amplitude
     sigma = noise * math.sqrt(inverse[2, 2]) / found.amplitude
-    if stats.chi2.sf(float(np.sum((phase / sigma) ** 2)), len(pages) - 1) < FALSE_ALARM:
+    if chance_beyond(float(np.sum((phase / sigma) ** 2)), len(pages) - 1) < FALSE_ALARM:
         moved = float(np.std(phase)) / (2.0 * math.pi * found.cycles_per_pixel)
         raise BarError(
             f"the bars move by {moved:.2g} px rms from page to page (sigma of a page"

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
+from analysis.chi_square import chance_beyond
 from analysis.mtf import slanted_edge
 from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, locate_edge
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
@@ -187,14 +187,14 @@ class _Shift:
     @property
     def p_value(self) -> float:
         """Probability of a larger chi-square; 1 for a single page."""
-        return float(stats.chi2.sf(self.chi_square, 2 * (len(self.line) - 1))) if len(self.line) > 1 else 1.0
+        return float(chance_beyond(self.chi_square, 2 * (len(self.line) - 1))) if len(self.line) > 1 else 1.0
 
     @property
     def turned(self) -> bool:
         """The pages turn against each other, too."""
         slope = self.line[:, 1] - self.line[:, 1].mean()
         chi_square = float(np.sum(slope**2 / self.covariance[:, 1, 1]))
-        return bool(stats.chi2.sf(chi_square, len(slope) - 1) < FALSE_ALARM)
+        return bool(chance_beyond(chi_square, len(slope) - 1) < FALSE_ALARM)
 
 
 @dataclass(frozen=True, eq=False)

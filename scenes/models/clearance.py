@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from optics.geometry.pose import Pose
 from optics.geometry.solid import Face, Solid, SolidError, face_plane, solid_mesh
@@ -21,6 +21,9 @@ from scenes.models.instrument_model import Instrument, MisplacedError, key_of
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
 from scenes.specs.instrument import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, channel_of, prism_of
 from scenes.yaml.errors import InputError, Issue, KeyPath
+
+if TYPE_CHECKING:
+    from scipy.spatial import ConvexHull
 
 LEAST_GAP = 20e-6
 """Bodies nearer than this count as touching, metres: what the path tracer needs between two of them."""
@@ -48,12 +51,19 @@ class Overlap:
     way: tuple[int, float] | None = None
 
 
+def convex_hull(points: np.ndarray) -> ConvexHull:
+    """The hull of points (N, 3); SciPy is imported when the first is made, since who only reads a file makes none."""
+    from scipy.spatial import ConvexHull
+
+    return ConvexHull(points)
+
+
 def separation(first: np.ndarray, second: np.ndarray) -> float:
     """Distance of the convex hulls of two sets of points, (P, 3) and (Q, 3), metres.
 
     Negative when they overlap: the shortest displacement that takes them apart, with a minus sign.
     """
-    difference = ConvexHull((first[:, None] - second[None]).reshape(-1, 3))
+    difference = convex_hull((first[:, None] - second[None]).reshape(-1, 3))
     deepest = float(np.max(difference.equations[:, 3]))  # of the origin, relative to every face
     if deepest <= 0.0:
         return deepest
@@ -75,7 +85,7 @@ def way_apart(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) ->
     Returns:
         The axis, 0 to 2, and how far the second is moved along it, metres with its sign.
     """
-    faces = ConvexHull((first[:, None] - second[None]).reshape(-1, 3)).equations
+    faces = convex_hull((first[:, None] - second[None]).reshape(-1, 3)).equations
     ways = []
     for axis in range(3):
         for sign in (1.0, -1.0):
@@ -101,7 +111,7 @@ def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) ->
                 continue
             path = f"{BASE}/{camera}/{mirror}"
             mesh = mirror_mesh(model.surfaces[mirror], model.apertures[mirror], behind(model, mirror), _CELLS)
-            corners = mesh.vertices[ConvexHull(mesh.vertices).vertices]
+            corners = mesh.vertices[convex_hull(mesh.vertices).vertices]
             out[path] = placed.pose(path).apply(corners)
         path = f"{BASE}/{camera}/focal_plane"
         spots = [p for c in instrument.channels if c.camera == camera for p in (c.pinhole, c.ccd)]

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from optics.geometry.solid import solid_mesh
 from optics.materials.material import material
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from scenes.models.clearance import convex_hull
 from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import imaging_segments, rays_taken
 from scenes.specs import instrument as instruments
@@ -327,7 +327,7 @@ class ImagingBeams:
         placed, out = instrument.assembly.place(), np.zeros((len(self.segments), 3, RAYS), dtype=bool)
         for solid in instrument.solids:
             corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).mesh.vertices)
-            planes = ConvexHull(corners).equations
+            planes = convex_hull(corners).equations
             for c, beams in enumerate(self.segments.values()):
                 for k, rays in enumerate(beams):
                     out[c, k] |= rays_taken(rays, planes)

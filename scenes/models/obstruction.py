@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from optics.geometry.solid import solid_mesh
 from optics.geometry.tree import PlacedBodies, State
@@ -22,7 +21,7 @@ from optics.raytrace.assembly import points_to_world
 from optics.raytrace.system import SystemBatch, assemble, media_along
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import line_body
-from scenes.models.clearance import convex_bodies, remedy
+from scenes.models.clearance import convex_bodies, convex_hull, remedy
 from scenes.models.instrument_model import Instrument, MisplacedError, key_of
 from scenes.models.monitor_chain import beside
 from scenes.specs.baffle import Plate
@@ -64,7 +63,7 @@ def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruc
     solids = {}
     for solid in instrument.solids:
         corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).mesh.vertices)
-        solids[solid.path] = ConvexHull(corners).equations
+        solids[solid.path] = convex_hull(corners).equations
     found: dict[tuple[str, str], Obstruction] = {}
     for camera in instrument.cameras:
         for segments in imaging_segments(instrument, backend, camera):
@@ -261,7 +260,7 @@ def _standing_in(
 ) -> Iterator[tuple[MonitorBeam, str, Plate | None, np.ndarray]]:
     """Beam, body or plate in words, the plate if it is one, and which of the beam's rays it takes, (N,)."""
     bodies = convex_bodies(instrument, placed)
-    hulls = {path: ConvexHull(corners).equations for path, corners in bodies.items()}
+    hulls = {path: convex_hull(corners).equations for path, corners in bodies.items()}
     for beam in beams:
         camera = instrument.cameras[beam.channel.camera]
         within = len(camera.mirrors)  # segments inside the camera, on the way out and on the way back

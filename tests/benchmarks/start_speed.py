@@ -16,14 +16,17 @@ from pathlib import Path
 
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
+from twin.run.console import PROGRAMS as ALL_PROGRAMS
 
 ROOT = Path(__file__).resolve().parents[2]
 COLD_S, WARM_S, START_S, IMPORT_S = 12.0, 4.0, 0.5, 0.3
-PROGRAMS = (
-    *("twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate", "twin.compare"),
-    *("twin.doctor", "twin.live", "twin.recover", "scenes.schema", "analysis.mtf"),
+PROGRAMS = tuple(module for module, _ in ALL_PROGRAMS.values())
+READ = (
+    *(("twin.render",), ("twin.study",), ("twin.design", "camera"), ("twin.design", "monitor"), ("twin.lab", "focus")),
+    *(("twin.orbit", "angle"), ("twin.orbit", "adjust"), ("twin.camera",), ("twin.live",), ("twin.recover",)),
+    *(("twin.uncertainty",), ("twin.tolerance",), ("twin.asbuilt", "estimate"), ("twin.operate", "status")),
 )
-READ = (("twin.render",), ("twin.study",), ("twin.design",), ("twin.lab", "focus"), ("twin.orbit", "angle"))
+"""Commands that are given a file they cannot read, and a record that is not one."""
 BAD = "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: [0 um, 0 um, 3 arcsec]}}\nno_such_key: 1\n"
 UNKNOWN = Limit(2.0)
 """All modules of the checks are imported for their names."""

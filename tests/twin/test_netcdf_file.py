@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from scenes.specs.study import UNITS
-from twin.run.data_files import COUNTS, SPELT, follow_cf, netcdf
+from twin.run.data_files import COUNTS, SPELT, GridData, follow_cf, netcdf
 
 UDUNITS = {
     *("arcsec", "arcmin", "milliarcsec", "degree", "rad", "urad", "mrad", "pm", "nm", "um", "mm", "m", "km"),
@@ -48,6 +48,22 @@ def test_units_are_those_that_udunits_knows_and_the_numbers_stay() -> None:
         for name in given.variables:
             np.testing.assert_array_equal(read[name].values, given[name].values)
     assert given["shift"].attrs["units"] == "px"  # what a script holds keeps its units
+
+
+def test_without_xarray_the_file_is_the_same_to_the_byte() -> None:
+    """With coordinates of an axis, of an axis that has another name, of none, and with texts."""
+    photons = (("state", "row"), np.array([[1.0, np.nan], [3.0, 4.0]]), {"units": "photons", "long_name": "photons"})
+    coords = {
+        "state": ("state", ["before", "after"], {"long_name": "when"}),
+        "y": ("row", np.array([0.0, 1e-5]), {"units": "m", "long_name": "place"}),
+        "wavelength": ((), 6.5e-7, {"units": "m", "long_name": "of the light"}),
+    }
+    mean = ("state", np.array([1.0, 3.5]), {"units": "deg", "long_name": "angle"})
+    data = GridData({"photons": photons, "mean": mean}, coords, {"title": "a test", "pitch_m": 1e-5})
+    content = netcdf(data)
+    assert content == netcdf(data.to_xarray())
+    with pytest.raises(TypeError, match="n: neither float64 nor texts: int64"):
+        netcdf(GridData({"n": ("x", np.arange(3), {})}, {}, {"title": "whole numbers"}))
 
 
 @pytest.mark.parametrize("unit", sorted({*UNITS.values(), *SPELT, *COUNTS}))

@@ -33,9 +33,9 @@ from twin.operate.desk import Desk, plain, unix_micros
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.plans import kept_plan
 from twin.operate.overview import Overview
-from twin.operate.record.database import RecordFailed
 from twin.operate.record.entries import Alarm, Given, digest_of_data, micros
 from twin.operate.record.history import History
+from twin.operate.record.place import RecordFailed
 from twin.operate.serve import LONGEST_POST, PARTS, OperateServer
 from twin.serving.guard import Guard
 from twin.serving.server import listen

@@ -6,6 +6,7 @@ Few tests start a process, since each needs seconds to begin; the others call th
 import hashlib
 import json
 import os
+import pickle
 import re
 import resource
 import signal
@@ -29,6 +30,7 @@ from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from twin.main_job.render_drawings import IRRADIANCE, SCENE, SUMMARY, _tried, drawings, without_failed
 from twin.main_job.render_job import render_job
+from twin.pictures.light_paths import trace_light_paths
 
 run = partial(invoke, command.app)
 """The command inside this process."""
@@ -158,6 +160,15 @@ def test_what_cannot_be_drawn_costs_nothing_else(repeated, tmp_path, monkeypatch
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert set(told) <= set(manifest["warnings"])
     assert "no such font &lt;x&gt;</text>" in (tmp_path / "run" / "report.html").read_text("utf-8")
+
+
+def test_all_that_is_drawn_can_be_sent_to_the_second_process(repeated):
+    """What cannot is drawn by the first process alone: a run that is right and takes twice as long."""
+    kept = repeated[3][0]
+    assert kept.recovery.curvature  # also with the motions that were traced again
+    paths = trace_light_paths(kept.experiment.instrument, kept.experiment.backend, kept.state)
+    sent = pickle.loads(pickle.dumps(drawings(kept, paths)))
+    assert sent["side"]() == drawings(kept, paths)["side"]()
 
 
 # --- a run that works -------------------------------------------------------------------------------------------------

@@ -55,11 +55,7 @@ READ = (
     ("twin.orbit", "angle"),
 )
 """Commands that read a YAML file; all tests of a program do it in the same way."""
-PROGRAMS = (
-    *("twin.render", "twin.camera", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate"),
-    *("twin.compare", "twin.doctor", "twin.uncertainty", "twin.live", "twin.recover"),
-    *("scenes.lens", "scenes.schema", "analysis.mtf"),
-)
+PROGRAMS = tuple(module for module, _ in ALL_PROGRAMS.values())
 BAD = "seed: 1\nno_such_key: [2 arcsec, 3 um, 20 degC]\n"
 
 
@@ -128,51 +124,79 @@ def test_help_waits_for_nothing_that_computes_or_reads() -> None:
     assert (packages(found["modules"]) & HEAVY, found["pydantic"]) == (set(), False)
 
 
-OWN = {
-    "twin.render": ("", "instrument: gf7_pair\nno_such_key: 1\n"),
-    "twin.lab": ("focus", "name: x\nmisset: {}\nscan: {}\nno_such_key: 1\n"),
-    "twin.orbit.__main__": ("angle", "name: x\ncamera: tlc\norbit: {}\nstrips: []\nno_such_key: 1\n"),
-    "twin.study.__main__": ("", "name: x\nbase: {}\nfactors: {}\nresponses: {}\nno_such_key: 1\n"),
-    "twin.tolerance.__main__": ("", "instrument: gf7\ntolerances: {}\nmerits: {}\nno_such_key: 1\n"),
-    "twin.design.__main__": ("", "name: x\ncamera: gf7\nvary: {}\nno_such_key: 1\n"),
-    "twin.recover.__main__": ("", "frames: {}\nno_such_key: 1\n"),
-}
-"""Program -> its subcommand, and a file of its kind with a key that it does not know."""
+PLACE = {"twin.live": "job", "twin.uncertainty": "job"}
+"""Programs that read a kind of file which another program has for its own, and whose name is in `FILE_KINDS`."""
 REFUSED = """
 import importlib
 more = {}
-for program, words in json.loads(sys.argv[1]):
+for name, module, words in json.loads(sys.argv[1]):
+    before = set(sys.modules)
     with redirect_stderr(StringIO()) as told, redirect_stdout(StringIO()):
-        try: importlib.import_module(program).app(words)
+        try: importlib.import_module(module).app(words)
         except SystemExit as end: code = end.code
-    more[program] = [code, told.getvalue(), sorted({name.partition(".")[0] for name in sys.modules})]
+    new = sorted({name.partition(".")[0] for name in set(sys.modules) - before})
+    more[name] = [code, told.getvalue(), new]
 """
 
 
+def refused(folder: Path, named: str, command: str, text: str) -> tuple[str, str, list[str]]:
+    """A command and the words by which it reads a file of this text, as ``REFUSED`` takes them.
+
+    Args:
+        folder: where the file is written.
+        named: the case.
+        command: the program, with its subcommand.
+        text: of the file.
+    """
+    file = folder / f"{named}.yaml"
+    file.write_text(text, "utf-8")
+    program, *sub = command.split()
+    module = program if (ROOT / f"{program.replace('.', '/')}.py").exists() else f"{program}.__main__"
+    return named, module, [*sub, str(file)]
+
+
 @pytest.mark.second
-def test_a_bad_file_waits_for_nothing_that_computes(tmp_path: Path) -> None:
+def test_a_bad_file_of_every_kind_waits_for_nothing_that_computes(tmp_path: Path) -> None:
+    """A key that its kind does not know, beside those by which the kind is told; whatever command reads it."""
     runs = []
-    for program, (sub, text) in OWN.items():
-        file = tmp_path / f"{program}.yaml"
-        file.write_text(text, "utf-8")
-        runs.append((program, [*sub.split(), str(file)]))
+    for kind in FILE_KINDS:
+        keys = "".join(f"{key}: {{}}\n" for key in (*kind.needs, *kind.one_of[:1]))
+        commands = [kind.command, *(program for program, read in PLACE.items() if read == kind.name)]
+        # a plan and tables of readings are read into a record, see below
+        for command in (one for one in commands if one and not one.startswith("twin.operate")):
+            runs.append(refused(tmp_path, f"{kind.name} {command}", command, f"{keys}no_such_key: 1\n"))
+    assert len(runs) > 20
+    assert {f"{module.removesuffix('.__main__')}" for _, module, _ in runs} >= {
+        *("twin.render", "twin.recover", "twin.camera", "twin.lab", "twin.orbit", "twin.design", "twin.study"),
+        *("twin.asbuilt", "twin.tolerance", "twin.live", "twin.uncertainty"),
+    }
     found = loaded(REFUSED, json.dumps(runs))
-    for program, (_, text) in OWN.items():
-        code, told, there = found[program]
-        line = text.count("\n")
-        assert (code, set(there) & HEAVY) == (2, set()), (program, told)
-        assert f"{program}.yaml:{line}: no_such_key: unknown key; found 'no_such_key'" in told
+    for named, _, _ in runs:
+        code, told, new = found[named]
+        assert (code, set(new) & HEAVY) == (2, set()), (named, told)
+        assert f"{named}.yaml:" in told
+        assert "no_such_key: unknown key; found 'no_such_key'" in told
+
+
+@pytest.mark.parametrize("command", ["status", "ingest", "forecast", "report", "products"])
+def test_a_record_that_is_not_there_waits_for_no_database(command: str, tmp_path: Path) -> None:
+    words = [command, str(tmp_path / "none"), *(["a.yaml"] if command == "ingest" else [])]
+    found = loaded(REFUSED, json.dumps([("record", "twin.operate.__main__", words)]))
+    code, told, new = found["record"]
+    assert code == 2
+    assert f"no record at {tmp_path}/none/record.sqlite; python -m twin.operate init" in told.replace("\n", " ")
+    assert not set(new) & HEAVY
 
 
 def test_a_bad_job_waits_for_no_other_kind_of_file(tmp_path: Path) -> None:
     """Nor is a model built that it does not need."""
     file = tmp_path / "job.yaml"
-    file.write_text(OWN["twin.render"][1], "utf-8")
+    file.write_text("instrument: gf7_pair\nno_such_key: 1\n", "utf-8")
     found = loaded(
         REFUSED + "from scenes.yaml.spec import Spec\n"
         "def below(model):\n return [model, *(one for part in model.__subclasses__() for one in below(part))]\n"
         "more['built'] = [model.__name__ for model in below(Spec) if model.__pydantic_complete__]",
-        json.dumps([("twin.render", [str(file)])]),
+        json.dumps([("job", "twin.render", [str(file)])]),
     )
     modules = set(found["modules"])
     assert "scenes.specs.job" in modules
@@ -186,6 +210,19 @@ def test_a_bad_job_waits_for_no_other_kind_of_file(tmp_path: Path) -> None:
 def test_import_twin_imports_nothing() -> None:
     found = loaded("import twin")["modules"]
     assert packages(found) & (HEAVY | {"numpy", "pydantic", "rich", "ruamel", "typer"}) == set()
+
+
+@pytest.mark.second
+def test_the_main_job_imports_only_what_it_uses() -> None:
+    """The first process nothing that draws, the second one neither data frames nor a scheduler; xarray brings both."""
+    first = loaded("import twin.main_job.render_command, twin.main_job.render_cost")["modules"]
+    assert "twin.main_job.render_folder" in first
+    assert packages(first) & {*DRAWS, "dask", "distributed", "h5netcdf", "networkx", "pandas", "sqlalchemy"} == set()
+    assert "scipy.stats" not in first
+    second = loaded("from twin.main_job.render_drawings import load_drawing\nload_drawing()")["modules"]
+    assert {"h5netcdf", "matplotlib", "trimesh"} <= packages(second)
+    assert packages(second) & {"dask", "distributed", "mitsuba", "pandas", "pyarrow", "xarray"} == set()
+    assert "scipy.stats" not in second
 
 
 def test_a_kind_is_told_by_keys_that_its_model_requires() -> None:

@@ -18,7 +18,7 @@ SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
 """What is no figure of the report: the bytes of summary.png, scene.glb, irradiance.nc."""
 APART = (SUMMARY, SCENE, IRRADIANCE)
 LOADED = (SCENE, IRRADIANCE)
-"""What needs libraries that nothing else of a run needs, trimesh and xarray: drawn where `load_drawing` was called."""
+"""What needs libraries that nothing else of a run needs, trimesh and h5netcdf: drawn after `load_drawing`."""
 FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"}
 """Where these are written."""
 
@@ -106,15 +106,14 @@ def without_failed(drawn: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str,
 
 def load_drawing() -> None:
     """Import what all runs draw with, and let it find its fonts."""
-    import xarray
+    import h5netcdf
 
     from twin.main_job import light_path_plots, spot_plots, summary_plot
     from twin.pictures import scene_file
     from twin.run.svg import look, new_figure, to_svg
     from twin.uncertainty import uncertainty_report
 
-    _ = light_path_plots, spot_plots, summary_plot, scene_file, uncertainty_report
-    xarray.DataArray([0.0], dims="x", name="first").to_netcdf(engine="h5netcdf")
+    _ = h5netcdf, light_path_plots, spot_plots, summary_plot, scene_file, uncertainty_report
     with look("first"):
         figure = new_figure(1.0)
         figure.subplots().set_title("0 \N{MINUS SIGN}", fontweight="bold")

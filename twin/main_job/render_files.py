@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,14 +15,11 @@ from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.image_quality import QUALITY
 from twin.monitor.time_series import TimeSeries
-from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files, netcdf
+from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, GridData, Gridded, frame_files, netcdf
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import RunFolder
 from twin.targets.target_measurement import TargetRun
 from twin.uncertainty.uncertainty_numbers import LIMITS
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 def write_data(run: RenderRun, folder: RunFolder) -> None:
@@ -124,24 +121,23 @@ def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
 _WAVELENGTH = {"units": "m", "standard_name": "radiation_wavelength", "long_name": "of the light in vacuum"}
 
 
-def irradiance(run: RenderRun) -> xr.Dataset:
+def irradiance(run: RenderRun) -> GridData:
     """Expected photons before and after, (state, channel, row, column), with stray light apart where it was traced."""
     photons = np.stack([run.photons_before, run.photons_after])
     states = ("state", ["before", "after"], {"long_name": "before the disturbance or after it"})
     images = _images(run, "state", states, photons)
-    if run.stray is not None:
-        stray = np.stack([run.stray.before.photons, run.stray.after.photons])
-        about = {"units": "photons", "long_name": "of these, ghosts and stray light"}
-        images["stray_photons"] = (("state", "channel", "row", "column"), stray, about)
-    return images
+    if run.stray is None:
+        return images
+    stray = np.stack([run.stray.before.photons, run.stray.after.photons])
+    about = {"units": "photons", "long_name": "of these, ghosts and stray light"}
+    apart: Gridded = (("state", "channel", "row", "column"), stray, about)
+    return replace(images, variables={**images.variables, "stray_photons": apart})
 
 
-def _images(run: RenderRun, first: str, coordinate: tuple[Any, ...], photons: np.ndarray) -> xr.Dataset:
+def _images(run: RenderRun, first: str, coordinate: Gridded, photons: np.ndarray) -> GridData:
     """Expected images (N, C, rows, columns) with the coordinate of their first axis."""
-    import xarray as xr
-
     path = run.experiment.path
-    return xr.Dataset(
+    return GridData(
         {
             "photons": (
                 (first, "channel", "row", "column"),
@@ -149,14 +145,14 @@ def _images(run: RenderRun, first: str, coordinate: tuple[Any, ...], photons: np
                 {"units": "photons", "long_name": "expected photons per pixel and frame"},
             )
         },
-        coords={
+        {
             first: coordinate,
             "channel": ("channel", [c.key for c in path.channels], {"long_name": "camera and side of the area CCD"}),
             "x": ("column", path.axis(1), {"units": "m", "long_name": "detector x, along which columns count"}),
             "y": ("row", path.axis(0), {"units": "m", "long_name": "detector y, along which rows count"}),
             "wavelength": ((), path.wavelength, _WAVELENGTH),
         },
-        attrs={
+        {
             "title": "expected images of the monitor's area CCDs",
             "wavelength_m": path.wavelength,
             "pitch_m": path.pitch,

@@ -247,8 +247,9 @@ def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: Sy
     axes.set_xticks(range(values.shape[1]), [f"{name} [µm]" for name in names], rotation=turn)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
+    deep = np.abs(np.asarray(norm(values)) - 0.5) * 2.0
     for (row, column), value in np.ndenumerate(values):
-        deep = abs(float(norm(value)) - 0.5) * 2.0
-        colour = "white" if deep > _STRONG else svg.INK
+        colour = "white" if deep[row, column] > _STRONG else svg.INK
         text = significant(float(value), 2, floor=SAME)
-        axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
+        # inside its panel, which is arranged without looking at it
+        axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour, in_layout=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -48,44 +49,49 @@ def motion_models(
     """
     out = {"model": _of_families(path, sight, cameras)}
     if stated is not None and disturbances is not None:
-        parts = stated.components
-        size = stated.sigma
-        known = disturbances
-
-        def amounts(noise: np.ndarray) -> np.ndarray:
-            return known.best_amounts(noise)
-
-        def state(row: np.ndarray) -> State:
-            return state_of(row * size, parts, thermal)
-
-        out["posterior"] = MotionModel(known.spots, known.parameters, amounts, _tracer(path, sight, state), NEAR)
+        moved = partial(_stated_state, stated, thermal)
+        trace = partial(_traced, path, sight, moved)
+        out["posterior"] = MotionModel(
+            disturbances.spots, disturbances.parameters, disturbances.best_amounts, trace, NEAR
+        )
     return out
+
+
+# What a model calls are functions of the module: a run is sent to the process that draws it, with all that it holds.
+
+
+def _stated_state(stated: StatedMotions, thermal: ThermalModel, row: np.ndarray) -> State:
+    """The state of one row of stated amounts, (P,)."""
+    return state_of(row * stated.sigma, stated.components, thermal)
 
 
 def _of_families(path: MonitorPath, sight: LineSight, cameras: Mapping[str, CameraCalibration]) -> MotionModel:
     """Each camera's four motions of paper 001."""
     families = {name: line_family(name) for name in cameras}
-    ends = np.cumsum([0, *(2 * len(camera.channels) for camera in cameras.values())]).tolist()
-    own = [slice(a, b) for a, b in pairwise(ends)]
-    count = sum(map(len, families.values()))
-    spots, parameters = np.zeros((ends[-1], count)), np.zeros((4 * len(cameras), count))
+    own, count = _spots_of(cameras), sum(map(len, families.values()))
+    spots, parameters = np.zeros((own[-1].stop, count)), np.zeros((4 * len(cameras), count))
     for k, (camera, at) in enumerate(zip(cameras.values(), own, strict=True)):
         block = slice(4 * k, 4 * k + 4)
         spots[at, block], parameters[block, block] = camera.spot_jacobian, camera.parameter_jacobian
-
-    def amounts(noise: np.ndarray) -> np.ndarray:
-        out = np.zeros((len(noise), count, ends[-1]))
-        for k, (camera, at) in enumerate(zip(cameras.values(), own, strict=True)):
-            block = slice(4 * k, 4 * k + 4)
-            out[:, block, at] = model_fit.gain(noise[:, at, at], camera.spot_jacobian, np.eye(4), camera.motions)
-        return out
-
     every = [motion for family in families.values() for motion in family]
+    trace = partial(_traced, path, sight, partial(_together, every))
+    return MotionModel(spots, parameters, partial(_family_amounts, cameras), trace)
 
-    def state(row: np.ndarray) -> State:
-        return _together(every, row)
 
-    return MotionModel(spots, parameters, amounts, _tracer(path, sight, state))
+def _spots_of(cameras: Mapping[str, CameraCalibration]) -> list[slice]:
+    """Where the coordinates of each camera's spots stand among all."""
+    ends = np.cumsum([0, *(2 * len(camera.channels) for camera in cameras.values())]).tolist()
+    return [slice(a, b) for a, b in pairwise(ends)]
+
+
+def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray) -> np.ndarray:
+    """Covariance of the shifts (S, D, D), px^2 -> gain of the cameras' own motions, (S, P, D)."""
+    own = _spots_of(cameras)
+    out = np.zeros((len(noise), 4 * len(cameras), own[-1].stop))
+    for k, (camera, at) in enumerate(zip(cameras.values(), own, strict=True)):
+        block = slice(4 * k, 4 * k + 4)
+        out[:, block, at] = model_fit.gain(noise[:, at, at], camera.spot_jacobian, np.eye(4), camera.motions)
+    return out
 
 
 def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> State:
@@ -106,21 +112,15 @@ def _sum(one: tuple[float, float, float], two: tuple[float, float, float]) -> tu
     return one[0] + two[0], one[1] + two[1], one[2] + two[2]
 
 
-def _tracer(
-    path: MonitorPath, sight: LineSight, state: Callable[[np.ndarray], State]
-) -> Callable[[np.ndarray], Retraced]:
-    """Amounts of motions (S, P) -> what they do."""
-
-    def traced(rows: np.ndarray) -> Retraced:
-        try:
-            return traced_states(path, sight, [state(row) for row in rows])
-        except LOST:
-            if len(rows) == 1:
-                return Retraced(*(np.full((1, n), np.nan) for n in (2 * len(path.channels), 4 * len(path.cameras))))
-        parts = [traced(rows[k : k + 1]) for k in range(len(rows))]
-        return Retraced(np.concatenate([p.spots for p in parts]), np.concatenate([p.parameters for p in parts]))
-
-    return traced
+def _traced(path: MonitorPath, sight: LineSight, state: Callable[[np.ndarray], State], rows: np.ndarray) -> Retraced:
+    """What the states of rows of amounts (S, P) do; NaN for one whose light is lost."""
+    try:
+        return traced_states(path, sight, [state(row) for row in rows])
+    except LOST:
+        if len(rows) == 1:
+            return Retraced(*(np.full((1, n), np.nan) for n in (2 * len(path.channels), 4 * len(path.cameras))))
+    parts = [_traced(path, sight, state, rows[k : k + 1]) for k in range(len(rows))]
+    return Retraced(np.concatenate([p.spots for p in parts]), np.concatenate([p.parameters for p in parts]))
 
 
 def traced_states(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Retraced:

@@ -23,7 +23,7 @@ from twin.operate.followed import PlanFile
 from twin.operate.life_commands import judge, simulate
 from twin.operate.products_command import products
 from twin.operate.shown_commands import report, serve
-from twin.operate.terminal import Place, line, tell, told
+from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run import durable
 from twin.run.cli import (
     BAD_INPUT,
@@ -151,6 +151,7 @@ def ingest(
 
     Exit codes: 0 success, 2 bad input or something was refused (all else is taken), 1 anything else.
     """
+    require_record(record)
     from twin.operate.record.history import History
     from twin.operate.record.sources import Sources, moment_said
 
@@ -245,6 +246,7 @@ def status(record: Place, plan: PlanFile = None, as_json: AsJson = False, quiet:
 
     Exit codes: 0 success, whether alarms are open or not, 2 bad input, 1 anything else.
     """
+    require_record(record)
     from twin.operate.record.history import History
 
     with told() as errors, History(record) as history:
@@ -297,6 +299,7 @@ def export(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
+    require_record(record)
     from twin.operate.record.history import History
     from twin.operate.record.record_tables import tables as all_tables
     from twin.run.data_files import TABLE_FORMATS, MissingPackage

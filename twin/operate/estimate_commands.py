@@ -11,7 +11,7 @@ from rich.console import Console
 
 from scenes.yaml.errors import Problem
 from twin.operate.followed import PlanFile, followed, known_of, operation_of, plan_of
-from twin.operate.terminal import Place, line, tell, told
+from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict, print_whole, result_table
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ def forecast(
 
     Exit codes: 0 success, 2 bad input, 1 anything else.
     """
+    require_record(record)
     from twin.operate.record.history import History
 
     with told() as errors, History(record) as history:
@@ -93,6 +94,7 @@ def alarms(
 
     Exit codes: 0 success, whether alarms are open or not, 2 bad input, 1 anything else.
     """
+    require_record(record)
     from twin.operate.record.entries import one_line
     from twin.operate.record.history import History
 

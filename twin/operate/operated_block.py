@@ -19,10 +19,9 @@ from scenes.yaml.errors import InputError, Problem, unknown
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.plans import kept_plan, read_plan
 from twin.operate.posterior import Posterior, posterior
-from twin.operate.record.database import RecordFailed
 from twin.operate.record.entries import micros
 from twin.operate.record.history import History
-from twin.operate.record.schema import NotARecord
+from twin.operate.record.place import NotARecord, RecordFailed
 from twin.orbit.block.block_run import BlockRun, run_adjustment
 from twin.run.procedure import Advance, silent
 

@@ -10,7 +10,7 @@ import typer
 from scenes.yaml.errors import Problem
 from scenes.yaml.standard_output import FAILURE, print_error
 from twin.operate.followed import PlanFile, operation_of
-from twin.operate.terminal import Place, line, tell, told
+from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run import durable
 from twin.run.cli import AsJson, InputErrorText, Quiet
 
@@ -47,6 +47,7 @@ def products(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
+    require_record(record)
     from twin.operate.record.entries import one_line
     from twin.operate.record.history import History
 

@@ -22,7 +22,7 @@ from starlette.routing import Route
 
 from analysis.images.image_file import ImageError
 from twin.operate.desk import Desk
-from twin.operate.record.database import RecordFailed
+from twin.operate.record.place import RecordFailed
 from twin.operate.shown_readings import frame_numbered, frame_png
 from twin.serving.guard import Guard
 from twin.serving.server import SHARED, TYPES, PageServer, nothing

@@ -11,7 +11,7 @@ from rich.console import Console
 from scenes.yaml.errors import Problem
 from scenes.yaml.standard_output import FAILURE, print_error
 from twin.operate.followed import PlanFile, followed, known_of, operation_of
-from twin.operate.terminal import Place, line, tell, told
+from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run import durable
 from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict
 
@@ -50,6 +50,7 @@ def report(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
+    require_record(record)
     with told() as errors:
         from twin.operate.daily_report import daily_report, end_of_day, report_html
         from twin.operate.overview import Overview
@@ -117,6 +118,7 @@ def serve(
 
     Exit codes: 0 ended, 2 bad input, 1 anything else.
     """
+    require_record(record)
     with told():
         try:
             from twin.operate.serve import OperateServer

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
+from twin.operate.record.place import NotARecord, RecordFailed, file_of, require_file
 from twin.run.cli import InputErrorText, explained
 
 Place = Annotated[
@@ -20,12 +21,20 @@ Place = Annotated[
 ]
 
 
+def require_record(place: str) -> None:
+    """Tell that a folder holds no record, before what reads a record is imported.
+
+    Raises:
+        typer.Exit: it holds none, which has been told.
+    """
+    if (file := file_of(place)) is not None:
+        with told():
+            require_file(file)
+
+
 @contextmanager
 def told() -> Iterator[Console]:
     """Errors as one sentence and an exit code."""
-    from twin.operate.record.database import RecordFailed
-    from twin.operate.record.schema import NotARecord
-
     errors = Console(stderr=True)
     with explained(errors):
         try:

@@ -43,13 +43,40 @@ COUNTS = frozenset(("px", "waves", "DN", "photons"))
 WRITER = "space-camera-twin"
 
 
-def netcdf(data: xr.Dataset) -> bytes:
+Gridded = tuple[str | tuple[str, ...], Any, Mapping[str, Any]]
+"""Axes, values and attributes of a variable, as xarray takes them."""
+
+
+@dataclass(frozen=True, eq=False)
+class GridData:
+    """Arrays on named axes, to be written without xarray, whose import takes longer than most files.
+
+    Attributes:
+        variables: name -> numbers in float64.
+        coords: name -> coordinates of the axes, numbers in float64 or texts.
+        attrs: of all, ``title`` among them.
+    """
+
+    variables: Mapping[str, Gridded]
+    coords: Mapping[str, Gridded]
+    attrs: Mapping[str, Any]
+
+    def to_xarray(self) -> xr.Dataset:
+        """The same as a data set."""
+        import xarray as xr
+
+        return xr.Dataset(self.variables, self.coords, self.attrs)
+
+
+def netcdf(data: xr.Dataset | GridData) -> bytes:
     """A data set as the contents of a netCDF-4 file by CF 1.11; the same data give the same bytes.
 
     Args:
         data: with ``title`` among its attributes; of every variable ``long_name`` and of numbers ``units``, which are 1
             where there are none.
     """
+    if isinstance(data, GridData):
+        return _grid_file(data)
     told = follow_cf(data)
     # coordinates have no gaps
     view = told.to_netcdf(engine="h5netcdf", encoding={name: {"_FillValue": None} for name in told.coords})
@@ -58,6 +85,43 @@ def netcdf(data: xr.Dataset) -> bytes:
     if isinstance(view, memoryview):
         view.release()
     return content
+
+
+def _grid_file(data: GridData) -> bytes:
+    """The file that xarray makes of the same data, to the byte."""
+    import h5netcdf
+    import h5py
+
+    every = [
+        *((name, one, False) for name, one in data.variables.items()),
+        *((*of, True) for of in data.coords.items()),
+    ]
+    buffer = io.BytesIO()
+    with h5netcdf.File(buffer, "w") as file:
+        file.attrs.update(_cf_attributes(data.attrs))
+        for _, (dims, values, _), _ in every:
+            for dim, size in zip(_axes(dims), np.shape(values), strict=True):
+                if dim not in file.dimensions:
+                    file.dimensions[dim] = size
+        for name, (dims, values, attrs), coordinate in every:
+            axes, array = _axes(dims), np.asarray(values)
+            if array.dtype.kind not in "fU" or (array.dtype.kind == "f" and array.dtype != np.float64):
+                raise TypeError(f"{name}: neither float64 nor texts: {array.dtype}")
+            text = array.dtype.kind == "U"
+            # coordinates have no gaps
+            fill = None if coordinate or text else array.dtype.type(np.nan)
+            kind = h5py.string_dtype() if text else array.dtype
+            made = file.create_variable(name, axes, dtype=kind, fillvalue=fill)
+            made.attrs.update(_units(attrs, not text))
+            of_it = sorted(k for k, (on, *_) in data.coords.items() if k not in axes and set(_axes(on)) <= set(axes))
+            if of_it and not coordinate:
+                made.attrs["coordinates"] = " ".join(of_it)
+            made[...] = array.astype(object) if text else array
+    return buffer.getvalue()
+
+
+def _axes(dims: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (dims,) if isinstance(dims, str) else dims
 
 
 def read_netcdf(content: bytes) -> xr.Dataset:
@@ -81,15 +145,20 @@ def read_netcdf(content: bytes) -> xr.Dataset:
 
 def follow_cf(data: xr.Dataset) -> xr.Dataset:
     """The data set with the attributes that CF asks for; values are the same."""
-    version = f"{WRITER} {importlib.metadata.version(WRITER)}"
-    # CF wants a history, which begins here; it names no time, so that the same run gives the same bytes
-    said = {"Conventions": CONVENTIONS, "source": f"simulation by {version}", "history": f"written by {version}"}
-    out = data.assign_attrs({**data.attrs, **said})
+    out = data.assign_attrs(_cf_attributes(data.attrs))
     for name in out.variables:
         variable = out.variables[name]
         numbers = variable.dtype.kind in "iufb"
         out[name].attrs = _units(variable.attrs, numbers)
     return out
+
+
+def _cf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+    """Attributes of a file with those that CF asks for."""
+    version = f"{WRITER} {importlib.metadata.version(WRITER)}"
+    # CF wants a history, which begins here; it names no time, so that the same run gives the same bytes
+    said = {"Conventions": CONVENTIONS, "source": f"simulation by {version}", "history": f"written by {version}"}
+    return {**attributes, **said}
 
 
 def _units(attributes: Mapping[Any, Any], numbers: bool) -> dict[str, Any]:

@@ -245,7 +245,7 @@ def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
     before = after = np.zeros((0, run.frames, 0, 0), np.uint16)
     expected = xr.Dataset()
     if isinstance(run, RenderRun):
-        before, after, expected = run.before, run.after, irradiance(run)
+        before, after, expected = run.before, run.after, irradiance(run).to_xarray()
         about |= {"exposure_s": run.experiment.exposure, "pitch_m": run.experiment.path.pitch, "seed": run.seed}
 
     def frames(name: str, values: np.ndarray) -> xr.DataArray:

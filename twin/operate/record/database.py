@@ -11,18 +11,12 @@ from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, IntegrityError, NoSuchModuleError
 
-from twin.operate.record.schema import NotARecord
+from twin.operate.record.place import NotARecord, RecordFailed, file_of, require_file
 
-FILE = "record.sqlite"
-"""Of a record in a folder."""
 WAIT = 60.0
 """Seconds that a writer waits for another one."""
 _LOCK = 7_236_001
 """Number of the lock by which writers on a PostgreSQL server take turns."""
-
-
-class RecordFailed(Exception):
-    """The database did not do what it was asked: a full disk, a server that is gone. Nothing is half done."""
 
 
 def url_of(place: str) -> URL:
@@ -31,8 +25,8 @@ def url_of(place: str) -> URL:
     Raises:
         NotARecord: not an address that SQLAlchemy knows.
     """
-    if "://" not in place:
-        return URL.create("sqlite", database=str(Path(place).absolute() / FILE))
+    if (file := file_of(place)) is not None:
+        return URL.create("sqlite", database=str(file))
     try:
         return make_url(place)
     except (ArgumentError, ValueError):
@@ -72,8 +66,8 @@ def _on_begin(connection: Connection) -> None:
 
 def opened(url: URL) -> Engine:
     """The database of a record that is there."""
-    if url.get_backend_name() == "sqlite" and not Path(str(url.database)).is_file():
-        raise NotARecord(f"no record at {url.database}; python -m twin.operate init DIR INSTRUMENT makes one")
+    if url.get_backend_name() == "sqlite":
+        require_file(Path(str(url.database)))
     return engine_of(url)
 
 

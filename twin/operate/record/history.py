@@ -18,7 +18,7 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.json_file import parse_json
 from twin.operate.record import schema
-from twin.operate.record.database import RecordFailed, engine_of, failures_told, opened, said, url_of, writing
+from twin.operate.record.database import engine_of, failures_told, opened, said, url_of, writing
 from twin.operate.record.entries import (
     Alarm,
     Checkpoint,
@@ -29,6 +29,7 @@ from twin.operate.record.entries import (
     now,
     utc_text,
 )
+from twin.operate.record.place import NotARecord, RecordFailed
 from twin.operate.record.schema import (
     ACKNOWLEDGEMENT,
     ALARM,
@@ -38,7 +39,6 @@ from twin.operate.record.schema import (
     PLAN,
     REFUSED,
     SOURCE,
-    NotARecord,
 )
 from twin.operate.record.taking import Taken, Taking
 from twin.run.data_files import WRITER

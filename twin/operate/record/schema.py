@@ -27,6 +27,7 @@ from sqlalchemy import (
 from sqlalchemy.schema import CreateIndex, CreateTable
 
 from optics.numerics.frozen_map import FrozenMap
+from twin.operate.record.place import NotARecord
 
 VERSION = 3
 _METADATA = MetaData()
@@ -142,10 +143,6 @@ CHECKPOINT = _table(
 )
 """Where an estimate stood at some time: derived from the entries, and the only rows that may be altered and removed."""
 _DERIVED = (CHECKPOINT.name,)
-
-
-class NotARecord(Exception):
-    """A database that holds no record, or one of another version; the message says what to do."""
 
 
 def _guard(connection: Connection, table: str) -> None:
