@@ -322,24 +322,27 @@ def _local_motions(
     growth, stretch = np.ones(size, dtype), np.ones(size, dtype)
     pivot = np.zeros((*size, 3))
     for b, body in enumerate(bodies):
-        for s, state in enumerate(states):
-            motion = state.get(body.path)
-            if motion is not None:
-                rotate[b, s], shift[b, s], growth[b, s] = motion.rotate, motion.shift, 1.0 + motion.scale
-                stretch[b, s] = 1.0 + motion.stretch
-                if motion.pivot not in body.pivots:
-                    raise KeyError(f"{body.path}: pivot {motion.pivot!r}")
-                pivot[b, s] = body.pivots[motion.pivot]
-            if step is not None and step[s][0] == body.path:
-                kind, axis = step[s][1], step[s][2]
-                if kind == "rotate":
-                    rotate[b, s, axis] += 1j * COMPLEX_STEP
-                elif kind == "shift":
-                    shift[b, s, axis] += 1j * COMPLEX_STEP
-                elif kind == "scale":
-                    growth[b, s] += 1j * COMPLEX_STEP
-                elif kind != FIGURE:  # a figure changes the surface, not the pose: see ``optics.raytrace.system``
-                    raise ValueError(f"unknown kind of motion {kind!r}")
+        named = {s: state[body.path] for s, state in enumerate(states) if body.path in state}
+        if named:
+            own = list(named)
+            numbers = np.array([(*m.rotate, *m.shift, m.scale, m.stretch) for m in named.values()])
+            rotate[b, own], shift[b, own] = numbers[:, :3], numbers[:, 3:6]
+            growth[b, own], stretch[b, own] = 1.0 + numbers[:, 6], 1.0 + numbers[:, 7]
+            for name in {motion.pivot for motion in named.values()}:
+                if name not in body.pivots:
+                    raise KeyError(f"{body.path}: pivot {name!r}")
+                pivot[b, [s for s, motion in named.items() if motion.pivot == name]] = body.pivots[name]
+        for s, (path, kind, axis) in enumerate(step or ()):
+            if path != body.path:
+                continue
+            if kind == "rotate":
+                rotate[b, s, axis] += 1j * COMPLEX_STEP
+            elif kind == "shift":
+                shift[b, s, axis] += 1j * COMPLEX_STEP
+            elif kind == "scale":
+                growth[b, s] += 1j * COMPLEX_STEP
+            elif kind != FIGURE:  # a figure changes the surface, not the pose: see ``optics.raytrace.system``
+                raise ValueError(f"unknown kind of motion {kind!r}")
     turned = rotation_matrix(rotate)
     offset = pivot + shift - (growth * stretch)[..., None] * np.einsum("bsij,bsj->bsi", turned, pivot)
     return turned, offset, growth, stretch

@@ -102,7 +102,7 @@ def of_frames(bench: Workbench, count: int) -> Callable[[], object]:
 GROWTHS = (
     Growth("states", "states", (100, 1000, 10_000, 30_000), (25, 50), of_states, 1.1),
     Growth("pixels", "pixels on a side", (32, 64, 128, 256, 512, 1024), (32, 64), of_pixels, 4.2),
-    Growth("bodies", "bodies", (10, 20, 40, 80, 160), (10, 40), of_bodies, 1.6),
+    Growth("bodies", "bodies", (10, 20, 40, 80, 160), (10, 40), of_bodies, 1.2),
     Growth("frames", "frames", (1, 10, 100, 1000, 10_000), (1, 10), of_frames, 1.1),
 )
 
