@@ -486,18 +486,19 @@ def assemble(
     touched = touched_bodies(assembly, states, placed) if real else None
 
     parts = list(zip(chains, media, strict=True))
+    # to find an assembly takes the hash of all that it consists of
+    of_design = _known_numbers(assembly) if real else {}
 
     def known_of(i: int) -> KeptNumbers | None:
         """The numbers of the i-th elements of all chains if no state touches them, as they are kept."""
         if touched is None or any(not touched.isdisjoint(bodies_of(chain, i, along)) for chain, along in parts):
             return None
         key = (i, tuple(tuple(element.name for element in chain[: i + 2]) for chain in chains), structures[i])
-        known = _known_numbers(assembly)
-        if key not in known:
+        if key not in of_design:
             nominal = assembly.place()
             own = [numbers_of(assembly, c, i, m, structures[i], ({},), nominal, None) for c, m in parts]
-            known[key] = KeptNumbers(_joined(own))
-        return known[key]
+            of_design[key] = KeptNumbers(_joined(own))
+        return of_design[key]
 
     def joined(i: int, known: KeptNumbers | None) -> ElementNumbers:
         """The numbers of the i-th elements of all chains."""
