@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, settings
 
 from optics.numerics.backend import Backend, load_backend
 from optics.numerics.threads import cores
+from scenes.models import instrument_builder
 from scenes.models.camera_model import CameraModel, derive_camera
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
@@ -82,12 +83,14 @@ class Calibrated:
     those do that a script makes from each other; one of unequal disturbances computes what rests on them itself.
 
     Attributes:
-        on: whether experiments are kept and taken. What is computed under a test's monkeypatch is its own.
+        on: whether experiments and instruments are kept and taken. What is computed under a test's monkeypatch is its
+            own.
     """
 
     def __init__(self) -> None:
         self.on = True
         self._build = MonitorExperiment.__init__
+        self._built = instrument_builder._built
         self._kept: list[MonitorExperiment] = []
 
     def init(self, new: MonitorExperiment, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
@@ -104,6 +107,9 @@ class Calibrated:
             self._build(new, resolved, backend, free_beams)
         if self.on and free_beams:
             self._kept = [new, *(one for one in self._kept if one not in same)]
+
+    def built(self, asked: instrument_builder._Asked) -> Instrument:
+        return self._built(asked) if self.on else self._built.__wrapped__(asked)
 
     def keep_only(self, one: MonitorExperiment) -> None:
         self._kept = [one]
@@ -124,6 +130,7 @@ def calibrated() -> Iterator[Calibrated]:
     found = Calibrated()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MonitorExperiment, "__init__", lambda *arguments, **options: found.init(*arguments, **options))
+        patch.setattr(instrument_builder, "_built", found.built)
         yield found
 
 

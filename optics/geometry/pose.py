@@ -81,8 +81,8 @@ def triple(vector: Any) -> tuple[float, float, float]:
 
 _UNIT = np.eye(3)
 _ROUNDING = 1e-12 + 1e-5 * _UNIT
-"""How far a rotation times its transpose may be off the unit matrix: axes are square to each other to rounding, and their
-lengths are those of a matrix that a file gives in a few digits."""
+"""How far a rotation times its transpose may be off the unit matrix: axes are square to each other to rounding, and
+their lengths are those of a matrix that a file gives in a few digits."""
 
 
 @dataclass(frozen=True, eq=False)
