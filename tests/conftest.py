@@ -1,7 +1,9 @@
 """Fixtures that every test may use. They last the session, so that kernels compile and cameras are derived once."""
 
+import gc
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from functools import cache
 
@@ -10,6 +12,7 @@ from hypothesis import HealthCheck, settings
 
 from optics.numerics.backend import Backend, load_backend
 from optics.numerics.threads import cores
+from scenes.models import instrument_builder
 from scenes.models.camera_model import CameraModel, derive_camera
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
@@ -50,9 +53,27 @@ def pytest_configure(config: pytest.Config) -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    # The tests start hundreds of Python processes, and each would compile the same sources.
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     if getattr(config.option, "numprocesses", None):
         for library in ("OPENBLAS", "OMP", "MKL"):
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """A slow case of a test of the second tier belongs to the third alone."""
+    if config.option.markexpr == "second":
+        slow = [item for item in items if item.get_closest_marker("slow")]
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if not item.get_closest_marker("slow")]
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    """Leave thousands of collected tests and all imported modules out of each later collection of garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -70,12 +91,14 @@ class Calibrated:
     those do that a script makes from each other; one of unequal disturbances computes what rests on them itself.
 
     Attributes:
-        on: whether experiments are kept and taken. What is computed under a test's monkeypatch is its own.
+        on: whether experiments and instruments are kept and taken. What is computed under a test's monkeypatch is its
+            own.
     """
 
     def __init__(self) -> None:
         self.on = True
         self._build = MonitorExperiment.__init__
+        self._built = instrument_builder._built
         self._kept: list[MonitorExperiment] = []
 
     def init(self, new: MonitorExperiment, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
@@ -92,6 +115,9 @@ class Calibrated:
             self._build(new, resolved, backend, free_beams)
         if self.on and free_beams:
             self._kept = [new, *(one for one in self._kept if one not in same)]
+
+    def built(self, asked: instrument_builder._Asked) -> Instrument:
+        return self._built(asked) if self.on else self._built.__wrapped__(asked)
 
     def keep_only(self, one: MonitorExperiment) -> None:
         self._kept = [one]
@@ -112,6 +138,7 @@ def calibrated() -> Iterator[Calibrated]:
     found = Calibrated()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MonitorExperiment, "__init__", lambda *arguments, **options: found.init(*arguments, **options))
+        patch.setattr(instrument_builder, "_built", found.built)
         yield found
 
 

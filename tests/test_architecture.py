@@ -88,6 +88,12 @@ def source_files() -> list[Path]:
 
 
 @cache
+def parsed(path: Path) -> ast.Module:
+    """A file of the source, which no test changes."""
+    return ast.parse(path.read_text("utf-8"))
+
+
+@cache
 def imported_modules(path: Path) -> set[str]:
     """Names of everything a file imports, at any depth, also by importlib with a literal name; of what is imported from
     a module, the module's and the one that it would have as a module of its own.
@@ -378,7 +384,7 @@ def test_general_commands_know_no_paper(room: str) -> None:
         f"{path.relative_to(ROOT)}:{line}: {text[:60]!r}"
         for path in files
         if path.name != "__main__.py"
-        for line, text in texts(ast.parse(path.read_text("utf-8")))
+        for line, text in texts(parsed(path))
         if OF_PAPERS.search(text)
     ]
     assert not told, "\n".join(told)
@@ -399,7 +405,7 @@ def test_one_notation_for_units(room: str) -> None:
         if place.startswith("twin/validation/") or place == "analysis/mtf/mtf_command.py":
             # the latter reads what users write, in whichever letter
             continue
-        for line, text in texts(ast.parse(path.read_text("utf-8"))):
+        for line, text in texts(parsed(path)):
             if any(sign in text for sign in OTHER_SIGNS) or (room == "twin" and UNIT_AFTER_COMMA.fullmatch(text)):
                 found.append(f"{place}:{line}: {text[:60]!r}")
     assert not found, "\n".join(found)

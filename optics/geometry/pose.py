@@ -79,6 +79,12 @@ def triple(vector: Any) -> tuple[float, float, float]:
     return (float(x), float(y), float(z))
 
 
+_UNIT = np.eye(3)
+_ROUNDING = 1e-12 + 1e-5 * _UNIT
+"""How far a rotation times its transpose may be off the unit matrix: axes are square to each other to rounding, and
+their lengths are those of a matrix that a file gives in a few digits."""
+
+
 @dataclass(frozen=True, eq=False)
 class Pose:
     """Rigid transform x_parent = rotation @ x_body + translation.
@@ -97,7 +103,7 @@ class Pose:
         translation = np.array(self.translation, dtype=np.float64)
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise ValueError(f"a pose needs shapes (3, 3) and (3,), found {rotation.shape} and {translation.shape}")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12) or np.linalg.det(rotation) < 0:
+        if not np.all(np.abs(rotation @ rotation.T - _UNIT) <= _ROUNDING) or np.linalg.det(rotation) < 0:
             raise ValueError("a pose's rotation must be a proper orthogonal matrix")
         rotation.setflags(write=False)
         translation.setflags(write=False)
@@ -106,10 +112,10 @@ class Pose:
 
     def __eq__(self, other: object) -> bool:
         """Equal when both arrays are bit-equal."""
-        return (
+        return self is other or (
             isinstance(other, Pose)
-            and np.array_equal(self.rotation, other.rotation)
-            and np.array_equal(self.translation, other.translation)
+            and self.rotation.tobytes() == other.rotation.tobytes()
+            and self.translation.tobytes() == other.translation.tobytes()
         )
 
     def __hash__(self) -> int:

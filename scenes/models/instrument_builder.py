@@ -5,6 +5,8 @@ faces.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import combinations, permutations
 
 import numpy as np
@@ -42,7 +44,8 @@ from scenes.specs.baffle import Plate
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE, CENTRAL_PRISM, Channel, InstrumentSpec
 from scenes.specs.perturbation import NodeInfo
-from scenes.yaml.errors import InputError, Issue, unknown
+from scenes.yaml.errors import InputError, Issue, KeyPath, unknown
+from scenes.yaml.spec import Spec
 
 _FLIP = np.diag([-1.0, 1.0, -1.0])  # area CCD in the focal plane: columns along -X, rows along +Y, facing the light
 
@@ -69,8 +72,10 @@ def build_instrument(
         InputError: prisms or central prism cannot stand as the file says, the cameras are too different, or what was
             built is not of this instrument.
     """
+    named = tuple(camera_specs.items())
+    read = tuple((one.source.file, one.source.lines) for one in (spec, *camera_specs.values()) if isinstance(one, Spec))
     try:
-        return _build(spec, camera_specs, backend, free_beams, free_bodies)
+        return _built(_Asked(spec, named, backend, free_beams, free_bodies, repr((spec, named)), read))
     except MisplacedError as error:
         key = error.key if error.channel is None else spec.key_of(*error.channel, error.key)
         issue = spec.issue(str(error), key, allowed=error.remedy)
@@ -80,6 +85,31 @@ def build_instrument(
         if not first:
             raise
         raise InputError(*first, *error.issues) from error
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What an instrument is built from.
+
+    Attributes:
+        spec, cameras, backend, free_beams, free_bodies: as of ``build_instrument``.
+        text: of the specifications; the order of parts is that of the results, and no part of equality.
+        read: file and lines of each specification, which errors name later; equal specifications may differ in them.
+    """
+
+    spec: InstrumentSpec
+    cameras: tuple[tuple[str, object], ...]
+    backend: Backend
+    free_beams: bool
+    free_bodies: bool
+    text: str
+    read: tuple[tuple[str, Mapping[KeyPath, int]], ...] = field(hash=False)
+
+
+@lru_cache(maxsize=8)
+def _built(asked: _Asked) -> Instrument:
+    """The instrument; commands and scripts build the same one again and again, so those built last are kept."""
+    return _build(asked.spec, FrozenMap(asked.cameras), asked.backend, asked.free_beams, asked.free_bodies)
 
 
 def _no_cameras(camera_specs: Mapping[str, object], backend: Backend) -> tuple[Issue, ...]:

@@ -107,7 +107,7 @@ def test_the_response_is_that_of_a_difference() -> None:
     )
 
 
-@pytest.mark.parametrize("gaps", [GAPS[:1], pytest.param(GAPS, marks=pytest.mark.second)], ids=["one", "two"])
+@pytest.mark.parametrize("gaps", [GAPS[:1], pytest.param(GAPS, marks=pytest.mark.slow)], ids=["one", "two"])
 def test_the_false_alarm_rate_is_a_bound_and_close(gaps: tuple[float, ...]) -> None:
     """400 passes of noise: the highest power of all frequencies exceeds each level at most as often as is said, and not
     much more rarely.

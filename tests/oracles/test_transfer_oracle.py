@@ -12,6 +12,7 @@ from optics.waves.pupil_stack import fit_pupils
 from scenes.models.camera_model import IMAGE
 from tests.optics.test_imaging import PERTURBED, WAVELENGTH, Camera
 from tests.oracles.peers import batoid_camera, batoid_rays
+from tests.tiers import quick
 
 batoid = pytest.importorskip("batoid")
 pytestmark = pytest.mark.oracle
@@ -27,7 +28,7 @@ def slopes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return along_x, along_y
 
 
-@pytest.mark.parametrize("dz", [0.0, -200e-6])
+@pytest.mark.parametrize("dz", quick(1, [-200e-6, 0.0]))
 def test_transform_of_batoids_image(backend, gf7, dz: float) -> None:
     """batoid traces the rays and gives the phase of each plane wave at each pixel; only the rays' start is shared.
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from optics.numerics.frozen_map import FrozenMap
+from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import (
     CAMERAS,
     DETECTORS,
@@ -218,3 +220,20 @@ def test_mappings_cannot_be_changed() -> None:
         camera.mirrors["M4"] = camera.mirrors["M1"]
     with pytest.raises(TypeError, match="cannot be changed"):
         camera.mirrors.clear()
+
+
+def test_an_equal_instrument_is_built_once_and_that_of_another_file_anew(backend, tmp_path) -> None:
+    """Errors name the file that an instrument was read from, and results the order in which it names its parts."""
+    first, again = (load_instrument("monitor_pair") for _ in range(2))
+    cameras = {site.camera: load_camera(site.camera) for site in first.cameras.values()}
+    built = build_instrument(first, cameras, backend)
+    assert build_instrument(again, dict(cameras), backend) is built
+    (tmp_path / "own.yaml").write_text(f"# mine\n{(LIBRARY / INSTRUMENTS / 'monitor_pair.yaml').read_text('utf-8')}")
+    own = load_instrument(tmp_path / "own.yaml")
+    assert own == first
+    other = build_instrument(own, cameras, backend)
+    assert other is not built
+    assert other.spec.source.file == str(tmp_path / "own.yaml")
+    turned = first.model_copy(update={"cameras": FrozenMap(reversed(first.cameras.items()))})
+    assert turned == first
+    assert list(build_instrument(turned, cameras, backend).cameras) == list(built.cameras)[::-1]

@@ -110,30 +110,34 @@ def test_intersected_points_against_least_squares(sensors) -> None:
     root = np.linalg.cholesky(np.linalg.inv(stated.image))
     there = {name: np.stack(s.image(point), axis=-1)[0] for name, s in pair.items()}
 
-    def images(move: np.ndarray) -> np.ndarray:
-        at = point + move @ axes
-        return np.concatenate([np.stack(s.image(at), -1)[0] @ root for s in pair.values()])
+    def images(moves: np.ndarray) -> np.ndarray:
+        """Of points (M, 3) moved from the first, (M, 2 for each sensor)."""
+        at = point + moves @ axes
+        return np.concatenate([np.stack(s.image(at), -1) @ root for s in pair.values()], axis=-1)
 
     # steps of 10 m: the sensor's own inverse is right to 1e-7 px
-    slope = np.stack([(images(step) - images(-step)) / 20.0 for step in 10.0 * np.eye(3)], axis=1)
+    slope = ((images(10.0 * np.eye(3)) - images(-10.0 * np.eye(3))) / 20.0).T
 
-    def intersected(places) -> np.ndarray:
-        move, wanted = np.zeros(3), np.concatenate([places[name] @ root for name in pair])
+    def intersected(places: list[dict[str, np.ndarray]]) -> np.ndarray:
+        """(M, 3) from M points' places in all images."""
+        wanted = np.array([np.concatenate([one[name] @ root for name in pair]) for one in places])
+        moves = np.zeros((len(places), 3))
         for _ in range(3):
-            move = move + np.linalg.lstsq(slope, wanted - images(move), rcond=None)[0]
-        return move
+            moves = moves + np.linalg.lstsq(slope, (wanted - images(moves)).T, rcond=None)[0].T
+        return moves
 
-    columns = []
+    places = []
     for j, sigma in enumerate(PLATFORM):
         moved = np.zeros(6)
         moved[j] = sigma
-        columns.append(intersected({n: np.stack(wrong(s, moved).image(point), -1)[0] for n, s in pair.items()}))
+        places.append({n: np.stack(wrong(s, moved).image(point), -1)[0] for n, s in pair.items()})
     for name, sensor in pair.items():
         middle = there[name][1] - 0.5 * (sensor.camera.pixels - 1)
         for own in ([INTERIOR[0], 0.0], [0.0, INTERIOR[1]], [0.0, INTERIOR[2] * middle]):
-            columns.append(intersected(there | {name: there[name] + own}))
+            places.append(there | {name: there[name] + own})
+    columns = intersected(places)
     constant = sum(np.outer(c, c) for c in columns)
-    columns = [intersected(there | {name: there[name] + own}) for name in pair for own in ([0.2, 0.0], [0.0, 0.3])]
+    columns = intersected([there | {name: there[name] + own} for name in pair for own in ([0.2, 0.0], [0.0, 0.3])])
     random = sum(np.outer(c, c) for c in columns)
     for got, wanted in ((found.constant[k], constant), (found.random[k], random)):
         scale = np.sqrt(np.diag(wanted))

@@ -10,6 +10,7 @@ from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
+from tests.tiers import quick
 from tests.twin.pushbroom_bench import LINE_TIME, PLACE, Ground, lines
 from twin.orbit.flight.jitter import Jitter
 from twin.orbit.flight.trajectory import Trajectory
@@ -203,7 +204,7 @@ def test_what_is_no_jitter_is_told(text: str, told: str) -> None:
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("frequency", [12.0, 62.0])
+@pytest.mark.parametrize("frequency", quick(1, [62.0, 12.0]))
 def test_every_line_of_an_image_is_displaced_and_blurred_by_its_own_transfer(frequency: float) -> None:
     """A wave along the line, 0.3 cycles per pixel, under 32 stages: its amplitude in each line, over that without
     jitter, is the transfer at that line's time. The renderer's places are good to 0.002 pixels, 0.004 of the wave.

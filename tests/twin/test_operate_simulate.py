@@ -347,6 +347,7 @@ def test_a_record_that_holds_readings_or_real_ones_is_refused(made: tuple[Path, 
     assert "init --simulated makes such a record" in done.stderr.replace("\n", " ")
 
 
+@pytest.mark.second
 def test_a_life_without_a_record_is_its_files_alone(tmp_path: Path) -> None:
     words = ("--from", "2027-01-01T00:00:00Z", "--days", 1, "--every", "6d", "--frames", 2)
     done = run("simulate", PLAN, *words, "--out", tmp_path / "files", "--truth", "none", "--json")

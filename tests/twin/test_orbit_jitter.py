@@ -16,6 +16,7 @@ from scenes.specs.orbit.jitter_search import OrbitJitterSpec
 from scenes.specs.orbit.setup import JitterSetup, load_three_line_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from tests.tiers import quick
 from tests.twin.commands import invoke
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
@@ -80,7 +81,7 @@ def test_an_oscillation_of_the_body_is_found_about_its_axes() -> None:
     assert numbers["oscillations"][0]["true_amplitude_arcsec"] == pytest.approx({"roll": 2.4, "pitch": 1.0})
 
 
-@pytest.mark.parametrize(("pair", "blind"), [(("blue", "green"), 8.223), (("green", "red"), 9.765)])
+@pytest.mark.parametrize(("pair", "blind"), quick(1, [(("blue", "green"), 8.223), (("green", "red"), 9.765)]))
 def test_two_bands_are_blind_at_the_inverse_of_their_gap(pair: tuple[str, str], blind: float) -> None:
     """An oscillation of 1 px there is not found by the two, but by all four."""
     line = {"frequency": f"{blind} Hz", "amplitude": "2.4 0 0 arcsec", "phase": "0 deg"}
@@ -104,6 +105,7 @@ def quiet() -> JitterSetup:
     )
 
 
+@pytest.mark.second
 def test_readings_of_the_attitude_leave_no_period(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without jitter none is found; against readings joined by a spline it would be, below half of their rate."""
     assert not [seed for seed in range(3) if len(searched(quiet(), seed).lines.frequency)]
@@ -139,6 +141,7 @@ def test_a_hundred_passes_without_jitter_in_figures() -> None:
         assert power <= stats.chi2.ppf(1.0 - 1e-3, len(found) * one.before.order), frequency
 
 
+@pytest.mark.second
 def test_what_is_exported_gives_the_same_oscillations(tmp_path: Path) -> None:
     path = tmp_path / "pass.yaml"
     ask = {"highest": "6 Hz", "height": "300 m", "spline": {"interval": "0.2 s", "sigma": "3 arcsec"}}

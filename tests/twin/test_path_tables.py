@@ -125,6 +125,7 @@ def test_drawn_directions_follow_the_table(backend, kind: str, degrees: float) -
     assert statistic < chi2.ppf(1.0 - FALSE_ALARM, int(seen.sum()))
 
 
+@pytest.mark.second
 def test_between_whole_degrees_all_that_the_table_says_is_scattered(backend) -> None:
     table, angle = lambert(0.6), np.radians(67.43)
     specular = np.array([np.sin(angle), 0.0, np.cos(angle)])

@@ -154,6 +154,7 @@ def test_what_no_spot_sees_is_a_warning(orbit) -> None:
     assert "as likelier motions do" in told
 
 
+@pytest.mark.second
 def test_a_statement_of_what_no_spot_sees_is_a_warning(pair, tmp_path) -> None:
     file = tmp_path / "line.yaml"
     file.write_text(

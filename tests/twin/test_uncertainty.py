@@ -193,6 +193,7 @@ def test_shares_add_up_to_the_variance_and_known_motions_take_theirs_away():
     assert left < 0.7 * limits.splits[BEST].sigma[0]
 
 
+@pytest.mark.second
 def test_a_second_monitor_and_other_remedies_never_harm():
     experiment, _ = bench("gf7_pair", "orbit")
     limits = find_limits(experiment, expected_covariance(experiment, FRAMES), FRAMES, second_monitor=True)

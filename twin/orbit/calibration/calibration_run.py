@@ -229,6 +229,8 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     campaign = source_of(setup, shown, advance)
     parts = 6 + len(campaign.passes)
     advance("calibration", 1, parts)
+    # readings that are too few for them are told before anything is adjusted
+    differences = {one.name: _third_differences(one) for one in campaign.passes}
     latitude = latitude_fits(campaign, simultaneous(campaign))
     rates = rate_priors(campaign, latitude)
     campaign = drift_looked_for(campaign, rates)
@@ -236,7 +238,7 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     advance("calibration", 2, parts)
     fields = {}
     for k, one in enumerate(campaign.passes):
-        fields[one.name] = FieldResult(calibrated_alone(campaign, one), *_third_differences(one))
+        fields[one.name] = FieldResult(calibrated_alone(campaign, one), *differences[one.name])
         advance("calibration", 3 + k, parts)
     first = campaign.spec.schemes[0][0]
     control = next(p.control for p in campaign.passes if p.name == first)
