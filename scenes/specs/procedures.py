@@ -61,6 +61,17 @@ class FileKind:
 
 
 @dataclass(frozen=True)
+class Brief:
+    """Why a command takes little memory and time whatever its file says: nothing is said of it beforehand.
+
+    Attributes:
+        reason: a sentence, for people.
+    """
+
+    reason: str
+
+
+@dataclass(frozen=True)
 class Procedure:
     """A test, of whose run a command makes a report and a study takes the numbers.
 
@@ -75,7 +86,8 @@ class Procedure:
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
         report: run -> `twin.run.report.Report`.
         export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
-        cost: set-up -> `twin.run.cost.Cost`, what a run takes of memory and time; none for what never takes much.
+        cost: set-up -> `twin.run.cost.Cost`, what a run takes of memory and time; of a test that never takes much
+            `Brief`, with the reason.
         files: kinds of file that it reads; their command is known from the list.
         varied: whether a study can vary it.
         judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
