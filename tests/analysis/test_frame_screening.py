@@ -60,7 +60,7 @@ def test_pieces_change_nothing(count: int, moving: float, real: bool, monkeypatc
 
 
 def test_memory_does_not_grow_with_the_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    """But for a few numbers of each frame: a quarter of what more frames take as they were recorded would be too much."""
+    """But for a few numbers of each frame: not by a quarter of what more frames take as they were recorded."""
     monkeypatch.setattr(frame_screening, "_HELD", 1 << 16)
     peaks = []
     for count in (40, 160):
