@@ -14,12 +14,12 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from optics.numerics.threads import one_blas_thread
-from scenes.yaml.errors import InputError, KeyPath
-from scenes.yaml.spec import Spec
+from scenes.yaml.errors import KeyPath
 from twin.run.memory import LIMIT, amount_text, free_memory, largest
 
 MUCH_MEMORY, LONG = 2.0 * 2**30, 300.0
@@ -32,19 +32,27 @@ PACE_SECONDS = 0.0041
 """What the calculation of `pace` takes on the machine on which the rates were measured, seconds of one core."""
 
 
+class Owner(Protocol):
+    """Where a number stands: a file's part (`Spec`), or the options of a command."""
+
+    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> Exception:
+        """The error that says what is wrong with it, for the caller to raise."""
+        ...
+
+
 @dataclass(frozen=True)
 class Lowered:
-    """A number of a file with which a command takes less memory.
+    """A number of a file or an option with which a command takes less memory.
 
     Attributes:
-        owner, key: the file and where in it the number stands.
+        owner, key: the file or the options, and where in it the number stands.
         number: as it is.
         unit: of the number, in words.
         bytes: memory with another number.
         least: that it may be.
     """
 
-    owner: Spec
+    owner: Owner
     key: KeyPath
     number: int
     unit: str
@@ -100,7 +108,7 @@ def require_memory(cost: Cost, own: float = math.inf, own_key: str = "") -> None
         own_key: where the file says so.
 
     Raises:
-        InputError: it does not; at the key of what takes most, with the number that would fit.
+        InputError, InputErrorText: it does not; at the key or option of what takes most, with the number that fits.
     """
     free = free_memory()
     if cost.bytes <= min(own, max(ORDINARY, free)) or cost.lower is None:
@@ -110,7 +118,7 @@ def require_memory(cost: Cost, own: float = math.inf, own_key: str = "") -> None
 
 def beyond(
     need: float, free: float, lower: Lowered, there: float = 0.0, most_of_it: str = "", own_key: str = ""
-) -> InputError:
+) -> Exception:
     """More memory is needed than there is: the error that says so, for the caller to raise.
 
     Args:

@@ -1,0 +1,32 @@
+"""What an instrument as built takes of memory and time, from what its file says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from twin.run.cost import Cost, Lowered
+
+if TYPE_CHECKING:
+    from scenes.specs.asbuilt import AsBuiltSetup
+
+STARTED, STARTED_SECONDS = 290e6, 6.0
+"""Of an estimate with few draws: kernels, and what draws its report; bytes and seconds."""
+DRAW, DRAW_SECONDS = 2e4, 5e-3
+"""Bytes and seconds of a state of the prior, of the posterior and after the next move, for a merit at nine fields."""
+_FIELDS = 9
+
+
+def asbuilt_cost(setup: AsBuiltSetup) -> Cost:
+    """What `run_asbuilt` and its report take.
+
+    Args:
+        setup: the measurements.
+    """
+    test = setup.test
+    fields = sum(len(one.fields) for one in test.merits.values()) / _FIELDS
+
+    def needed(draws: int) -> float:
+        return STARTED + draws * DRAW
+
+    lower = Lowered(test, ("draws",), test.draws, "draws", needed, 20)
+    return Cost(needed(test.draws), STARTED_SECONDS + test.draws * fields * DRAW_SECONDS, lower)
