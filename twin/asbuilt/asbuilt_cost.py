@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from twin.asbuilt.asbuilt_run import ALONG
 from twin.run.cost import Cost, Lowered
+from twin.tolerance.tolerance_cost import different_fields
 
 if TYPE_CHECKING:
     from scenes.specs.asbuilt import AsBuiltSetup
@@ -13,7 +15,7 @@ STARTED, STARTED_SECONDS = 290e6, 6.0
 """Of an estimate with few draws: kernels, and what draws its report; bytes and seconds."""
 DRAW, DRAW_SECONDS = 2e4, 5e-3
 """Bytes and seconds of a state of the prior, of the posterior and after the next move, for a merit at nine fields."""
-_FIELDS = 9
+_ALONG = len(ALONG)
 
 
 def asbuilt_cost(setup: AsBuiltSetup) -> Cost:
@@ -23,7 +25,7 @@ def asbuilt_cost(setup: AsBuiltSetup) -> Cost:
         setup: the measurements.
     """
     test = setup.test
-    fields = sum(len(one.fields) for one in test.merits.values()) / _FIELDS
+    fields = different_fields(test.merits.values()) + _ALONG
 
     def needed(draws: int) -> float:
         return STARTED + draws * DRAW

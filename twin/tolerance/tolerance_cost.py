@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from twin.run.cost import Cost, Lowered
 from twin.study.runs.plan import CELL
+from twin.tolerance.merits import AT_FIELDS
 
 if TYPE_CHECKING:
-    from scenes.specs.tolerance import ToleranceSetup
+    from scenes.specs.tolerance import MeritSpec, ToleranceSetup
 
 STARTED, STARTED_SECONDS = 265e6, 8.0
 """Of a budget of few numbers and cameras: kernels, what draws its report, and a worker; bytes and seconds."""
 PAIR, PAIR_SECONDS = 6.6e3, 1.7e-3
 """Bytes and seconds for two numbers that vary together, by which the merits are modelled to the second order."""
 CAMERA_SECONDS = 6e-4
-"""Seconds of a camera that is drawn, for each field of a merit: its light, adjustments and merits."""
+"""Seconds of a camera that is drawn, for each field of its merits: light, adjustments and merits."""
 DRAWN, MODELLED = 32.0, 40.0
 """Bytes of a number that varies, and of a merit of the models, for each camera."""
+
+
+def different_fields(merits: Iterable[MeritSpec]) -> int:
+    """At how many fields merits need light."""
+    return len({place for one in merits if one.kind in AT_FIELDS for place in one.fields})
 
 
 def tolerance_cost(setup: ToleranceSetup) -> Cost:
@@ -28,7 +35,7 @@ def tolerance_cost(setup: ToleranceSetup) -> Cost:
     """
     test = setup.test
     numbers = sum(max(1, len(one.spectrum)) for one in test.tolerances.values())
-    fields = sum(len(one.fields) for one in test.merits.values())
+    fields = different_fields(test.merits.values())
     columns = len(test.merits) + len(test.compensators)
 
     def needed(samples: int) -> float:
