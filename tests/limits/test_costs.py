@@ -79,7 +79,10 @@ SIZES = {
         "design monitor",
         "examples/design_monitor_two.yaml",
         (
-            ("{beams: 60, layouts: 2000, rounds: 6, changed: 20, exact: 6}", "{beams: 8, layouts: 40, rounds: 1}"),
+            (
+                "{beams: 60, layouts: 2000, rounds: 6, changed: 20, exact: 6}",
+                "{beams: 8, layouts: 40, rounds: 1, changed: 4, exact: 2}",
+            ),
             ("ghost_paths: 100000", "ghost_paths: 10000"),
         ),
         ("--workers", "1"),
@@ -91,8 +94,8 @@ SIZES = {
         options=("--workers", "1", "--samples", "1500"),
         others=True,
     ),
-    "1500 draws as built": Sized(
-        "asbuilt estimate", "examples/asbuilt_gf7.yaml", (("prior: assembled", "draws: 1500\nprior: assembled"),)
+    "800 draws as built": Sized(
+        "asbuilt estimate", "examples/asbuilt_gf7.yaml", (("prior: assembled", "draws: 800\nprior: assembled"),)
     ),
     "life of 100 readings": Sized(
         "operate simulate",

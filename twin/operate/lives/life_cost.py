@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from scenes.yaml.errors import KeyPath
     from twin.operate.lives.simulate import Simulation
 
-STARTED_SECONDS = 9.0
+STARTED_SECONDS = 5.9
 """Of a life of one reading: kernels, and the record; seconds."""
-READING, READING_SECONDS = 2e5, 0.1
+READING, READING_SECONDS = 2e5, 0.14
 """Bytes and seconds of a reading beside its frames: of numbers that are kept, light, fits, estimators, truth."""
 EXPOSED_SECONDS = 1e-7
 """Seconds per pixel of a frame."""
@@ -51,10 +51,10 @@ def simulation_cost(plan: OperationSetup, what: Simulation) -> Cost:
     return Cost(needed(readings), STARTED_SECONDS + readings * seconds, lower)
 
 
-JUDGED, JUDGED_SECONDS = 300e6, 5.0
-"""Of a short life that is followed: what draws its report; bytes and seconds."""
-FOLLOWED, FOLLOWED_SECONDS = 2e5, 0.1
-"""Bytes and seconds of a reading that is followed."""
+JUDGED, JUDGED_SECONDS = 305e6, 9.1
+"""Of a short life that is followed: kernels, and what draws its report; bytes and seconds."""
+FOLLOWED, FOLLOWED_SECONDS = 2.6e6, 0.5
+"""Bytes of a reading in the window of the estimate, and seconds of a reading that is followed."""
 
 
 def judging_cost(plan: OperationSetup, readings: int) -> Cost:
@@ -64,4 +64,5 @@ def judging_cost(plan: OperationSetup, readings: int) -> Cost:
         plan: of the operation.
         readings: of the monitor in the life.
     """
-    return Cost(JUDGED + readings * FOLLOWED, JUDGED_SECONDS + readings * FOLLOWED_SECONDS)
+    held = min(readings, plan.operation.window) * FOLLOWED + readings * READING
+    return Cost(JUDGED + held, JUDGED_SECONDS + readings * FOLLOWED_SECONDS)

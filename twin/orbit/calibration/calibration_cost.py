@@ -11,12 +11,14 @@ from twin.run.cost import Cost, Lowered
 if TYPE_CHECKING:
     from scenes.specs.measured.orbit_data_setup import AnyCalibration
 
-STARTED, STARTED_SECONDS = 200e6, 5.0
-"""Of a calibration over one field with few points: what draws its report, most of all; bytes and seconds."""
-POINT = 3e3
-"""Bytes per point in each line and field."""
-POINT_SECONDS, REPEATED_SECONDS = 1e-3, 1e-3
-"""Seconds per point in each line and field, of the campaign itself and of one that is repeated."""
+STARTED, STARTED_SECONDS = 230e6, 5.0
+"""Of a calibration with few fields and points: what draws its report, most of all; bytes and seconds."""
+POINT, POINT_SECONDS = 5.4e3, 6.5e-4
+"""Bytes and seconds per point in each line and field."""
+TIE, TIE_SECONDS = 1.7e5, 0.016
+"""Bytes and seconds per tie point of a strip in each line and field, with the splines that it determines."""
+FIELD_SECONDS, REPEATED_SECONDS = 3.4, 0.18
+"""Seconds of a field beside its points, in the campaign itself, with what limits it, and in one that is repeated."""
 
 
 def calibration_cost(setup: AnyCalibration) -> Cost:
@@ -44,13 +46,18 @@ def calibration_cost(setup: AnyCalibration) -> Cost:
             fields * len(plan.patches) * lines * plan.lines * plan.pixels, plan.oversampling, measured=True
         )
         lowered = Lowered(test, ("images", longer), side, "lines and pixels", needed, 100)
-        return Cost(needed(side), STARTED_SECONDS + seen * POINT_SECONDS + imaged, lowered)
-    others = test.points.check + (0 if test.strip is None else test.strip.ties)
+        seconds = STARTED_SECONDS + fields * FIELD_SECONDS + seen * POINT_SECONDS + imaged
+        return Cost(needed(side), seconds, lowered)
+    assert test.points is not None  # what has no images has points
+    control = test.points.control
+    others = test.points.check
+    ties = lines * fields * (0 if test.strip is None else test.strip.ties)
 
-    def needed_for(control: int) -> float:
-        return STARTED + lines * fields * (control + others) * POINT
+    def needed_for(count: int) -> float:
+        return STARTED + lines * fields * (count + others) * POINT + ties * TIE
 
-    seen = lines * fields * (test.points.control + others)
-    seconds = STARTED_SECONDS + seen * (POINT_SECONDS + test.repeats * REPEATED_SECONDS)
-    lower = Lowered(test, ("points", "control"), test.points.control, "control points", needed_for)
-    return Cost(needed_for(test.points.control), seconds, lower)
+    seen = lines * fields * (control + others)
+    seconds = STARTED_SECONDS + fields * (FIELD_SECONDS + test.repeats * REPEATED_SECONDS) + seen * POINT_SECONDS
+    seconds += ties * TIE_SECONDS
+    lower = Lowered(test, ("points", "control"), control, "control points", needed_for)
+    return Cost(needed_for(control), seconds, lower)
