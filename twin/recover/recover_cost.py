@@ -18,8 +18,8 @@ STARTED, STARTED_SECONDS = 290e6, 5.6
 """Of a recovery from few frames of small CCDs: kernels, and what draws its report; bytes and seconds."""
 PIXEL, PIXEL_SECONDS = 77.0, 4e-6
 """Bytes and seconds per pixel of a state's mean image: maps of the search, of the fits and of their covariance."""
-FRAME_SECONDS = 3.2e-7
-"""Seconds per pixel of a frame that is read and searched."""
+SEARCHED_SECONDS, READ_SECONDS = 3.2e-7, 1e-7
+"""Seconds per pixel of a frame that is searched for defects, and of one whose noise alone is looked at."""
 
 
 def recover_cost(setup: MeasurementSetup) -> Cost:
@@ -50,7 +50,8 @@ def recover_cost(setup: MeasurementSetup) -> Cost:
     def needed(count: int) -> float:
         return started + count * each
 
-    seconds = STARTED_SECONDS + pixels * PIXEL_SECONDS + frames * FRAME_SECONDS
+    each_frame = SEARCHED_SECONDS if test.corrections == "automatic" else READ_SECONDS
+    seconds = STARTED_SECONDS + pixels * PIXEL_SECONDS + frames * each_frame
     lower = None
     if test.times is not None:
         lower = Lowered(test, ("times",), states - 1, "times", lambda count: needed(count + 1))
