@@ -81,8 +81,8 @@ def distortion_cost(setup: ExperimentSetup[Any]) -> Cost:
 TURNTABLE_STARTED, TURNTABLE_SECONDS = 290e6, 5.0
 """Of a calibration without its network; bytes and seconds."""
 TRAINING_SECONDS = 1.6
-"""Seconds of one training of the network, which takes nearly all of the time. It goes on until it has come to a minimum,
-so that it took 0.6 to 2.2 s.
+"""Seconds of one training of the network, which takes nearly all of the time. It goes on until it has come to a
+minimum, so that it took 0.6 to 2.2 s.
 """
 
 

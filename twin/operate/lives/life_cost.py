@@ -51,9 +51,9 @@ def simulation_cost(plan: OperationSetup, what: Simulation) -> Cost:
     return Cost(needed(readings), STARTED_SECONDS + readings * seconds, lower)
 
 
-JUDGED, JUDGED_SECONDS = 305e6, 9.1
+JUDGED, JUDGED_SECONDS = 305e6, 4.5
 """Of a short life that is followed: kernels, and what draws its report; bytes and seconds."""
-FOLLOWED, FOLLOWED_SECONDS = 2.6e6, 0.5
+FOLLOWED, FOLLOWED_SECONDS = 2.6e6, 0.2
 """Bytes of a reading in the window of the estimate, and seconds of a reading that is followed."""
 
 

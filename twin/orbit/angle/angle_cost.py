@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 STARTED, STARTED_SECONDS = 205e6, 4.4
 """Of a test in few points and passes: what draws its report, most of all; bytes and seconds."""
-PASS_SECONDS, SIGHT_SECONDS = 2e-3, 1.56e-5
+PASS_SECONDS, SIGHT_SECONDS = 2e-3, 1.25e-5
 """Seconds of a pass that is repeated, and of each point in it on each line."""
 
 

@@ -12,9 +12,9 @@ from twin.sensors.area_detector import EmvaDetector
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import LoopSetup
 
-STARTED_SECONDS = 5.7
+STARTED_SECONDS = 5.0
 """Of a loop of few readings: kernels, and what draws its report."""
-READING_SECONDS = 0.65
+READING_SECONDS = 0.5
 """Seconds of a reading, with the loop closed and open."""
 _PASSES, _PAIR, _OVERSAMPLING = 2, 2, 3
 
