@@ -61,11 +61,12 @@ from scenes.specs.instrument import PRISMS
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.orbit.flight import OrbitSpec
-from scenes.specs.procedures import FileKind, Procedure
+from scenes.specs.procedures import Procedure
 from scenes.specs.resolved import ExperimentSetup, resolve
 from scenes.specs.samplers import Sampler
 from scenes.specs.study import DesignSpec
 from scenes.yaml.errors import InputError
+from scenes.yaml.file_kind import FileKind
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES

@@ -18,6 +18,7 @@ from scenes.yaml.named import Named
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.run import cli
 from twin.run.command import Result, run_command
+from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
@@ -111,9 +112,8 @@ def main(
         return run_render(resolved, session, frames, seed, picture)
 
     def cost(resolved: ResolvedJob) -> Cost:
-        from twin.main_job.render_cost import render_cost
-
-        return render_cost(resolved, frames)
+        model: Cost = MODELS["render"](resolved, frames)
+        return model
 
     run_command(
         job.stem,

@@ -142,7 +142,7 @@ def _run(
 ) -> Validation:
     from optics.numerics.backend import load_backend
     from twin.run.command import tell_cost
-    from twin.run.cost import Cost
+    from twin.run.command_costs import MODELS
     from twin.run.provenance import program_digest
     from twin.validation.runner import rough_seconds, run_checks
     from twin.validation.validation_report import write_validation
@@ -157,7 +157,7 @@ def _run(
     tracer = load_backend(backend)
     program_digest()  # of the files that compute, which may be others when the checks end
     total = rough_seconds(selections, fast)
-    tell_cost(Cost(0.0, total), errors, quiet=False)
+    tell_cost(MODELS["validate"](selections, fast), errors, quiet=False)
     with Progress(*columns, console=errors, disable=not errors.is_terminal, transient=True) as bar:
         task = bar.add_task("start", total=total)
 

@@ -146,6 +146,17 @@ class ImageFile:
         Raises:
             ImageError: colours, too large an image, or one that cannot be decoded.
         """
+        return np.stack(list(self.pages(region)))
+
+    def pages(self, region: Region | None = None) -> Iterator[NDArray[Any]]:
+        """The pages of `frames`, (H, W) each, one at a time.
+
+        Args:
+            region: as there.
+
+        Raises:
+            ImageError: as there.
+        """
         head = self.header
         if head.channels > 2:
             raise ImageError(f"{self.path} has {head.channels} colours; frames of a monochrome detector are needed")
@@ -158,13 +169,11 @@ class ImageFile:
                 f" {1e-9 * size:.1f} GB, more than {1e-9 * MOST_BYTES:.1f} GB: cut the region out first, or take fewer"
                 " frames"
             )
-        out = []
         for data in self._decoded():
             grey = np.array(data[part.slices])
             grey = grey[..., 0] if grey.ndim == 3 else grey
             grey = grey.astype(grey.dtype.newbyteorder("="), copy=False)
-            out.append(int(head.full_scale) - grey if head.inverted else grey)
-        return np.stack(out)
+            yield int(head.full_scale) - grey if head.inverted else grey
 
     def _check(self, name: str, region: Region, most: float = MOST_PIXELS) -> None:
         down, right = region.row + region.height, region.column + region.width

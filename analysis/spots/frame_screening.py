@@ -12,7 +12,9 @@ once in 1 / FALSE_ALARM.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise, repeat
 from typing import Any
 
 import numpy as np
@@ -22,7 +24,6 @@ from scipy.stats import chi2, norm
 
 from analysis.measurement_error import MeasurementError
 from analysis.spots import rounding
-from analysis.spots.centroid import mean_frames
 from analysis.spots.noise import NoiseModel
 
 __all__ = [
@@ -37,6 +38,9 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Released = Callable[[NDArray[Any]], None]
+_HELD = 1 << 25
+"""Bytes of frames that are worked on at a time."""
 FALSE_ALARM = 1e-6
 """Chance that a test finds something in clean frames of one spot in one state."""
 GROWTH_SIGMAS = 3.5
@@ -118,67 +122,168 @@ class ScreenedFrames:
         return not any(finding.corrects for finding in self.findings)
 
 
-def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = None) -> ScreenedFrames:
+def _kept(frames: NDArray[Any]) -> None:
+    """Frames that are in memory anyway."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Stack:
+    """Frames of one state of which a few at a time are in memory as real numbers.
+
+    Attributes:
+        frames: (N, H, W) grey values as recorded.
+        numbers: (K,) of the frames that are looked at.
+        bad: (H, W) pixels that are of no use in any frame.
+        released: is told when some frames have been gone over, which may lie in a file.
+        blank: whether bad pixels are taken as 0.
+    """
+
+    frames: NDArray[Any]
+    numbers: NDArray[np.intp]
+    bad: Mask
+    released: Released
+    blank: bool = False
+
+    @classmethod
+    def of(cls, frames: NDArray[Any], bad: Mask | None, released: Released, blank: bool = False) -> _Stack:
+        """All frames."""
+        known = np.zeros(frames.shape[1:], dtype=bool) if bad is None else bad
+        return cls(frames, np.arange(len(frames)), known, released, blank)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.frames.shape[1], self.frames.shape[2]
+
+    def taken(self, numbers: NDArray[np.intp]) -> _Stack:
+        """Some of the frames, by their numbers among all."""
+        return replace(self, numbers=numbers)
+
+    def each(self, backwards: bool = False) -> Iterator[tuple[Array, Mask]]:
+        """Frame after frame: (H, W) its values, 0 where it has none, and where it has one."""
+        each = self.frames.itemsize * self.frames[0].size
+        for k, number in enumerate(self.numbers[::-1] if backwards else self.numbers):
+            yield self._read(self.frames[number], self.bad)
+            if (k + 1) * each // _HELD != k * each // _HELD:
+                self.released(self.frames)
+        self.released(self.frames)
+
+    def _read(self, frames: NDArray[Any], bad: Mask) -> tuple[Array, Mask]:
+        values = np.asarray(frames, dtype=np.float64)
+        finite = np.isfinite(values)
+        return np.where(finite & ~bad if self.blank else finite, values, 0.0), finite
+
+    def known(self) -> tuple[Mask, Mask]:
+        """(H, W) pixels that have a value in all frames, and in any."""
+        every, some = np.ones(self.shape, dtype=bool), np.zeros(self.shape, dtype=bool)
+        if np.issubdtype(self.frames.dtype, np.integer):
+            return every, ~some
+        for _, finite in self.each():
+            every &= finite
+            some |= finite
+        return every, some
+
+    def median(self, filled: bool = False) -> Array:
+        """(H, W) medians over the frames.
+
+        Args:
+            filled: where a frame has no value it has that median, instead of 0.
+        """
+        out = np.empty(self.shape)
+        rows = max(1, _HELD // (24 * len(self) * self.shape[1]))
+        some = max(1, _HELD // (self.frames.itemsize * self.frames[0].size))
+        for start in range(0, self.shape[0], rows):
+            own = slice(start, start + rows)
+            values = np.empty((len(self), *out[own].shape))
+            finite = np.empty(values.shape, dtype=bool)
+            for first in range(0, len(self), some):
+                part = slice(first, first + some)
+                values[part], finite[part] = self._read(self.frames[self.numbers[part], own], self.bad[own])
+                self.released(self.frames)
+            out[own] = np.median(values, axis=0)
+            if filled and not finite.all():
+                out[own] = np.median(np.where(finite, values, out[own]), axis=0)
+        return out
+
+
+def screen_frames(
+    frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = None, released: Released = _kept
+) -> ScreenedFrames:
     """Leave out what is not the same in all frames, and what is saturated.
+
+    Few of the frames are in memory at a time as real numbers, so that there may be many of them in a file.
 
     Args:
         frames: (N, H, W) grey values as recorded, integers or real numbers; NaN for pixels without a value.
         noise: of the detector.
         bad: (H, W) pixels that are known to be bad; None for none.
+        released: is told when some frames have been gone over.
 
     Raises:
         FramesError: too few of the frames hold the light, or none of their pixels can be used.
     """
-    values = np.asarray(frames, dtype=np.float64)
-    finite = np.isfinite(values)
-    known = np.zeros(values.shape[1:], dtype=bool) if bad is None else bad
+    stack = _Stack.of(frames, bad, released)
+    known, (finite, defined) = stack.bad, stack.known()
     findings: list[Finding] = []
     if np.any(known):
         findings.append(Finding("bad pixels", f"{np.count_nonzero(known)} of the bad-pixel map are left out"))
     if not np.all(finite):
-        count = np.count_nonzero(~finite.all(axis=0))
-        findings.append(Finding("undefined pixels", f"{count} without a value are left out"))
-    values = np.where(finite, values, 0.0)
-    kept = _lit(values, finite & ~known, findings)
-    hits = ~finite
-    model = np.zeros_like(values)
+        findings.append(Finding("undefined pixels", f"{np.count_nonzero(~finite)} without a value are left out"))
+    kept = _lit(stack, finite & ~known, findings)
+    found: _Compared | None = None
     jitter = np.zeros((2, 2))
     if len(kept) > 1:
-        found = _compared(values[kept], finite[kept], known, noise)
+        found = _compared(stack.taken(kept), noise)
         unlike = found.unlike()
         if np.any(unlike):
             names = _numbers(kept[unlike])
             findings.append(Finding("spoilt frames", f"{names} unlike the others are left out"))
-            if np.count_nonzero(~unlike) < 0.5 * len(values):
+            if np.count_nonzero(~unlike) < 0.5 * len(frames):
                 raise FramesError(
-                    f"{len(values) - np.count_nonzero(~unlike)} of {len(values)} frames are unlike the others or dark",
+                    f"{len(frames) - np.count_nonzero(~unlike)} of {len(frames)} frames are unlike the others or dark",
                     "record frames of one state under one name, with the light on",
                 )
             kept = kept[~unlike]
-            found = _compared(values[kept], finite[kept], known, noise) if len(kept) > 1 else found
-        if len(kept) > 1:
-            hits[kept] |= found.hits
-            model[kept] = found.model
+            found = _compared(stack.taken(kept), noise) if len(kept) > 1 else None
+        if found is not None:
             findings += found.findings()
             jitter = found.jitter
-    saturated = _saturated(values[kept], noise) & ~known
+    used = stack.taken(kept)
+    saturated = _saturated(used, noise) & ~known
     if np.any(saturated):
         findings.append(
             Finding("saturation", f"{np.count_nonzero(saturated)} pixels at and beside saturated ones are left out")
         )
-    used, lost = values[kept], hits[kept]
-    counts = len(kept) - np.count_nonzero(lost, axis=0).astype(np.float64)
+    total, lost = _summed(used, found)
+    counts = len(kept) - lost
     # a pixel that flickers in more than a third of the frames is no detector of light
     flickers = (counts < np.ceil(2.0 / 3.0 * len(kept))) & ~known
-    if np.any(flickers & finite.any(axis=0)):
+    if np.any(flickers & defined):
         findings.append(Finding("flickering pixels", f"{np.count_nonzero(flickers)} are left out"))
     good = ~known & ~saturated & ~flickers
-    whole = len(kept) == len(values) and not np.any(hits)
-    if whole and np.issubdtype(frames.dtype, np.integer):
-        mean = mean_frames(frames)
-    else:
-        mean = np.where(lost, model[kept], used).mean(axis=0)
-    return ScreenedFrames(mean, np.maximum(counts, 1.0), good, len(kept), len(values), jitter, tuple(findings))
+    mean = total / len(kept)
+    return ScreenedFrames(mean, np.maximum(counts, 1.0), good, len(kept), len(frames), jitter, tuple(findings))
+
+
+def _summed(used: _Stack, found: _Compared | None) -> tuple[Array, Array]:
+    """(H, W) sums over the frames, in which what is lost has its model's value, and how many are lost. Of whole numbers
+    the sum is exact, and by ``len(used)`` the mean of `centroid.mean_frames`.
+    """
+    total, lost = np.zeros(used.shape), np.zeros(used.shape)
+    for k, (values, finite) in enumerate(used.each()):
+        gone = ~finite
+        if found is None:
+            values[gone] = 0.0
+        else:
+            where, instead = found.replaced[k]
+            values.flat[where] = instead
+            gone.flat[where] = True
+        total += values
+        lost += gone
+    return total, lost
 
 
 def _numbers(frames: NDArray[np.intp]) -> str:
@@ -188,21 +293,19 @@ def _numbers(frames: NDArray[np.intp]) -> str:
     return f"frame{'s' * (len(frames) > 1)} {shown}{more}"
 
 
-def _lit(values: Array, usable: Mask, findings: list[Finding]) -> NDArray[np.intp]:
-    """Numbers of the frames that hold the light."""
-    edge = np.ones(values.shape[1:], dtype=bool)
+def _lit(stack: _Stack, inside: Mask, findings: list[Finding]) -> NDArray[np.intp]:
+    """Numbers of the frames that hold the light; ``inside`` are the pixels that can be used in all of them."""
+    edge = np.ones(stack.shape, dtype=bool)
     edge[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = False
-    inside = usable.all(axis=0)
     border = inside & edge if np.any(inside & edge) else edge
-    level = np.median(values[:, border], axis=1)
-    light = ((values - level[:, None, None]) * inside).sum(axis=(1, 2))
+    light = np.array([((values - np.median(values[border])) * inside).sum() for values, _ in stack.each()])
     # the brightest but for a few: a frame may be bright by accident
     reference = float(np.sort(light)[max(len(light) - 1 - len(light) // 4, 0)])
     dark = light < _DIM * reference
     kept = np.flatnonzero(~dark)
-    if 2 * len(kept) < len(values):
+    if 2 * len(kept) < len(light):
         raise FramesError(
-            f"{len(values) - len(kept)} of {len(values)} frames hold less than half of the light",
+            f"{len(light) - len(kept)} of {len(light)} frames hold less than half of the light",
             "record frames of one state under one name, with the light on",
         )
     if np.any(dark):
@@ -212,12 +315,14 @@ def _lit(values: Array, usable: Mask, findings: list[Finding]) -> NDArray[np.int
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """N frames against their reference: model and hits (N, H, W), light and level (N,) with the largest sigma of a
-    level, offsets (N, 2) px and their covariance (N, 2, 2).
+    """N frames of so many pixels against their reference: of each the number of pixels that were hit (N,), and which
+    pixels its model replaces by what values; light and level (N,) with the largest sigma of a level, offsets (N, 2) px
+    and their covariance (N, 2, 2).
     """
 
-    model: Array
-    hits: Mask
+    pixels: int
+    hits: NDArray[np.int64]
+    replaced: tuple[tuple[NDArray[np.intp], Array], ...]
     light: Array
     level: Array
     level_sigma: float
@@ -227,15 +332,13 @@ class _Compared:
 
     def unlike(self) -> Mask:
         """Which frames as a whole."""
-        count = np.count_nonzero(self.hits, axis=(1, 2))
-        return np.asarray(count > max(_UNLIKE * self.hits[0].size, _FEWEST_UNLIKE))
+        return np.asarray(self.hits > max(_UNLIKE * self.pixels, _FEWEST_UNLIKE))
 
     def findings(self) -> list[Finding]:
         out = []
         if np.any(self.hits):
-            struck = np.flatnonzero(self.hits.any(axis=(1, 2)))
-            count = np.count_nonzero(self.hits)
-            out.append(Finding("cosmic rays", f"{count} pixels of {_numbers(struck)} are left out"))
+            struck = np.flatnonzero(self.hits)
+            out.append(Finding("cosmic rays", f"{self.hits.sum()} pixels of {_numbers(struck)} are left out"))
         if np.any(self.jitter):
             rms = math.sqrt(float(np.trace(self.jitter)))
             out.append(Finding("movement between frames", f"{rms:.2g} px rms; its share in the mean is added to sigma"))
@@ -248,38 +351,34 @@ class _Compared:
         return out
 
 
-def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Compared:
-    count = len(values)
+def _compared(stack: _Stack, noise: NoiseModel) -> _Compared:
+    count, pixels = len(stack), stack.frames[0].size
     # what is saturated does not follow the light
-    usable = finite & ~bad & ~_saturated(values, noise)
-    blind = np.flatnonzero(~usable.any(axis=(1, 2)))
+    follows = ~stack.bad & ~_saturated(stack, noise)
+    blind = np.flatnonzero([not np.any(finite & follows) for _, finite in stack.each()])
     if blind.size:
         raise FramesError(
             f"every pixel of {_numbers(blind)} is saturated or known to be bad",
             "frames below saturation, and a map of bad pixels that leaves some",
         )
-    threshold = float(norm.isf(FALSE_ALARM / (2.0 * values.size)))
-    if count > 2:
-        reference = np.broadcast_to(
-            np.median(np.where(finite, values, np.median(values, axis=0)), axis=0), values.shape
-        )
-        excess = 1.0 + _MEDIAN / count
-    else:
-        reference, excess = values[::-1], 2.0
-    model, hits = np.empty_like(values), np.zeros(values.shape, dtype=bool)
+    threshold = float(norm.isf(FALSE_ALARM / (2.0 * count * pixels)))
+    # of a median the same for all frames that have not moved
+    middle = stack.median(filled=True) if count > 2 else None
+    still = None if middle is None else _basis(middle)
+    excess = 1.0 + _MEDIAN / count if count > 2 else 2.0
+    others = repeat(middle) if middle is not None else (values for values, _ in stack.each(backwards=True))
     light, level, sigmas = np.empty((3, count))
     offset, spread = np.empty((count, 2)), np.empty((count, 2, 2))
-    z = np.empty_like(values)
-    # of a median the same for all frames that have not moved
-    still = _basis(reference[0]) if count > 2 else None
-    for k, frame in enumerate(values):
-        weight = usable[k] / (excess * noise.frame_variance_dn2(reference[k]))
+    hits, replaced = np.empty(count, np.int64), []
+    for k, ((frame, finite), reference) in enumerate(zip(stack.each(), others, strict=False)):
+        usable = finite & follows
+        weight = usable / (excess * noise.frame_variance_dn2(reference))
         place = np.zeros(2)
         for _ in range(_MOST_MOVES):
             if np.any(place):
-                basis = _basis(ndimage.shift(reference[k], place, order=3, mode="nearest"))
+                basis = _basis(ndimage.shift(reference, place, order=3, mode="nearest"))
             else:
-                basis = _basis(reference[k]) if still is None else still
+                basis = _basis(reference) if still is None else still
             solution, inverse = _robust(basis, frame, weight)
             # of frames without light nothing can be said
             share = max(abs(float(solution[0])), _LEAST_SHARE)
@@ -287,23 +386,28 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
             if np.max(np.abs(further)) < _SMALL_PX or np.max(np.abs(place + further)) > _LARGEST_PX:
                 break
             place = place + further
-        model[k] = np.tensordot(solution, basis, 1)
-        sigma = np.sqrt(excess * noise.frame_variance_dn2(model[k]))
-        z[k] = np.where(usable[k], (frame - model[k]) / sigma, 0.0)
+        model = np.tensordot(solution, basis, 1)
+        sigma = np.sqrt(excess * noise.frame_variance_dn2(model))
+        z = np.where(usable, (frame - model) / sigma, 0.0)
         light[k], level[k], sigmas[k] = solution[0], solution[-1], math.sqrt(max(float(inverse[-1, -1]), 0.0))
         # a spot that has moved by d is its reference minus d times the slope
         offset[k] = place + further
         spread[k] = np.clip(inverse[1:3, 1:3], -_UNKNOWN, _UNKNOWN) / share**2
-    # of two frames that differ the brighter one was struck
-    struck = z > threshold if count == 2 else np.abs(z) > threshold
-    for k in range(count):
-        hits[k] = _grown(struck[k], np.abs(z[k]) > GROWTH_SIGMAS)
+        # of two frames that differ the brighter one was struck
+        struck = _grown(z > threshold if count == 2 else np.abs(z) > threshold, np.abs(z) > GROWTH_SIGMAS)
+        where = np.flatnonzero(struck | ~finite)
+        hits[k] = np.count_nonzero(struck)
+        replaced.append((where, model.flat[where]))
     moved = _jitter(offset, spread, count)
-    return _Compared(model, hits, light, level, float(sigmas.max()), offset, spread, moved)
+    return _Compared(pixels, hits, tuple(replaced), light, level, float(sigmas.max()), offset, spread, moved)
 
 
 def noise_ratio(
-    frames: NDArray[Any], noise: NoiseModel, usable: Mask | None = None, where: Mask | None = None
+    frames: NDArray[Any],
+    noise: NoiseModel,
+    bad: Mask | None = None,
+    where: Mask | None = None,
+    released: Released = _kept,
 ) -> float | None:
     """Noise of frames that hold the light, beside the spot, over the stated one, by the differences of each to the
     next; None where they agree, and where frames cannot show it.
@@ -311,39 +415,40 @@ def noise_ratio(
     Every pair of frames has a say, and the middle one counts, lest one spoilt frame is taken for noise.
 
     Args:
-        frames: (N, H, W) grey values of one state.
+        frames: (N, H, W) grey values of one state; NaN for pixels without a value.
         noise: of the detector, as stated.
-        usable: (N, H, W) pixels that are good; None for all.
+        bad: (H, W) pixels that are not to be used; None for none.
         where: (H, W) pixels to look at; None for those beside the spot.
+        released: is told when some frames have been gone over.
     """
-    values = np.asarray(frames, dtype=np.float64)
-    good = np.ones(values.shape, dtype=bool) if usable is None else usable
+    stack = _Stack.of(frames, bad, released, blank=True)
     try:
-        kept = _lit(values, good, [])
+        kept = _lit(stack, stack.known()[0] & ~stack.bad, [])
     except FramesError:
         return None
-    values, good = values[kept], good[kept]
-    if len(values) < 2:
+    stack = stack.taken(kept)
+    if len(stack) < 2:
         return None
-    middle = np.median(values, axis=0)
+    middle = stack.median()
     low = float(np.median(middle))
     if noise.frame_variance_dn2(low) < rounding.SHOWN**2 + rounding.WHOLE:
         # frames show what rounding makes of it, more or less, as pixels stand between two steps
         return None
     beside = middle < low + _LIT * (float(middle.max()) - low) if where is None else where
+    beside = beside & ~stack.bad
     sigma = np.sqrt(2.0 * noise.frame_variance_dn2(middle))
-    squares, fewest = [], values[0].size
-    for k in range(1, len(values)):
-        chosen = beside & good[k] & good[k - 1]
+    squares, fewest = [], middle.size
+    for (last, before), (values, good) in pairwise(stack.each()):
+        chosen = beside & good & before
         if not np.any(chosen):
             continue
-        difference = (values[k] - values[k - 1])[chosen]
+        difference = (values - last)[chosen]
         z2 = ((difference - np.median(difference)) / sigma[chosen]) ** 2
         square = 1.0
         for _ in range(_ROUNDS):
-            before, square = square, max(float(np.minimum(z2, _MOST_SIGMAS**2 * square).mean()), 1e-12)
+            known, square = square, max(float(np.minimum(z2, _MOST_SIGMAS**2 * square).mean()), 1e-12)
             # noise that is not more than stated is told at once
-            if square < (1.0 + _NOISE_OFF) ** 2 or square < 1.001 * before:
+            if square < (1.0 + _NOISE_OFF) ** 2 or square < 1.001 * known:
                 break
         squares.append(square)
         fewest = min(fewest, z2.size)
@@ -354,7 +459,13 @@ def noise_ratio(
     return ratio if max(ratio, 1.0 / ratio) > 1.0 + max(_NOISE_OFF, 6.0 * spread) else None
 
 
-def shown_noise(frames: NDArray[Any], noise: NoiseModel, ratio: float | None) -> NoiseModel:
+def shown_noise(
+    frames: NDArray[Any],
+    noise: NoiseModel,
+    ratio: float | None,
+    bad: Mask | None = None,
+    released: Released = _kept,
+) -> NoiseModel:
     """The detector with the noise that its frames show, where that is more than stated: what is more is taken for read
     noise.
 
@@ -362,10 +473,14 @@ def shown_noise(frames: NDArray[Any], noise: NoiseModel, ratio: float | None) ->
         frames: (N, H, W) grey values.
         noise: as stated.
         ratio: see `noise_ratio`.
+        bad: as there.
+        released: as there.
     """
     if ratio is None or ratio <= 1.0:
         return noise
-    own = float(noise.frame_variance_dn2(float(np.median(frames))))
+    # of the medians of all pixels, most of which have no light
+    level = float(np.median(_Stack.of(frames, bad, released, blank=True).median()))
+    own = float(noise.frame_variance_dn2(level))
     read = noise.dark_noise_e**2 + (ratio**2 - 1.0) * own / noise.gain_dn_per_e**2
     return replace(noise, dark_noise_e=math.sqrt(read))
 
@@ -416,8 +531,8 @@ def _jitter(offset: Array, spread: Array, count: int) -> Array:
     return np.asarray((vector * np.maximum(value, 0.0) * few) @ vector.T)
 
 
-def _saturated(values: Array, noise: NoiseModel) -> Mask:
+def _saturated(stack: _Stack, noise: NoiseModel) -> Mask:
     """Pixels that are saturated in most frames, and those beside them, whose charge may have run over."""
     limit = noise.saturation_dn - _SATURATION_SIGMAS * math.sqrt(noise.frame_variance_dn2(noise.saturation_dn))
-    clipped = np.median(values, axis=0) >= limit
+    clipped = stack.median() >= limit
     return np.asarray(ndimage.binary_dilation(clipped, np.ones((3, 3)))) if np.any(clipped) else clipped

@@ -5,8 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from scenes.specs.procedures import PROCEDURES, FileKind
+from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.file_kind import FileKind
 from scenes.yaml.yaml_file import read_yaml
 
 Given = TypeVar("Given")

@@ -9,55 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.file_kind import FileKind
 from scenes.yaml.named import Named
-
-if TYPE_CHECKING:
-    from scenes.yaml.spec import Spec
 
 
 @dataclass(frozen=True)
-class FileKind:
-    """A kind of file.
+class Brief:
+    """Why a command takes little memory and time whatever its file says: nothing is said of it beforehand.
 
     Attributes:
-        name: of its JSON Schema.
-        described: model of what it may say, as `Named` takes its name.
-        what: it is, with article, for messages.
-        command: that reads it, as the user calls it; empty for what only other files name.
-        place: where other files name it; empty for what only a command reads.
-        one_of: keys of which it has at least one.
-        needs: keys that the model requires and few other kinds have: a file without them is known to be of another
-            kind before the model is imported.
+        reason: a sentence, for people.
     """
 
-    name: str
-    described: str
-    what: str
-    command: str = ""
-    place: str = ""
-    one_of: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ()
-
-    @property
-    def model(self) -> type[Spec]:
-        """What it may say."""
-        model: type[Spec] = Named(self.described).get()
-        return model
-
-    def may_be(self, keys: set[str]) -> bool:
-        """Whether a file with these keys can be one of this kind, by what is known before the model is imported."""
-        return keys >= set(self.needs) and (not self.one_of or bool(keys & set(self.one_of)))
-
-    def strangers(self, keys: set[str]) -> int | None:
-        """How many of the keys are none of this kind's; None if one that it needs is missing."""
-        if not self.may_be(keys):
-            return None
-        fields = self.model.model_fields
-        needed = {name for name, item in fields.items() if item.is_required()}
-        return len(keys - set(fields)) if needed <= keys else None
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -75,7 +42,8 @@ class Procedure:
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
         report: run -> `twin.run.report.Report`.
         export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
-        cost: set-up -> `twin.run.cost.Cost`, what a run takes of memory and time; none for what never takes much.
+        cost: set-up -> `twin.run.cost.Cost`, what a run takes of memory and time; of a test that never takes much
+            `Brief`, with the reason.
         files: kinds of file that it reads; their command is known from the list.
         varied: whether a study can vary it.
         judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
@@ -131,6 +99,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.resolved:resolve_focus_test",
         run="twin.laboratory.focus_run:run_focus",
         numbers="twin.laboratory.focus_numbers:focus_numbers",
+        cost="twin.laboratory.laboratory_cost:focus_cost",
         report="twin.laboratory.focus_report:focus_report",
         export="twin.laboratory.export:export_focus",
         files=(
@@ -159,6 +128,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.resolved:resolve_distortion_test",
         run="twin.laboratory.distortion_run:run_distortion",
         numbers="twin.laboratory.distortion_numbers:DISTORTION",
+        cost="twin.laboratory.laboratory_cost:distortion_cost",
         report="twin.laboratory.distortion_report:distortion_report",
         export="twin.laboratory.export:export_distortion",
         files=(
@@ -193,6 +163,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.resolved:resolve_turntable_test",
         run="twin.laboratory.turntable_run:run_turntable_test",
         numbers="twin.laboratory.turntable_numbers:TURNTABLE",
+        cost="twin.laboratory.laboratory_cost:turntable_cost",
         report="twin.laboratory.turntable_report:turntable_report",
         export="twin.laboratory.export:export_turntable",
         files=(
@@ -258,6 +229,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_any_angle",
         run="twin.orbit.angle.measured_angle:run_angle_test",
         numbers="twin.orbit.angle.angle_numbers:angle_numbers",
+        cost="twin.orbit.angle.angle_cost:angle_cost",
         report="twin.orbit.angle.angle_report:angle_report",
         export="twin.orbit.angle.measured_angle:angle_exported",
         files=(
@@ -295,6 +267,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_any_calibration",
         run="twin.orbit.calibration.calibration_run:run_calibration",
         numbers="twin.orbit.calibration.calibration_numbers:CALIBRATION",
+        cost="twin.orbit.calibration.calibration_cost:calibration_cost",
         report="twin.orbit.calibration.calibration_report:calibration_report",
         export="twin.orbit.calibration.calibration_export:exported",
         files=(
@@ -331,6 +304,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_check",
         run="twin.orbit.conventions.check_run:run_check",
         numbers="twin.orbit.conventions.check_numbers:CHECK",
+        cost="twin.orbit.conventions.check_cost:check_cost",
         report="twin.orbit.conventions.check_report:check_report",
         export="twin.orbit.conventions.check_run:exported",
         files=(
@@ -362,6 +336,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_any_jitter",
         run="twin.orbit.jitter.jitter_run:run_jitter",
         numbers="twin.orbit.jitter.jitter_numbers:JITTER",
+        cost="twin.orbit.jitter.jitter_cost:jitter_cost",
         report="twin.orbit.jitter.jitter_report:jitter_report",
         export="twin.orbit.jitter.jitter_run:exported",
         files=(
@@ -399,6 +374,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.orbit.setup:resolve_loop",
         run="twin.orbit.loop.loop_run:run_loop",
         numbers="twin.orbit.loop.loop_numbers:LOOP",
+        cost="twin.orbit.loop.loop_cost:loop_cost",
         report="twin.orbit.loop.loop_report:loop_report",
         files=(
             FileKind(
@@ -424,6 +400,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_match",
         run="twin.orbit.matching.match_run:run_match",
         numbers="twin.orbit.matching.match_run:MATCH",
+        cost="twin.orbit.matching.match_cost:match_cost",
         report="twin.orbit.matching.match_report:match_report",
         export="twin.orbit.matching.match_run:exported",
         files=(
@@ -452,6 +429,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.orbit.setup:resolve_monitor",
         run="twin.orbit.monitoring.monitoring_run:run_monitor",
         numbers="twin.orbit.monitoring.monitoring_numbers:MONITOR",
+        cost="twin.orbit.monitoring.monitoring_cost:monitoring_cost",
         report="twin.orbit.monitoring.monitoring_report:monitor_report",
         files=(
             FileKind(
@@ -506,6 +484,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.models.camera_design:resolve_design",
         run="twin.design.design_run:run_design",
         numbers="twin.design.design_run:DESIGN",
+        cost="twin.design.design_cost:camera_design_cost",
         report="twin.design.design_report:design_report",
         files=(
             FileKind(
@@ -535,6 +514,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.models.monitor_layout:resolve_monitor_design",
         run="twin.design.monitor_design:run_monitor_design",
         numbers="twin.design.monitor_design:LAYOUTS",
+        cost="twin.design.design_cost:monitor_design_cost",
         report="twin.design.monitor_report:monitor_design_report",
         files=(
             FileKind(
@@ -552,6 +532,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.asbuilt:resolve_asbuilt",
         run="twin.asbuilt.asbuilt_run:run_asbuilt",
         numbers="twin.asbuilt.asbuilt_run:ASBUILT",
+        cost="twin.asbuilt.asbuilt_cost:asbuilt_cost",
         report="twin.asbuilt.asbuilt_report:asbuilt_report",
         files=(
             FileKind(
@@ -579,6 +560,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.asbuilt:resolve_asbuilt",
         run="twin.asbuilt.orientation_check:run_check",
         numbers="twin.asbuilt.orientation_check:ORIENTATION",
+        cost=Brief("Sixteen readings of each wavefront, of which there are two hundred at most, are compared."),
         report="twin.asbuilt.orientation_check:check_report",
         judged=False,
         about="""

@@ -1,14 +1,16 @@
 """``python -m tests.limits.measured COMMAND ARGUMENTS``: a command in a process of its own, and what it took.
 
-The last line of stdout is JSON: exit code, seconds of the processor and of the clock, bytes at most above those of the
-imported program, bytes that a monitor's job was estimated to take, and bytes and seconds of one core that the command
-was said to take before it started (0 where nothing was).
+The last line of stdout is JSON: exit code, seconds of the processor (also those of processes that it started and
+waited for, by themselves) and of the clock, bytes at most above those of the imported program, bytes that a monitor's
+job was estimated to take, and bytes and seconds of one core that the command was said to take before it started (0
+where nothing was).
 """
 
 from __future__ import annotations
 
 import importlib
 import json
+import resource
 import sys
 import time
 from dataclasses import replace
@@ -57,7 +59,9 @@ def taken(command: str, arguments: list[str]) -> dict[str, Any]:
         code = getattr(error, "exit_code", 1)
         if not hasattr(error, "exit_code"):
             raise
+    others = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = {"clock": time.monotonic() - clock, "processor": time.process_time() - processor}
+    seconds["others"] = others.ru_utime + others.ru_stime
     told = {"told_bytes": said[-1].bytes, "told_seconds": said[-1].seconds}
     return {"code": code, **seconds, "used": resident("VmHWM") - start, "estimated": estimates[-1], **told}
 

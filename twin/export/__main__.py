@@ -78,7 +78,7 @@ def main(
         return finished(session, KIND, export_report(done), done.numbers(), backend="", program=PROGRAM, **facts)
 
     stem = f"{run.resolve().name}-files"
-    run_command(stem, Options(out, None, "llvm", force, as_json, quiet), read, work)
+    run_command(stem, Options(out, None, "llvm", force, as_json, quiet), read, work, None)
 
 
 if __name__ == "__main__":

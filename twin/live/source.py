@@ -14,9 +14,9 @@ from scenes.specs.job import JobSpec
 from scenes.specs.load import CAMERAS, INSTRUMENTS, library_names
 from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
-from scenes.specs.procedures import FileKind
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
+from scenes.yaml.file_kind import FileKind
 from scenes.yaml.spec import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from twin.monitor.monitor_memory import MonitorSize
 from twin.run.cost import Cost
 from twin.sensors.area_detector import EmvaDetector
 from twin.targets.target_measurement import target_pixels
 
 if TYPE_CHECKING:
-    from scenes.specs.instrument import MonitorSpec
     from scenes.specs.resolved import ResolvedJob
 
 STARTED, STARTED_SECONDS = 400e6, 11.6
@@ -38,17 +35,8 @@ def render_cost(resolved: ResolvedJob, frames: int | None = None) -> Cost:
         return Cost(STARTED, STARTED_SECONDS)
     count, course = resolved.frames if frames is None else frames, job.course
     times = 0 if course is None else len(course.times)
-    spots = 2 * len(resolved.instrument.cameras)
-    ccd = monitor.area_ccd
-    size = MonitorSize(spots, ccd.rows, ccd.columns, _phase(resolved, monitor), count, times, target_pixels(resolved))
-    exposed = spots * ccd.rows * ccd.columns * count * EXPOSED_SECONDS
-    stray = 0.0 if job.render.stray is None else job.render.stray.paths * spots * PATH_SECONDS
+    size = MonitorSize.stated(resolved, count, times, target_pixels(resolved))
+    exposed = size.pixels * count * EXPOSED_SECONDS
+    stray = 0.0 if job.render.stray is None else job.render.stray.paths * size.spots * PATH_SECONDS
     seconds = STARTED_SECONDS + 2.0 * exposed + times * (STATE_SECONDS + exposed) + stray
-    return Cost(size.bytes(EmvaDetector.from_sheet(resolved.area_detector, ccd.exposure)), seconds)
-
-
-def _phase(resolved: ResolvedJob, monitor: MonitorSpec) -> float:
-    """From the middle to the edge of the pupil for one pixel, radians, of a beam that fills its aperture."""
-    focal_length = min(camera.focal_length for camera in resolved.cameras.values())
-    aperture = 0.5 * monitor.return_face.aperture / focal_length
-    return float(2.0 * np.pi * aperture * monitor.area_ccd.pitch / monitor.wavelength)
+    return Cost(size.bytes(EmvaDetector.from_sheet(resolved.area_detector, monitor.area_ccd.exposure)), seconds)

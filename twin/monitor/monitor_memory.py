@@ -7,6 +7,7 @@ of the pupil grow with the square of the CCD's diagonal.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -92,6 +93,31 @@ class MonitorSize:
     frames: int = 1
     times: int = 0
     pictures: int = 0
+
+    @classmethod
+    def stated(cls, resolved: ResolvedJob, frames: int, times: int = 0, pictures: int = 0) -> MonitorSize:
+        """What the files of an instrument say, before it is built.
+
+        Args:
+            resolved: the job.
+            frames: of each state.
+            times: of a course, 0 for none.
+            pictures: pixels of the frames of all other images.
+
+        Raises:
+            InputError: the instrument has no monitor.
+        """
+        monitor, ccd = resolved.instrument.autocollimator, resolved.instrument.autocollimator.area_ccd
+        focal_length = min(camera.focal_length for camera in resolved.cameras.values())
+        # of a beam that fills its aperture
+        phase = math.pi * monitor.return_face.aperture / focal_length * ccd.pitch / monitor.wavelength
+        spots = sum(len(resolved.instrument.channels_of(name)) for name in resolved.instrument.cameras)
+        return cls(spots, ccd.rows, ccd.columns, phase, frames, times, pictures)
+
+    @property
+    def pixels(self) -> int:
+        """Of all area CCDs."""
+        return self.spots * self.rows * self.columns
 
     @property
     def rays(self) -> int:

@@ -16,6 +16,7 @@ from scenes.kinds.file_kinds import read_for
 from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet
 from twin.run.command import Result, finished, run_command
+from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ def main(
         Options(out, None, backend, force, as_json, quiet),
         lambda: read_for(PROGRAM, measurement, Named("scenes.specs.measured.monitor_frames:resolve_measurement")),
         work,
+        MODELS["recover"],
     )
 
 

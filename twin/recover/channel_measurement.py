@@ -8,7 +8,6 @@ import numpy as np
 
 from analysis.monitor.calibration import MonitorCalibration
 from analysis.monitor.recovery import measure_spots
-from analysis.spots.centroid import mean_frames
 from analysis.spots.fit_state import widened
 from analysis.spots.frame_screening import (
     Finding,
@@ -35,6 +34,7 @@ from analysis.spots.static_defects import Examined, examine, lone_pixels, refit,
 from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.yaml.errors import Issue
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
+from twin.run.frame_store import let_go, mean_of
 
 __all__ = ["ChannelMeasurement", "ChannelResult", "SpotResult", "remedy"]
 
@@ -187,15 +187,12 @@ class ChannelMeasurement:
     def _show_noise(self) -> None:
         """From here on the detector has the noise of its noisiest frames, where that is more than stated."""
         channel = self.channel
-        good = None if channel.bad is None else ~channel.bad
         shown = []
         for state in channel.states:
-            usable = np.isfinite(state.frames)
-            usable &= True if good is None else state.of_ccd(good)
-            frames = np.where(usable, state.frames, 0)
-            ratio = noise_ratio(frames, channel.raw_noise, usable)
+            bad = None if channel.bad is None else state.of_ccd(channel.bad)
+            ratio = noise_ratio(state.frames, channel.raw_noise, bad, released=let_go)
             self._noise_ratios.append(ratio)
-            shown.append(shown_noise(frames, channel.raw_noise, ratio).dark_noise_e)
+            shown.append(shown_noise(state.frames, channel.raw_noise, ratio, bad, let_go).dark_noise_e)
         most = max(shown)
         if most > channel.raw_noise.dark_noise_e:
             raw, corrected = (replace(one, dark_noise_e=most) for one in (channel.raw_noise, channel.noise))
@@ -216,11 +213,11 @@ class ChannelMeasurement:
             bad |= state.of_ccd(channel.bad)
         if not self._searches:
             values = state.frames
-            mean = mean_frames(values) if np.issubdtype(values.dtype, np.integer) else np.mean(values, axis=0)
+            mean = mean_of(values) if np.issubdtype(values.dtype, np.integer) else np.mean(values, axis=0)
             counts, still = np.full(state.shape, float(len(values))), np.zeros((2, 2))
             screened = ScreenedFrames(np.asarray(mean, np.float64), counts, ~bad, len(values), len(values), still, ())
         else:
-            screened = screen_frames(state.frames, channel.raw_noise, bad)
+            screened = screen_frames(state.frames, channel.raw_noise, bad, let_go)
         if channel.correction is None:
             return screened
         known = channel.correction
@@ -387,11 +384,9 @@ class ChannelMeasurement:
         if ratio is None or ratio <= 1.0:
             return 1.0
         frames = self.channel.states[number].frames
-        usable = np.isfinite(frames) & fit.used
         light = fit.level - float(fit.level.min())
-        found = noise_ratio(
-            np.where(usable, frames, 0), self.channel.raw_noise, usable, light > CORE_SHARE * light.max()
-        )
+        core = light > CORE_SHARE * light.max()
+        found = noise_ratio(frames, self.channel.raw_noise, ~fit.used, core, let_go)
         return 1.0 if found is None else min(max(found, 1.0), ratio) ** 2
 
     def result(self) -> ChannelResult:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
@@ -20,6 +21,7 @@ from scenes.specs.course import moment
 from scenes.specs.measured.monitor_frames import AFTER, BEFORE, MeasurementSetup, MeasurementSpec, per_channel
 from scenes.yaml.errors import InputError, Issue, KeyPath
 from scenes.yaml.spec import Spec
+from twin.run.frame_store import PART, frame_room, let_go
 
 _OTHER_FILES = "frames that were recorded one by one, each named once: the right files of before and after"
 NOMINAL, PERTURBED = "nominal", "perturbed"
@@ -62,6 +64,7 @@ def _digests(state: StateFrames) -> Iterator[tuple[int, bytes]]:
         if values.min() < values.max():
             shape = f"{values.shape}".encode()
             yield number, hashlib.blake2b(values.tobytes() + shape, digest_size=16).digest()
+    let_go(state.frames)
 
 
 def _files(state: StateFrames) -> str:
@@ -260,31 +263,66 @@ def _state(test: Spec, files: tuple[str, ...], offset: Shape, key: KeyPath) -> S
 
 
 def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
-    """Frames of all files one after the other, (N, H, W)."""
-    parts: list[np.ndarray] = []
-    for file in files:
-        try:
-            image = ImageFile.open(Path(file), choose="")
-            if image.header.turned:
-                raise ImageError(
-                    f"{file} is stored turned or mirrored ({image.header.turned}): save it as it was read out"
-                )
-            if image.header.coded:
-                raise ImageError(f"{file}: {image.header.coded}, which is not linear in light: give raw frames")
-            parts.append(image.frames())
-        except ImageError as error:
-            raise _told(test, key, str(error), "raw frames of a CCD: TIFF, FITS, 16-bit PNG") from error
-        except OSError as error:
-            raise _told(test, key, f"{file}: {error.strerror or error}", "a file that can be read") from error
-        largest = float(np.max(np.abs(parts[-1]), where=np.isfinite(parts[-1]), initial=0.0))
-        if largest > _MOST_GREY:
-            text = f"{file} has grey values up to {largest:.3g}"
-            raise _told(test, key, text, f"grey values of a converter, at most {_MOST_GREY:g}")
-        if parts[-1].shape[1:] != parts[0].shape[1:]:
-            sizes = (" x ".join(map(str, part.shape[1:])) for part in (parts[0], parts[-1]))
-            text = f"{files[0]} and {file} have frames of different sizes, {' and '.join(sizes)}"
-            raise _told(test, key, text, "frames of one size in one state")
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    """Frames of all files one after the other, (N, H, W), in a file of no name where they are many."""
+    images = [_opened(test, file, key) for file in files]
+    room: np.ndarray | None = None
+    count = held = 0
+    for file, image in zip(files, images, strict=True):
+        for page in _pages(test, file, image, key):
+            if room is None:
+                shape, kind = page.shape, page.dtype
+                room = frame_room((sum(len(one.header.pages) for one in images), *shape), kind)
+            if page.shape != shape:
+                sizes = (" x ".join(map(str, size)) for size in (shape, page.shape))
+                text = f"{files[0]} and {file} have frames of different sizes, {' and '.join(sizes)}"
+                raise _told(test, key, text, "frames of one size in one state")
+            if np.result_type(kind, page.dtype) != kind:
+                kind = np.result_type(kind, page.dtype)
+                wider = frame_room(room.shape, kind)
+                wider[:count] = room[:count]
+                room = wider
+            room[count] = page
+            count, held = count + 1, held + page.nbytes
+            if held > PART:
+                let_go(room)
+                held = 0
+    assert room is not None  # a file without pages is none
+    let_go(room)
+    return room
+
+
+def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
+    """The image of a file, whose header is read; raw frames alone."""
+    with _readable(test, file, key):
+        image = ImageFile.open(Path(file), choose="")
+        if image.header.turned:
+            raise ImageError(f"{file} is stored turned or mirrored ({image.header.turned}): save it as it was read out")
+        if image.header.coded:
+            raise ImageError(f"{file}: {image.header.coded}, which is not linear in light: give raw frames")
+        return image
+
+
+def _pages(test: Spec, file: str, image: ImageFile, key: KeyPath) -> Iterator[np.ndarray]:
+    """Frames of a file, whose grey values a converter could give."""
+    largest = 0.0
+    with _readable(test, file, key):
+        for page in image.pages():
+            largest = max(largest, float(np.max(np.abs(page), where=np.isfinite(page), initial=0.0)))
+            yield page
+    if largest > _MOST_GREY:
+        text = f"{file} has grey values up to {largest:.3g}"
+        raise _told(test, key, text, f"grey values of a converter, at most {_MOST_GREY:g}")
+
+
+@contextmanager
+def _readable(test: Spec, file: str, key: KeyPath) -> Iterator[None]:
+    """What is wrong with a file told at its place in the measurement."""
+    try:
+        yield
+    except ImageError as error:
+        raise _told(test, key, str(error), "raw frames of a CCD: TIFF, FITS, 16-bit PNG") from error
+    except OSError as error:
+        raise _told(test, key, f"{file}: {error.strerror or error}", "a file that can be read") from error
 
 
 def _check_place(test: Spec, state: StateFrames, ccd: Shape) -> None:

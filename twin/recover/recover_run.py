@@ -14,7 +14,7 @@ from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
 from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Consistency, Disturbances
 from analysis.monitor.monitoring import MonitorGeometry, coefficients
-from analysis.monitor.recovery import Recovery, recover, recovery_of
+from analysis.monitor.recovery import Recovery, judged_spots, recover, recovery_of
 from analysis.short_repr import shows
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import one_shape
@@ -34,11 +34,13 @@ from twin.monitor.time_series import CourseSmoother, SmoothedCourse
 from twin.recover.channel_measurement import ChannelMeasurement, ChannelResult, SpotResult, remedy
 from twin.recover.measured_frames import (
     ChannelFrames,
+    StateFrames,
     cannot_measure,
     order_warnings,
     read_measurement,
     repeated_frames,
 )
+from twin.run.frame_store import mean_of
 from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import EmvaDetector, told_of_steps
 
@@ -234,16 +236,23 @@ def _plain(
     setup: MeasurementSetup, bench: _Bench, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
     """Recover the states in the same way, and in the same portions, as the main job does."""
-    before = np.stack([channel.before.frames for channel in channels])
-    states = len(channels[0].after)
+    states, count = len(channels[0].after), len(channels[0].after[0].frames)
+    centroid = setup.test.analysis.centroid
+
+    def means(frames: Sequence[StateFrames]) -> np.ndarray:
+        return np.stack([mean_of(one.frames) for one in frames])
+
+    before = judged_spots(
+        means([channel.before for channel in channels]), len(channels[0].before.frames), calibration, centroid
+    )
     smoother = _smoother(setup, bench)
     out: list[Recovery] = []
     for piece in pieces(states, sum(channel.after[0].frames.size for channel in channels)):
-        after = np.stack([np.stack([c.after[k].frames for c in channels]) for k in range(piece.start, piece.stop)])
+        after = np.stack([means([c.after[k] for c in channels]) for k in range(piece.start, piece.stop)])
         try:
             found = recover(
-                before, after, calibration, setup.test.analysis.centroid,
-                disturbances=bench.disturbances, keep_parts=smoother is not None, motions=bench.motions,
+                before, after, calibration, centroid,
+                disturbances=bench.disturbances, keep_parts=smoother is not None, motions=bench.motions, frames=count,
             )  # fmt: skip
         except SpotError as error:
             raise SpotError({piece.start * len(channels) + n: why for n, why in error.reasons.items()}) from error

@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.progress import Progress, TaskID
 
 from scenes.kinds.file_kinds import read_for
-from scenes.specs.procedures import PROCEDURES, Procedure
+from scenes.specs.procedures import PROCEDURES, Brief, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run import cli, durable
 from twin.run.procedure import Advance, Session, performed
@@ -74,7 +74,7 @@ def run_command(
     options: cli.Options,
     resolve: Callable[[], Given],
     work: Callable[[Given, Session], Result],
-    cost: Callable[[Given], Cost] | None = None,
+    cost: Callable[[Given], Cost] | None,
 ) -> None:
     """Read what is asked for, do it in a run folder and print what it gave.
 
@@ -83,7 +83,8 @@ def run_command(
         options: what the user chose.
         resolve: reads the files and checks what is asked for. Raises InputError, InputErrorText.
         work: computes and writes all files of the run folder, the manifest last. Raises InputError.
-        cost: what that takes of memory and time; None where it never takes much.
+        cost: what that takes of memory and time, the command's entry in `twin.run.command_costs`; None where it never
+            takes much.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
@@ -253,9 +254,9 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
         done = finished(session, procedure.kind, shown, numbers, program=program, **facts)
         return replace(done, problem=problem)
 
-    run_command(
-        file.stem, options, lambda: read_for(f"{program} {command}", file, procedure.resolve), work, procedure.cost
-    )
+    name = f"{program} {command}"
+    cost = None if isinstance(procedure.cost, Brief) else procedure.cost
+    run_command(file.stem, options, lambda: read_for(name, file, procedure.resolve), work, cost)
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:

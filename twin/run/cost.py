@@ -10,15 +10,16 @@ blink. How far a run is and what is left, the progress says.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from optics.numerics.threads import one_blas_thread
-from scenes.yaml.errors import InputError, KeyPath
-from scenes.yaml.spec import Spec
+from scenes.yaml.errors import KeyPath
 from twin.run.memory import LIMIT, amount_text, free_memory, largest
 
 MUCH_MEMORY, LONG = 2.0 * 2**30, 300.0
@@ -31,19 +32,27 @@ PACE_SECONDS = 0.0041
 """What the calculation of `pace` takes on the machine on which the rates were measured, seconds of one core."""
 
 
+class Owner(Protocol):
+    """Where a number stands: a file's part (`Spec`), or the options of a command."""
+
+    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> Exception:
+        """The error that says what is wrong with it, for the caller to raise."""
+        ...
+
+
 @dataclass(frozen=True)
 class Lowered:
-    """A number of a file with which a command takes less memory.
+    """A number of a file or an option with which a command takes less memory.
 
     Attributes:
-        owner, key: the file and where in it the number stands.
+        owner, key: the file or the options, and where in it the number stands.
         number: as it is.
         unit: of the number, in words.
         bytes: memory with another number.
         least: that it may be.
     """
 
-    owner: Spec
+    owner: Owner
     key: KeyPath
     number: int
     unit: str
@@ -90,19 +99,26 @@ def pace() -> float:
     return float(least / PACE_SECONDS)
 
 
-def require_memory(cost: Cost) -> None:
-    """See whether a command fits into the memory that is free.
+def require_memory(cost: Cost, own: float = math.inf, own_key: str = "") -> None:
+    """See whether a command fits into the memory that is free, and into what its own file lets it have.
+
+    Args:
+        cost: of the command.
+        own: bytes that its file lets it have.
+        own_key: where the file says so.
 
     Raises:
-        InputError: it does not; at the key of what takes most, with the number that would fit.
+        InputError, InputErrorText: it does not; at the key or option of what takes most, with the number that fits.
     """
     free = free_memory()
-    if cost.bytes <= max(ORDINARY, free) or cost.lower is None:
+    if cost.bytes <= min(own, max(ORDINARY, free)) or cost.lower is None:
         return
-    raise beyond(cost.bytes, free, cost.lower)
+    raise beyond(cost.bytes, min(own, free), cost.lower, own_key=own_key if own < free else "")
 
 
-def beyond(need: float, free: float, lower: Lowered, there: float = 0.0, most_of_it: str = "") -> InputError:
+def beyond(
+    need: float, free: float, lower: Lowered, there: float = 0.0, most_of_it: str = "", own_key: str = ""
+) -> Exception:
     """More memory is needed than there is: the error that says so, for the caller to raise.
 
     Args:
@@ -111,9 +127,12 @@ def beyond(need: float, free: float, lower: Lowered, there: float = 0.0, most_of
         lower: the number that could be smaller.
         there: bytes of the need that the process has already, and which are not free any more.
         most_of_it: how much of the need is for what, as a part of the message.
+        own_key: where the command's own file says that no more may be taken; empty where the machine does.
     """
-    most = largest(lambda number: lower.bytes(number) <= max(ORDINARY, free + there), lower.number, lower.least - 1)
+    room = free if own_key else max(ORDINARY, free + there)
+    most = largest(lambda number: lower.bytes(number) <= room, lower.number, lower.least - 1)
     more = f"more memory (the environment variable {LIMIT}, as 8 GB, says how much may be taken)"
+    more = f"a larger {own_key}" if own_key else more
     of_it = f", {most_of_it}," if most_of_it else ","
     return lower.owner.error(
         f"this needs about {amount_text(need)} of memory{of_it} and {amount_text(free)} may be taken",

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from analysis.spots.centroid import mean_frames
 
@@ -32,17 +32,21 @@ def kept_bytes(size: float) -> float:
     return size if size <= IN_MEMORY else 0.5 * PART
 
 
-def frame_room(shape: tuple[int, ...]) -> NDArray[np.uint16]:
+def frame_room(shape: tuple[int, ...], kind: DTypeLike = np.uint16) -> NDArray[Any]:
     """Room for frames, (..., frames, H, W); what it holds is undefined.
+
+    Args:
+        shape: of them all.
+        kind: of the grey values.
 
     Raises:
         OSError: there is no room on the disk. ``TMPDIR`` names another place.
     """
-    size = 2 * math.prod(shape)
+    size = np.dtype(kind).itemsize * math.prod(shape)
     if size <= IN_MEMORY:
-        return np.empty(shape, np.uint16)
+        return np.empty(shape, kind)
     with _file(size) as file:
-        return np.frombuffer(mmap.mmap(file.fileno(), size), np.uint16).reshape(shape)
+        return np.frombuffer(mmap.mmap(file.fileno(), size), kind).reshape(shape)
 
 
 def _file(size: int) -> Any:

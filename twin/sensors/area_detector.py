@@ -51,7 +51,10 @@ class NoiseTerm(FurtherNoise, Protocol):
         ...
 
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-        """New in every frame: electrons of the shape of those collected, (frames, H, W); None for nothing."""
+        """New in every frame: electrons of the shape of those collected, (frames, H, W); None for nothing.
+
+        Many frames come in pieces, one after the other with the same ``rng``.
+        """
         ...
 
 
@@ -125,8 +128,9 @@ Seed = int | np.random.SeedSequence
 
 # Beyond this the input is certainly in the wrong unit; NumPy's generator, which draws the largest, works up to 9e18.
 _MAX_PHOTONS = 1e12
-# Numbers of read noise that are drawn at once: 9 frames of a CCD of 682 x 682 pixels, 455 of one of 96 x 96.
-_FRAMES_PIXELS = 1 << 22
+# Numbers of read noise that are drawn at once: 9 frames of a CCD of 682 x 682 pixels, 455 of one of 96 x 96. Every
+# thread has room for those of further noise, which are fewer.
+_FRAMES_PIXELS, _FURTHER_PIXELS = 1 << 22, 1 << 20
 # A pixel counts as saturated from this many read-noise sigmas below the clipped level, because read noise is added
 # after the well is clipped: half of all full wells would otherwise read below "full".
 _SATURATION_SIGMAS = 4.0
@@ -350,10 +354,12 @@ class EmvaDetector:
 
         def image(index: tuple[int, ...], own: np.random.SeedSequence) -> None:
             rng = np.random.Generator(np.random.SFC64(own))
+            # numbers of one term do not depend on how many another one draws, nor on what is drawn together
+            others = [np.random.Generator(np.random.SFC64(stream(own, k))) for k in range(len(self.noise))]
             mean_e, shift = expected(index)
             start = 0
             for collected in poisson_pieces(mean_e, int(frames), rng, together):
-                out[index][start : start + together] = self._read_out(collected, shift, rng)
+                out[index][start : start + together] = self._read_out(collected, shift, (rng, *others))
                 let_go(out)
                 start += together
 
@@ -366,15 +372,14 @@ class EmvaDetector:
         return out
 
     def frames_at_once(self, frames: int, pixels: int) -> int:
-        """Frames of an image whose further noise is drawn at once: all, or so many that memory stays bounded, where
-        only the read noise is drawn; the stream of numbers is the same.
+        """Frames of an image whose numbers are drawn at once: so many that memory stays bounded; the frames do not
+        depend on it.
 
         Args:
             frames: of the image.
             pixels: of a frame.
         """
-        several = any(not isinstance(term, FixedOffsets) for term in self.noise)
-        return frames if several else min(frames, max(1, _FRAMES_PIXELS // pixels))
+        return min(frames, max(1, (_FURTHER_PIXELS if self.noise else _FRAMES_PIXELS) // pixels))
 
     def exposing_bytes(self, frames: int, pixels: int, threads: int) -> int:
         """Memory that the exposure of images takes for a while, beside the frames that it gives, bytes.
@@ -392,11 +397,12 @@ class EmvaDetector:
     def _reading(self) -> Reading:
         return Reading(self.dark_noise_e, self.system_gain_dn_per_e, self.full_well_e, self.max_dn)
 
-    def _read_out(self, level: np.ndarray, shift: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Grey values of frames (N, H, W) from electrons, whose array they take over."""
+    def _read_out(self, level: np.ndarray, shift: np.ndarray, each: Sequence[np.random.Generator]) -> np.ndarray:
+        """Grey values of frames (N, H, W) from electrons, whose array they take over; of each term its own numbers."""
         np.minimum(level, self.full_well_e, out=level)
         before = level.copy() if self.noise else level
-        added = [term.temporal_e(before, rng) for term in (ReadNoise(self.dark_noise_e), *self.noise)]
+        terms = ReadNoise(self.dark_noise_e), *self.noise
+        added = [term.temporal_e(before, rng) for term, rng in zip(terms, each, strict=True)]
         return self._reading.read_out(level, [one for one in added if one is not None], shift)
 
     def saturated(self, frames: NDArray[np.uint16]) -> SaturationReport:

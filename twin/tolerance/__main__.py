@@ -18,6 +18,7 @@ from scenes.kinds.file_kinds import read_for
 from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
 from twin.run.command import Result, finished, run_command
+from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ def main(
         facts = {"config": setup.to_yaml(), "named": setup.plain(), "seed": setup.test.seed}
         return finished(session, "tolerance", tolerance_report(run), TOLERANCE(run), program=PROGRAM, **facts)
 
-    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work)
+    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work, MODELS["tolerance"])
     shutil.rmtree(journal, ignore_errors=True)  # what came of it stands in the run folder
 
 

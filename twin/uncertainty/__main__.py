@@ -14,6 +14,7 @@ import typer
 
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
 from twin.run.command import Result, finished, run_command
+from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
@@ -83,9 +84,8 @@ def main(
         return resolved.with_render(resolved.frames, chosen)
 
     def cost(resolved: ResolvedJob) -> Cost:
-        from twin.uncertainty.coverage_cost import coverage_cost
-
-        return coverage_cost(resolved, states)
+        model: Cost = MODELS["uncertainty"](resolved, states)
+        return model
 
     def work(resolved: ResolvedJob, session: Session) -> Result:
         from twin.run.provenance import checks_in

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from twin.monitor.monitor_memory import MonitorSize
 from twin.run.cost import Cost
 
 if TYPE_CHECKING:
@@ -32,6 +33,6 @@ def coverage_cost(resolved: ResolvedJob, states: int) -> Cost:
     monitor = resolved.instrument.monitor
     if monitor is None:
         return Cost(STARTED, STARTED_SECONDS)
-    pixels = 2 * len(resolved.instrument.cameras) * monitor.area_ccd.rows * monitor.area_ccd.columns
+    pixels = MonitorSize.stated(resolved, resolved.frames).pixels
     exposed = 2 * resolved.frames * pixels * EXPOSED_SECONDS
     return Cost(STARTED + min(states, AT_ONCE) * pixels * PIXEL, STARTED_SECONDS + states * (STATE_SECONDS + exposed))

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from twin.run.cost import Cost, Lowered
 
 if TYPE_CHECKING:
+    from scenes.specs.orbit.scene import GroundSpec
     from scenes.specs.orbit.setup import SimulateSetup
-    from scenes.specs.orbit.simulate import OrbitSimulateSpec
 
 GROUND_SPEED = 7e3
 """Of the point below a satellite in a low orbit, metres per second; an image line of square pixels is as wide."""
@@ -30,23 +30,39 @@ def simulation_cost(setup: SimulateSetup) -> Cost:
     """
     spec, patch = setup.test, setup.test.patch
     pixels = patch.lines * patch.pixels * len(spec.lines)
-    samples = pixels * spec.oversampling**2
-    measured = 0 if spec.points is None else pixels
-    seconds = STARTED_SECONDS + samples * SAMPLE_SECONDS + measured * MEASURED_SECONDS
+    seconds = STARTED_SECONDS + images_seconds(pixels, spec.oversampling, spec.points is not None)
     longer = "lines" if patch.lines >= patch.pixels else "pixels"
+    lines, step = len(spec.lines), sample_step(spec.line_time, spec.ground)
 
-    def lower(number: int) -> float:
-        return _bytes(spec, min(patch.lines, number), min(patch.pixels, number))
+    def needed(number: int) -> float:
+        return STARTED + images_bytes(min(patch.lines, number) * min(patch.pixels, number), lines, step)
 
-    lowered = Lowered(spec, ("patch", longer), max(patch.lines, patch.pixels), "lines and pixels", lower, 100)
-    return Cost(_bytes(spec, patch.lines, patch.pixels), seconds, lowered)
-
-
-def _bytes(spec: OrbitSimulateSpec, lines: int, pixels: int) -> float:
-    return STARTED + lines * pixels * len(spec.lines) * PIXEL + _texture(spec, lines, pixels) * SAMPLE
+    lowered = Lowered(spec, ("patch", longer), max(patch.lines, patch.pixels), "lines and pixels", needed, 100)
+    return Cost(needed(max(patch.lines, patch.pixels)), seconds, lowered)
 
 
-def _texture(spec: OrbitSimulateSpec, lines: int, pixels: int) -> float:
-    """Samples of the ground's texture below the patch."""
-    step = GROUND_SPEED * spec.line_time / spec.ground.texture.spacing
-    return lines * pixels * step**2
+def sample_step(line_time: float, ground: GroundSpec) -> float:
+    """Samples of the ground's texture on the side of a pixel."""
+    return GROUND_SPEED * line_time / ground.texture.spacing
+
+
+def images_seconds(pixels: float, oversampling: int, measured: bool) -> float:
+    """Seconds of images of so many pixels.
+
+    Args:
+        pixels: of all images.
+        oversampling: samples of the ground along each side of a pixel.
+        measured: whether points are measured in them.
+    """
+    return pixels * (oversampling**2 * SAMPLE_SECONDS + measured * MEASURED_SECONDS)
+
+
+def images_bytes(pixels: float, lines: int, step: float) -> float:
+    """Memory of one patch of ground and its images, bytes.
+
+    Args:
+        pixels: of one line's image.
+        lines: that see it.
+        step: see `sample_step`.
+    """
+    return pixels * (lines * PIXEL + step**2 * SAMPLE)

@@ -14,7 +14,7 @@ from scenes.yaml.errors import InputError, KeyPath, Problem
 from scenes.yaml.spec import validate
 from scenes.yaml.units import with_unit
 from scenes.yaml.yaml_file import YamlFile
-from twin.run.memory import LIMIT, amount_text, free_memory, largest
+from twin.run.cost import Cost, Lowered, require_memory
 from twin.study.runs.base_job import Run, leaf, with_values
 from twin.study.runs.sampling import Scaling, draw, extremes, number_of, ratios, run_count, scaled
 from twin.study.runs.setup import StudySetup
@@ -223,20 +223,16 @@ def require_study_memory(setup: StudySetup) -> None:
     Raises:
         InputError: they do not; with the number of runs that would.
     """
+    require_memory(study_cost(setup), setup.study.limits.bytes, "limits.memory")
+
+
+def study_cost(setup: StudySetup) -> Cost:
+    """What the process that keeps the results takes of memory. Of the time a first block of runs tells more than a
+    model could, before the others begin (`twin.study.runs.engine`).
+
+    Args:
+        setup: the study.
+    """
     study, runs = setup.study, run_count(setup.study)
-    free = free_memory()
-    own = study.limits.bytes < free
-    most = min(free, study.limits.bytes)
-    need = study_bytes(setup, runs)
-    if need <= most:
-        return
-    fewer = largest(lambda n: study_bytes(setup, n) <= most, runs)
     key: KeyPath = ("factors",) if study.design.kind == GRID else ("design", "runs")
-    more = (
-        "a larger limits.memory" if own else f"more memory (the environment variable {LIMIT}, as 8 GB, says how much)"
-    )
-    raise setup.error(
-        f"the results of {runs} runs need about {amount_text(need)} of memory, and {amount_text(most)} may be taken",
-        key,
-        allowed=f"at most {fewer} runs, or {more}",
-    )
+    return Cost(study_bytes(setup, runs), 0.0, Lowered(study, key, runs, "runs", lambda n: study_bytes(setup, n)))
