@@ -248,33 +248,49 @@ class RigidTree:
             if body.parent in moved:
                 moved.add(body.path)  # it is carried along
         carried = [body for body in self.bodies if body.path in moved]
-        for body, *local in zip(carried, *_local_motions(carried, states, step, dtype), strict=True):
-            i, (motion, offset, growth, stretch) = index[body.path], local
-            position = body.pose.translation
-            if body.parent:
-                p = index[body.parent]
+        place = {body.path: k for k, body in enumerate(carried)}
+        motion, offset, growth, stretch = _local_motions(carried, states, step, dtype)
+        # bodies as far from the root are placed together
+        for level in self._levels:
+            bodies = [body for body in level if body.path in moved]
+            if not bodies:
+                continue
+            i, k = ([table[body.path] for body in bodies] for table in (index, place))
+            own = [np.array([getattr(body.pose, part) for body in bodies]) for part in ("rotation", "translation")]
+            if bodies[0].parent:
+                p = [index[body.parent] for body in bodies]
                 base_rotation, base_translation = rotation[:, p], translation[:, p]
                 inherited, distances = passed_on[:, p], scale[:, p]
             else:
-                base_rotation = np.broadcast_to(np.eye(3, dtype=dtype), (count, 3, 3))
-                base_translation = np.zeros((count, 3), dtype)
-                inherited = distances = np.ones(count, dtype)
-            here = product(base_rotation, body.pose.rotation)
-            inner = inherited if body.scales else np.ones(count, dtype)
-            rotation[:, i] = product(here, motion)
+                base_rotation = np.broadcast_to(np.eye(3, dtype=dtype), (count, len(bodies), 3, 3))
+                base_translation = np.zeros((count, len(bodies), 3), dtype)
+                inherited = distances = np.ones((count, len(bodies)), dtype)
+            here = product(base_rotation, own[0])
+            inner = np.where([body.scales for body in bodies], inherited, 1.0)
+            rotation[:, i] = product(here, np.swapaxes(motion[k], 0, 1))
             translation[:, i] = (
-                np.einsum("sij,sj->si", base_rotation, distances[:, None] * position)
+                turned(base_rotation, distances[..., None] * own[1])
                 + base_translation
-                + np.einsum("sij,sj->si", here, offset)
+                + turned(here, np.swapaxes(offset[k], 0, 1))
             )
-            passed_on[:, i] = inner * growth
-            scale[:, i] = inner * growth * stretch
+            passed_on[:, i] = inner * growth[k].T
+            scale[:, i] = inner * growth[k].T * stretch[k].T
         return PlacedBodies(index, rotation, translation, scale)
 
     @cached_property
     def _index(self) -> FrozenMap[str, int]:
         """Path -> number of a body."""
         return FrozenMap({path: i for i, path in enumerate(self.paths)})
+
+    @cached_property
+    def _levels(self) -> tuple[tuple[Body, ...], ...]:
+        """The bodies by their distance from the root."""
+        far: dict[str, int] = {}
+        for body in self.bodies:
+            far[body.path] = far[body.parent] + 1 if body.parent else 0
+        return tuple(
+            tuple(b for b in self.bodies if far[b.path] == n) for n in range(max(far.values(), default=-1) + 1)
+        )
 
     @cached_property
     def _designed(self) -> PlacedBodies:
