@@ -93,12 +93,13 @@ class _Asked:
 
     Attributes:
         spec, cameras, backend, free_beams, free_bodies: as of ``build_instrument``.
-        text: of the specifications; the order of parts is that of the results, and no part of equality.
+        text: of the specifications, by which they are looked up; the order of parts is that of the results, and no part
+            of equality.
         read: file and lines of each specification, which errors name later; equal specifications may differ in them.
     """
 
-    spec: InstrumentSpec
-    cameras: tuple[tuple[str, object], ...]
+    spec: InstrumentSpec = field(hash=False)
+    cameras: tuple[tuple[str, object], ...] = field(hash=False)
     backend: Backend
     free_beams: bool
     free_bodies: bool

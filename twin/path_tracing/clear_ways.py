@@ -217,7 +217,7 @@ def _patch(number: int, index: int, surface: SceneSurface, aperture: Aperture) -
         return Patch.flat(number, index, pose, aperture.bounds, surface.solid)
     x0, x1, y0, y1 = aperture.bounds
     x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
-    middle = np.array([x, y, float(surface.surface.sag(x, y))])
+    middle = np.array([x, y, surface.surface.sag(np.array([x]), np.array([y]))[0]])
     corner = surface.vertices[surface.triangles]
     normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normals *= np.sign(normals[:, 2:]) / np.linalg.norm(normals, axis=-1, keepdims=True)
