@@ -15,7 +15,12 @@ import numpy as np
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.system import SystemBatch
-from optics.raytrace.trace import SECTION, Rays, Traced, make_rays, rows, trace
+from optics.raytrace.trace import Rays, Traced, make_rays, rows, trace
+
+SECTION = 1
+"""Elements that one kernel differentiates in forward mode. Its code is several times that of a trace, and the time to
+compile it grows faster than its length: with six elements in one, the kernels of the main job take twice as long to
+compile as one by one, and those of derivatives no less to run."""
 
 
 @dataclass(frozen=True, eq=False)

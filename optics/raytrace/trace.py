@@ -141,7 +141,7 @@ depart by millimetres.
 """
 
 SECTION = 6
-"""Elements that one kernel traces, and differentiates: the time to compile it grows faster than its length, and
+"""Elements that one kernel traces: the time to compile it grows faster than its length, and
 sequences that begin alike share the kernels of their beginning. Between them rays pass through memory."""
 
 MOST_RECORDINGS = 16
