@@ -265,7 +265,7 @@ def trace(
     uploaded = systems.upload(backend) if isinstance(systems, SystemBatch) else systems
     rays, shared = _spread(backend, rays, uploaded.count)
     differentiable = uploaded.differentiable or dr.grad_enabled(rays.position) or dr.grad_enabled(rays.direction)
-    how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate)
+    how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate, SECTION)
     stride = None if uploaded.count == 1 else dr.opaque(backend.UInt, uploaded.count)
     through = _frozen(how, uploaded.form) if evaluate and not differentiable else partial(how.through, uploaded.form)
     (p, d, path, valid), hits, outside = through(
@@ -287,6 +287,7 @@ class _Way:
         world: whether the final rays in the world frame are.
         differentiable: whether numbers or rays carry derivatives.
         evaluate: whether kernels are launched.
+        section: elements of a kernel.
     """
 
     backend: Backend
@@ -295,6 +296,7 @@ class _Way:
     world: bool
     differentiable: bool
     evaluate: bool
+    section: int
 
     def through(self, form: Any, numbers: Any, rays: Any, shared: Any) -> Any:
         """Rays after the last element, hit points, and the former in the world frame.
@@ -333,7 +335,7 @@ class _Way:
                 valid = valid & ok
             if i in self.keep:
                 hits.append(p)
-            if not differentiable and i % SECTION == SECTION - 1 and i + 1 < len(self.structure):
+            if not differentiable and i % self.section == self.section - 1 and i + 1 < len(self.structure):
                 dr.eval(p, d, path, valid)
         d = d + dr.zeros(backend.Float, dr.width(p))  # nothing may have turned a shared direction
         outside = None
