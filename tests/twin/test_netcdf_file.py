@@ -51,7 +51,7 @@ def test_units_are_those_that_udunits_knows_and_the_numbers_stay() -> None:
 
 
 def test_without_xarray_the_file_is_the_same_to_the_byte() -> None:
-    """With coordinates of an axis, of an axis that has another name, of none, and with texts."""
+    """With coordinates of an axis, of an axis that has another name, of none, with texts, and in either precision."""
     photons = (("state", "row"), np.array([[1.0, np.nan], [3.0, 4.0]]), {"units": "photons", "long_name": "photons"})
     coords = {
         "state": ("state", ["before", "after"], {"long_name": "when"}),
@@ -59,10 +59,11 @@ def test_without_xarray_the_file_is_the_same_to_the_byte() -> None:
         "wavelength": ((), 6.5e-7, {"units": "m", "long_name": "of the light"}),
     }
     mean = ("state", np.array([1.0, 3.5]), {"units": "deg", "long_name": "angle"})
-    data = GridData({"photons": photons, "mean": mean}, coords, {"title": "a test", "pitch_m": 1e-5})
+    single = ("row", np.array([0.1, np.nan], np.float32), {"units": "photons", "long_name": "of a course"})
+    data = GridData({"photons": photons, "mean": mean, "single": single}, coords, {"title": "a test", "pitch_m": 1e-5})
     content = netcdf(data)
     assert content == netcdf(data.to_xarray())
-    with pytest.raises(TypeError, match="n: neither float64 nor texts: int64"):
+    with pytest.raises(TypeError, match="n: neither real numbers nor texts: int64"):
         netcdf(GridData({"n": ("x", np.arange(3), {})}, {}, {"title": "whole numbers"}))
 
 

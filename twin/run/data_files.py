@@ -52,8 +52,8 @@ class GridData:
     """Arrays on named axes, to be written without xarray, whose import takes longer than most files.
 
     Attributes:
-        variables: name -> numbers in float64.
-        coords: name -> coordinates of the axes, numbers in float64 or texts.
+        variables: name -> real numbers.
+        coords: name -> coordinates of the axes, real numbers or texts.
         attrs: of all, ``title`` among them.
     """
 
@@ -105,8 +105,8 @@ def _grid_file(data: GridData) -> bytes:
                     file.dimensions[dim] = size
         for name, (dims, values, attrs), coordinate in every:
             axes, array = _axes(dims), np.asarray(values)
-            if array.dtype.kind not in "fU" or (array.dtype.kind == "f" and array.dtype != np.float64):
-                raise TypeError(f"{name}: neither float64 nor texts: {array.dtype}")
+            if array.dtype.kind not in "fU":
+                raise TypeError(f"{name}: neither real numbers nor texts: {array.dtype}")
             text = array.dtype.kind == "U"
             # coordinates have no gaps
             fill = None if coordinate or text else array.dtype.type(np.nan)
