@@ -32,7 +32,9 @@ def require_honest(outcomes) -> Counter:
     return Counter(o.kind for o in outcomes)
 
 
-@pytest.mark.parametrize("cases", quick(0, [FEW, 60]))
+@pytest.mark.parametrize(
+    "cases", [pytest.param(FEW, marks=pytest.mark.second), pytest.param(60, marks=pytest.mark.slow)]
+)
 def test_nobody_is_misled(found, cases) -> None:
     outcomes = found(0, cases, 12 if cases > FEW else 3)
     counts = require_honest(outcomes)

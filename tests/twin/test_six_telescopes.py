@@ -33,7 +33,7 @@ def files(tmp_path_factory, backend) -> dict[str, str]:
     ("name", "runs"),
     [
         pytest.param("ritchey_chretien", 6, marks=pytest.mark.second),
-        pytest.param("schmidt_cassegrain", 6, marks=pytest.mark.second),
+        pytest.param("schmidt_cassegrain", 6, marks=pytest.mark.slow),
         *(pytest.param(name, 500, marks=pytest.mark.slow) for name in SIX),
     ],
 )

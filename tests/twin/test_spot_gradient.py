@@ -130,7 +130,7 @@ def test_what_no_spot_sees(motions, gradient) -> None:
     assert max(size[BASE, kind, axis] for kind in ("shift", "rotate") for axis in range(3)) < 1e-8
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_about_a_perturbed_state(path) -> None:
     """Derivatives by components of motions that are not zero: of a rotation vector, which does not just turn."""
     plane, mirror = f"{BASE}/forward/focal_plane", f"{BASE}/forward/M3"
@@ -167,7 +167,7 @@ def test_about_a_perturbed_state(path) -> None:
     assert np.count_nonzero(changed > 1e-5 * size) >= 5  # the state is not the nominal one
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_pieces_of_the_beam_add_up(path, motions, gradient) -> None:
     some = motions[::7]
     pieces = spot_gradient(path, some, chunk=4 * 50)
