@@ -382,10 +382,9 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
         turn_1, offset_1 = _affine(before, body)
         turn_2, offset_2 = _affine(motion, body)
         growth = (1.0 + before.stretch) * (1.0 + before.scale)
-        turning = before if any(before.rotate) else motion
         turn, offset = product(turn_1, turn_2), turned(turn_1, growth * offset_2) + offset_1
         out[path] = Motion(
-            rotate=_rotation_of(turn) if any(before.rotate) and any(motion.rotate) else turning.rotate,
+            rotate=_turned_both(before, motion, turn),
             shift=triple(offset),
             scale=(1.0 + before.scale) * (1.0 + motion.scale) - 1.0,
             figure={j: before.figure.get(j, 0.0) + motion.figure.get(j, 0.0) for j in {*before.figure, *motion.figure}},
@@ -400,7 +399,12 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
     return out
 
 
-def _rotation_of(turn: np.ndarray) -> tuple[float, float, float]:
+def _turned_both(first: Motion, then: Motion, turn: np.ndarray) -> tuple[float, float, float]:
+    """Rotation vector of two motions together, whose matrix is ``turn``; most motions turn nothing."""
+    if not any(then.rotate):
+        return first.rotate
+    if not any(first.rotate):
+        return then.rotate
     # messages about files and help wait for this module, and scipy takes a quarter of a second
     from scipy.spatial.transform import Rotation
 

@@ -6,7 +6,7 @@ None stands for what is not there, and has no leaves.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from itertools import count
@@ -52,13 +52,18 @@ def numbers_in(tree: Any) -> list[Any]:
 
 
 def _append_numbers(tree: Any, numbers: list[Any]) -> None:
-    for branch in tree if isinstance(tree, tuple) else vars(tree).values():
+    for branch in _branches(tree):
         if branch is None:
             continue
         if isinstance(branch, tuple) or _names(branch.__class__) is not None:
             _append_numbers(branch, numbers)
         else:
             numbers.append(branch)
+
+
+def _branches(tree: Any) -> Iterable[Any]:
+    """What a tuple or a dataclass holds, in the order of its fields."""
+    return tree if isinstance(tree, tuple) else [getattr(tree, name) for name in _names(tree.__class__) or ()]
 
 
 def map_leaves(function: Callable[..., Any], tree: Tree, *others: Any) -> Tree:
@@ -94,7 +99,7 @@ def _mapped_alone(function: Callable[[Any], Any], tree: Any) -> Any:
     if not whole and names is None:
         return function(tree)
     out: list[Any] = []
-    for branch in tree if whole else [getattr(tree, name) for name in names or ()]:
+    for branch in _branches(tree):
         if branch is None:
             out.append(None)
         elif isinstance(branch, tuple) or _names(branch.__class__) is not None:

@@ -187,11 +187,14 @@ def reshaped_bodies(states: Sequence[State], placed: PlacedBodies) -> set[str]:
     return found.union(path for state in states for path, motion in state.items() if motion.reshapes)
 
 
-def frames_of(placed: PlacedBodies, chains: Sequence[Sequence[Element]]) -> list[FrameNumbers]:
+def frames_of(placed: PlacedBodies, bodies: np.ndarray) -> list[FrameNumbers]:
     """Per element of chains, the transform into its frame from that of the element before, each number (C * S,), chain
     by chain.
+
+    Args:
+        placed: the bodies of S states.
+        bodies: numbers of those of the elements, (C, K).
     """
-    bodies = np.array([[placed.index[element.body] for element in chain] for chain in chains])
     rotation, translation = placed.rotation[:, bodies], placed.translation[:, bodies]
     turn, offset = np.empty_like(rotation), np.empty_like(translation)
     turn[:, :, 0] = np.swapaxes(rotation[:, :, 0], -1, -2)
@@ -533,16 +536,16 @@ def assemble(
                 )
         return _joined([found[key] for key in keys])
 
+    bodies = np.array([[placed.index[element.body] for element in chain] for chain in chains])
     values = []
     tables: list[np.ndarray | None] = []
-    for i, frame in enumerate(frames_of(placed, chains)):
+    for i, frame in enumerate(frames_of(placed, bodies)):
         own, spline = own_of(i), None
         if structures[i].grid:
             grid, spline = grid_numbers([chain[i] for chain in chains], states)
             own = replace(own, surface=replace(own.surface, grid=grid))
         tables.append(spline)
         values.append(ElementNumbers(frame, own.surface, own.aperture, own.before, own.after))
-    bodies = [[placed.index[element.body] for element in chain] for chain in chains]
     world = Poses(*(np.concatenate([a[:, own] for own in bodies]) for a in (placed.rotation, placed.translation)))
     size = np.concatenate([placed.size(chain[-1].body) for chain in chains])
     form = known.get(structures)

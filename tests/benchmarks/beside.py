@@ -24,10 +24,9 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.benchmarks.page import shown
-from twin.run.cli import InputErrorText, print_whole
+from twin.run.cli import BAD_INPUT, InputErrorText, print_whole
 
 ROOT = Path(__file__).resolve().parents[2]
-_INPUT_ERROR = 2
 
 Numbers = dict[str, float]
 Runner = Callable[[Path, str, bool], Numbers | None]
@@ -98,7 +97,7 @@ def numbers_of(sources: Path, name: str, quick: bool) -> Numbers | None:
     command = [sys.executable, "-m", "tests.benchmarks", "--json", "--only", name, *(["--quick"] if quick else [])]
     environment = os.environ | {"PYTHONPATH": str(sources)}
     done = subprocess.run(command, cwd=sources, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode == _INPUT_ERROR:
+    if done.returncode == BAD_INPUT:
         return None
     try:
         found = json.loads(done.stdout)[name]
