@@ -98,19 +98,6 @@ class Motion:
         """Relative change of a glass's dispersion, which its Abbe number makes."""
         return 1.0 / (1.0 + self.abbe) - 1.0
 
-    @property
-    def reshapes(self) -> bool:
-        """Whether it gives a surface another shape or a glass another index, apart from growth."""
-        return bool(
-            self.figure
-            or self.grid is not None
-            or self.radius
-            or self.conic
-            or self.index
-            or self.abbe
-            or any(self.index_gradient)
-        )
-
     def component(self, kind: str, axis: int) -> float:
         """One number of the motion, SI: ``rotate`` or ``shift`` by an axis, a ``figure`` term, or one of ``scale``,
         ``radius``, ``conic``, ``index`` and ``abbe``.

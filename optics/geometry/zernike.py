@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from math import comb, factorial, isqrt, sqrt
 from typing import Any
 
@@ -202,6 +202,23 @@ def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.
         for a, b, c in cartesian_terms(j):
             out[triangle_index(a, b)] += amplitude * c / radius ** (a + b)
     return out
+
+
+@lru_cache(maxsize=256)
+def unit_monomials(last: int, order: int, radius: float) -> np.ndarray:
+    """``monomials`` of each of Z_1..Z_last with amplitude 1, (last, triangle_size(order)); terms beyond the order: 0.
+
+    Args:
+        last: highest Noll index.
+        order: highest degree a + b.
+        radius: of the disk, metres.
+    """
+    table = np.zeros((last, triangle_size(order)))
+    for j in range(1, last + 1):
+        if noll_to_nm(j)[0] <= order:
+            table[j - 1] = monomials({j: 1.0}, order, radius)
+    table.setflags(write=False)
+    return table
 
 
 def order_of(indices: Any) -> int:

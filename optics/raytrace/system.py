@@ -1,174 +1,38 @@
 """Numbers of a sequence of elements for a batch of systems, ready for the trace.
 
-What decides the code of a kernel, as against the numbers that it works on, is a `Structure`.
-
 A *system* is one sequence in one perturbed state. Sequences of the same structure (same kinds of surface in the same
 order) can be batched together: the two cameras of an instrument, left and right channels, hundreds of states.
+
+Most states only move bodies, warm them, and change the index of glass. Then the numbers are those of the design, which
+an assembly keeps; frames are written over them, each number of a body that has grown is multiplied by a power of its
+size, and indices are added. Only elements of another shape are worked out one by one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from optics.geometry import zernike
-from optics.geometry.aperture import ApertureNumbers
-from optics.geometry.sag_terms import SagTerm, grown, kinds_of, of_kinds
-from optics.geometry.surface import (
-    Figure,
-    FigureNumbers,
-    GridFigure,
-    GridNumbers,
-    SummedFigure,
-    SurfaceNumbers,
-    ZernikeFigure,
-)
-from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State
+from optics.geometry.tree import AT_REST, COMPLEX_STEP, Motion, PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import form_of, map_leaves, numbers_in
-from optics.raytrace.assembly import Assembly, Element, Interaction
-
-
-@dataclass(frozen=True)
-class Structure:
-    """What decides the code of the kernel (as against the numbers that it works on), for one element."""
-
-    interaction: Interaction
-    plane: bool
-    even: int
-    terms: tuple[type[SagTerm], ...]  # kinds of further terms of the sag
-    figure_order: int  # radial order of the Zernike figure, -1 for none
-    grid: bool
-    aperture: type[ApertureNumbers] | None
-    graded: tuple[bool, bool] = (False, False)  # whether the medium before and the one after has an index gradient
-
-
-@dataclass(frozen=True, eq=False)
-class CoordinateNumbers:
-    """One coordinate of a rigid transform: ``shift`` + ``turn`` . p, metres."""
-
-    shift: Any
-    turn: tuple[Any, Any, Any]
-
-
-@dataclass(frozen=True, eq=False)
-class FrameNumbers:
-    """A rigid transform of points, coordinate by coordinate."""
-
-    x: CoordinateNumbers
-    y: CoordinateNumbers
-    z: CoordinateNumbers
-
-    @classmethod
-    def of(cls, rotation: np.ndarray, translation: np.ndarray) -> FrameNumbers:
-        """From arrays (S, 3, 3) and (S, 3)."""
-        rows = ((rotation[:, a, 0], rotation[:, a, 1], rotation[:, a, 2]) for a in range(3))
-        return cls(*(CoordinateNumbers(translation[:, a], row) for a, row in enumerate(rows)))
-
-    @property
-    def coordinates(self) -> tuple[CoordinateNumbers, CoordinateNumbers, CoordinateNumbers]:
-        """Numbers of the coordinates x, y and z."""
-        return self.x, self.y, self.z
-
-
-@dataclass(frozen=True, eq=False)
-class IndexNumbers:
-    """Refractive index of a medium: ``index`` + ``gradient`` . p at p in the element's frame; no gradient: None."""
-
-    index: Any
-    gradient: tuple[Any, Any, Any] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ElementNumbers:
-    """All that the trace reads of one element.
-
-    Attributes:
-        frame: from the frame of the element before (the world for the first) into this element's.
-        surface: its shape; aperture: its clear aperture, None for an unlimited one.
-        before, after: refractive index on the side that light comes from and on the one that it goes to.
-    """
-
-    frame: FrameNumbers
-    surface: SurfaceNumbers
-    aperture: ApertureNumbers | None
-    before: IndexNumbers
-    after: IndexNumbers
-
-
-@dataclass(frozen=True, eq=False)
-class OwnNumbers:
-    """Numbers of an element that do not depend on where it stands; as of ``ElementNumbers``."""
-
-    surface: SurfaceNumbers
-    aperture: ApertureNumbers | None
-    before: IndexNumbers
-    after: IndexNumbers
-
-
-@dataclass(frozen=True)
-class Medium:
-    """What light travels in: a glass body of the assembly, or something homogeneous of a given index."""
-
-    solid: str | None = None
-    index: float = 1.0
-
-
-def media_along(chain: Sequence[Element]) -> list[Medium]:
-    """The medium before the first element, between the elements and after the last one."""
-    out = [Medium()]
-    for element in chain:
-        before = out[-1]
-        if element.interaction is Interaction.REFRACT and element.solid is not None:
-            out.append(Medium() if before.solid == element.solid else Medium(element.solid))
-        elif element.solid is not None or before.solid is not None:
-            out.append(before)
-        else:
-            out.append(Medium(None, element.index_after))
-    return out
-
-
-def structure_of(elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool]) -> Structure:
-    """Common structure of the i-th elements of all chains."""
-    grid = any(_has_grid(e, states) for e in elements)
-    apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
-    kinds = {(e.interaction, e.surface.is_plane, own) for e, own in zip(elements, apertures, strict=True)}
-    if len(kinds) != 1:
-        names = ", ".join(sorted(e.name for e in elements))
-        raise ValueError(f"elements of different kinds cannot be batched: {names}")
-    interaction, is_plane, aperture = kinds.pop()
-    # a plane may have terms that are zero, and the terms that a surface lacks are
-    terms = kinds_of([term for e in elements for term in e.surface.terms])
-    even = 0 if is_plane else max(len(e.surface.even) for e in elements)
-    order = -1
-    for e in elements:
-        if e.surface.zernike_figure is not None:
-            order = max(order, zernike.order_of(e.surface.zernike_figure.terms))
-        for state in states:
-            motion = state.get(e.body)
-            if motion is not None and motion.figure:
-                order = max(order, zernike.order_of(motion.figure))
-    return Structure(interaction, is_plane, even, terms, order, grid, aperture, graded)
-
-
-def _known_figure(element: Element) -> Figure | None:
-    """The figure of an element's surface; ValueError for one that the trace would leave out."""
-    match element.surface.figure:
-        case None | ZernikeFigure() | GridFigure() | SummedFigure() as figure:
-            return figure
-        case other:
-            raise ValueError(f"element {element.name!r}: the trace knows no figure of type {type(other).__name__}")
-
-
-def _has_grid(element: Element, states: Sequence[State]) -> bool:
-    """Whether a surface has a figure on a grid, of its own or in some state."""
-    _known_figure(element)
-    own = element.surface.grid_figure is not None
-    return own or any(state.get(element.body, AT_REST).grid is not None for state in states)
+from optics.raytrace.assembly import Assembly, Element
+from optics.raytrace.element_numbers import (
+    ElementNumbers,
+    FrameNumbers,
+    Medium,
+    OwnNumbers,
+    Structure,
+    grid_numbers,
+    media_along,
+    own_numbers_of,
+    structure_of,
+)
 
 
 def touched_bodies(assembly: Assembly, states: Sequence[State], placed: PlacedBodies) -> set[str]:
@@ -180,16 +44,9 @@ def touched_bodies(assembly: Assembly, states: Sequence[State], placed: PlacedBo
     return {path for path, i in placed.index.items() if other[i]}.union(*states)
 
 
-def reshaped_bodies(states: Sequence[State], placed: PlacedBodies) -> set[str]:
-    """Bodies that have another size, shape or refractive index than designed in some state."""
-    other = np.any(placed.scale != 1.0, axis=0)
-    found = {path for path, i in placed.index.items() if other[i]}
-    return found.union(path for state in states for path, motion in state.items() if motion.reshapes)
-
-
-def frames_of(placed: PlacedBodies, bodies: np.ndarray) -> list[FrameNumbers]:
-    """Per element of chains, the transform into its frame from that of the element before, each number (C * S,), chain
-    by chain.
+def frames_of(placed: PlacedBodies, bodies: np.ndarray) -> np.ndarray:
+    """Per element of chains, the transform into its frame from that of the element before: numbers of
+    ``FrameNumbers``, (K, 12, C * S), chain by chain.
 
     Args:
         placed: the bodies of S states.
@@ -203,150 +60,44 @@ def frames_of(placed: PlacedBodies, bodies: np.ndarray) -> list[FrameNumbers]:
     away = translation[:, :, :-1] - translation[:, :, 1:]
     offset[:, :, 1:] = np.einsum("sckmi,sckm->scki", rotation[:, :, 1:], away)
     numbers = np.concatenate([offset[..., None], turn], axis=-1).transpose(2, 3, 4, 1, 0)
-    rows = np.ascontiguousarray(numbers).reshape(*numbers.shape[:3], -1)
-    return [FrameNumbers(*(CoordinateNumbers(c[0], (c[1], c[2], c[3])) for c in element)) for element in rows]
-
-
-def own_numbers_of(
-    assembly: Assembly,
-    element: Element,
-    media: tuple[Medium, Medium],
-    structure: Structure,
-    states: Sequence[State],
-    placed: PlacedBodies,
-    step: Sequence[tuple[str, str, int]] | None,
-) -> OwnNumbers:
-    """Shape, aperture and indices of an element between two media, each number (S,), complex when a derivative is
-    carried.
-    """
-    scale = placed.scale[:, placed.index[element.body]]
-    sides = zip(media, structure.graded, strict=True)
-    outer, inner = (_index_numbers(assembly, element, medium, graded, states, placed) for medium, graded in sides)
-    return OwnNumbers(
-        _surface_numbers(element, structure, scale, states, step),
-        # an edge has no derivative: it lets a ray pass or stops it
-        None if element.aperture is None else element.aperture.numbers(scale.real),
-        outer,
-        inner,
-    )
-
-
-def _index_numbers(
-    assembly: Assembly, element: Element, medium: Medium, graded: bool, states: Sequence[State], placed: PlacedBodies
-) -> IndexNumbers:
-    """Index (S,) of a medium beside an element, with its gradient in the element's frame where it is graded."""
-    if medium.solid is None:
-        index = np.full(len(states), medium.index)
-        gradient = np.zeros((len(states), 3)) if graded else None
-    else:
-        motions = [state.get(medium.solid, AT_REST) for state in states]
-        index = np.array([assembly.index(medium.solid, m) for m in motions])
-        gradient = None
-        if graded:
-            here, glass = placed.index[element.body], placed.index[medium.solid]
-            own = np.array([m.index_gradient for m in motions])
-            world = np.einsum("sij,sj->si", placed.rotation[:, glass], own)
-            gradient = np.einsum("sji,sj->si", placed.rotation[:, here], world)
-            away = placed.translation[:, here] - placed.translation[:, glass]
-            index = index + np.einsum("si,si->s", world, away)
-    return IndexNumbers(index, None if gradient is None else (gradient[:, 0], gradient[:, 1], gradient[:, 2]))
-
-
-def _surface_numbers(
-    element: Element,
-    structure: Structure,
-    scale: np.ndarray,
-    states: Sequence[State],
-    step: Sequence[tuple[str, str, int]] | None,
-) -> SurfaceNumbers:
-    surface = element.surface
-    curvature, conic, even = None, None, []
-    if not structure.plane:
-        motions = [state.get(element.body, AT_REST) for state in states]
-        radius = scale * (1.0 + np.array([motion.radius for motion in motions]))
-        curvature, conic = surface.curvature / radius, surface.conic + np.array([motion.conic for motion in motions])
-        for n in range(structure.even):
-            term = surface.even[n] if n < len(surface.even) else 0.0
-            even.append(term / scale ** (2 * n + 3))
-    terms = tuple(grown(term, scale) for term in of_kinds(surface.terms, structure.terms))
-    figure = _figure_numbers(element, structure.figure_order, states, step) if structure.figure_order >= 0 else None
-    return SurfaceNumbers(curvature, conic, tuple(even), terms, figure)
-
-
-def _figure_numbers(
-    element: Element, order: int, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None
-) -> FigureNumbers:
-    """Monomial coefficients of the Zernike figure of each state."""
-    figure = element.figure_disk
-    kind = np.float64 if step is None else np.complex128
-    table = np.empty((len(states), zernike.triangle_size(order)), kind)
-    for s, state in enumerate(states):
-        terms: dict[int, Any] = dict(figure.terms)
-        for j, amplitude in state.get(element.body, AT_REST).figure.items():
-            terms[j] = terms.get(j, 0.0) + amplitude
-        if step is not None and step[s][:2] == (element.body, FIGURE):
-            terms[step[s][2]] = terms.get(step[s][2], 0.0) + 1j * COMPLEX_STEP
-        table[s] = zernike.monomials(terms, order, figure.radius)
-    x, y = (np.full(len(states), c) for c in figure.centre)
-    return FigureNumbers(x, y, tuple(table[:, m] for m in range(table.shape[1])))
-
-
-_NO_GRID = GridFigure(np.zeros((4, 4)), (-1.0, 1.0, -1.0, 1.0))
-"""What a system without a grid reads where others of its batch have one."""
-
-
-def grid_numbers(elements: Sequence[Element], states: Sequence[State]) -> tuple[GridNumbers, np.ndarray]:
-    """Numbers of the grids of the i-th elements of all chains in all states, (chains * states,) each, and one table of
-    the coefficients of all.
-    """
-    first: dict[int, int] = {}
-    figures, numbers, tables, length = [], [], [], 0
-    for element in elements:
-        own: dict[int, GridFigure] = {}  # a grid that many states share is added to the element's and stored once
-        for state in states:
-            motion = state.get(element.body, AT_REST)
-            if id(motion.grid) not in own:
-                own[id(motion.grid)] = element.grid_in(motion) or _NO_GRID
-            figure = own[id(motion.grid)]
-            if id(figure) not in first:
-                first[id(figure)] = length
-                figures.append(figure)  # so that its id remains its own
-                tables.append(figure.spline.ravel())
-                length += tables[-1].size
-            numbers.append(replace(figure.numbers, first=float(first[id(figure)])))
-    return map_leaves(lambda *values: np.array(values), numbers[0], *numbers[1:]), np.concatenate(tables)
-
-
-Numbers = TypeVar("Numbers", ElementNumbers, OwnNumbers)
+    return np.ascontiguousarray(numbers).reshape(len(numbers), 12, -1)
 
 
 @dataclass(frozen=True, eq=False)
 class SystemBatch:
-    """Numbers of B systems: element by element, each an array of shape (B,), float64.
+    """Numbers of B systems.
 
     Attributes:
         structure: per element.
-        values: per element, what the trace reads.
+        form: per element what the trace reads, and the pose of the last element, with the row of each number.
+        numbers: (L, B).
         world: poses of the elements in the world.
         tangents: ``values`` for the derivative that was asked for (None for a number that has none), or None.
         world_tangents: likewise of ``world``.
         size: of the last element's body relative to nominal, (B,).
         grids: per element, the spline tables of all systems' grid figures, one after the other; None without any.
-        count: B.
         states: number of states S; systems are ordered sequence by sequence, B = sequences * S.
-        form: of ``values`` and the pose of the last element, with the place of each number.
     """
 
     structure: tuple[Structure, ...]
-    values: tuple[ElementNumbers, ...]
+    form: tuple[tuple[ElementNumbers, ...], FrameNumbers]
+    numbers: np.ndarray
     world: Poses
     tangents: tuple[ElementNumbers, ...] | None
     world_tangents: Poses | None
     size: np.ndarray
     grids: tuple[np.ndarray | None, ...]
-    count: int
     states: int
-    form: tuple[tuple[ElementNumbers, ...], FrameNumbers]
+
+    @property
+    def count(self) -> int:
+        """B."""
+        return int(self.numbers.shape[1])
+
+    @cached_property
+    def values(self) -> tuple[ElementNumbers, ...]:
+        """Per element, what the trace reads, each number (B,)."""
+        return map_leaves(lambda row: self.numbers[row], self.form[0])
 
     def upload(self, backend: Backend, own: bool = False) -> UploadedSystems:
         """Copy to the backend's memory as kernel inputs; derivatives, if any, become forward-mode gradients.
@@ -356,28 +107,24 @@ class SystemBatch:
             own: each number of the systems is an array of its own, so that it may be differentiated by; else those of
                 several systems lie in one.
         """
+        grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
         if self.tangents is None:
-            grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
-            parts = numbers_in((self.values, self.world.last()))
             # of a single system each number is one for all rays, which no ray needs to look up
             alone = own or self.count == 1
-            numbers = tuple(backend.opaque_each(parts)) if alone else backend.opaque(np.array(parts))
+            numbers = tuple(backend.opaque_each(list(self.numbers))) if alone else backend.opaque(self.numbers)
             return UploadedSystems(backend, self.structure, self.form, numbers, grids, self.count, False)
         import drjit as dr
 
-        def copied(value: np.ndarray, tangent: np.ndarray | None = None) -> Any:
-            array = backend.opaque(value)
+        def copied(row: int, tangent: np.ndarray | None = None) -> Any:
+            array = backend.opaque(self.numbers[row])
             if tangent is not None:
                 dr.enable_grad(array)
                 dr.set_grad(array, backend.opaque(tangent))
             return array
 
-        values = map_leaves(copied, self.values, self.tangents)
         last = None if self.world_tangents is None else self.world_tangents.last()
-        world = map_leaves(copied, self.world.last(), last)
-        grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
-        numbers = tuple(numbers_in((values, world)))
-        return UploadedSystems(backend, self.structure, self.form, numbers, grids, self.count, True)
+        derived = map_leaves(copied, self.form, (self.tangents, last))
+        return UploadedSystems(backend, self.structure, self.form, tuple(numbers_in(derived)), grids, self.count, True)
 
     def take(self, systems: np.ndarray) -> SystemBatch:
         """The systems of the given indices."""
@@ -389,15 +136,14 @@ class SystemBatch:
 
         return SystemBatch(
             self.structure,
-            map_leaves(taken, self.values),
+            self.form,
+            self.numbers[:, systems],
             map_leaves(taken, self.world),
             map_leaves(taken, self.tangents),
             map_leaves(taken, self.world_tangents),
             self.size[systems],
             self.grids,
             len(systems),
-            len(systems),
-            self.form,
         )
 
 
@@ -414,7 +160,12 @@ class Poses:
 
     def last(self) -> FrameNumbers:
         """Poses of the last elements."""
-        return FrameNumbers.of(self.rotation[:, -1], self.translation[:, -1])
+        return FrameNumbers.of(self.last_rows())
+
+    def last_rows(self) -> np.ndarray:
+        """The numbers of ``last`` in their order, (12, B)."""
+        both = np.concatenate([self.translation[:, -1, :, None], self.rotation[:, -1]], axis=-1)
+        return np.ascontiguousarray(both.reshape(len(both), 12).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -460,6 +211,281 @@ class UploadedSystems:
         return replace(self, structure=self.structure[part], form=form, grids=self.grids[part])
 
 
+@dataclass(frozen=True, eq=False)
+class _Shapes:
+    """What some states do to shapes, in so far as it decides the code of a kernel.
+
+    Attributes:
+        orders: body -> highest radial order of its figures.
+        gridded: bodies with a figure on a grid.
+        graded: glass bodies with a gradient of their index.
+    """
+
+    orders: Mapping[str, int]
+    gridded: frozenset[str]
+    graded: frozenset[str]
+
+    @classmethod
+    def of(cls, states: Sequence[State]) -> _Shapes:
+        """Look through the motions of states."""
+        orders: dict[str, int] = {}
+        gridded, graded = set(), set()
+        for state in states:
+            for path, motion in state.items():
+                if motion.figure:
+                    orders[path] = max(orders.get(path, -1), zernike.order_of(motion.figure))
+                if motion.grid is not None:
+                    gridded.add(path)
+                if any(motion.index_gradient):
+                    graded.add(path)
+        return cls(orders, frozenset(gridded), frozenset(graded))
+
+
+@dataclass(frozen=True, eq=False)
+class _Chains:
+    """Sequences of C chains of K elements each.
+
+    Attributes:
+        elements, media: of each chain: the elements, and what light travels in before, between and after them.
+        bodies: numbers of the elements' bodies, (C, K).
+        depends: per element of the chains, the bodies whose shape or index it may have to do with.
+        designed: structure of the elements as designed.
+    """
+
+    elements: tuple[tuple[Element, ...], ...]
+    media: tuple[tuple[Medium, ...], ...]
+    bodies: np.ndarray
+    depends: tuple[frozenset[str], ...]
+    designed: tuple[Structure, ...]
+
+    @classmethod
+    def of(cls, assembly: Assembly, sequences: tuple[str | tuple[str, ...], ...]) -> _Chains:
+        """The chains of sequences; ValueError where their lengths differ."""
+        named = [assembly.sequences[s] if isinstance(s, str) else s for s in sequences]
+        chains = tuple(tuple(assembly.elements[name] for name in names) for names in named)
+        lengths = {len(chain) for chain in chains}
+        if len(lengths) != 1:
+            raise ValueError(f"sequences of different lengths cannot be batched: {sorted(lengths)}")
+        media = tuple(tuple(media_along(chain)) for chain in chains)
+        index = assembly.place().index
+        depends = []
+        for i in range(len(chains[0])):
+            glass = {m.solid for along in media for m in along[i : i + 2] if m.solid is not None}
+            depends.append(frozenset(glass.union(chain[i].body for chain in chains)))
+        bodies = np.array([[index[element.body] for element in chain] for chain in chains])
+        designed = tuple(structure_of(column) for column in zip(*chains, strict=True))
+        return cls(chains, media, bodies, tuple(depends), designed)
+
+    def elements_at(self, i: int) -> list[Element]:
+        """The i-th ones of all chains."""
+        return [chain[i] for chain in self.elements]
+
+    def structure(self, shapes: _Shapes) -> tuple[Structure, ...]:
+        """Of the elements with what states do to their shapes."""
+        changed, out = shapes.orders.keys() | shapes.gridded | shapes.graded, list(self.designed)
+        for i, one in enumerate(out):
+            if changed.isdisjoint(self.depends[i]):
+                continue
+            bodies = {element.body for element in self.elements_at(i)}
+            out[i] = replace(
+                one,
+                figure_order=max(one.figure_order, *(shapes.orders.get(body, -1) for body in bodies)),
+                grid=one.grid or not shapes.gridded.isdisjoint(bodies),
+                graded=(self._graded(i, shapes), self._graded(i + 1, shapes)),
+            )
+        return tuple(out)
+
+    def _graded(self, medium: int, shapes: _Shapes) -> bool:
+        return any(media[medium].solid in shapes.graded for media in self.media)
+
+    def own(
+        self,
+        assembly: Assembly,
+        i: int,
+        structure: Structure,
+        states: Sequence[State],
+        placed: PlacedBodies,
+        step: Sequence[tuple[str, str, int]] | None = None,
+    ) -> tuple[OwnNumbers, np.ndarray | None]:
+        """Shapes and indices of the i-th elements, each number (C * S,), and the tables of their grids; worked out once
+        for an element that several chains share.
+        """
+        found: dict[tuple[str, Medium, Medium], OwnNumbers] = {}
+        keys = [(chain[i].name, m[i], m[i + 1]) for chain, m in zip(self.elements, self.media, strict=True)]
+        for key in keys:
+            if key not in found:
+                name, before, after = key
+                found[key] = own_numbers_of(
+                    assembly, assembly.elements[name], (before, after), structure, states, placed, step
+                )
+        parts = [found[key] for key in keys]
+        own = map_leaves(lambda *arrays: np.concatenate(arrays), parts[0], *parts[1:])
+        if not structure.grid:
+            return own, None
+        grid, spline = grid_numbers(self.elements_at(i), states)
+        return replace(own, surface=replace(own.surface, grid=grid)), spline
+
+
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    """Sides of elements on which one glass body lies.
+
+    Attributes:
+        rows, chains, bodies: row of the index on each, its chain, and the number of the element's body, (N,).
+        gradient: which sides have a gradient of the index; slopes: its rows, (3, of these).
+    """
+
+    rows: np.ndarray
+    chains: np.ndarray
+    bodies: np.ndarray
+    gradient: np.ndarray
+    slopes: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Design:
+    """Numbers of C chains of one structure as designed, and what a state does to them.
+
+    Attributes:
+        chains: whose they are.
+        structure, form: as of ``SystemBatch``.
+        numbers: (L, C); those of frames are left open.
+        grids: as of ``SystemBatch``.
+        grown: power -> rows and chains of the numbers that grow with that power of their bodies' sizes, and these
+            bodies' numbers.
+        glass: glass body -> the sides of elements that it lies on.
+        frame_rows: rows of the elements' frames and of the last pose, (K + 1, 12).
+    """
+
+    chains: _Chains
+    structure: tuple[Structure, ...]
+    form: tuple[tuple[ElementNumbers, ...], FrameNumbers]
+    numbers: np.ndarray
+    grids: tuple[np.ndarray | None, ...]
+    grown: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
+    glass: Mapping[str, _Sides]
+    frame_rows: np.ndarray
+
+    @classmethod
+    def of(cls, assembly: Assembly, chains: _Chains, structure: tuple[Structure, ...]) -> _Design:
+        """Work them out."""
+        placed, frame = assembly.place(), FrameNumbers.of(np.zeros((12, len(chains.elements))))
+        twice = replace(placed, scale=np.full_like(placed.scale, 2.0))
+
+        def values(placed: PlacedBodies) -> tuple[tuple[ElementNumbers, ...], list[np.ndarray | None]]:
+            own, grids = zip(
+                *(chains.own(assembly, i, one, ({},), placed) for i, one in enumerate(structure)), strict=True
+            )
+            return tuple(ElementNumbers(frame, o.surface, o.aperture, o.before, o.after) for o in own), grids
+
+        designed, grids = values(placed)
+        form = form_of((designed, frame))
+        numbers, doubled = (np.array(numbers_in((own, frame))) for own in (designed, values(twice)[0]))
+        # each goes with a power of its body's size, which is exact at twice the size
+        power = np.log2(np.divide(doubled, numbers, out=np.ones_like(numbers), where=numbers != 0.0)).astype(int)
+        element = np.zeros(len(numbers), int)
+        for i, own in enumerate(form[0]):
+            element[numbers_in(own)] = i
+        grown = {}
+        for one in set(power.ravel().tolist()) - {0}:
+            rows, columns = np.nonzero(power == one)
+            grown[one] = rows, columns, chains.bodies[columns, element[rows]]
+        frames = np.array([numbers_in(f) for f in (*(own.frame for own in form[0]), form[1])])
+        return cls(chains, structure, form, numbers, grids, grown, cls._sides(chains, form[0]), frames)
+
+    @staticmethod
+    def _sides(chains: _Chains, form: tuple[ElementNumbers, ...]) -> dict[str, _Sides]:
+        found: dict[str, list[tuple[Any, int, int]]] = {}
+        for c, media in enumerate(chains.media):
+            for i, own in enumerate(form):
+                for medium, side in ((media[i], own.before), (media[i + 1], own.after)):
+                    if medium.solid is not None:
+                        found.setdefault(medium.solid, []).append((side, c, int(chains.bodies[c, i])))
+        out = {}
+        for solid, sides in found.items():
+            index, columns, bodies = (
+                np.array(column) for column in zip(*((s.index, c, b) for s, c, b in sides), strict=True)
+            )
+            graded = np.array([k for k, (side, _, _) in enumerate(sides) if side.gradient is not None], int)
+            slopes = np.array([sides[k][0].gradient for k in graded], int).reshape(-1, 3).T
+            out[solid] = _Sides(index, columns, bodies, graded, slopes)
+        return out
+
+    def in_states(self, assembly: Assembly, states: Sequence[State], placed: PlacedBodies) -> np.ndarray:
+        """The numbers in S states, but for grids, (L, C * S)."""
+        count = len(states)
+        out = np.repeat(self.numbers[:, :, None], count, axis=2)
+        if np.any(placed.scale != 1.0):
+            self._grow(out, placed)
+        paths = {path for state in states for path in state}
+        for solid in paths.intersection(self.glass):
+            self._set_index(out, assembly, solid, states, placed)
+        known: dict[tuple[str, int, float], np.ndarray] = {}
+        for i, structure in enumerate(self.structure):
+            if not paths.isdisjoint(self.chains.depends[i]):
+                self._reshape(out, i, structure, states, known)
+        flat = out.reshape(len(out), -1)
+        flat[self.frame_rows[:-1]] = frames_of(placed, self.chains.bodies)
+        return flat
+
+    def _grow(self, out: np.ndarray, placed: PlacedBodies) -> None:
+        for power, (rows, columns, bodies) in self.grown.items():
+            size = placed.scale[:, bodies].T
+            factor = size
+            for _ in range(abs(power) - 1):
+                factor = factor * size
+            if power > 0:
+                out[rows, columns] *= factor
+            else:
+                out[rows, columns] /= factor
+
+    def _set_index(
+        self, out: np.ndarray, assembly: Assembly, solid: str, states: Sequence[State], placed: PlacedBodies
+    ) -> None:
+        sides, glass = self.glass[solid], placed.index[solid]
+        motions = [state.get(solid, AT_REST) for state in states]
+        out[sides.rows, sides.chains] = [assembly.index(solid, motion) for motion in motions]
+        if not sides.gradient.size:
+            return
+        columns, here = sides.chains[sides.gradient], sides.bodies[sides.gradient]
+        world = np.einsum("sij,sj->si", placed.rotation[:, glass], [motion.index_gradient for motion in motions])
+        out[sides.slopes, columns] = np.einsum("snji,sj->ins", placed.rotation[:, here], world)
+        away = placed.translation[:, here] - placed.translation[:, glass, None]
+        out[sides.rows[sides.gradient], columns] += np.einsum("si,sni->ns", world, away)
+
+    def _reshape(
+        self,
+        out: np.ndarray,
+        i: int,
+        structure: Structure,
+        states: Sequence[State],
+        known: dict[tuple[str, int, float], np.ndarray],
+    ) -> None:
+        """Add what states do to the shape of the i-th elements; ``known``: body, order and radius -> figures."""
+        surface = self.form[0][i].surface
+        for c, element in enumerate(self.chains.elements_at(i)):
+            motions = [state.get(element.body, AT_REST) for state in states]
+            if surface.curvature is not None and any(m.radius or m.conic for m in motions):
+                out[surface.curvature, c] /= [1.0 + motion.radius for motion in motions]
+                out[surface.conic, c] += [motion.conic for motion in motions]
+            if surface.figure is None or not any(motion.figure for motion in motions):
+                continue
+            key = element.body, structure.figure_order, element.figure_disk.radius
+            if key not in known:
+                known[key] = _figures(motions, *key[1:])
+            out[list(surface.figure.coefficients), c] += known[key]
+
+
+def _figures(motions: Sequence[Motion], order: int, radius: float) -> np.ndarray:
+    """Coefficients that figures of S motions add, (T, S), as ``zernike.monomials`` has them."""
+    amplitudes = np.zeros((len(motions), max(j for motion in motions for j in motion.figure)))
+    for s, motion in enumerate(motions):
+        for j, amplitude in motion.figure.items():
+            amplitudes[s, j - 1] = amplitude
+    # in one order on every processor
+    return np.asarray(np.einsum("sj,jt->ts", amplitudes, zernike.unit_monomials(amplitudes.shape[1], order, radius)))
+
+
 def assemble(
     assembly: Assembly,
     sequences: Sequence[str | Sequence[str]],
@@ -484,94 +510,40 @@ def assemble(
         ValueError: the sequences differ in structure.
     """
     placed = assembly.place(states, step) if placed is None else placed
-    chains = [
-        tuple(assembly.elements[n] for n in (assembly.sequences[s] if isinstance(s, str) else s)) for s in sequences
-    ]
-    lengths = {len(chain) for chain in chains}
-    if len(lengths) != 1:
-        raise ValueError(f"sequences of different lengths cannot be batched: {sorted(lengths)}")
-    media = [media_along(chain) for chain in chains]
-    graded = {path for state in states for path, motion in state.items() if any(motion.index_gradient)}
-    real = step is None and not np.iscomplexobj(placed.rotation)
-    reshaped = reshaped_bodies(states, placed) if real else set(placed.index)
     known = assembly.worked_out
-    names = tuple(tuple(element.name for element in chain) for chain in chains)
-
-    def structure(i: int) -> Structure:
-        """Of the i-th elements of all chains."""
-        before, after = (any(m[k].solid in graded for m in media) for k in (i, i + 1))
-        elements = [chain[i] for chain in chains]
-        if not reshaped.isdisjoint(e.body for e in elements):
-            return structure_of(elements, states, (before, after))
-        key = ("structure", i, names, before, after)
-        if key not in known:
-            known[key] = structure_of(elements, (), (before, after))
-        found: Structure = known[key]
-        return found
-
-    structures = tuple(structure(i) for i in range(len(chains[0])))
-
-    def own_of(i: int) -> OwnNumbers:
-        """Shapes and indices of the i-th elements of all chains, each number (C * S,)."""
-        depends = {chain[i].body for chain in chains}
-        depends |= {m.solid for along in media for m in along[i : i + 2] if m.solid is not None}
-        if not depends.isdisjoint(reshaped):
-            return joined(i, states, placed, step)
-        # as designed: each system's number for all its states
-        key = (i, names, structures[i])
-        if key not in known:
-            known[key] = joined(i, ({},), assembly.place(), None)
-        one: OwnNumbers = known[key]
-        return one if len(states) == 1 else map_leaves(lambda value: np.repeat(value, len(states)), one)
-
-    def joined(i: int, states: Sequence[State], placed: PlacedBodies, step: Any) -> OwnNumbers:
-        """The same worked out; once for an element that several chains share."""
-        found: dict[tuple[str, Medium, Medium], OwnNumbers] = {}
-        keys = [(chain[i].name, along[i], along[i + 1]) for chain, along in zip(chains, media, strict=True)]
-        for key in keys:
-            if key not in found:
-                name, before, after = key
-                found[key] = own_numbers_of(
-                    assembly, assembly.elements[name], (before, after), structures[i], states, placed, step
-                )
-        return _joined([found[key] for key in keys])
-
-    bodies = np.array([[placed.index[element.body] for element in chain] for chain in chains])
+    along = tuple(s if isinstance(s, str) else tuple(s) for s in sequences)
+    chains = known.get(along)
+    if chains is None:
+        chains = known[along] = _Chains.of(assembly, along)
+    shapes = _Shapes.of(states)
+    structure = chains.structure(shapes)
+    design = known.get((along, structure))
+    if design is None:
+        design = known[along, structure] = _Design.of(assembly, chains, structure)
+    world = Poses(*(np.concatenate([a[:, b] for b in chains.bodies]) for a in (placed.rotation, placed.translation)))
+    size = np.concatenate([placed.size(chain[-1].body) for chain in chains.elements])
+    grids = list(design.grids)
+    if step is None and not np.iscomplexobj(placed.rotation):
+        numbers = design.in_states(assembly, states, placed)
+        numbers[design.frame_rows[-1]] = world.last_rows()
+        for i, here in enumerate(design.form[0]):
+            if not shapes.gridded.isdisjoint(chains.depends[i]):
+                own, grids[i] = chains.own(assembly, i, structure[i], states, placed)
+                rows = numbers_in((here.surface, here.aperture, here.before, here.after))
+                numbers[rows] = numbers_in((own.surface, own.aperture, own.before, own.after))
+        return SystemBatch(structure, design.form, numbers, world, None, None, size, tuple(grids), len(states))
     values = []
-    tables: list[np.ndarray | None] = []
-    for i, frame in enumerate(frames_of(placed, bodies)):
-        own, spline = own_of(i), None
-        if structures[i].grid:
-            grid, spline = grid_numbers([chain[i] for chain in chains], states)
-            own = replace(own, surface=replace(own.surface, grid=grid))
-        tables.append(spline)
-        values.append(ElementNumbers(frame, own.surface, own.aperture, own.before, own.after))
-    world = Poses(*(np.concatenate([a[:, own] for own in bodies]) for a in (placed.rotation, placed.translation)))
-    size = np.concatenate([placed.size(chain[-1].body) for chain in chains])
-    form = known.get(structures)
-    if form is None:
-        form = known[structures] = form_of((tuple(values), world.last()))
+    for i, frame in enumerate(frames_of(placed, chains.bodies)):
+        own, grids[i] = chains.own(assembly, i, structure[i], states, placed, step)
+        values.append(ElementNumbers(FrameNumbers.of(frame), own.surface, own.aperture, own.before, own.after))
+    numbers = np.array([number.real for number in numbers_in((tuple(values), world.last()))])
+    tangents, world_tangents = None, None
+    if step is not None:
+        tangents, world_tangents = tuple(map_leaves(_tangent, v) for v in values), map_leaves(_tangent, world)
+    world = map_leaves(lambda value: np.ascontiguousarray(value.real), world)
     return SystemBatch(
-        structures,
-        tuple(values) if real else tuple(map_leaves(_real, value) for value in values),
-        world if real else map_leaves(_real, world),
-        tuple(map_leaves(_tangent, value) for value in values) if step is not None else None,
-        map_leaves(_tangent, world) if step is not None else None,
-        size,
-        tuple(tables),
-        len(chains) * len(states),
-        len(states),
-        form,
+        structure, design.form, numbers, world, tangents, world_tangents, size, tuple(grids), len(states)
     )
-
-
-def _joined(parts: Sequence[Numbers]) -> Numbers:
-    """The numbers of all chains, (S,) each, one after the other."""
-    return map_leaves(lambda *arrays: np.concatenate(arrays), parts[0], *parts[1:])
-
-
-def _real(value: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(value.real)
 
 
 def _tangent(value: np.ndarray) -> np.ndarray | None:

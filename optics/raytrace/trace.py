@@ -27,15 +27,14 @@ from optics.numerics.backend import Backend
 from optics.numerics.number_tree import map_leaves
 from optics.numerics.physical_error import PhysicalError
 from optics.raytrace.assembly import Interaction
-from optics.raytrace.system import (
+from optics.raytrace.element_numbers import (
     CoordinateNumbers,
     ElementNumbers,
     FrameNumbers,
     IndexNumbers,
     Structure,
-    SystemBatch,
-    UploadedSystems,
 )
+from optics.raytrace.system import SystemBatch, UploadedSystems
 
 
 def truncation_bound(gradient: float, length: float, index: float = 1.5) -> tuple[float, float]:

@@ -18,7 +18,8 @@ from optics.numerics.backend import Backend
 from optics.numerics.quadrature import even_disk
 from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.system import SystemBatch, assemble, media_along
+from optics.raytrace.element_numbers import media_along
+from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import line_body
 from scenes.models.clearance import convex_bodies, convex_hull, remedy

@@ -24,7 +24,8 @@ from analysis.spots.spot_positions import difference_covariance
 from optics.geometry.tree import Motion, State
 from optics.numerics.threads import one_blas_thread, one_kernel_thread
 from optics.raytrace.assembly import Interaction
-from optics.raytrace.system import Structure, assemble
+from optics.raytrace.element_numbers import Structure
+from optics.raytrace.system import assemble
 from optics.raytrace.trace import FURTHER_STEPS, NEWTON_STEPS
 from optics.waves.diffraction import image
 from optics.waves.field_samples import FieldSamples

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, State
-from optics.numerics.number_tree import Path, leaves, with_leaf
+from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
@@ -98,8 +98,9 @@ def test_forward_mode_for_the_shape(backend, bare, rays, mirror: int, name: str)
     sides = []
     for sign in (1, -1):
         path = (mirror, *NUMBERS[name])
-        values = with_leaf(systems.values, path, leaves(systems.values)[path] + sign * h)
-        sides.append(columns(trace(backend, replace(systems, values=values), make_rays(backend, *rays))))
+        numbers = systems.numbers.copy()
+        numbers[leaves(systems.form[0])[path]] += sign * h
+        sides.append(columns(trace(backend, replace(systems, numbers=numbers), make_rays(backend, *rays))))
     np.testing.assert_allclose(exact, (sides[0][0][0] - sides[1][0][0]) / (2 * h), rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(exact_path, (sides[0][2][0] - sides[1][2][0]) / (2 * h), rtol=1e-6, atol=1e-8)
 

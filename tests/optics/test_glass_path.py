@@ -8,7 +8,8 @@ from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from optics.raytrace.system import Medium, assemble, media_along
+from optics.raytrace.element_numbers import Medium, media_along
+from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 
 N = 1.52

@@ -1,10 +1,8 @@
-from dataclasses import fields
 
 import numpy as np
 import pytest
 
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
-from optics.geometry.surface import GridFigure
 from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, State, compose
 
 PIVOT = (0.0, 0.2, -0.1)
@@ -177,24 +175,3 @@ def test_a_tree_stands_by_itself_as_another_does_in_a_state() -> None:
     ):
         with pytest.raises(error):
             tree.standing(state)
-
-
-OTHER = {
-    "figure": {5: 1e-9},
-    "index_gradient": (0.0, 1e-9, 0.0),
-    "grid": GridFigure(np.ones((4, 4)), (-1.0, 1.0, -1.0, 1.0)),
-}
-
-
-@pytest.mark.parametrize("name", [field.name for field in fields(Motion)])
-def test_what_gives_another_shape_is_told_from_what_moves(name: str) -> None:
-    """Of every number of a motion: a system takes its surfaces as designed where no state reshapes them. Growth is seen
-    in the placed bodies.
-    """
-    if name in ("rotate", "shift"):
-        motion = Motion(**{name: (1e-9, 0.0, 0.0)})
-    elif name == "pivot":
-        motion = Motion(pivot="corner")
-    else:
-        motion = Motion(**{name: OTHER.get(name, 1e-9)})
-    assert motion.reshapes is (name not in ("rotate", "shift", "pivot", "scale", "stretch"))

@@ -16,7 +16,7 @@ from optics.materials.glass import N_BK7, Glass, ThermalDispersion
 from optics.materials.material import Material, TemperatureRange, material
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Element, Interaction
-from optics.raytrace.system import Medium
+from optics.raytrace.element_numbers import Medium
 
 FIGURE = ZernikeFigure(0.5, (0.1, 0.0), {4: 1e-7, 5: 2e-7})
 SURFACE = Surface(-0.15, -1.5, (1e-5, 2e-6), FIGURE)

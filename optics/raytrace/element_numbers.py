@@ -1,0 +1,262 @@
+"""What the trace reads of one element: its frame, its shape and clear aperture, and the media on both sides.
+
+What decides the code of a kernel, as against the numbers that it works on, is a `Structure`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optics.geometry import zernike
+from optics.geometry.aperture import ApertureNumbers
+from optics.geometry.sag_terms import SagTerm, grown, kinds_of, of_kinds
+from optics.geometry.surface import (
+    Figure,
+    FigureNumbers,
+    GridFigure,
+    GridNumbers,
+    SummedFigure,
+    SurfaceNumbers,
+    ZernikeFigure,
+)
+from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State
+from optics.numerics.number_tree import map_leaves
+from optics.raytrace.assembly import Assembly, Element, Interaction
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What decides the code of the kernel (as against the numbers that it works on), for one element."""
+
+    interaction: Interaction
+    plane: bool
+    even: int
+    terms: tuple[type[SagTerm], ...]  # kinds of further terms of the sag
+    figure_order: int  # radial order of the Zernike figure, -1 for none
+    grid: bool
+    aperture: type[ApertureNumbers] | None
+    graded: tuple[bool, bool] = (False, False)  # whether the medium before and the one after has an index gradient
+
+
+@dataclass(frozen=True, eq=False)
+class CoordinateNumbers:
+    """One coordinate of a rigid transform: ``shift`` + ``turn`` . p, metres."""
+
+    shift: Any
+    turn: tuple[Any, Any, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameNumbers:
+    """A rigid transform of points, coordinate by coordinate."""
+
+    x: CoordinateNumbers
+    y: CoordinateNumbers
+    z: CoordinateNumbers
+
+    @classmethod
+    def of(cls, rows: np.ndarray) -> FrameNumbers:
+        """From its numbers in the order of the fields, (12, ...)."""
+        return cls(*(CoordinateNumbers(c[0], (c[1], c[2], c[3])) for c in rows.reshape(3, 4, *rows.shape[1:])))
+
+    @property
+    def coordinates(self) -> tuple[CoordinateNumbers, CoordinateNumbers, CoordinateNumbers]:
+        """Numbers of the coordinates x, y and z."""
+        return self.x, self.y, self.z
+
+
+@dataclass(frozen=True, eq=False)
+class IndexNumbers:
+    """Refractive index of a medium: ``index`` + ``gradient`` . p at p in the element's frame; no gradient: None."""
+
+    index: Any
+    gradient: tuple[Any, Any, Any] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ElementNumbers:
+    """All that the trace reads of one element.
+
+    Attributes:
+        frame: from the frame of the element before (the world for the first) into this element's.
+        surface: its shape; aperture: its clear aperture, None for an unlimited one.
+        before, after: refractive index on the side that light comes from and on the one that it goes to.
+    """
+
+    frame: FrameNumbers
+    surface: SurfaceNumbers
+    aperture: ApertureNumbers | None
+    before: IndexNumbers
+    after: IndexNumbers
+
+
+@dataclass(frozen=True, eq=False)
+class OwnNumbers:
+    """Numbers of an element that do not depend on where it stands; as of ``ElementNumbers``."""
+
+    surface: SurfaceNumbers
+    aperture: ApertureNumbers | None
+    before: IndexNumbers
+    after: IndexNumbers
+
+
+@dataclass(frozen=True)
+class Medium:
+    """What light travels in: a glass body of the assembly, or something homogeneous of a given index."""
+
+    solid: str | None = None
+    index: float = 1.0
+
+
+def media_along(chain: Sequence[Element]) -> list[Medium]:
+    """The medium before the first element, between the elements and after the last one."""
+    out = [Medium()]
+    for element in chain:
+        before = out[-1]
+        if element.interaction is Interaction.REFRACT and element.solid is not None:
+            out.append(Medium() if before.solid == element.solid else Medium(element.solid))
+        elif element.solid is not None or before.solid is not None:
+            out.append(before)
+        else:
+            out.append(Medium(None, element.index_after))
+    return out
+
+
+def structure_of(elements: Sequence[Element]) -> Structure:
+    """Common structure of elements as designed, the i-th ones of several chains."""
+    grid = any(_known_figure(e) is not None and e.surface.grid_figure is not None for e in elements)
+    apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
+    kinds = {(e.interaction, e.surface.is_plane, own) for e, own in zip(elements, apertures, strict=True)}
+    if len(kinds) != 1:
+        names = ", ".join(sorted(e.name for e in elements))
+        raise ValueError(f"elements of different kinds cannot be batched: {names}")
+    interaction, is_plane, aperture = kinds.pop()
+    # a plane may have terms that are zero, and the terms that a surface lacks are
+    terms = kinds_of([term for e in elements for term in e.surface.terms])
+    even = 0 if is_plane else max(len(e.surface.even) for e in elements)
+    figures = [e.surface.zernike_figure for e in elements]
+    order = max(-1 if figure is None else zernike.order_of(figure.terms) for figure in figures)
+    return Structure(interaction, is_plane, even, terms, order, grid, aperture)
+
+
+def _known_figure(element: Element) -> Figure | None:
+    """The figure of an element's surface; ValueError for one that the trace would leave out."""
+    match element.surface.figure:
+        case None | ZernikeFigure() | GridFigure() | SummedFigure() as figure:
+            return figure
+        case other:
+            raise ValueError(f"element {element.name!r}: the trace knows no figure of type {type(other).__name__}")
+
+
+def own_numbers_of(
+    assembly: Assembly,
+    element: Element,
+    media: tuple[Medium, Medium],
+    structure: Structure,
+    states: Sequence[State],
+    placed: PlacedBodies,
+    step: Sequence[tuple[str, str, int]] | None,
+) -> OwnNumbers:
+    """Shape, aperture and indices of an element between two media, each number (S,), complex when a derivative is
+    carried.
+    """
+    scale = placed.scale[:, placed.index[element.body]]
+    sides = zip(media, structure.graded, strict=True)
+    outer, inner = (_index_numbers(assembly, element, medium, graded, states, placed) for medium, graded in sides)
+    return OwnNumbers(
+        _surface_numbers(element, structure, scale, states, step),
+        # an edge has no derivative: it lets a ray pass or stops it
+        None if element.aperture is None else element.aperture.numbers(scale.real),
+        outer,
+        inner,
+    )
+
+
+def _index_numbers(
+    assembly: Assembly, element: Element, medium: Medium, graded: bool, states: Sequence[State], placed: PlacedBodies
+) -> IndexNumbers:
+    """Index (S,) of a medium beside an element, with its gradient in the element's frame where it is graded."""
+    if medium.solid is None:
+        index = np.full(len(states), medium.index)
+        gradient = np.zeros((len(states), 3)) if graded else None
+    else:
+        motions = [state.get(medium.solid, AT_REST) for state in states]
+        index = np.array([assembly.index(medium.solid, m) for m in motions])
+        gradient = None
+        if graded:
+            here, glass = placed.index[element.body], placed.index[medium.solid]
+            own = np.array([m.index_gradient for m in motions])
+            world = np.einsum("sij,sj->si", placed.rotation[:, glass], own)
+            gradient = np.einsum("sji,sj->si", placed.rotation[:, here], world)
+            away = placed.translation[:, here] - placed.translation[:, glass]
+            index = index + np.einsum("si,si->s", world, away)
+    return IndexNumbers(index, None if gradient is None else (gradient[:, 0], gradient[:, 1], gradient[:, 2]))
+
+
+def _surface_numbers(
+    element: Element,
+    structure: Structure,
+    scale: np.ndarray,
+    states: Sequence[State],
+    step: Sequence[tuple[str, str, int]] | None,
+) -> SurfaceNumbers:
+    surface = element.surface
+    curvature, conic, even = None, None, []
+    if not structure.plane:
+        motions = [state.get(element.body, AT_REST) for state in states]
+        radius = scale * (1.0 + np.array([motion.radius for motion in motions]))
+        curvature, conic = surface.curvature / radius, surface.conic + np.array([motion.conic for motion in motions])
+        for n in range(structure.even):
+            term = surface.even[n] if n < len(surface.even) else 0.0
+            even.append(term / scale ** (2 * n + 3))
+    terms = tuple(grown(term, scale) for term in of_kinds(surface.terms, structure.terms))
+    figure = _figure_numbers(element, structure.figure_order, states, step) if structure.figure_order >= 0 else None
+    return SurfaceNumbers(curvature, conic, tuple(even), terms, figure)
+
+
+def _figure_numbers(
+    element: Element, order: int, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None
+) -> FigureNumbers:
+    """Monomial coefficients of the Zernike figure of each state."""
+    figure = element.figure_disk
+    kind = np.float64 if step is None else np.complex128
+    table = np.empty((len(states), zernike.triangle_size(order)), kind)
+    for s, state in enumerate(states):
+        terms: dict[int, Any] = dict(figure.terms)
+        for j, amplitude in state.get(element.body, AT_REST).figure.items():
+            terms[j] = terms.get(j, 0.0) + amplitude
+        if step is not None and step[s][:2] == (element.body, FIGURE):
+            terms[step[s][2]] = terms.get(step[s][2], 0.0) + 1j * COMPLEX_STEP
+        table[s] = zernike.monomials(terms, order, figure.radius)
+    x, y = (np.full(len(states), c) for c in figure.centre)
+    return FigureNumbers(x, y, tuple(table[:, m] for m in range(table.shape[1])))
+
+
+_NO_GRID = GridFigure(np.zeros((4, 4)), (-1.0, 1.0, -1.0, 1.0))
+"""What a system without a grid reads where others of its batch have one."""
+
+
+def grid_numbers(elements: Sequence[Element], states: Sequence[State]) -> tuple[GridNumbers, np.ndarray]:
+    """Numbers of the grids of the i-th elements of all chains in all states, (chains * states,) each, and one table of
+    the coefficients of all.
+    """
+    first: dict[int, int] = {}
+    figures, numbers, tables, length = [], [], [], 0
+    for element in elements:
+        own: dict[int, GridFigure] = {}  # a grid that many states share is added to the element's and stored once
+        for state in states:
+            motion = state.get(element.body, AT_REST)
+            if id(motion.grid) not in own:
+                own[id(motion.grid)] = element.grid_in(motion) or _NO_GRID
+            figure = own[id(motion.grid)]
+            if id(figure) not in first:
+                first[id(figure)] = length
+                figures.append(figure)  # so that its id remains its own
+                tables.append(figure.spline.ravel())
+                length += tables[-1].size
+            numbers.append(replace(figure.numbers, first=float(first[id(figure)])))
+    return map_leaves(lambda *values: np.array(values), numbers[0], *numbers[1:]), np.concatenate(tables)
