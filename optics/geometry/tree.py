@@ -49,9 +49,9 @@ class Body:
 
     def moved(self, motion: Motion) -> Body:
         """The body at rest where a rigid motion takes it."""
-        turn, offset = _affine(motion, self)
+        turn, offset, _ = _affine([motion], [self])
         rotation, translation = self.pose.rotation, self.pose.translation
-        return replace(self, pose=Pose(product(rotation, turn), translation + turned(rotation, offset)))
+        return replace(self, pose=Pose(product(rotation, turn[0]), translation + turned(rotation, offset[0])))
 
 
 @dataclass(frozen=True)
@@ -359,43 +359,58 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
     Raises:
         ValueError: both have a grid figure of the same body, on different samples.
     """
-    out = dict(first)
-    for path, motion in then.items():
-        before = out.get(path)
-        if before is None:
-            out[path] = motion
-            continue
-        body = bodies[path]
-        turn_1, offset_1 = _affine(before, body)
-        turn_2, offset_2 = _affine(motion, body)
-        growth = (1.0 + before.stretch) * (1.0 + before.scale)
-        turn, offset = product(turn_1, turn_2), turned(turn_1, growth * offset_2) + offset_1
-        out[path] = Motion(
-            rotate=_turned_both(before, motion, turn),
-            shift=triple(offset),
+    return composed((first, then), bodies)
+
+
+def composed(states: Sequence[State], bodies: Mapping[str, Body]) -> State:
+    """One state that does several, each on top of the one before it, as ``compose`` has it of two."""
+    along: dict[str, list[Motion]] = {}
+    for state in states:
+        for path, motion in state.items():
+            along.setdefault(path, []).append(motion)
+    out = {path: motions[0] for path, motions in along.items()}
+    # the second motions of all bodies together, then the third ones
+    for k in range(1, max(map(len, along.values()), default=0)):
+        paths = [path for path, motions in along.items() if len(motions) > k]
+        pairs = [(out[path], along[path][k]) for path in paths]
+        out.update(zip(paths, _both(pairs, [bodies[path] for path in paths]), strict=True))
+    return out
+
+
+def _both(pairs: Sequence[tuple[Motion, Motion]], bodies: Sequence[Body]) -> list[Motion]:
+    """First motions with second ones on top, about the origins of N bodies."""
+    (turn_1, offset_1, growth), (turn_2, offset_2, _) = (_affine([pair[k] for pair in pairs], bodies) for k in range(2))
+    turn, offset = product(turn_1, turn_2), turned(turn_1, growth[:, None] * offset_2) + offset_1
+    rotate = _turned_both(pairs, turn)
+    return [
+        Motion(
+            rotate=rotate[k],
+            shift=triple(offset[k]),
             scale=(1.0 + before.scale) * (1.0 + motion.scale) - 1.0,
             figure={j: before.figure.get(j, 0.0) + motion.figure.get(j, 0.0) for j in {*before.figure, *motion.figure}},
             stretch=(1.0 + before.stretch) * (1.0 + motion.stretch) - 1.0,
             index=before.index + motion.index,
-            index_gradient=triple(np.array(before.index_gradient) + np.array(motion.index_gradient)),
+            index_gradient=triple([a + b for a, b in zip(before.index_gradient, motion.index_gradient, strict=True)]),
             grid=_sum(before.grid, motion.grid),
             radius=(1.0 + before.radius) * (1.0 + motion.radius) - 1.0,
             conic=before.conic + motion.conic,
             abbe=(1.0 + before.abbe) * (1.0 + motion.abbe) - 1.0,
         )
+        for k, (before, motion) in enumerate(pairs)
+    ]
+
+
+def _turned_both(pairs: Sequence[tuple[Motion, Motion]], turn: np.ndarray) -> list[tuple[float, float, float]]:
+    """Rotation vectors of two motions together, whose matrices are ``turn``, (N, 3, 3); most motions turn nothing."""
+    out = [then.rotate if any(then.rotate) else first.rotate for first, then in pairs]
+    both = [k for k, (first, then) in enumerate(pairs) if any(first.rotate) and any(then.rotate)]
+    if both:
+        # messages about files and help wait for this module, and scipy takes a quarter of a second
+        from scipy.spatial.transform import Rotation
+
+        for k, vector in zip(both, Rotation.from_matrix(turn[both]).as_rotvec(), strict=True):
+            out[k] = triple(vector)
     return out
-
-
-def _turned_both(first: Motion, then: Motion, turn: np.ndarray) -> tuple[float, float, float]:
-    """Rotation vector of two motions together, whose matrix is ``turn``; most motions turn nothing."""
-    if not any(then.rotate):
-        return first.rotate
-    if not any(first.rotate):
-        return then.rotate
-    # messages about files and help wait for this module, and scipy takes a quarter of a second
-    from scipy.spatial.transform import Rotation
-
-    return triple(Rotation.from_matrix(turn).as_rotvec())
 
 
 def _sum(first: GridFigure | None, then: GridFigure | None) -> GridFigure | None:
@@ -404,11 +419,10 @@ def _sum(first: GridFigure | None, then: GridFigure | None) -> GridFigure | None
     return first.plus(then)
 
 
-def _affine(motion: Motion, body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and offset (3,) of x -> R growth x + offset, as ``RigidTree.place`` has it."""
-    pivot = np.array(body.pivots[motion.pivot])
-    growth = (1.0 + motion.scale) * (1.0 + motion.stretch)
-    if not any(motion.rotate):  # most motions of bodies that warm up
-        return np.eye(3), pivot + np.array(motion.shift) - growth * pivot
-    turn = rotation_matrix(np.array(motion.rotate))
-    return turn, pivot + np.array(motion.shift) - growth * turned(turn, pivot)
+def _affine(motions: Sequence[Motion], bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotation (N, 3, 3), offset (N, 3) and growth (N,) of x -> R growth x + offset, as ``RigidTree.place`` has it."""
+    pivot = np.array([body.pivots[motion.pivot] for motion, body in zip(motions, bodies, strict=True)])
+    rotate, shift = (np.array([getattr(motion, name) for motion in motions]) for name in ("rotate", "shift"))
+    growth = np.array([(1.0 + motion.scale) * (1.0 + motion.stretch) for motion in motions])
+    turn = rotation_matrix(rotate)
+    return turn, pivot + shift - growth[:, None] * turned(turn, pivot), growth

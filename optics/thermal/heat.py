@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.geometry.pose import Pose, triple
+from optics.numerics.array_math import inner
 
 
 @dataclass(frozen=True)
@@ -35,15 +36,17 @@ class Temperature:
 
 
 def carried_motion(expansion: float, gradient: np.ndarray, arm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation vector and shift, (3,) each, that a gradient gives to what stands at ``arm`` from the fixed point.
+    """Rotation vectors and shifts, (..., 3) each, that a gradient gives to what stands at ``arm`` from the fixed point.
 
     The stress-free displacement of a linear field, u = a ((g . q) q - q^2 g / 2), and its rotation a (g x q); see
     ``optics.thermal.thermo_elastic.free_linear_field``. The uniform part, a dT q, is the body's ``Motion.stretch``.
 
     Args:
         expansion: a, 1/K.
-        gradient: g, K/m, in the body's frame.
-        arm: q, metres, likewise.
+        gradient: g, K/m, in the body's frame, (3,).
+        arm: q, metres, likewise, (..., 3).
     """
     g, q = np.asarray(gradient, np.float64), np.asarray(arm, np.float64)
-    return expansion * np.cross(g, q), expansion * ((g @ q) * q - 0.5 * (q @ q) * g)
+    turn = np.stack([g[a] * q[..., b] - g[b] * q[..., a] for a, b in ((1, 2), (2, 0), (0, 1))], axis=-1)
+    along, square = inner(g, q)[..., None], inner(q, q)[..., None]
+    return expansion * turn, expansion * (along * q - 0.5 * square * g)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from optics.geometry.pose import triple
-from optics.geometry.tree import ORIGIN, Motion, State, compose
+from optics.geometry.tree import ORIGIN, Motion, State, composed
 from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
@@ -247,7 +247,7 @@ def state_of(
         motions: what else happens; it acts on top of the same body's motion.
     """
     heat: dict[str, Temperature] = {}
-    moves: State = {}
+    moves: list[State] = []
     bodies = {body.path: body for body in thermal.instrument.assembly.tree.bodies}
     for (_, body, pivot), group in _groups(components):
         values = {(components[k].kind, components[k].axis): float(amounts[k]) for k in group}
@@ -256,9 +256,10 @@ def state_of(
             heat[body] = heat.get(body, Temperature()) + field
         motion = _motion(values, pivot)
         if motion is not None:
-            moves = compose(moves, {body: motion}, bodies)
-    state = thermal.state(heat, moves) if heat else moves
-    return compose(state, motions, bodies) if motions else state
+            moves.append({body: motion})
+    if heat:
+        moves = [thermal.state(heat, composed(moves, bodies))]
+    return composed([*moves, motions or {}], bodies)
 
 
 def _groups(components: Sequence[Component]) -> Iterator[tuple[tuple[str, str, str], list[int]]]:

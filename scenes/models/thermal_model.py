@@ -11,7 +11,7 @@ a free body (``scenes.models.lens_heat``). Glass changes its index by dn/dT.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,9 +21,10 @@ from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose, triple
 from optics.geometry.solid import Solid, solid_mesh
 from optics.geometry.surface import Surface
-from optics.geometry.tree import ORIGIN, Body, Motion, State, compose
+from optics.geometry.tree import ORIGIN, Body, Motion, State, composed
 from optics.materials.glass import WarmGlass, glass
 from optics.materials.material import Material, TemperatureRange, material
+from optics.numerics.array_math import turned
 from optics.numerics.physical_error import PhysicalError
 from optics.thermal.deformation import Displaced, FaceChange, Formula, face_change
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
@@ -41,7 +42,35 @@ CELLS = 8
 TERMS = 15
 """Zernike terms that hold a deformed face, to fourth order."""
 
-Response = Mapping[str, tuple[FaceChange, FaceChange, FaceChange]]
+
+@dataclass(frozen=True, eq=False)
+class _Response:
+    """What gradients of 1 K/m along x, y and z of a body do to one of its faces.
+
+    Attributes:
+        rotate, shift: (3, 3), a row for each gradient, radians and metres.
+        terms: Noll indices of the figures; figures: (3, of these), metres.
+    """
+
+    rotate: np.ndarray
+    shift: np.ndarray
+    terms: tuple[int, ...]
+    figures: np.ndarray
+
+    @classmethod
+    def of(cls, units: Sequence[FaceChange]) -> _Response:
+        """From the changes by the three gradients."""
+        terms = tuple(sorted({j for unit in units for j in unit.figure}))
+        figures = np.array([[unit.figure.get(j, 0.0) for j in terms] for unit in units]).reshape(3, -1)
+        return cls(np.array([unit.rotate for unit in units]), np.array([unit.shift for unit in units]), terms, figures)
+
+    def to(self, gradient: np.ndarray) -> Motion:
+        """The motion of the face by a gradient (3,), K/m."""
+        rotate, shift, amplitudes = (turned(part.T, gradient) for part in (self.rotate, self.shift, self.figures))
+        figure = {j: a for j, a in zip(self.terms, amplitudes.tolist(), strict=True) if a}
+        return Motion(rotate=triple(rotate), shift=triple(shift), figure=figure)
+
+
 """Body of a face -> what a gradient of 1 K/m along each axis of the solid's frame does to it."""
 
 
@@ -60,6 +89,23 @@ class TemperatureError(PhysicalError, ValueError):
     def __init__(self, problem: str, origin: str, allowed: str) -> None:
         super().__init__(problem)
         self.origin, self.allowed = origin, allowed
+
+
+@dataclass(frozen=True, eq=False)
+class _Carried:
+    """What stands on a body: lenses, and N other bodies.
+
+    Attributes:
+        lenses, bodies: they.
+        mount: where the bodies are held, in their own frames, (N, 3), metres; place: the same in the carrier's.
+        inward: rotations from the carrier's frame to theirs, (N, 3, 3).
+    """
+
+    lenses: tuple[Lens, ...]
+    bodies: tuple[Body, ...]
+    mount: np.ndarray
+    place: np.ndarray
+    inward: np.ndarray
 
 
 class ThermalModel:
@@ -84,12 +130,11 @@ class ThermalModel:
         every = (lens for name, model in instrument.cameras.items() for lens in lenses_of(name, model, self._bodies))
         self.lenses: dict[str, Lens] = {lens.path: lens for lens in every}
         self._lens_of = {face: lens for lens in self.lenses.values() for face in lens.faces}
-        self._carried: dict[str, list[Body]] = {path: [] for path in self._bodies}
-        for body in instrument.assembly.tree.bodies:
-            if body.parent:
-                self._carried[body.parent].append(body)
-        self._responses: dict[str, Response] = {}
+        self._responses: dict[str, dict[str, _Response]] = {}
         self._extents: dict[str, np.ndarray] = {}
+        self._carried: dict[str, _Carried] = {}
+        self._inside: dict[str, tuple[str, ...]] = {}
+        self._owners: dict[str, str | None] = {}
 
     @cached_property
     def materials(self) -> Mapping[str, Material | WarmGlass]:
@@ -121,9 +166,10 @@ class ThermalModel:
         """The solid that a body belongs to, itself or a parent: the outermost, whose pieces the others are; of a lens's
         face the first face, which stands for the lens.
         """
-        if path in self._lens_of:
-            return self._lens_of[path].path
-        return next((p for p in reversed(list(_upward(path))) if p in self.solids), None)
+        if path not in self._owners:
+            outermost = next((p for p in reversed(list(_upward(path))) if p in self.solids), None)
+            self._owners[path] = self._lens_of[path].path if path in self._lens_of else outermost
+        return self._owners[path]
 
     def _pieces(self, path: str) -> list[Solid]:
         """A solid and those that are pieces of it."""
@@ -234,14 +280,14 @@ class ThermalModel:
             progress: called with the path of each body whose finite-element solution begins.
         """
         fields = self.fields(temperatures)
-        thermal: State = {}
+        thermal: list[State] = []
         for path, field in fields.items():
             if self._owner(path) in (None, path) and field != Temperature():
-                thermal = compose(thermal, self._warmed(path, field, progress), self._bodies)
-        return compose(thermal, motions or {}, self._bodies)
+                thermal += self._warmed(path, field, progress)
+        return composed([*thermal, motions or {}], self._bodies)
 
-    def _warmed(self, path: str, field: Temperature, progress: Callable[[str], None]) -> State:
-        """What a body's field does to the body itself, to its faces and to what it carries."""
+    def _warmed(self, path: str, field: Temperature, progress: Callable[[str], None]) -> list[State]:
+        """What a body's field does to the body itself, to its faces and to what it carries: the last one first."""
         if path in self.lenses:
             return self._warmed_lens(self.lenses[path], field, progress)
         body, stuff = self._bodies[path], self.materials[path]
@@ -256,39 +302,47 @@ class ThermalModel:
         out: dict[str, Motion] = {path: own}
         if path in self.solids or path in self.mirrors:
             # the tree's stretch carries what stands on a body and does not enlarge it; faces and footprints are its own
-            out.update({face: Motion(stretch=own.stretch) for face in self._bodies if face.startswith(f"{path}/")})
-            if not bent:
-                return out
-            bending = {face: _superposed(units, gradient) for face, units in self._response(path, progress).items()}
-            return compose(bending, out, self._bodies)
-        for child in self._carried[path]:
-            if child.path in self._lens_of:
-                if child.path in self.lenses:
-                    lens = self.lenses[child.path]
-                    out.update(
-                        lens.carried(*carried_motion(stuff.expansion, gradient, lens.mount - about), own.stretch)
-                    )
-                continue
-            mount = np.array(child.pivots[_mount(child)])
-            turn, move = carried_motion(stuff.expansion, gradient, child.pose.apply(mount) - about)
-            inward = child.pose.rotation.T
-            # the tree's stretch carries the child's origin, but what moves with this body is the child's mount
-            shift = inward @ move + own.stretch * mount
-            if np.any(turn) or np.any(shift):
-                out[child.path] = Motion(rotate=triple(inward @ turn), shift=triple(shift), pivot=_mount(child))
-        return out
+            out.update(dict.fromkeys(self._within(path), Motion(stretch=own.stretch)))
+            return [self._bent(path, gradient, progress), out] if bent else [out]
+        carried = self._carried_by(path)
+        for lens in carried.lenses:
+            out.update(lens.carried(*carried_motion(stuff.expansion, gradient, lens.mount - about), own.stretch))
+        turn, move = carried_motion(stuff.expansion, gradient, carried.place - about)
+        # the tree's stretch carries the child's origin, but what moves with this body is the child's mount
+        rotate = turned(carried.inward, turn)
+        shift = turned(carried.inward, move) + own.stretch * carried.mount
+        moved = np.any(turn, axis=1) | np.any(shift, axis=1)
+        for k in np.flatnonzero(moved).tolist():
+            child = carried.bodies[k]
+            out[child.path] = Motion(rotate=triple(rotate[k]), shift=triple(shift[k]), pivot=_mount(child))
+        return [out]
 
-    def _warmed_lens(self, lens: Lens, field: Temperature, progress: Callable[[str], None]) -> State:
+    def _carried_by(self, path: str) -> _Carried:
+        if path not in self._carried:
+            bodies = [body for body in self._bodies.values() if body.parent == path]
+            lenses = [self.lenses[body.path] for body in bodies if body.path in self.lenses]
+            others = [body for body in bodies if body.path not in self._lens_of]
+            mount = np.array([body.pivots[_mount(body)] for body in others]).reshape(-1, 3)
+            place = np.array([body.pose.apply(at) for body, at in zip(others, mount, strict=True)]).reshape(-1, 3)
+            inward = np.array([body.pose.rotation.T for body in others]).reshape(-1, 3, 3)
+            self._carried[path] = _Carried(tuple(lenses), tuple(others), mount, place, inward)
+        return self._carried[path]
+
+    def _within(self, path: str) -> tuple[str, ...]:
+        """Bodies that a body carries, and those that they carry."""
+        if path not in self._inside:
+            self._inside[path] = tuple(other for other in self._bodies if other.startswith(f"{path}/"))
+        return self._inside[path]
+
+    def _warmed_lens(self, lens: Lens, field: Temperature, progress: Callable[[str], None]) -> list[State]:
         """What a lens's field does to its faces and to its index."""
         assert lens.glass is not None
         here, gradient = self.reference + field.change, np.array(field.gradient)
         out: State = lens.grown(lens.glass.expansion * field.at(lens.middle))
         index = lens.glass.change(self.reference, here), triple(lens.glass.slope(here) * gradient)
         out = {**out, lens.path: replace(out[lens.path], index=index[0], index_gradient=index[1])}
-        if not np.any(gradient) or lens.glass.expansion == 0.0:
-            return out
-        bending = {face: _superposed(units, gradient) for face, units in self._response(lens.path, progress).items()}
-        return compose(bending, out, self._bodies)
+        bent = bool(np.any(gradient)) and lens.glass.expansion != 0.0
+        return [self._bent(lens.path, gradient, progress), out] if bent else [out]
 
     def _index(self, path: str, field: Temperature) -> tuple[float, tuple[float, float, float]]:
         """Change of index at a solid's origin, and its gradient, 1/m."""
@@ -300,14 +354,13 @@ class ThermalModel:
         slope = kind.dn_dt(wavelength, here)
         return change, triple(slope * np.array(field.gradient))
 
-    def _response(self, path: str, progress: Callable[[str], None]) -> Response:
+    def _bent(self, path: str, gradient: np.ndarray, progress: Callable[[str], None]) -> State:
+        """What a gradient (3,), K/m, does to the faces of a body."""
         if path not in self._responses:
             progress(path)
             changes = [self.changes(path, moved) for moved in self.unit_displacements(path)]
-            self._responses[path] = {
-                face: (changes[0][face], changes[1][face], changes[2][face]) for face in changes[0]
-            }
-        return self._responses[path]
+            self._responses[path] = {face: _Response.of([one[face] for one in changes]) for face in changes[0]}
+        return {face: response.to(gradient) for face, response in self._responses[path].items()}
 
     def surface(self, face: str) -> Surface:
         """Nominal shape of the optical face of a body."""
@@ -451,12 +504,3 @@ def _upward(path: str) -> Iterator[str]:
 def _unit_load(axis: int, about: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     # zero at the point about which the uniform part, the body's stretch, is taken
     return lambda points: points[:, axis] - about[axis]
-
-
-def _superposed(units: tuple[FaceChange, FaceChange, FaceChange], gradient: np.ndarray) -> Motion:
-    rotate = sum(g * np.array(u.rotate) for g, u in zip(gradient, units, strict=True))
-    shift = sum(g * np.array(u.shift) for g, u in zip(gradient, units, strict=True))
-    terms = sorted({j for u in units for j in u.figure})
-    figure = {j: float(sum(g * u.figure.get(j, 0.0) for g, u in zip(gradient, units, strict=True))) for j in terms}
-    figure = {j: a for j, a in figure.items() if a}
-    return Motion(rotate=triple(np.asarray(rotate)), shift=triple(np.asarray(shift)), figure=figure)
