@@ -13,15 +13,16 @@ sec. 10.3). Derivatives stay those of the instrument at rest: they change by as 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.states import OfStates
 
-__all__ = ["BEYOND", "Curvature", "MotionModel", "Retraced", "read_again"]
+__all__ = ["BEYOND", "Curvature", "LinearReading", "MotionModel", "Retraced", "read_again"]
 
 Array = NDArray[np.float64]
 BEYOND = 3.0
@@ -52,14 +53,16 @@ class MotionModel:
         spots: A, (D, P) px per unit of each motion.
         parameters: B, (4 K, P) rad and m, likewise.
         amounts: covariance of the shifts (S, D, D), px^2 -> G, (S, P, D) units per px.
-        trace: amounts (S, P) -> what these states do.
+        state: amounts (P,) -> the state that they make.
+        trace: S states -> what they do. Models that have the same one are traced together.
         near_px: states in which no spot moves by more are taken as linear and not traced, px.
     """
 
     spots: Array
     parameters: Array
     amounts: Callable[[Array], Array]
-    trace: Callable[[Array], Retraced]
+    state: Callable[[Array], Any]
+    trace: Callable[[Sequence[Any]], Retraced]
     near_px: float = 0.0
 
 
@@ -91,52 +94,112 @@ class Curvature(OfStates):
         return worst, float(size[worst])
 
 
+@dataclass(frozen=True, eq=False)
+class LinearReading:
+    """What an estimator reads by derivatives in S states.
+
+    Attributes:
+        values: (S, 4 K), rad and m.
+        total: (S, 4 K, 4 K) covariance of their errors.
+        model: the motions by which it reads.
+    """
+
+    values: Array
+    total: Array
+    model: MotionModel
+
+
 def read_again(
-    values: Array, shift: Array, noise: Array, total: Array, rows: Array, model: MotionModel
-) -> tuple[Array, Curvature]:
-    """Readings (S, 4 K), worked out anew where they are not linear, and what was found.
+    readings: Mapping[str, LinearReading], shift: Array, noise: Array, rows: Array
+) -> dict[str, tuple[Array, Curvature]]:
+    """Readings (S, 4 K) of each estimator, worked out anew where they are not linear, and what was found.
 
     Args:
-        values: linear readings, (S, 4 K), rad and m.
+        readings: estimator -> its linear readings.
         shift: (S, D) px.
         noise: (S, D, D) px^2 of them.
-        total: (S, 4 K, 4 K) covariance of the readings' errors.
         rows: (Q, 4 K) of the quantities that are judged.
-        model: of the motions by which the estimator reads.
     """
-    gain = model.amounts(noise)
-    sigma = np.sqrt(np.maximum(np.einsum("qi,sij,qj->sq", rows, total, rows), 0.0))
+    steps = {title: _Steps.of(reading, shift, noise, rows) for title, reading in readings.items()}
+    found = _traced_together({title: (own.model, own.x[own.far]) for title, own in steps.items()})
+    return {title: own.judged(readings[title].values, found[title]) for title, own in steps.items()}
 
-    def in_sigmas(change: Array, states: slice | NDArray[np.intp]) -> Array:
-        moved = np.abs(change @ rows.T)
+
+def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[str, Retraced]:
+    """What the states of amounts (S, P) of each model do."""
+    ways: dict[int, list[str]] = {}
+    for title, (model, _) in wanted.items():
+        ways.setdefault(id(model.trace), []).append(title)
+    out: dict[str, Retraced] = {}
+    for titles in ways.values():
+        states = [wanted[title][0].state(row) for title in titles for row in wanted[title][1]]
+        ends = np.cumsum([len(wanted[title][1]) for title in titles])
+        all_of_them = wanted[titles[0]][0].trace(states) if states else None
+        for title, last in zip(titles, ends.tolist(), strict=True):
+            model, amounts = wanted[title]
+            own = slice(last - len(amounts), last)
+            if all_of_them is None or not len(amounts):
+                out[title] = Retraced(np.empty((0, len(model.spots))), np.empty((0, len(model.parameters))))
+            else:
+                out[title] = Retraced(all_of_them.spots[own], all_of_them.parameters[own])
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Steps of Gauss and Newton about the states that S readings of an estimator stand for.
+
+    Attributes:
+        model: of its motions.
+        shift: (S, D) px; gain: G, (S, P, D); x: (S, P) motions that the readings stand for.
+        sigma: (S, Q) of the quantities; rows: theirs, (Q, 4 K).
+        far: states that are traced.
+    """
+
+    model: MotionModel
+    shift: Array
+    gain: Array
+    x: Array
+    sigma: Array
+    rows: Array
+    far: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, reading: LinearReading, shift: Array, noise: Array, rows: Array) -> _Steps:
+        gain = reading.model.amounts(noise)
+        sigma = np.sqrt(np.maximum(np.einsum("qi,sij,qj->sq", rows, reading.total, rows), 0.0))
+        far = np.flatnonzero(np.any(np.abs(shift) > reading.model.near_px, axis=1))
+        return cls(reading.model, shift, gain, np.einsum("spd,sd->sp", gain, shift), sigma, rows, far)
+
+    def in_sigmas(self, change: Array, states: slice | NDArray[np.intp]) -> Array:
+        moved = np.abs(change @ self.rows.T)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(moved == 0.0, 0.0, moved / sigma[states])
+            return np.where(moved == 0.0, 0.0, moved / self.sigma[states])
 
-    def step(x: Array, found: Retraced, states: slice | NDArray[np.intp]) -> Array:
-        return np.einsum("spd,sd->sp", gain[states], shift[states] - found.spots + x @ model.spots.T)
+    def step(self, x: Array, found: Retraced, states: slice | NDArray[np.intp]) -> Array:
+        rest = self.shift[states] - found.spots + x @ self.model.spots.T
+        return np.asarray(np.einsum("spd,sd->sp", self.gain[states], rest))
 
-    every = slice(None)
-    x = np.einsum("spd,sd->sp", gain, shift)
-    found = Retraced(x @ model.spots.T, x @ model.parameters.T)
-    far = np.flatnonzero(np.any(np.abs(shift) > model.near_px, axis=1))
-    if len(far):
-        traced = model.trace(x[far])
-        found.spots[far], found.parameters[far] = traced.spots, traced.parameters
-    # the two are one number where everything is linear
-    curved = found.parameters + (step(x, found, every) - x) @ model.parameters.T - x @ model.parameters.T
-    off = in_sigmas(curved, every)
-    beyond = ~np.all(off <= BEYOND, axis=1)
-    out, rests = values.copy(), ~beyond
-    left = np.flatnonzero(beyond & np.all(np.isfinite(off), axis=1))
-    x, last = x[left], Retraced(found.spots[left], found.parameters[left])
-    for _ in range(_MOST_STEPS):
-        if not len(left):
-            break
-        x = step(x, last, left)
-        now = model.trace(x)
-        change = in_sigmas(now.parameters - last.parameters, left)
-        done = np.all(change <= _REST, axis=1)
-        out[left[done]], rests[left[done]] = now.parameters[done], True
-        on = ~done & np.all(np.isfinite(change), axis=1)
-        left, x, last = left[on], x[on], Retraced(now.spots[on], now.parameters[on])
-    return out, Curvature(off, beyond, rests)
+    def judged(self, values: Array, traced: Retraced) -> tuple[Array, Curvature]:
+        """Readings (S, 4 K), worked out anew where they are not linear, by what the states that are far do."""
+        model, x, every = self.model, self.x, slice(None)
+        found = Retraced(x @ model.spots.T, x @ model.parameters.T)
+        found.spots[self.far], found.parameters[self.far] = traced.spots, traced.parameters
+        # the two are one number where everything is linear
+        curved = found.parameters + (self.step(x, found, every) - x) @ model.parameters.T - x @ model.parameters.T
+        off = self.in_sigmas(curved, every)
+        beyond = ~np.all(off <= BEYOND, axis=1)
+        out, rests = values.copy(), ~beyond
+        left = np.flatnonzero(beyond & np.all(np.isfinite(off), axis=1))
+        x, last = x[left], Retraced(found.spots[left], found.parameters[left])
+        for _ in range(_MOST_STEPS):
+            if not len(left):
+                break
+            x = self.step(x, last, left)
+            now = model.trace([model.state(row) for row in x])
+            change = self.in_sigmas(now.parameters - last.parameters, left)
+            done = np.all(change <= _REST, axis=1)
+            out[left[done]], rests[left[done]] = now.parameters[done], True
+            on = ~done & np.all(np.isfinite(change), axis=1)
+            left, x, last = left[on], x[on], Retraced(now.spots[on], now.parameters[on])
+        return out, Curvature(off, beyond, rests)

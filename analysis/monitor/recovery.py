@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from analysis.monitor import intersection_angle
 from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
-from analysis.monitor.curvature import Curvature, MotionModel, read_again
+from analysis.monitor.curvature import Curvature, LinearReading, MotionModel, read_again
 from analysis.monitor.disturbances import Consistency, Disturbances, consistency
 from analysis.monitor.estimators import PARAMETERS_EACH, Shifts, applicable
 from analysis.monitor.ground_error import GroundError, GroundGeometry
@@ -258,16 +258,18 @@ def estimates(
     shifts = Shifts(start, end, covariance, cameras, disturbances)
     found: dict[str, tuple[Array, Array, Array | None]] = {}
     curvature: dict[str, Curvature] = {}
-    rows = np.stack([quantity.row for quantity in quantities(cameras, ground)]) if motions else np.empty((0, 0))
+    readings: dict[str, LinearReading] = {}
     for title, estimator in applicable(cameras, disturbances).items():
         gain, values = estimator.gain(shifts), estimator.read(shifts)
         noise = gain @ shifts.covariance @ np.swapaxes(gain, -1, -2)
         total = None if disturbances is None else noise + disturbances.misfit(gain)
         if motions is not None and title in motions:
-            whole = noise if total is None else total
-            again = read_again(values, shifts.vector, shifts.covariance, whole, rows, motions[title])
-            values, curvature[title] = again
+            readings[title] = LinearReading(values, noise if total is None else total, motions[title])
         found[title] = values, noise, total
+    if readings:
+        rows = np.stack([quantity.row for quantity in quantities(cameras, ground)])
+        for title, (values, own) in read_again(readings, shifts.vector, shifts.covariance, rows).items():
+            found[title], curvature[title] = (values, *found[title][1:]), own
     return replace(estimates_of(found, cameras, ground), curvature=curvature)
 
 

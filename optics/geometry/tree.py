@@ -231,8 +231,8 @@ class RigidTree:
         rotation[:], translation[:] = nominal
         scale = np.ones((count, len(index)), dtype)
         passed_on = np.ones((count, len(index)), dtype)
-        for body in self.bodies:
-            if body.parent in moved:
+        for body, parent in zip(self.bodies, self._parents, strict=True):
+            if parent in moved:
                 moved.add(body.path)  # it is carried along
         carried = [body for body in self.bodies if body.path in moved]
         place = {body.path: k for k, body in enumerate(carried)}
@@ -268,6 +268,11 @@ class RigidTree:
     def _index(self) -> FrozenMap[str, int]:
         """Path -> number of a body."""
         return FrozenMap({path: i for i, path in enumerate(self.paths)})
+
+    @cached_property
+    def _parents(self) -> tuple[str, ...]:
+        """Parent of each body."""
+        return tuple(body.parent for body in self.bodies)
 
     @cached_property
     def _levels(self) -> tuple[tuple[Body, ...], ...]:

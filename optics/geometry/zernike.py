@@ -223,4 +223,6 @@ def unit_monomials(last: int, order: int, radius: float) -> np.ndarray:
 
 def order_of(indices: Any) -> int:
     """Highest radial order among Noll indices, -1 for none."""
-    return max((noll_to_nm(j)[0] for j in indices), default=-1)
+    # it never falls along Noll's order
+    last = max(indices, default=0)
+    return noll_to_nm(last)[0] if last else -1

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.monitor.curvature import BEYOND, Curvature, MotionModel, Retraced, read_again
+from analysis.monitor.curvature import BEYOND, Curvature, LinearReading, MotionModel, Retraced, read_again
 
 RNG = np.random.default_rng(4)
 A = RNG.standard_normal((4, 4)) + 3.0 * np.eye(4)
@@ -27,17 +27,27 @@ def parameters(x):
 
 def model(trace=lambda x: Retraced(spots(x), parameters(x))):
     inverse = np.linalg.inv(A)
-    return MotionModel(A, B, lambda noise: np.broadcast_to(inverse, (len(noise), 4, 4)), trace)
+    return MotionModel(
+        A,
+        B,
+        lambda noise: np.broadcast_to(inverse, (len(noise), 4, 4)),
+        state=lambda row: row,
+        trace=lambda states: trace(np.array(states)),
+    )
+
+
+def linear_reading(shift, how):
+    linear = shift @ np.linalg.inv(A).T @ B.T
+    gain = B @ np.linalg.inv(A)
+    return LinearReading(linear, np.broadcast_to(gain @ NOISE[0] @ gain.T, (len(shift), 4, 4)), how)
 
 
 def read(x, how=None):
     """Linear readings of a true state's exact spots, and those that are worked out anew."""
     shift = spots(x)
-    linear = shift @ np.linalg.inv(A).T @ B.T
-    gain = B @ np.linalg.inv(A)
-    total = np.broadcast_to(gain @ NOISE[0] @ gain.T, (len(x), 4, 4))
-    noise = np.broadcast_to(NOISE, (len(x), 4, 4))
-    return linear, *read_again(linear, shift, noise, total, ROWS, model() if how is None else how)
+    linear = linear_reading(shift, model() if how is None else how)
+    again = read_again({"own": linear}, shift, np.broadcast_to(NOISE, (len(x), 4, 4)), ROWS)
+    return linear.values, *again["own"]
 
 
 def test_small_motions_are_left_as_they_are() -> None:
@@ -98,6 +108,26 @@ def test_states_without_light_and_steps_without_end_do_not_hold() -> None:
     _, _, told = read(x[:1], model(wild))
     assert told.beyond.all()
     assert not told.holds.any()
+
+
+def test_estimators_that_trace_alike_are_traced_together_and_keep_their_own() -> None:
+    asked = []
+
+    def counted(states):
+        asked.append(len(states))
+        return Retraced(spots(states), parameters(states))
+
+    x = np.stack([1e-3 * np.ones(4), 0.5 * np.ones(4), 0.4 * np.ones(4)])
+    shift, noise, one = spots(x), np.broadcast_to(NOISE, (3, 4, 4)), model(counted)
+    models = {"near": replace(one, near_px=0.1), "all": one, "none": replace(one, near_px=99.0), "other": model()}
+    together = read_again({name: linear_reading(shift, how) for name, how in models.items()}, shift, noise, ROWS)
+    assert asked[0] == 2 + 3
+    for name, how in models.items():
+        alone = read_again({name: linear_reading(shift, how)}, shift, noise, ROWS)[name]
+        np.testing.assert_array_equal(together[name][0], alone[0])
+        np.testing.assert_array_equal(together[name][1].off, alone[1].off)
+        assert together[name][1].rests.tolist() == alone[1].rests.tolist()
+    assert not together["none"][1].beyond.any()
 
 
 def test_states_of_a_series_stay_in_their_order() -> None:

@@ -47,12 +47,12 @@ def motion_models(
         stated: what moves, None for nothing.
         disturbances: the same with its derivatives.
     """
-    out = {"model": _of_families(path, sight, cameras)}
+    trace = partial(_traced, path, sight)
+    out = {"model": _of_families(cameras, trace)}
     if stated is not None and disturbances is not None:
-        moved = partial(_stated_state, stated, thermal)
-        trace = partial(_traced, path, sight, moved)
+        state = partial(_stated_state, stated, thermal)
         out["posterior"] = MotionModel(
-            disturbances.spots, disturbances.parameters, disturbances.best_amounts, trace, NEAR
+            disturbances.spots, disturbances.parameters, disturbances.best_amounts, state, trace, NEAR
         )
     return out
 
@@ -65,7 +65,7 @@ def _stated_state(stated: StatedMotions, thermal: ThermalModel, row: np.ndarray)
     return state_of(row * stated.sigma, stated.components, thermal)
 
 
-def _of_families(path: MonitorPath, sight: LineSight, cameras: Mapping[str, CameraCalibration]) -> MotionModel:
+def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequence[State]], Retraced]) -> MotionModel:
     """Each camera's four motions of paper 001."""
     families = {name: line_family(name) for name in cameras}
     own, count = _spots_of(cameras), sum(map(len, families.values()))
@@ -74,8 +74,7 @@ def _of_families(path: MonitorPath, sight: LineSight, cameras: Mapping[str, Came
         block = slice(4 * k, 4 * k + 4)
         spots[at, block], parameters[block, block] = camera.spot_jacobian, camera.parameter_jacobian
     every = [motion for family in families.values() for motion in family]
-    trace = partial(_traced, path, sight, partial(_together, every))
-    return MotionModel(spots, parameters, partial(_family_amounts, cameras), trace)
+    return MotionModel(spots, parameters, partial(_family_amounts, cameras), partial(_together, every), trace)
 
 
 def _spots_of(cameras: Mapping[str, CameraCalibration]) -> list[slice]:
@@ -112,14 +111,14 @@ def _sum(one: tuple[float, float, float], two: tuple[float, float, float]) -> tu
     return one[0] + two[0], one[1] + two[1], one[2] + two[2]
 
 
-def _traced(path: MonitorPath, sight: LineSight, state: Callable[[np.ndarray], State], rows: np.ndarray) -> Retraced:
-    """What the states of rows of amounts (S, P) do; NaN for one whose light is lost."""
+def _traced(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Retraced:
+    """What S states do; NaN for one whose light is lost."""
     try:
-        return traced_states(path, sight, [state(row) for row in rows])
+        return traced_states(path, sight, states)
     except LOST:
-        if len(rows) == 1:
+        if len(states) == 1:
             return Retraced(*(np.full((1, n), np.nan) for n in (2 * len(path.channels), 4 * len(path.cameras))))
-    parts = [_traced(path, sight, state, rows[k : k + 1]) for k in range(len(rows))]
+    parts = [_traced(path, sight, [state]) for state in states]
     return Retraced(np.concatenate([p.spots for p in parts]), np.concatenate([p.parameters for p in parts]))
 
 
@@ -134,8 +133,8 @@ def traced_states(path: MonitorPath, sight: LineSight, states: Sequence[State]) 
     Raises:
         AimError, BeamMissedError: light of one of them is lost.
     """
-    place = path.coarse_trace([{}, *states]).place
-    shifts = np.moveaxis(place[:, 1:] - place[:, :1], 1, 0).reshape(len(states), -1)
-    changes = sight.truth(states).cameras.values()
+    placed = path.instrument.assembly.place(states)
+    shifts = np.moveaxis(path.coarse_trace(states, placed).place - path.place_at_rest, 1, 0).reshape(len(states), -1)
+    changes = sight.truth(states, placed).cameras.values()
     rows = [np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=1) for c in changes]
     return Retraced(shifts, np.concatenate(rows, axis=1))

@@ -296,6 +296,11 @@ class MonitorBeams:
         spots = place.reshape(*by_state, 2), blur.reshape(by_state), aperture.reshape(by_state)
         return CoarseTrace(fan, outgoing, back, uploaded, turn, *spots)
 
+    @cached_property
+    def place_at_rest(self) -> np.ndarray:
+        """Where ``coarse_trace`` sees the spots of the unperturbed instrument, (C, 1, 2)."""
+        return self.coarse_trace([{}]).place
+
     def mean_spots(self, states: Sequence[State]) -> np.ndarray:
         """Means of the rays, which are the energy centroids of the images: (S, C, 2), row and column, px from the first
         pixel's centre. Raises as ``rays``.
