@@ -391,7 +391,7 @@ class _Design:
             rows, columns = np.nonzero(power == one)
             grown[one] = rows, columns, chains.bodies[columns, element[rows]]
         frames = np.array([numbers_in(f) for f in (*(own.frame for own in form[0]), form[1])])
-        return cls(chains, structure, form, numbers, grids, grown, cls._sides(chains, form[0]), frames)
+        return cls(chains, structure, form, numbers, tuple(grids), grown, cls._sides(chains, form[0]), frames)
 
     @staticmethod
     def _sides(chains: _Chains, form: tuple[ElementNumbers, ...]) -> dict[str, _Sides]:

@@ -69,6 +69,10 @@ def test_states_are_written_over_the_design(instrument, names: list[str]) -> Non
     for sequences in (channels, ["forward/image_to_object", "backward/image_to_object"]):
         found, exact = assemble(assembly, sequences, states), one_by_one(assembly, sequences, states)
         assert found.structure == exact.structure
+        glass = any(element.solid for element in assembly.sequence(sequences[0]))
+        assert any(any(one.graded) for one in found.structure) == (glass and "index_gradient" in names)
+        assert any(one.grid for one in found.structure) == ("grid" in names)
+        assert max(one.figure_order for one in found.structure) == (4 if "figure" in names else -1)
         assert found.count == len(sequences) * len(states)
         np.testing.assert_array_equal(found.size, exact.size)
         for grid, other in zip(found.grids, exact.grids, strict=True):
