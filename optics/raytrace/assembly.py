@@ -26,6 +26,9 @@ class Interaction(Enum):
     TOTAL = "total"
     """Total reflection inside glass; a ray that is not beyond the critical angle is lost."""
 
+    # a member is one object; by its name, as Python has it, it takes as long to find a recorded trace as to launch it
+    __hash__ = object.__hash__
+
 
 @dataclass(frozen=True)
 class Element:

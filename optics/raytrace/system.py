@@ -276,6 +276,16 @@ class _Chains:
         designed = tuple(structure_of(column) for column in zip(*chains, strict=True))
         return cls(chains, media, bodies, tuple(depends), designed)
 
+    def radius(self, i: int, c: int) -> float:
+        """Of the disk of a figure of the i-th element of a chain, metres."""
+        if (i, c) not in self._radii:
+            self._radii[i, c] = self.elements[c][i].figure_disk.radius
+        return self._radii[i, c]
+
+    @cached_property
+    def _radii(self) -> dict[tuple[int, int], float]:
+        return {}
+
     def elements_at(self, i: int) -> list[Element]:
         """The i-th ones of all chains."""
         return [chain[i] for chain in self.elements]
@@ -381,8 +391,9 @@ class _Design:
         designed, grids = values(placed)
         form = form_of((designed, frame))
         numbers, doubled = (np.array(numbers_in((own, frame))) for own in (designed, values(twice)[0]))
-        # each goes with a power of its body's size, which is exact at twice the size
-        power = np.log2(np.divide(doubled, numbers, out=np.ones_like(numbers), where=numbers != 0.0)).astype(int)
+        # each goes with a power of its body's size, which can be read off without rounding at twice the size
+        ratio = np.divide(doubled, numbers, out=np.ones_like(numbers), where=numbers != 0.0)
+        power = np.frexp(ratio)[1] - 1
         element = np.zeros(len(numbers), int)
         for i, own in enumerate(form[0]):
             element[numbers_in(own)] = i
@@ -470,7 +481,7 @@ class _Design:
                 out[surface.conic, c] += [motion.conic for motion in motions]
             if surface.figure is None or not any(motion.figure for motion in motions):
                 continue
-            key = element.body, structure.figure_order, element.figure_disk.radius
+            key = element.body, structure.figure_order, self.chains.radius(i, c)
             if key not in known:
                 known[key] = _figures(motions, *key[1:])
             out[list(surface.figure.coefficients), c] += known[key]

@@ -362,7 +362,8 @@ def _frozen(way: _Way, form: Any) -> Any:
     known = getattr(_threads, "known", None)
     if known is None:
         known = _threads.known = {}
-    if way not in known:
+    found = known.get(way)
+    if found is None:
         recorded = partial(way.through, form)
 
         # what a frozen function closes over is compared at each call; a default is not
@@ -370,8 +371,8 @@ def _frozen(way: _Way, form: Any) -> Any:
         def through(numbers: Any, rays: Any, shared: Any, run: Any = recorded) -> Any:
             return run(numbers, rays, shared)
 
-        known[way] = through
-    return known[way]
+        found = known[way] = through
+    return found
 
 
 def require_some(valid: np.ndarray, what: str) -> None:

@@ -214,7 +214,7 @@ class ReadingTable:
 
 def plain(number: Any) -> Any:
     """A float or nested lists, as JSON holds them; a negative zero becomes a plain one."""
-    return (np.asarray(number) + 0.0).tolist()
+    return number + 0.0 if isinstance(number, float) else (np.asarray(number) + 0.0).tolist()
 
 
 def reading_table(
