@@ -392,8 +392,8 @@ class _Design:
         form = form_of((designed, frame))
         numbers, doubled = (np.array(numbers_in((own, frame))) for own in (designed, values(twice)[0]))
         # each goes with a power of its body's size, which can be read off without rounding at twice the size
-        ratio = np.divide(doubled, numbers, out=np.ones_like(numbers), where=numbers != 0.0)
-        power = np.frexp(ratio)[1] - 1
+        known = (numbers != 0.0) & (doubled != 0.0)
+        power = np.frexp(np.divide(doubled, numbers, out=np.ones_like(numbers), where=known))[1] - 1
         element = np.zeros(len(numbers), int)
         for i, own in enumerate(form[0]):
             element[numbers_in(own)] = i
