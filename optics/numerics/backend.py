@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from optics.numerics.heap import keep_freed_memory
 from optics.numerics.llvm import ensure_llvm
 
 NAMES = ("llvm", "cuda")
@@ -99,6 +100,7 @@ def load_backend(name: str = "llvm") -> Backend:
     """
     if name not in NAMES:
         raise BackendUnavailable(f"unknown backend {name!r}; choose one of {', '.join(NAMES)}")
+    keep_freed_memory()
     ensure_llvm()
     import drjit as dr
 
