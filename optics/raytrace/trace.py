@@ -13,7 +13,7 @@ is left out. (Born and Wolf, Principles of Optics, section 3.2, for the ray equa
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import cosh
@@ -143,6 +143,10 @@ SECTION = 6
 """Elements that one kernel traces: the time to compile it grows faster than its length, and
 sequences that begin alike share the kernels of their beginning. Between them rays pass through memory."""
 
+FEWEST_LANES = 4
+"""Systems from which each lane of the processor traces one, on one thread; of several threads each has to have four
+times as many."""
+
 MOST_RECORDINGS = 16
 """Of one trace in one thread: it is recorded anew where a bundle has other numbers in common, such as a direction."""
 
@@ -266,9 +270,12 @@ def trace(
     differentiable = uploaded.differentiable or dr.grad_enabled(rays.position) or dr.grad_enabled(rays.direction)
     how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate, SECTION)
     stride = None if uploaded.count == 1 else dr.opaque(backend.UInt, uploaded.count)
+    lanes = _lanes(uploaded) if evaluate and not differentiable else None
     through = _frozen(how, uploaded.form) if evaluate and not differentiable else partial(how.through, uploaded.form)
     (p, d, path, valid), hits, outside = through(
-        (uploaded.numbers, uploaded.grids, stride), (rays.position, rays.direction, rays.path, rays.valid), shared
+        (uploaded.numbers, uploaded.grids, stride, lanes),
+        (rays.position, rays.direction, rays.path, rays.valid),
+        shared,
     )
     local = Rays(p, d, path, valid, uploaded.count)
     seen = Rays(outside[0], outside[1], path, valid, uploaded.count) if world else None
@@ -302,18 +309,60 @@ class _Way:
 
         Args:
             form: as of ``UploadedSystems``.
-            numbers: likewise, the grids, and how many systems there are, as an array of width 1 or None for one.
+            numbers: likewise, the grids, how many systems there are, as an array of width 1 or None for one, and the
+                systems' own places, (B,), where each takes its rays one after the other; else None.
             rays: position, direction, path and whether they are alive.
             shared: rays of each system, as an array of width 1; None for a single system.
         """
+        table, grids, stride, systems = numbers
+        hits: list[Any] = []
+        outside: list[Any] = []
+        for first in range(0, len(self.structure), self.section):
+            leg = range(first, min(first + self.section, len(self.structure)))
+            if systems is not None:
+                rays = self._one_by_one(leg, form, (table, grids, stride, systems), rays, shared, hits, outside)
+                continue
+            lookup = _lookup(self.backend, rays[0], table, stride, shared)
+            rays = self._along(leg, [lookup(form[0][i]) for i in leg], grids, rays, hits)
+            if leg.stop == len(self.structure):
+                rays = self._at_end(rays, lookup(form[1]) if self.world else None, outside)
+            self._launch(leg, rays, hits, outside)
+        return rays, hits, tuple(outside) if self.world else None
+
+    def _launch(self, leg: range, rays: Any, hits: list[Any], outside: list[Any]) -> None:
+        """Launch the kernel of a leg, where kernels are launched at its end."""
+        import drjit as dr
+
+        if leg.stop == len(self.structure):
+            if self.evaluate:
+                dr.eval(*rays, hits, outside)
+        elif not self.differentiable:
+            dr.eval(*rays)
+
+    def _at_end(self, rays: Any, pose: FrameNumbers | None, outside: list[Any]) -> Any:
+        """Rays at the last element; with its pose also, into ``outside``, in the world."""
+        import drjit as dr
+
+        p, d, path, valid = rays
+        d = d + dr.zeros(self.backend.Float, dr.width(p))  # nothing may have turned a shared direction
+        if pose is not None:
+            to_world = pose.coordinates
+            outside += [
+                self.backend.Vector3(
+                    *(c.turn[0] * p.x + c.turn[1] * p.y + c.turn[2] * p.z + c.shift for c in to_world)
+                ),
+                self.backend.Vector3(*(c.turn[0] * d.x + c.turn[1] * d.y + c.turn[2] * d.z for c in to_world)),
+            ]
+        return p, d, path, valid
+
+    def _along(self, leg: range, elements: Sequence[ElementNumbers], grids: Any, rays: Any, hits: list[Any]) -> Any:
+        """Rays after some elements, of each the hit points into ``hits`` where they are kept."""
         import drjit as dr
 
         backend, differentiable = self.backend, self.differentiable
-        (table, grids, stride), (p, d, path, valid) = numbers, rays
-        lookup = _lookup(backend, p, table, stride, shared)
-        hits: list[Any] = []
-        for i, structure in enumerate(self.structure):
-            element, table = lookup(form[0][i]), grids[i]
+        p, d, path, valid = rays
+        for i, element in zip(leg, elements, strict=True):
+            structure, table = self.structure[i], grids[i]
             surface = element.surface
             p, d = _into_frame(backend, p, d, element.frame)
             steps = _steps(surface, structure.interaction)
@@ -334,19 +383,64 @@ class _Way:
                 valid = valid & ok
             if i in self.keep:
                 hits.append(p)
-            if not differentiable and i % self.section == self.section - 1 and i + 1 < len(self.structure):
-                dr.eval(p, d, path, valid)
-        d = d + dr.zeros(backend.Float, dr.width(p))  # nothing may have turned a shared direction
-        outside = None
-        if self.world:
-            to_world = lookup(form[1]).coordinates
-            outside = (
-                backend.Vector3(*(c.turn[0] * p.x + c.turn[1] * p.y + c.turn[2] * p.z + c.shift for c in to_world)),
-                backend.Vector3(*(c.turn[0] * d.x + c.turn[1] * d.y + c.turn[2] * d.z for c in to_world)),
+        return p, d, path, valid
+
+    def _one_by_one(
+        self, leg: range, form: Any, numbers: Any, rays: Any, shared: Any, hits: list[Any], outside: list[Any]
+    ) -> Any:
+        """A leg along which each lane of the processor takes all rays of one system, one after the other.
+
+        It reads the system's numbers once. Where each lane has a ray of its own, it looks up all of them, which takes
+        more time than the rays.
+        """
+        import drjit as dr
+
+        backend = self.backend
+        table, grids, stride, systems = numbers
+
+        def own(part: Any) -> Any:
+            return map_leaves(
+                lambda place: dr.gather(backend.Float, table, systems + backend.UInt(place) * stride), part
             )
-        if self.evaluate:
-            dr.eval(p, d, path, valid, hits, [] if outside is None else list(outside))
-        return (p, d, path, valid), hits, outside
+
+        elements = [own(form[0][i]) for i in leg]
+        last = leg.stop == len(self.structure)
+        pose = own(form[1]) if self.world and last else None
+        first = systems * shared
+        kept = sum(i in self.keep for i in leg)
+        made = self._room(rays[0].x, 2 + kept + 2 * (pose is not None))
+
+        def ray(place: Any) -> tuple[Any, ...]:
+            at = first + place
+            mine = tuple(array if dr.width(array) == 1 else dr.gather(type(array), array, at) for array in rays)
+            own_hits: list[Any] = []
+            own_outside: list[Any] = []
+            end = self._along(leg, elements, grids, mine, own_hits)
+            if last:
+                end = self._at_end(end, pose, own_outside)
+            for target, value in zip(made, (*end, *own_hits, *own_outside), strict=True):
+                dr.scatter(target, value, at)
+            return (place + 1,)
+
+        (ended,) = dr.while_loop(
+            (dr.zeros(backend.UInt, dr.width(systems)),), lambda place: place < shared, ray, mode="symbolic"
+        )
+        dr.eval(made, ended)
+        hits += made[4 : 4 + kept]
+        outside += made[4 + kept :]
+        return tuple(made[:4])
+
+    def _room(self, like: Any, vectors: int) -> list[Any]:
+        """Arrays of the size of another one, for position, direction, path and whether rays are alive, and further
+        vectors, whatever that size was when this was recorded: their contents, which are written over, come from it.
+        """
+        import drjit as dr
+
+        numbers = [like - float(k) for k in range(3 * vectors + 1)]
+        room: list[Any] = [self.backend.Vector3(*numbers[3 * k : 3 * k + 3]) for k in range(vectors)]
+        room[2:2] = [numbers[-1], like > 0.0]
+        dr.eval(room)
+        return room
 
 
 _threads = local()
@@ -404,6 +498,19 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
         dr.gather(backend.Bool, rays.valid, ray),
     )
     return rays, dr.opaque(backend.UInt, width)
+
+
+def _lanes(systems: UploadedSystems) -> Any:
+    """The systems' own places, (B,), where they are enough to fill the lanes of all threads; else None."""
+    import drjit as dr
+
+    backend, threads = systems.backend, dr.thread_count()
+    fewest = FEWEST_LANES if threads == 1 else 4 * FEWEST_LANES * threads
+    if backend.name != "llvm" or systems.count < max(fewest, 2):
+        return None
+    lanes = dr.arange(backend.UInt, systems.count)
+    dr.make_opaque(lanes)
+    return lanes
 
 
 def _lookup(backend: Backend, position: Any, numbers: Any, stride: Any, shared: Any) -> Any:
