@@ -144,8 +144,10 @@ SECTION = 6
 sequences that begin alike share the kernels of their beginning. Between them rays pass through memory."""
 
 FEWEST_LANES = 4
-"""Systems from which each lane of the processor traces one, on one thread; of several threads each has to have four
-times as many."""
+"""Systems from which each lane of the processor traces one, of however many rays: half of a packet."""
+
+BLOCK = 16384
+"""Lanes of a kernel that run on one thread, at least. So few rays are traced so from two systems on."""
 
 MOST_RECORDINGS = 16
 """Of one trace in one thread: it is recorded anew where a bundle has other numbers in common, such as a direction."""
@@ -270,7 +272,7 @@ def trace(
     differentiable = uploaded.differentiable or dr.grad_enabled(rays.position) or dr.grad_enabled(rays.direction)
     how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate, SECTION)
     stride = None if uploaded.count == 1 else dr.opaque(backend.UInt, uploaded.count)
-    lanes = _lanes(uploaded) if evaluate and not differentiable else None
+    lanes = _lanes(uploaded, dr.width(rays.position)) if evaluate and not differentiable else None
     through = _frozen(how, uploaded.form) if evaluate and not differentiable else partial(how.through, uploaded.form)
     (p, d, path, valid), hits, outside = through(
         (uploaded.numbers, uploaded.grids, stride, lanes),
@@ -500,13 +502,18 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
     return rays, dr.opaque(backend.UInt, width)
 
 
-def _lanes(systems: UploadedSystems) -> Any:
-    """The systems' own places, (B,), where they are enough to fill the lanes of all threads; else None."""
+def _lanes(systems: UploadedSystems, rays: int) -> Any:
+    """The systems' own places, (B,), where each lane traces one of them, on one thread; else None.
+
+    Args:
+        systems: B of them.
+        rays: of all systems.
+    """
     import drjit as dr
 
-    backend, threads = systems.backend, dr.thread_count()
-    fewest = FEWEST_LANES if threads == 1 else 4 * FEWEST_LANES * threads
-    if backend.name != "llvm" or systems.count < max(fewest, 2):
+    backend = systems.backend
+    pays = rays <= BLOCK or (dr.thread_count() == 1 and systems.count >= FEWEST_LANES)
+    if backend.name != "llvm" or systems.count == 1 or not pays:
         return None
     lanes = dr.arange(backend.UInt, systems.count)
     dr.make_opaque(lanes)

@@ -66,6 +66,7 @@ def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, threads: i
     """The same recording serves any number of systems and rays."""
     bare = gf7.bare_assembly()
     monkeypatch.setattr(trace_module, "SECTION", section)
+    monkeypatch.setattr(trace_module, "FEWEST_LANES", 10**9)
     position, direction = launch(gf7, 800)
     before = dr.thread_count()
     kernel_threads(threads)
@@ -82,8 +83,8 @@ def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, threads: i
             }
             for way, rays in ways.items():
                 found = []
-                for fewest in (1, 10**9):
-                    monkeypatch.setattr(trace_module, "FEWEST_LANES", fewest)
+                for block in (10**9, 0):
+                    monkeypatch.setattr(trace_module, "BLOCK", block)
                     found.append(ends(backend, systems, rays))
                 for lanes, looked_up in zip(*found, strict=True):
                     # the same operations; the compiler may contract other products into fma
