@@ -140,8 +140,13 @@ depart by millimetres.
 """
 
 SECTION = 6
-"""Elements that one kernel traces: the time to compile it grows faster than its length, and
-sequences that begin alike share the kernels of their beginning. Between them rays pass through memory."""
+"""Elements that one kernel traces where there are many rays, which pass through memory between kernels. The time to
+compile it grows faster than its length."""
+
+FEW = 1 << 16
+"""Rays below which every element is a kernel of its own: so few stay in the processor's cache. Elements of one
+structure then share a kernel wherever they stand in their sequences, and all kernels of the main job together take a
+fifth of the time to compile."""
 
 FEWEST_LANES = 4
 """Systems from which each lane of the processor traces one, on one thread; of several threads each has to have four
@@ -234,8 +239,11 @@ def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, pat
     systems = position.shape[0] if position.ndim == 3 else 1
     n = position.size // 3
     start = dr.zeros(backend.Float, n) if path is None else backend.opaque(path)
+    valid = dr.full(backend.Bool, True, n)
+    if n < FEW:
+        dr.make_opaque(start, valid)
     heading = backend.vector(direction.reshape(-1, 3)[:1] if shared else direction)
-    return Rays(backend.vector(position), heading, start, dr.full(backend.Bool, True, n), systems)
+    return Rays(backend.vector(position), heading, start, valid, systems)
 
 
 def trace(
@@ -268,12 +276,18 @@ def trace(
     uploaded = systems.upload(backend) if isinstance(systems, SystemBatch) else systems
     rays, shared = _spread(backend, rays, uploaded.count)
     differentiable = uploaded.differentiable or dr.grad_enabled(rays.position) or dr.grad_enabled(rays.direction)
-    how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate, SECTION)
-    stride = None if uploaded.count == 1 else dr.opaque(backend.UInt, uploaded.count)
     lanes = _lanes(uploaded) if evaluate and not differentiable else None
+    alone = lanes is None and not differentiable and dr.width(rays.position) < FEW
+    section = 1 if alone else SECTION
+    how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate, section, alone)
+    if alone and shared is not None:  # else the first element's kernel would be another one
+        shared = dr.arange(backend.UInt, dr.width(rays.position)) // shared
+        dr.eval(shared)
+    stride = None if uploaded.count == 1 else dr.opaque(backend.UInt, uploaded.count)
+    start = None if uploaded.first is None else dr.opaque(backend.UInt, uploaded.first * uploaded.count)
     through = _frozen(how, uploaded.form) if evaluate and not differentiable else partial(how.through, uploaded.form)
     (p, d, path, valid), hits, outside = through(
-        (uploaded.numbers, uploaded.grids, stride, lanes),
+        (uploaded.numbers, uploaded.grids, stride, start, lanes),
         (rays.position, rays.direction, rays.path, rays.valid),
         shared,
     )
@@ -294,6 +308,7 @@ class _Way:
         differentiable: whether numbers or rays carry derivatives.
         evaluate: whether kernels are launched.
         section: elements of a kernel.
+        alone: whether all elements of one structure share a kernel; ``section`` is 1.
     """
 
     backend: Backend
@@ -303,18 +318,22 @@ class _Way:
     differentiable: bool
     evaluate: bool
     section: int
+    alone: bool
 
     def through(self, form: Any, numbers: Any, rays: Any, shared: Any) -> Any:
         """Rays after the last element, hit points, and the former in the world frame.
 
         Args:
             form: as of ``UploadedSystems``.
-            numbers: likewise, the grids, how many systems there are, as an array of width 1 or None for one, and the
-                systems' own places, (B,), where each takes its rays one after the other; else None.
+            numbers: likewise, the grids, how many systems there are, as an array of width 1 or None for one; where the
+                numbers begin, likewise or None for the beginning; and the systems' own places, (B,), where each takes
+                its rays one after the other, else None.
             rays: position, direction, path and whether they are alive.
-            shared: rays of each system, as an array of width 1; None for a single system.
+            shared: rays of each system, as an array of width 1; the system of each ray where elements are ``alone``;
+                None for a single system.
         """
-        table, grids, stride, systems = numbers
+        table, grids, stride, start, systems = numbers
+        lookup = _Lookup(self, table, stride, start, self._system(rays[0], shared), form[0][0].frame.x.shift)
         hits: list[Any] = []
         outside: list[Any] = []
         for first in range(0, len(self.structure), self.section):
@@ -322,22 +341,30 @@ class _Way:
             if systems is not None:
                 rays = self._one_by_one(leg, form, (table, grids, stride, systems), rays, shared, hits, outside)
                 continue
-            lookup = _lookup(self.backend, rays[0], table, stride, shared)
             rays = self._along(leg, [lookup(form[0][i]) for i in leg], grids, rays, hits)
             if leg.stop == len(self.structure):
                 rays = self._at_end(rays, lookup(form[1]) if self.world else None, outside)
-            self._launch(leg, rays, hits, outside)
+            self._launch(leg, form, lookup, rays, hits, outside)
         return rays, hits, tuple(outside) if self.world else None
 
-    def _launch(self, leg: range, rays: Any, hits: list[Any], outside: list[Any]) -> None:
+    def _system(self, position: Any, shared: Any) -> Any:
+        """The system of each ray; None for a single system."""
+        import drjit as dr
+
+        return shared if shared is None or self.alone else dr.arange(self.backend.UInt, dr.width(position)) // shared
+
+    def _launch(
+        self, leg: range, form: Any, lookup: _Lookup, rays: Any, hits: list[Any], outside: list[Any]
+    ) -> None:
         """Launch the kernel of a leg, where kernels are launched at its end."""
         import drjit as dr
 
-        if leg.stop == len(self.structure):
-            if self.evaluate:
-                dr.eval(*rays, hits, outside)
-        elif not self.differentiable:
-            dr.eval(*rays)
+        last = leg.stop == len(self.structure)
+        if self.alone or not (self.differentiable or last):
+            lookup.go_on((form[1] if last else form[0][leg.stop].frame).x.shift)
+            dr.eval(*rays, lookup.place)
+        if last and self.evaluate:
+            dr.eval(*rays, hits, outside)
 
     def _at_end(self, rays: Any, pose: FrameNumbers | None, outside: list[Any]) -> Any:
         """Rays at the last element; with its pose also, into ``outside``, in the world."""
@@ -513,18 +540,43 @@ def _lanes(systems: UploadedSystems) -> Any:
     return lanes
 
 
-def _lookup(backend: Backend, position: Any, numbers: Any, stride: Any, shared: Any) -> Any:
-    """Function: a form of numbers -> those of each ray's system."""
-    import drjit as dr
+class _Lookup:
+    """Numbers of each ray's system, element after element.
 
-    if shared is None:
-        return lambda form: map_leaves(lambda place: numbers[place], form)
-    system = dr.arange(backend.UInt, dr.width(position)) // shared
-    if isinstance(numbers, tuple):
-        return lambda form: map_leaves(lambda place: dr.gather(backend.Float, numbers[place], system), form)
-    return lambda form: map_leaves(
-        lambda place: dr.gather(backend.Float, numbers, system + backend.UInt(place) * stride), form
-    )
+    The row at which they begin goes along with the rays from kernel to kernel. Were it written into a kernel, no two
+    elements could share one.
+
+    Args:
+        way: of the rays.
+        numbers: as of ``UploadedSystems``.
+        stride: how many systems there are, as an array of width 1; None for a single one.
+        start: where the first element's numbers begin, likewise; None for the beginning.
+        system: of each ray; None for a single one.
+        row: at which the numbers of the first element begin.
+    """
+
+    def __init__(self, way: _Way, numbers: Any, stride: Any, start: Any, system: Any, row: int) -> None:
+        self._number, self._count = way.backend.Float, way.backend.UInt
+        self._numbers, self._stride, self._system, self._row = numbers, stride, system, row
+        self.place = None if isinstance(numbers, tuple) else system if start is None else system + start
+
+    def __call__(self, form: Any) -> Any:
+        """Numbers of a form with their rows."""
+        import drjit as dr
+
+        if self.place is not None:
+            return map_leaves(lambda row: dr.gather(self._number, self._numbers, self._after(row)), form)
+        if self._system is None:
+            return map_leaves(lambda row: self._numbers[row], form)
+        return map_leaves(lambda row: dr.gather(self._number, self._numbers[row], self._system), form)
+
+    def go_on(self, row: int) -> None:
+        """Let the numbers begin at another row."""
+        if self.place is not None:
+            self.place, self._row = self._after(row), row
+
+    def _after(self, row: int) -> Any:
+        return self.place + self._count(row - self._row) * self._stride
 
 
 def _into_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[Any, Any]:
