@@ -66,6 +66,7 @@ def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, threads: i
     """The same recording serves any number of systems and rays."""
     bare = gf7.bare_assembly()
     monkeypatch.setattr(trace_module, "SECTION", section)
+    monkeypatch.setattr(trace_module, "FEWEST_IN_LANES", 1)
     position, direction = launch(gf7, 800)
     before = dr.thread_count()
     kernel_threads(threads)
@@ -93,8 +94,10 @@ def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, threads: i
         kernel_threads(before)
 
 
-def test_no_ray_of_a_batch_is_anothers(backend, gf7) -> None:
+def test_no_ray_of_a_batch_is_anothers(backend, gf7, monkeypatch) -> None:
     """Each system's rays, traced by lanes, against the system by itself, with rays that are lost among them."""
+    monkeypatch.setattr(trace_module, "FEWEST_LANES", 1)
+    monkeypatch.setattr(trace_module, "FEWEST_IN_LANES", 1)
     bare = gf7.bare_assembly()
     systems = assemble(bare, ["imaging"], some_states(24, 2, ("M2", "M3")))
     position, direction = launch(gf7, 24 * 50)
