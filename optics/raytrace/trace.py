@@ -426,7 +426,7 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
 
 
 def _lanes(systems: UploadedSystems, rays: int) -> Any:
-    """The systems' own places, (B,), where they are enough to fill the lanes of all threads, and rays enough; else None."""
+    """The systems' own places, (B,), where systems and rays are enough to fill the lanes of all threads; else None."""
     import drjit as dr
 
     backend, threads = systems.backend, dr.thread_count()
