@@ -99,19 +99,20 @@ def main(
     errors = Console(stderr=True)
     with cli.explained(errors):
         cli.check_backend(backend)
-        from twin.run.run_folder import RunFolder
         from twin.validation import registry
-        from twin.validation.checks.check import FAILED
-        from twin.validation.registry import UnknownCheck, select
 
         try:
-            selections = select(registry.GROUPS, only)
-        except UnknownCheck as error:
+            registry.require_known(only)
+            selections = registry.select(registry.GROUPS, only)
+        except registry.UnknownCheck as error:
             raise cli.InputErrorText(str(error)) from error
         if list_checks:
             with to_stdout(errors):
                 _print_list(selections, fast, as_json)
             return
+        from twin.run.run_folder import RunFolder
+        from twin.validation.checks.check import FAILED
+
         folder = None if out is None else RunFolder(out, force)
         with exit_on_terminate():
             validation = _run(selections, backend, seed, only, fast, folder, errors)

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from itertools import combinations, pairwise
 from math import ldexp
 from typing import TYPE_CHECKING
@@ -263,15 +264,24 @@ class SolidMesh:
     """The body as a triangle mesh in the frame of the solid's body, metres.
 
     Attributes:
-        mesh: watertight, outward winding.
-        face_of: (triangles,) index into ``Solid.faces``.
+        vertices: corners, (V, 3).
+        triangles: closed, with outward winding, (T, 3).
+        face_of: (T,) index into ``Solid.faces``.
         polygons: face by face, its corners in order, (K, 3), counterclockwise from outside; (0, 3) for a ground face
             that the other faces cut off.
     """
 
-    mesh: trimesh.Trimesh
+    vertices: np.ndarray
+    triangles: np.ndarray
     face_of: np.ndarray
     polygons: tuple[np.ndarray, ...]
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """The same for who measures or draws it."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.triangles, process=False)
 
 
 def face_plane(face: Face, placed: PlacedBodies, state: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -294,8 +304,6 @@ def solid_mesh(solid: Solid, placed: PlacedBodies, state: int = 0) -> SolidMesh:
         SolidError: the faces leave no room, leave the body open, or cut off one of them that is more than a ground
             surface.
     """
-    import trimesh
-
     own = placed.pose(solid.path, state).inverse()
     planes = [face_plane(face, placed, state) for face in solid.faces]
     normals = np.array([own.rotation @ n for _, n in planes])
@@ -310,5 +318,5 @@ def solid_mesh(solid: Solid, placed: PlacedBodies, state: int = 0) -> SolidMesh:
         if not ring and face.coating is not Coating.GROUND:
             raise SolidError(f"{solid.path}: face {face.name!r} is cut off by the other faces")
     fans = [(k, (ring[0], *pair)) for k, ring in enumerate(body.rings) for pair in pairwise(ring[1:])]
-    mesh = trimesh.Trimesh(body.vertices, np.array([corners for _, corners in fans]), process=False)
-    return SolidMesh(mesh, np.array([k for k, _ in fans]), tuple(body.vertices[list(ring)] for ring in body.rings))
+    faces, triangles = (np.array(column) for column in zip(*fans, strict=True))
+    return SolidMesh(body.vertices, triangles, faces, tuple(body.vertices[list(ring)] for ring in body.rings))

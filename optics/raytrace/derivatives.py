@@ -68,7 +68,8 @@ def jvp(
     steps = [
         backend.vector(np.broadcast_to(s, direction.shape).reshape(-1, 3)) for s in (position_step, direction_step)
     ]
-    along: Any = None
+    along = dr.zeros(backend.Float, dr.width(rays.position))
+    dr.make_opaque(along, rays.path, rays.valid)  # the first kernel is that of the others
     hits: dict[int, Any] = {}
     slopes: dict[int, Any] = {}
     for first in range(0, len(uploaded.structure), SECTION):
@@ -76,9 +77,8 @@ def jvp(
         dr.enable_grad(rays.position, rays.direction)
         dr.set_grad(rays.position, steps[0])
         dr.set_grad(rays.direction, steps[1])
-        if along is not None:
-            dr.enable_grad(rays.path)
-            dr.set_grad(rays.path, along)
+        dr.enable_grad(rays.path)
+        dr.set_grad(rays.path, along)
         own = [i - first for i in keep if first <= i < last]
         traced = trace(backend, uploaded.section(first, last), rays, keep=own, evaluate=False)
         local = traced.local

@@ -180,6 +180,7 @@ class UploadedSystems:
         grids: as of ``SystemBatch``.
         count: B.
         differentiable: whether numbers carry derivatives.
+        first: row of the first element's first number, where the elements are part of a longer sequence; else None.
     """
 
     backend: Backend
@@ -189,6 +190,7 @@ class UploadedSystems:
     grids: tuple[Any, ...]
     count: int
     differentiable: bool
+    first: int | None = None
 
     @cached_property
     def values(self) -> tuple[ElementNumbers, ...]:
@@ -208,7 +210,8 @@ class UploadedSystems:
         """
         part = slice(first, last)
         form = self.form[0][part], self.form[1]
-        return replace(self, structure=self.structure[part], form=form, grids=self.grids[part])
+        row = None if isinstance(self.numbers, tuple) else form[0][0].frame.x.shift
+        return replace(self, structure=self.structure[part], form=form, grids=self.grids[part], first=row)
 
 
 @dataclass(frozen=True, eq=False)

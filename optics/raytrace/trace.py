@@ -1,22 +1,10 @@
-"""Float64 sequential ray trace on Dr.Jit: positions, directions and optical path lengths through a batch of systems.
-
-With d tau = ds / n the ray equation d/ds (n dr/ds) = grad n becomes r'' = n grad n. For n = n0 + g . (r - r0) the index
-along the ray obeys n'' = |g|^2 n, so that
-
-    n(tau) = n0 cosh x + a/|g| sinh x,    x = |g| tau,  a = g . T0,  T0 = n0 d0,
-    r(tau) = r0 + T0 tau + g [n0 (cosh x - 1) / |g|^2 + a (sinh x / |g| - tau) / |g|^2],
-    optical path = integral of n^2 d tau.
-
-The hyperbolic functions are taken as their power series, which have no 0/0 at g = 0; ``truncation_bound`` bounds what
-is left out. (Born and Wolf, Principles of Optics, section 3.2, for the ray equation.)
-"""
+"""Float64 sequential ray trace on Dr.Jit: positions, directions and optical path lengths through a batch of systems."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import cosh
 from threading import local
 from typing import Any
 
@@ -34,100 +22,8 @@ from optics.raytrace.element_numbers import (
     IndexNumbers,
     Structure,
 )
+from optics.raytrace.graded_ray import GradedRay, meeting
 from optics.raytrace.system import SystemBatch, UploadedSystems
-
-
-def truncation_bound(gradient: float, length: float, index: float = 1.5) -> tuple[float, float]:
-    """Bounds of the errors of position and optical path (metres) from cutting the series off.
-
-    Args:
-        gradient: |grad n|, 1/m.
-        length: of the ray in the medium, metres.
-        index: refractive index; the ray's parameter is at most length / min(index along it), taken as length.
-    """
-    x = gradient * length
-    growth = cosh(x)  # all later terms together are at most the first one left out times cosh
-    position = gradient * length**2 * (index / 2.0 * x**6 / 20160.0 + index / 6.0 * length * gradient * x**6 / 60480.0)
-    y = (2.0 * x) ** 2
-    path = index**2 * length * (y**4 / 725760.0 + x * y**3 / 20160.0 + x**2 * y**3 / 181440.0)
-    return position * growth, path * cosh(2.0 * x)
-
-
-@dataclass(frozen=True, eq=False)
-class GradedRay:
-    """A curved ray, as Dr.Jit arrays in the frame of the element that it goes to.
-
-    Attributes:
-        origin: r0, metres.
-        tangent: T0 = n0 d0, d0 a unit vector.
-        index: n0 at the origin.
-        gradient: components of g, 1/m.
-        along: a = g . T0.
-        square: |g|^2.
-    """
-
-    origin: Any
-    tangent: Any
-    index: Any
-    gradient: tuple[Any, Any, Any]
-    along: Any
-    square: Any
-
-    @classmethod
-    def start(cls, p: Any, d: Any, index_at_zero: Any, gradient: tuple[Any, Any, Any]) -> GradedRay:
-        """The ray from p along the unit vector d, where the index is index_at_zero + gradient . p."""
-        gx, gy, gz = gradient
-        index = index_at_zero + gx * p.x + gy * p.y + gz * p.z
-        tangent = index * d
-        along = gx * tangent.x + gy * tangent.y + gz * tangent.z
-        return cls(p, tangent, index, gradient, along, gx * gx + gy * gy + gz * gz)
-
-    def detached(self) -> GradedRay:
-        """Return the rays without derivatives."""
-        import drjit as dr
-
-        return GradedRay(
-            dr.detach(self.origin),
-            dr.detach(self.tangent),
-            dr.detach(self.index),
-            tuple(dr.detach(g) for g in self.gradient),
-            dr.detach(self.along),
-            dr.detach(self.square),
-        )
-
-    def position(self, tau: Any) -> Any:
-        """r(tau), metres."""
-        x2 = self.square * tau * tau
-        even = 0.5 * tau * tau * (1.0 + x2 / 12.0 * (1.0 + x2 / 30.0))
-        odd = tau * tau * tau / 6.0 * (1.0 + x2 / 20.0 * (1.0 + x2 / 42.0))
-        return self._add(self.origin + self.tangent * tau, self.index * even + self.along * odd)
-
-    def slope(self, tau: Any) -> Any:
-        """dr/dtau = n times the unit direction."""
-        x2 = self.square * tau * tau
-        odd = tau * (1.0 + x2 / 6.0 * (1.0 + x2 / 20.0))
-        even = 0.5 * tau * tau * (1.0 + x2 / 12.0 * (1.0 + x2 / 30.0))
-        return self._add(self.tangent, self.index * odd + self.along * even)
-
-    def direction(self, tau: Any) -> Any:
-        """Unit direction at r(tau)."""
-        import drjit as dr
-
-        return dr.normalize(self.slope(tau))
-
-    def optical_path(self, tau: Any) -> Any:
-        """Integral of n ds from the origin, metres."""
-        y = 4.0 * self.square * tau * tau
-        first = tau * (1.0 + y / 12.0 * (1.0 + y / 20.0 * (1.0 + y / 42.0)))
-        second = tau * tau * (1.0 + y / 12.0 * (1.0 + y / 30.0))
-        third = tau * tau * tau / 3.0 * (1.0 + y / 20.0 * (1.0 + y / 42.0))
-        n, a = self.index, self.along
-        return n * n * first + a * n * second + a * a * third
-
-    def _add(self, vector: Any, amount: Any) -> Any:
-        gx, gy, gz = self.gradient
-        return type(vector)(vector.x + amount * gx, vector.y + amount * gy, vector.z + amount * gz)
-
 
 NEWTON_STEPS = 3
 """Newton steps from the conic to the asphere. The departure of a mirror from its conic is below 1e-4 m and its slope
@@ -140,14 +36,21 @@ depart by millimetres.
 """
 
 SECTION = 6
-"""Elements that one kernel traces: the time to compile it grows faster than its length, and
-sequences that begin alike share the kernels of their beginning. Between them rays pass through memory."""
+"""Elements that one kernel traces where there are many rays, which pass through memory between kernels. The time to
+compile it grows faster than its length."""
 
-FEWEST_LANES = 4
-"""Systems from which each lane of the processor traces one, of however many rays: half of a packet."""
+FEW = 1 << 16
+"""Rays below which every element is a kernel of its own: so few stay in the processor's cache. Elements of one
+structure then share a kernel wherever they stand in their sequences, and all kernels of the main job together take a
+fifth of the time to compile."""
 
-BLOCK = 16384
-"""Lanes of a kernel that run on one thread, at least. So few rays are traced so from two systems on."""
+FEWEST_LANES = 32
+"""Systems from which each lane of the processor traces one; of more than two threads each has to have half as many. Of
+fewer systems a trace element by element takes up to half as much time again, and its kernels, which elements share,
+are compiled already: those of lanes take seconds."""
+
+FEWEST_IN_LANES = 1 << 15
+"""Rays from which they do: fewer take some milliseconds in any way."""
 
 MOST_RECORDINGS = 16
 """Of one trace in one thread: it is recorded anew where a bundle has other numbers in common, such as a direction."""
@@ -236,8 +139,11 @@ def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, pat
     systems = position.shape[0] if position.ndim == 3 else 1
     n = position.size // 3
     start = dr.zeros(backend.Float, n) if path is None else backend.opaque(path)
+    valid = dr.full(backend.Bool, True, n)
+    if n < FEW:
+        dr.make_opaque(start, valid)
     heading = backend.vector(direction.reshape(-1, 3)[:1] if shared else direction)
-    return Rays(backend.vector(position), heading, start, dr.full(backend.Bool, True, n), systems)
+    return Rays(backend.vector(position), heading, start, valid, systems)
 
 
 def trace(
@@ -270,12 +176,18 @@ def trace(
     uploaded = systems.upload(backend) if isinstance(systems, SystemBatch) else systems
     rays, shared = _spread(backend, rays, uploaded.count)
     differentiable = uploaded.differentiable or dr.grad_enabled(rays.position) or dr.grad_enabled(rays.direction)
-    how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate, SECTION)
-    stride = None if uploaded.count == 1 else dr.opaque(backend.UInt, uploaded.count)
     lanes = _lanes(uploaded, dr.width(rays.position)) if evaluate and not differentiable else None
+    alone = lanes is None and not differentiable and dr.width(rays.position) < FEW
+    section = 1 if alone else SECTION
+    how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate, section, alone)
+    if alone and shared is not None:  # else the first element's kernel would be another one
+        shared = dr.arange(backend.UInt, dr.width(rays.position)) // shared
+        dr.eval(shared)
+    stride = None if uploaded.count == 1 else dr.opaque(backend.UInt, uploaded.count)
+    start = None if uploaded.first is None else dr.opaque(backend.UInt, uploaded.first * uploaded.count)
     through = _frozen(how, uploaded.form) if evaluate and not differentiable else partial(how.through, uploaded.form)
     (p, d, path, valid), hits, outside = through(
-        (uploaded.numbers, uploaded.grids, stride, lanes),
+        (uploaded.numbers, uploaded.grids, stride, start, lanes),
         (rays.position, rays.direction, rays.path, rays.valid),
         shared,
     )
@@ -296,6 +208,7 @@ class _Way:
         differentiable: whether numbers or rays carry derivatives.
         evaluate: whether kernels are launched.
         section: elements of a kernel.
+        alone: whether all elements of one structure share a kernel; ``section`` is 1.
     """
 
     backend: Backend
@@ -305,18 +218,22 @@ class _Way:
     differentiable: bool
     evaluate: bool
     section: int
+    alone: bool
 
     def through(self, form: Any, numbers: Any, rays: Any, shared: Any) -> Any:
         """Rays after the last element, hit points, and the former in the world frame.
 
         Args:
             form: as of ``UploadedSystems``.
-            numbers: likewise, the grids, how many systems there are, as an array of width 1 or None for one, and the
-                systems' own places, (B,), where each takes its rays one after the other; else None.
+            numbers: likewise, the grids, how many systems there are, as an array of width 1 or None for one; where the
+                numbers begin, likewise or None for the beginning; and the systems' own places, (B,), where each takes
+                its rays one after the other, else None.
             rays: position, direction, path and whether they are alive.
-            shared: rays of each system, as an array of width 1; None for a single system.
+            shared: rays of each system, as an array of width 1; the system of each ray where elements are ``alone``;
+                None for a single system.
         """
-        table, grids, stride, systems = numbers
+        table, grids, stride, start, systems = numbers
+        lookup = _Lookup(self, table, stride, start, self._system(rays[0], shared), form[0][0].frame.x.shift)
         hits: list[Any] = []
         outside: list[Any] = []
         for first in range(0, len(self.structure), self.section):
@@ -324,22 +241,28 @@ class _Way:
             if systems is not None:
                 rays = self._one_by_one(leg, form, (table, grids, stride, systems), rays, shared, hits, outside)
                 continue
-            lookup = _lookup(self.backend, rays[0], table, stride, shared)
             rays = self._along(leg, [lookup(form[0][i]) for i in leg], grids, rays, hits)
             if leg.stop == len(self.structure):
                 rays = self._at_end(rays, lookup(form[1]) if self.world else None, outside)
-            self._launch(leg, rays, hits, outside)
+            self._launch(leg, form, lookup, rays, hits, outside)
         return rays, hits, tuple(outside) if self.world else None
 
-    def _launch(self, leg: range, rays: Any, hits: list[Any], outside: list[Any]) -> None:
+    def _system(self, position: Any, shared: Any) -> Any:
+        """The system of each ray; None for a single system."""
+        import drjit as dr
+
+        return shared if shared is None or self.alone else dr.arange(self.backend.UInt, dr.width(position)) // shared
+
+    def _launch(self, leg: range, form: Any, lookup: _Lookup, rays: Any, hits: list[Any], outside: list[Any]) -> None:
         """Launch the kernel of a leg, where kernels are launched at its end."""
         import drjit as dr
 
-        if leg.stop == len(self.structure):
-            if self.evaluate:
-                dr.eval(*rays, hits, outside)
-        elif not self.differentiable:
-            dr.eval(*rays)
+        last = leg.stop == len(self.structure)
+        if self.alone or not (self.differentiable or last):
+            lookup.go_on((form[1] if last else form[0][leg.stop].frame).x.shift)
+            dr.eval(*rays, lookup.place)
+        if last and self.evaluate:
+            dr.eval(*rays, hits, outside)
 
     def _at_end(self, rays: Any, pose: FrameNumbers | None, outside: list[Any]) -> Any:
         """Rays at the last element; with its pose also, into ``outside``, in the world."""
@@ -374,7 +297,7 @@ class _Way:
                 path = dr.fma(element.before.index, t, path)
             else:
                 curve = GradedRay.start(p, d, element.before.index, element.before.gradient)
-                tau = _solve(curve, t / curve.index, surface, table, differentiable, steps)
+                tau = meeting(curve, t / curve.index, surface, table, differentiable, steps)
                 p, d, path = curve.position(tau), curve.direction(tau), path + curve.optical_path(tau)
                 ok = _reached(p, surface, table)
             valid = valid & ok
@@ -503,35 +426,55 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
 
 
 def _lanes(systems: UploadedSystems, rays: int) -> Any:
-    """The systems' own places, (B,), where each lane traces one of them, on one thread; else None.
-
-    Args:
-        systems: B of them.
-        rays: of all systems.
-    """
+    """The systems' own places, (B,), where systems and rays are enough to fill the lanes of all threads; else None."""
     import drjit as dr
 
-    backend = systems.backend
-    pays = rays <= BLOCK or (dr.thread_count() == 1 and systems.count >= FEWEST_LANES)
-    if backend.name != "llvm" or systems.count == 1 or not pays:
+    backend, threads = systems.backend, dr.thread_count()
+    fewest = max(2, FEWEST_LANES * max(2, threads) // 2)
+    if backend.name != "llvm" or systems.count < fewest or rays < FEWEST_IN_LANES:
         return None
     lanes = dr.arange(backend.UInt, systems.count)
     dr.make_opaque(lanes)
     return lanes
 
 
-def _lookup(backend: Backend, position: Any, numbers: Any, stride: Any, shared: Any) -> Any:
-    """Function: a form of numbers -> those of each ray's system."""
-    import drjit as dr
+class _Lookup:
+    """Numbers of each ray's system, element after element.
 
-    if shared is None:
-        return lambda form: map_leaves(lambda place: numbers[place], form)
-    system = dr.arange(backend.UInt, dr.width(position)) // shared
-    if isinstance(numbers, tuple):
-        return lambda form: map_leaves(lambda place: dr.gather(backend.Float, numbers[place], system), form)
-    return lambda form: map_leaves(
-        lambda place: dr.gather(backend.Float, numbers, system + backend.UInt(place) * stride), form
-    )
+    The row at which they begin goes along with the rays from kernel to kernel. Were it written into a kernel, no two
+    elements could share one.
+
+    Args:
+        way: of the rays.
+        numbers: as of ``UploadedSystems``.
+        stride: how many systems there are, as an array of width 1; None for a single one.
+        start: where the first element's numbers begin, likewise; None for the beginning.
+        system: of each ray; None for a single one.
+        row: at which the numbers of the first element begin.
+    """
+
+    def __init__(self, way: _Way, numbers: Any, stride: Any, start: Any, system: Any, row: int) -> None:
+        self._number, self._count = way.backend.Float, way.backend.UInt
+        self._numbers, self._stride, self._system, self._row = numbers, stride, system, row
+        self.place = None if isinstance(numbers, tuple) else system if start is None else system + start
+
+    def __call__(self, form: Any) -> Any:
+        """Numbers of a form with their rows."""
+        import drjit as dr
+
+        if self.place is not None:
+            return map_leaves(lambda row: dr.gather(self._number, self._numbers, self._after(row)), form)
+        if self._system is None:
+            return map_leaves(lambda row: self._numbers[row], form)
+        return map_leaves(lambda row: dr.gather(self._number, self._numbers[row], self._system), form)
+
+    def go_on(self, row: int) -> None:
+        """Let the numbers begin at another row."""
+        if self.place is not None:
+            self.place, self._row = self._after(row), row
+
+    def _after(self, row: int) -> Any:
+        return self.place + self._count(row - self._row) * self._stride
 
 
 def _into_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[Any, Any]:
@@ -589,24 +532,6 @@ def _steps(surface: SurfaceNumbers, interaction: Interaction) -> int:
     """Newton steps from the conic to the surface."""
     lens = bool(surface.even) and interaction is Interaction.REFRACT
     return NEWTON_STEPS + (FURTHER_STEPS if surface.terms or lens else 0)
-
-
-def _solve(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool, steps: int) -> Any:
-    """Parameter at which a curved ray meets the surface, by Newton's method from the straight ray's."""
-    import drjit as dr
-
-    def step(ray: GradedRay, tau: Any, numbers: SurfaceNumbers) -> Any:
-        p, slope = ray.position(tau), ray.slope(tau)
-        value, nx, ny, nz = level(p.x, p.y, p.z, numbers, table)
-        return tau - value / dr.fma(nx, slope.x, dr.fma(ny, slope.y, nz * slope.z))
-
-    numbers, ray = surface, curve
-    if attached:
-        numbers = map_leaves(dr.detach, surface)
-        ray, tau = curve.detached(), dr.detach(tau)
-    for _ in range(steps):
-        tau = step(ray, tau, numbers)
-    return step(curve, tau, surface) if attached else tau
 
 
 def _reached(p: Any, surface: SurfaceNumbers, table: Any) -> Any:

@@ -18,7 +18,7 @@ from optics.geometry.solid import Face, Solid, SolidError, face_plane, solid_mes
 from optics.geometry.tree import PlacedBodies
 from optics.raytrace.assembly import Assembly, Element
 from scenes.models.instrument_model import Instrument, MisplacedError, key_of
-from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
+from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_triangles
 from scenes.specs.instrument import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, channel_of, prism_of
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
@@ -67,11 +67,22 @@ def separation(first: np.ndarray, second: np.ndarray) -> float:
     deepest = float(np.max(difference.equations[:, 3]))  # of the origin, relative to every face
     if deepest <= 0.0:
         return deepest
-    import trimesh
+    return float(np.min(_distances(difference.points[difference.simplices])))
 
-    faces = difference.points[difference.simplices]
-    nearest = trimesh.triangles.closest_point(faces, np.zeros((len(faces), 3)))
-    return float(np.min(np.linalg.norm(nearest, axis=-1)))
+
+def _distances(triangles: np.ndarray) -> np.ndarray:
+    """Of the origin from triangles (T, 3, 3), which may have no area; (T,)."""
+    after = np.roll(triangles, -1, axis=1)
+    edges = after - triangles
+    square = np.maximum(np.einsum("tki,tki->tk", edges, edges), np.finfo(np.float64).tiny)
+    along = np.clip(-np.einsum("tki,tki->tk", triangles, edges) / square, 0.0, 1.0)
+    to_edges = np.min(np.linalg.norm(triangles + along[..., None] * edges, axis=-1), axis=1)
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    area = np.linalg.norm(normal, axis=-1)
+    # the foot of the perpendicular lies in the triangle where it is on the inner side of every edge
+    inside = (area > 0.0) & np.all(np.einsum("tki,ti->tk", np.cross(triangles, after), normal) >= 0.0, axis=1)
+    above = np.abs(np.einsum("ti,ti->t", triangles[:, 0], normal))
+    return np.where(inside, above / np.where(inside, area, 1.0), to_edges)
 
 
 def way_apart(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) -> tuple[int, float]:
@@ -104,15 +115,15 @@ def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) ->
         placed: where its bodies stand; by default as designed.
     """
     placed = instrument.assembly.place() if placed is None else placed
-    out = {s.path: placed.pose(s.path).apply(solid_mesh(s, placed).mesh.vertices) for s in instrument.solids}
+    out = {s.path: placed.pose(s.path).apply(solid_mesh(s, placed).vertices) for s in instrument.solids}
     for camera, model in instrument.cameras.items():
         for mirror in model.mirrors:
             if model.spec.mirrors[mirror].light == "passes":
                 continue
             path = f"{BASE}/{camera}/{mirror}"
-            mesh = mirror_mesh(model.surfaces[mirror], model.apertures[mirror], behind(model, mirror), _CELLS)
-            corners = mesh.vertices[convex_hull(mesh.vertices).vertices]
-            out[path] = placed.pose(path).apply(corners)
+            side = behind(model, mirror)
+            vertices, _ = mirror_triangles(model.surfaces[mirror], model.apertures[mirror], side, _CELLS)
+            out[path] = placed.pose(path).apply(vertices[convex_hull(vertices).vertices])
         path = f"{BASE}/{camera}/focal_plane"
         spots = [p for c in instrument.channels if c.camera == camera for p in (c.pinhole, c.ccd)]
         x, y = (0.5 * size for size in board_size(model, spots))

@@ -33,17 +33,27 @@ CHIP = 0.0005
 """Thickness of chips, metres."""
 
 
-def mirror_mesh(surface: Surface, aperture: Aperture, back: float, cells: int = GRID) -> trimesh.Trimesh:
-    """Watertight mesh of a mirror: its optical surface over the clear aperture, a flat back and an edge.
+def mirror_mesh(surface: Surface, aperture: Aperture, back: float) -> trimesh.Trimesh:
+    """Watertight mesh of a mirror, ``mirror_triangles`` for who draws it."""
+    import trimesh
+
+    return trimesh.Trimesh(*mirror_triangles(surface, aperture, back), process=False)
+
+
+def mirror_triangles(
+    surface: Surface, aperture: Aperture, back: float, cells: int = GRID
+) -> tuple[np.ndarray, np.ndarray]:
+    """A mirror as a closed surface: its optical surface over the clear aperture, a flat back and an edge.
 
     Args:
         surface: shape, metres.
         aperture: clear aperture.
         back: +1 when the substrate is on the surface's +z side, -1 when on its -z side.
         cells: across the mirror.
-    """
-    import trimesh
 
+    Returns:
+        Vertices (V, 3) in the mirror's frame, metres; triangles (T, 3) with outward winding.
+    """
     x0, x1, y0, y1 = aperture.bounds
     x, y, face = _grid(aperture, 0.5 * (x1 - x0), 0.5 * (y1 - y0), cells)
     z = surface.sag(x, y)
@@ -59,7 +69,7 @@ def mirror_mesh(surface: Surface, aperture: Aperture, back: float, cells: int = 
     offset = n * n
     edge = np.concatenate([np.stack([rim, rim + offset, after], 1), np.stack([after, rim + offset, after + offset], 1)])
     faces = np.concatenate([face, face[:, ::-1] + offset, edge])
-    return trimesh.Trimesh(np.concatenate([front, rear]), faces[:, ::-1] if back > 0 else faces, process=False)
+    return np.concatenate([front, rear]), faces[:, ::-1] if back > 0 else faces
 
 
 def _grid(aperture: Aperture, half_x: float, half_y: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -326,7 +326,7 @@ class ImagingBeams:
         """Which rays some prism of an instrument takes, (cameras, 3, RAYS)."""
         placed, out = instrument.assembly.place(), np.zeros((len(self.segments), 3, RAYS), dtype=bool)
         for solid in instrument.solids:
-            corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).mesh.vertices)
+            corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).vertices)
             planes = convex_hull(corners).equations
             for c, beams in enumerate(self.segments.values()):
                 for k, rays in enumerate(beams):

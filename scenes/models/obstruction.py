@@ -63,7 +63,7 @@ def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruc
     placed = instrument.assembly.place()
     solids = {}
     for solid in instrument.solids:
-        corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).mesh.vertices)
+        corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).vertices)
         solids[solid.path] = convex_hull(corners).equations
     found: dict[tuple[str, str], Obstruction] = {}
     for camera in instrument.cameras:

@@ -254,7 +254,7 @@ class ThermalModel:
         if path not in self._extents:
             if path in self.solids:
                 own = self._placed.pose(path).inverse()
-                meshes = ((p.path, solid_mesh(p, self._placed).mesh.vertices) for p in self._pieces(path))
+                meshes = ((p.path, solid_mesh(p, self._placed).vertices) for p in self._pieces(path))
                 points = np.concatenate([own.apply(self._placed.pose(name).apply(mesh)) for name, mesh in meshes])
             elif path in self.mirrors:
                 points = self._mirror_outline(path)
@@ -419,7 +419,7 @@ class ThermalModel:
             return ElasticBody(mesh, self._elastic_material(path)), Kinematic(support)
         if path not in self.solids or len(self._pieces(path)) > 1:
             return None
-        corners = solid_mesh(self.solids[path], self._placed).mesh.vertices
+        corners = solid_mesh(self.solids[path], self._placed).vertices
         low, high = corners.min(axis=0), corners.max(axis=0)
         middle, half = corners.mean(axis=0), 0.5 * (high - low)
         # three points around the middle, 120 deg apart in the plane of the two longest sides

@@ -28,8 +28,6 @@ READ = (
 )
 """Commands that are given a file they cannot read, and a record that is not one."""
 BAD = "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: [0 um, 0 um, 3 arcsec]}}\nno_such_key: 1\n"
-UNKNOWN = Limit(2.0)
-"""All modules of the checks are imported for their names."""
 START = Limit(START_S)
 COMPLETION = {"_CAMTWIN_COMPLETE": "complete_bash", "COMP_WORDS": "camtwin render --", "COMP_CWORD": "2"}
 """What a shell asks for after ``camtwin render --`` and the tabulator."""
@@ -91,7 +89,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
             Number("completion_s", completed, "completion of an option: processor time", "s", START),
             Number("import_s", imported, "import twin: processor time", "s", Limit(IMPORT_S)),
             Number("bad_s", max(refused.values()), "a bad file, the slowest command: processor time", "s", START),
-            Number("unknown_s", unknown, "an unknown check of twin.validate: processor time", "s", UNKNOWN),
+            Number("unknown_s", unknown, "an unknown check of twin.validate: processor time", "s", START),
             Number("cold_s", cold, "main job, empty kernel cache", "s", Limit(COLD_S)),
             Number("warm_s", warm, "main job, kernels in the cache", "s", Limit(WARM_S)),
         )

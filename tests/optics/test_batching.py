@@ -66,7 +66,7 @@ def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, threads: i
     """The same recording serves any number of systems and rays."""
     bare = gf7.bare_assembly()
     monkeypatch.setattr(trace_module, "SECTION", section)
-    monkeypatch.setattr(trace_module, "FEWEST_LANES", 10**9)
+    monkeypatch.setattr(trace_module, "FEWEST_IN_LANES", 1)
     position, direction = launch(gf7, 800)
     before = dr.thread_count()
     kernel_threads(threads)
@@ -83,8 +83,8 @@ def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, threads: i
             }
             for way, rays in ways.items():
                 found = []
-                for block in (10**9, 0):
-                    monkeypatch.setattr(trace_module, "BLOCK", block)
+                for fewest in (1, 10**9):
+                    monkeypatch.setattr(trace_module, "FEWEST_LANES", fewest)
                     found.append(ends(backend, systems, rays))
                 for lanes, looked_up in zip(*found, strict=True):
                     # the same operations; the compiler may contract other products into fma
@@ -94,8 +94,10 @@ def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, threads: i
         kernel_threads(before)
 
 
-def test_no_ray_of_a_batch_is_anothers(backend, gf7) -> None:
+def test_no_ray_of_a_batch_is_anothers(backend, gf7, monkeypatch) -> None:
     """Each system's rays, traced by lanes, against the system by itself, with rays that are lost among them."""
+    monkeypatch.setattr(trace_module, "FEWEST_LANES", 1)
+    monkeypatch.setattr(trace_module, "FEWEST_IN_LANES", 1)
     bare = gf7.bare_assembly()
     systems = assemble(bare, ["imaging"], some_states(24, 2, ("M2", "M3")))
     position, direction = launch(gf7, 24 * 50)
@@ -198,6 +200,36 @@ def test_aim_reaches_its_points_and_says_when_it_cannot(backend, gf7) -> None:
     np.testing.assert_array_equal(again, q)
     with pytest.raises(AimError, match="did not converge"):
         aim(backend, to_stop, fan, np.full((1, 2), np.inf))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_few_rays_are_traced_as_many_are(backend, gf7, monkeypatch, count) -> None:
+    """Element by element in kernels of their own, or many elements in one: no number differs."""
+    bare = gf7.bare_assembly()
+    systems = assemble(bare, ["imaging"], some_states(count, 1, ("M1", "M2", "M3", "image")))
+    position, direction = launch(gf7)
+    found = []
+    for few in (trace_module.FEW, 0):
+        monkeypatch.setattr(trace_module, "FEW", few)
+        traced = trace(backend, systems, make_rays(backend, position, direction), keep=(0, 2), world=True)
+        found.append((*traced.numpy(), *traced.numpy(traced.world), traced.hit(0), traced.hit(2)))
+    assert 0 < found[0][3].mean() < 1
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_elements_of_one_structure_share_a_kernel(backend, gf7_pair) -> None:
+    """Wherever they stand: a channel of 25 elements takes some ten kernels."""
+    name = next(name for name in gf7_pair.assembly.sequences if name.endswith("/monitor"))
+    systems = assemble(gf7_pair.assembly, [name], some_states(2, 1, ("base/backward/M2",)))
+    rays = make_rays(backend, np.zeros((2, 8, 3)), np.broadcast_to([0.0, 0.0, 1.0], (2, 8, 3)))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        trace(backend, systems, rays)
+        hashes = [k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert len(hashes) >= len(systems.structure)
+    # beside the elements' kernels the one that says which system a ray belongs to
+    assert len(set(hashes)) <= len(set(systems.structure)) + 1 < len(systems.structure) / 2
 
 
 def new_kernels(work) -> tuple[int, int]:

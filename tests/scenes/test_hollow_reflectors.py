@@ -147,7 +147,7 @@ def test_plates_and_frame_leave_room_to_the_beam_and_to_each_other(kind, width, 
     for hand in (1.0, -1.0) if kind == "hollow_transfer" else (1.0,):
         parts = make(length, width, hand) if kind == "hollow_transfer" else make(length, width)
         placed = RigidTree(parts.bodies).place()
-        bodies = {s.path: placed.pose(s.path).apply(solid_mesh(s, placed).mesh.vertices) for s in parts.solids}
+        bodies = {s.path: placed.pose(s.path).apply(solid_mesh(s, placed).vertices) for s in parts.solids}
         assert set(bodies) == {b.path for b in parts.bodies}
         for a, b in combinations(bodies, 2):
             assert separation(bodies[a], bodies[b]) > LEAST_GAP, (a, b)

@@ -22,15 +22,24 @@ import tifffile
 import xarray as xr
 
 import twin.main_job.render_command
+import twin.main_job.render_drawings
 import twin.main_job.render_folder
 import twin.render as command
 from optics.numerics.threads import LIMIT
 from scenes.specs.load import EXAMPLES
 from tests.tiers import quick
 from tests.twin.commands import files, invoke
-from twin.main_job.render_drawings import IRRADIANCE, SCENE, SUMMARY, _tried, drawings, without_failed
+from twin.main_job.render_drawings import (
+    IRRADIANCE,
+    SCENE,
+    SUMMARY,
+    _tried,
+    drawings,
+    instrument_drawings,
+    limits_drawing,
+    without_failed,
+)
 from twin.main_job.render_job import render_job
-from twin.pictures.light_paths import trace_light_paths
 
 run = partial(invoke, command.app)
 """The command inside this process."""
@@ -121,10 +130,12 @@ def ready(repeated, monkeypatch):
     _, _, _, kept = repeated
     monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept[0])
 
-    def few(*given):
-        return {SCENE: bytes, SUMMARY: bytes, IRRADIANCE: drawings(*given)[IRRADIANCE]}
+    def few(run):
+        return {SUMMARY: bytes, IRRADIANCE: drawings(run)[IRRADIANCE]}
 
+    monkeypatch.setattr(twin.main_job.render_drawings, "instrument_drawings", lambda *_: {SCENE: bytes})
     monkeypatch.setattr(twin.main_job.render_folder, "drawings", few)
+    monkeypatch.setattr(twin.main_job.render_folder, "limits_drawing", lambda _: {})
     monkeypatch.setattr(twin.main_job.render_folder, "render_report", lambda *_: "")
 
 
@@ -166,9 +177,9 @@ def test_all_that_is_drawn_can_be_sent_to_the_second_process(repeated):
     """What cannot is drawn by the first process alone: a run that is right and takes twice as long."""
     kept = repeated[3][0]
     assert kept.recovery.curvature  # also with the motions that were traced again
-    paths = trace_light_paths(kept.experiment.instrument, kept.experiment.backend, kept.state)
-    sent = pickle.loads(pickle.dumps(drawings(kept, paths)))
-    assert sent["side"]() == drawings(kept, paths)["side"]()
+    early = instrument_drawings(kept.experiment.instrument, kept.experiment.backend, kept.state)
+    sent = pickle.loads(pickle.dumps((early, drawings(kept), limits_drawing(kept.limits))))
+    assert sent[0]["side"]() == early["side"]()
 
 
 # --- a run that works -------------------------------------------------------------------------------------------------

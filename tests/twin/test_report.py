@@ -26,6 +26,7 @@ from twin.main_job.summary_plot import summary_png
 from twin.main_job.systematics import systematics
 from twin.main_job.verdict import judge
 from twin.pictures.scene_file import write_scene
+from twin.run import svg
 from twin.run.artefact import FAR, Text, decimals_for, fixed, plain, residual_text, significant
 
 VOID = {"meta", "br", "hr", "img", "input", "link", "col", "wbr"}
@@ -365,3 +366,57 @@ def test_what_is_marked_wrong():
     assert not is_wrong(1e-7, 0.0)
     assert not is_wrong(1e-3, 0.0, floor=2e-3)
     assert not np.isnan(FAR)
+
+
+# --- how figures are drawn --------------------------------------------------------------------------------------------
+
+
+def _all_kinds_of_axes():
+    """Shared and inverted axes, a fixed aspect, a logarithm, offsets, minor ticks, a colour bar and labels on top."""
+    figure = svg.new_figure(6.0)
+    grid = figure.subplots(2, 3, width_ratios=(1.0, 2.0, 1.0))
+    x = np.linspace(0.0, 1.0, 40)
+    grid[0, 0].plot(1e6 + x, 1e-9 * x)
+    shown = svg.signed_map(grid[0, 1], np.outer(x - 0.5, x))
+    figure.colorbar(shown, ax=list(grid[0, :2]), orientation="horizontal", label="bar")
+    grid[0, 2].semilogy(x, 1e3**x)
+    grid[0, 2].yaxis.set_label_position("right")
+    grid[1, 0].sharey(grid[0, 0])
+    grid[1, 0].set(xlabel="below", ylabel="beside", title="of the first")
+    grid[1, 1].xaxis.set_ticks_position("top")
+    grid[1, 1].plot(x, x)
+    grid[1, 1].set(title="above ticks", ylim=(1.0, 0.0))
+    grid[1, 1].minorticks_on()
+    grid[1, 2].plot(x, 3.0 * x)
+    grid[1, 2].set_aspect("equal", adjustable="datalim")
+    svg.gridded(grid[1, 2])
+    return figure
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("write", [svg.to_svg, lambda figure: svg.to_png(figure, 50)], ids=["svg", "png"])
+def test_ticks_that_are_kept_are_those_that_matplotlib_works_out_anew(write, monkeypatch):
+    with svg.look("kept"):
+        kept = write(_all_kinds_of_axes())
+        asked = []
+        plain = svg._kept_of
+
+        def counted(axis):
+            update, boxes = axis._update_ticks, axis._get_ticklabel_bboxes
+            return lambda: asked.append(axis) or update(), boxes
+
+        monkeypatch.setattr(svg, "_kept_of", counted)
+        assert write(_all_kinds_of_axes()) == kept
+        anew = len(asked)
+        asked.clear()
+
+        def counted_below(axis):
+            update = axis._update_ticks
+            axis._update_ticks = lambda: asked.append(axis) or update()
+            return plain(axis)
+
+        monkeypatch.setattr(svg, "_kept_of", counted_below)
+        figure = _all_kinds_of_axes()
+        assert write(figure) == kept
+    assert len(asked) < 0.6 * anew
+    assert not any("_update_ticks" in vars(axis) for axes in figure.axes for axis in (axes.xaxis, axes.yaxis))

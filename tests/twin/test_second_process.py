@@ -88,6 +88,25 @@ def test_both_processes_take_their_part() -> None:
     assert len({pid for _, pid in found.values()}) == 2
 
 
+def test_it_works_while_the_first_does_not_know_all_tasks_yet() -> None:
+    """Tasks that come one after the other, of which it does some before the last are known."""
+    own = os.getpid()
+    with SecondProcess(nothing) as beside:
+        beside.start({"a": partial(square, 1), "b": partial(square, 2)}, ("b",))
+        assert "a" in beside
+        assert "c" not in beside
+        time.sleep(0.5)
+        beside.start({"c": partial(large, 3)}, ("c",))
+        beside.start({})
+        beside.start({"d": lambda: own})  # cannot be sent
+        beside.start({str(k): partial(square, k, 0.02) for k in range(10)})
+        found = beside.results()
+    assert list(found) == [*"abcd", *map(str, range(10))]
+    assert (found["a"][0], found["b"][0], found["c"][-1], found["d"]) == (1, 4, 3.0, own)
+    assert own not in {found["a"][1], found["b"][1]}
+    assert len({found[str(k)][1] for k in range(10)}) == 2
+
+
 def test_results_larger_than_a_pipe() -> None:
     """8 MB each way, while the first process does something else."""
     table = np.arange(1_000_000.0)

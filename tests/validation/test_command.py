@@ -39,6 +39,7 @@ from twin.validation.checks.check import (
     Supposed,
 )
 from twin.validation.checks.group import CheckGroup, Context, matches
+from twin.validation.checks.row_names import names_in_files
 from twin.validation.registry import UnknownCheck, select
 from twin.validation.runner import run_checks
 
@@ -126,6 +127,22 @@ def test_selection(only, expected):
     chosen = select((GOOD, NEAR, LEAF, OTHER), only)
     assert set().union(*(selection.ids for selection in chosen)) == expected
     assert all(selection.ids <= set(selection.group.ids) and selection.ids for selection in chosen)
+
+
+def test_ids_read_as_text_are_those_of_all_rows():
+    """Also further ids of a row."""
+    found = names_in_files()
+    assert sorted(found) == sorted(name for one in registry.GROUPS for check in one.checks for name in check.names)
+    assert {"001.eq3", "001.eq4", "017.bundle"} <= set(found)
+
+
+@pytest.mark.parametrize("only", [None, "001,017.bundle", "001.eq4"])
+def test_ids_that_are_there_are_known_before_any_group_is_imported(only, monkeypatch):
+    monkeypatch.delattr(registry, "GROUPS", raising=False)
+    registry.require_known(only)
+    with pytest.raises(UnknownCheck, match=r"did you mean '001\.eq4'"):
+        registry.require_known("001.eq44")
+    assert "GROUPS" not in vars(registry)
 
 
 @pytest.mark.parametrize(

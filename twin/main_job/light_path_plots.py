@@ -170,7 +170,7 @@ def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
 
 def _outline(solid: Solid, paths: LightPaths) -> np.ndarray:
     """A convex body as the side view sees it: corners of its outline in order, x and z, metres."""
-    corners = paths.placed.pose(solid.path).apply(solid_mesh(solid, paths.placed).mesh.vertices)[:, [0, 2]]
+    corners = paths.placed.pose(solid.path).apply(solid_mesh(solid, paths.placed).vertices)[:, [0, 2]]
     return np.asarray(corners[ConvexHull(corners).vertices])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from rich.console import Console
@@ -12,7 +13,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.assumptions import assumed
-from twin.main_job.render_drawings import load_drawing
+from twin.main_job.render_drawings import begin_drawing, load_drawing
 from twin.main_job.render_folder import write_run
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import JobRun, RenderRun
@@ -51,7 +52,8 @@ def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed
     """
     # a second thread of linear algebra would wait for a core that the second process has
     with SecondProcess(load_drawing) as beside, one_blas_thread():
-        run = render_job(resolved, session.backend, frames, seed, session.advance)
+        begin = partial(begin_drawing, beside)
+        run = render_job(resolved, session.backend, frames, seed, session.advance, placed=begin)
         problem = write_run(run, session, picture, beside)
     return Result(_numbers(run), lambda console: _print_result(run, console), problem)
 

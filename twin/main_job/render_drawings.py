@@ -5,15 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
 
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from scenes.models.instrument_model import Instrument
 from twin.main_job.render_results import JobRun, RenderRun
-from twin.pictures.light_paths import LightPaths
+from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import Undrawn
+from twin.run.second_process import SecondProcess
 
-__all__ = ["APART", "FILES", "IRRADIANCE", "LOADED", "SCENE", "SUMMARY", "drawings", "load_drawing", "without_failed"]
+if TYPE_CHECKING:
+    from twin.uncertainty.monitor_limits import MonitorLimits
 
+__all__ = [
+    *("APART", "FILES", "IRRADIANCE", "LIMITS", "LOADED", "SCENE", "SUMMARY"),
+    *("begin_drawing", "drawings", "instrument_drawings", "limits_drawing", "load_drawing", "without_failed"),
+]
+
+LIMITS = "limits"
+"""The figure of what limits the readings."""
 SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
 """What is no figure of the report: the bytes of summary.png, scene.glb, irradiance.nc."""
 APART = (SUMMARY, SCENE, IRRADIANCE)
@@ -23,26 +35,56 @@ FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"
 """Where these are written."""
 
 
-def drawings(run: JobRun, paths: LightPaths) -> Mapping[str, Callable[[], Any]]:
-    """Name -> what draws it, the longest first: <svg> elements but for ``APART``, which are written as they are.
+def begin_drawing(beside: SecondProcess, instrument: Instrument, backend: Backend, state: State) -> None:
+    """Let the second process draw what is known before anything is measured, if it does not so already.
 
     Args:
-        run: the run; what it works out on demand is taken as it is now.
-        paths: its light, traced.
+        beside: the process.
+        instrument: of the run.
+        backend: where to trace its light.
+        state: that is shown.
     """
-    instrument, targets = run.experiment.instrument, run.targets
+    if SCENE not in beside:
+        beside.start(instrument_drawings(instrument, backend, state), LOADED)
+
+
+def instrument_drawings(instrument: Instrument, backend: Backend, state: State) -> dict[str, Callable[[], Any]]:
+    """Name -> what draws it, the longest first, of an instrument and its light in a state: <svg> elements, and the
+    bytes of scene.glb.
+    """
+    paths = trace_light_paths(instrument, backend, state)
+    return _tried_each(
+        {
+            "footprints": _drawing("light_path_plots.footprints_svg", instrument, paths),
+            "side": _drawing("light_path_plots.side_view_svg", instrument, paths),
+            SCENE: partial(_scene, instrument, state, paths),
+        }
+    )
+
+
+def drawings(run: JobRun) -> dict[str, Callable[[], Any]]:
+    """The same of what a run has found; what it works out on demand is taken as it is now."""
+    targets = run.targets
     out = _of_monitor(run) if isinstance(run, RenderRun) else {}
-    out["footprints"] = _drawing("light_path_plots.footprints_svg", instrument, paths)
     if targets is not None:
         for name, camera in targets.cameras.items():
             out[f"targets {name}"] = _drawing("target_plots.images_svg", name, camera)
             if targets.has_edges:
                 out[f"mtf {name}"] = _drawing("target_plots.curves_svg", name, camera)
-    out["side"] = _drawing("light_path_plots.side_view_svg", instrument, paths)
     if run.quality is not None and run.quality.obstruction:
         out["pupils"] = _drawing("target_plots.pupils_svg", run.quality)
-    out[SCENE] = partial(_scene, instrument, run.state, paths)
-    return {name: partial(_tried, name, draw) for name, draw in out.items()}
+    return _tried_each(out)
+
+
+def limits_drawing(limits: MonitorLimits | None) -> dict[str, Callable[[], Any]]:
+    """The same of what limits the readings, of which nothing is drawn where no prior is stated."""
+    if limits is None:
+        return {}
+    return _tried_each({LIMITS: partial(_call, "twin.uncertainty.uncertainty_report", "limits_svg", limits)})
+
+
+def _tried_each(drawing: Mapping[str, Callable[[], Any]]) -> dict[str, Callable[[], Any]]:
+    return {name: partial(_tried, name, draw) for name, draw in drawing.items()}
 
 
 def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:

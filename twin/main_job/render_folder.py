@@ -13,7 +13,19 @@ from markupsafe import Markup
 from twin.main_job.crosstalk_sections import crosstalk_section, formula_section, motion_section
 from twin.main_job.job_tables import config_text, faces_of, heated_of
 from twin.main_job.part_sections import finish_section, quality_section, stray_section, target_section
-from twin.main_job.render_drawings import APART, FILES, LOADED, SCENE, drawings, load_drawing, without_failed
+from twin.main_job.render_drawings import (
+    APART,
+    FILES,
+    LIMITS,
+    LOADED,
+    SCENE,
+    begin_drawing,
+    drawings,
+    instrument_drawings,
+    limits_drawing,
+    load_drawing,
+    without_failed,
+)
 from twin.main_job.render_files import write_results
 from twin.main_job.render_results import PROGRAM, JobRun, RenderRun
 from twin.main_job.result_sections import (
@@ -27,7 +39,6 @@ from twin.main_job.result_sections import (
 )
 from twin.main_job.setup_sections import done_table, facts, setup_section
 from twin.main_job.verdict import judge
-from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.viewer import viewer_markup, viewer_programs, viewer_scripts
 from twin.run.artefact import Piece
 from twin.run.page import report_page, write_artefacts
@@ -54,16 +65,18 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
             return write_run(run, session, picture, helper)
     seconds, folder = session.seconds, session.folder
     session.advance(WRITE, 0, 1)
-    pieces = drawings(run, trace_light_paths(run.experiment.instrument, run.experiment.backend, run.state))
-    beside.start(pieces, LOADED)
+    begin_drawing(beside, run.experiment.instrument, run.experiment.backend, run.state)
+    beside.start(drawings(run), LOADED)
+    if isinstance(run, RenderRun):
+        beside.start(limits_drawing(run.limits))
     write_results(run, folder)
     tables = tuple(section for section in _tabled(run) if section is not None)
     further = further_sections("render", run)
+    drawn, missing = without_failed(beside.results())
     limits: tuple[Section, ...] = ()
     if isinstance(run, RenderRun):
         finishes = finish_section(run)
-        limits = (*(() if finishes is None else (finishes,)), _limits(run))
-    drawn, missing = without_failed(beside.results())
+        limits = (*(() if finishes is None else (finishes,)), _limits(run, drawn.get(LIMITS)))
     for name, file in FILES.items():
         if name in drawn:
             folder.write_bytes(file, drawn[name])
@@ -80,11 +93,11 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
     return "; ".join(filter(None, problems))
 
 
-def _limits(run: RenderRun) -> Section:
-    """The section on what limits the readings."""
+def _limits(run: RenderRun, figure: str | None) -> Section:
+    """The section on what limits the readings, with its figure."""
     from twin.uncertainty.uncertainty_report import limits_section
 
-    return limits_section(run.limits)
+    return limits_section(run.limits, figure=figure)
 
 
 def _tabled(run: JobRun) -> tuple[Section | None, ...]:
@@ -139,8 +152,8 @@ def render_report(
     """
     experiment, backend = run.experiment, run.experiment.backend.name
     if drawn is None:
-        paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
-        drawn, _ = without_failed({name: draw() for name, draw in drawings(run, paths).items() if name not in APART})
+        pieces = instrument_drawings(experiment.instrument, experiment.backend, run.state) | drawings(run)
+        drawn, _ = without_failed({name: draw() for name, draw in pieces.items() if name not in APART})
     summary, *shown = result_tables(run)
     done, told = done_table(run), judge(run)
     moved = ", ".join(str(row[0]) for row in done.rows)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +16,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.physical_error import UnphysicalError
 from scenes.models.built import squared_facets
 from scenes.models.camera_sharpness import blur_warnings
-from scenes.models.instrument_model import MisplacedError
+from scenes.models.instrument_model import Instrument, MisplacedError
 from scenes.models.obstruction import find_obstructions, moved_into_beams
 from scenes.models.scenery import measured_finishes
 from scenes.specs.as_built import as_built_of
@@ -80,6 +82,7 @@ def render_job(
     seed: int | None = None,
     advance: Advance = silent,
     experiment: MonitorExperiment | None = None,
+    placed: Callable[[Instrument, Backend, State], object] | None = None,
 ) -> JobRun:
     """Run a job. Of a course, the time ``course.detail`` is the single state that most of the result is about.
 
@@ -94,6 +97,8 @@ def render_job(
         advance: told of each of STAGES and of QUALITY when it begins and ends, and of the long parts COURSE, STRAY and
             TARGETS how many of how many times, paths or places are done.
         experiment: the job's instrument where it has been built already; results are the same.
+        placed: told of a monitored instrument and of the state that is shown before the rest is computed, for who draws
+            it meanwhile.
 
     Raises:
         InputError: an unknown node, more memory than there is, or a perturbation so large that light misses the mirrors
@@ -118,6 +123,9 @@ def render_job(
     states = [experiment.state(resolved.job)] if course is None else series_states(experiment, resolved.job)
     shown = 0 if course is None else course.shown
     state = states[shown]
+    if placed is not None:
+        with suppress(*LOST):  # what light does not get through is said in its place below
+            placed(experiment.instrument, backend, state)
     stage.begin(2)
     try:
         focus = experiment.nominal_focus

@@ -11,13 +11,14 @@ from __future__ import annotations
 import gc
 import os
 import pickle
+import select
 import signal
+import struct
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
-from itertools import chain
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import IO, Any
 
 from optics.numerics.threads import cores
@@ -25,6 +26,8 @@ from optics.numerics.threads import cores
 __all__ = ["SecondProcess"]
 
 MOST_TASKS = 256
+_HEAD = struct.Struct("=QB")
+"""What tells of tasks: bytes that they take, and how many of them the second process does alone."""
 PATIENCE = 120.0
 """Seconds for which one task may keep the command waiting that has nothing else to do; then it is done here, too."""
 
@@ -40,7 +43,7 @@ class SecondProcess:
     def __init__(self, prepare: Callable[[], object], wanted: bool = True) -> None:
         self._prepare, self._wanted = prepare, wanted
         self._child = 0
-        self._tasks: Mapping[str, Callable[[], Any]] = {}
+        self._tasks: dict[str, Callable[[], Any]] = {}
 
     def __enter__(self) -> SecondProcess:
         alone = threading.current_thread() is threading.main_thread()
@@ -53,39 +56,49 @@ class SecondProcess:
             self._ended(0.0)
             self._from_child.close()
 
+    def __contains__(self, name: str) -> bool:
+        """Whether a task of that name has been started."""
+        return name in self._tasks
+
     def start(self, tasks: Mapping[str, Callable[[], Any]], apart: Collection[str] = ()) -> None:
-        """Let it begin. Tasks that cannot be pickled, because of what a user has added, are left to this process.
+        """Let it begin with some tasks, beside those that it may have already. Tasks that cannot be pickled, because of
+        what a user has added, are left to this process.
 
         Args:
-            tasks: name -> what is to be done; the longest first, at most ``MOST_TASKS``. They see the values that they
-                hold as they are now.
+            tasks: name -> what is to be done, the longest first. They see the values that they hold as they are now.
             apart: names of tasks that the second process does first and alone where there is one: what they import it
                 has imported already, and this process need not import it as well.
+
+        Raises:
+            ValueError: there are more than ``MOST_TASKS`` in all.
         """
-        if len(tasks) > MOST_TASKS:
-            raise ValueError(f"more than {MOST_TASKS} tasks: {len(tasks)}")
-        self._tasks = tasks
+        first = len(self._tasks)
+        if first + len(tasks) > MOST_TASKS:
+            raise ValueError(f"more than {MOST_TASKS} tasks: {first + len(tasks)}")
+        self._tasks |= tasks
         if not self._child:
             return
+        numbers = dict(zip(tasks, range(first, first + len(tasks)), strict=True))
         try:
-            alone = [number for number, name in enumerate(tasks) if name in apart]
-            content = pickle.dumps((alone, list(tasks.values())), pickle.HIGHEST_PROTOCOL)
+            content = pickle.dumps({numbers[name]: task for name, task in tasks.items()}, pickle.HIGHEST_PROTOCOL)
         except (pickle.PicklingError, TypeError, AttributeError):
-            content = b""
+            return
+        # through a file: a pipe that nobody reads yet would keep this process waiting
+        os.pwrite(self._to_child.fileno(), content, self._sent)
+        self._sent += len(content)
+        alone = bytes(number for name, number in numbers.items() if name in apart)
         try:
-            os.write(self._turns[1], bytes(number for number, name in enumerate(tasks) if name not in apart))
-            sent = 0
-            while sent < len(content):
-                sent += os.write(self._to_child, content[sent:])
+            # in this order: a turn is of a task that the second process has or finds announced
+            os.write(self._batches, _HEAD.pack(len(content), len(alone)) + alone)
+            os.write(self._turns[1], bytes(number for name, number in numbers.items() if name not in apart))
         except BrokenPipeError:
             pass  # it is gone
-        finally:
-            self._nothing_more()
 
     def results(self) -> dict[str, Any]:
         """Name -> result of every task. Raises whatever a task does."""
         names, found = list(self._tasks), {}
         if self._child:
+            self._nothing_more()
             for number in _turns(self._turns[0]):
                 found[names[number]] = self._tasks[names[number]]()
             self._ended(PATIENCE)
@@ -97,21 +110,24 @@ class SecondProcess:
         sys.stdout.flush()
         sys.stderr.flush()
         # whoever reads a byte has the task of that number; a pipe gives each to one reader alone
-        self._turns, given = os.pipe(), os.pipe()
+        self._turns, batches = os.pipe(), os.pipe()
+        os.set_blocking(self._turns[0], False)  # of two that wait for a byte one would wait in vain
+        self._to_child: IO[bytes] = tempfile.TemporaryFile()
         self._from_child: IO[bytes] = tempfile.TemporaryFile()
+        self._sent = 0
         child = os.fork()
         if child == 0:
             try:
-                os.close(given[1])
+                os.close(batches[1])
                 os.close(self._turns[1])
-                self._work(given[0])
+                self._work(batches[0])
             finally:
                 os._exit(0)  # nothing of the command is closed, written or told twice
-        os.close(given[0])
-        self._to_child = given[1]
+        os.close(batches[0])
+        self._batches = batches[1]
         self._child, self._sending = child, True
 
-    def _work(self, given: int) -> None:
+    def _work(self, batches: int) -> None:
         """All that the second process does."""
         gc.disable()  # what the first process computes with is left alone
         for number in (signal.SIGTERM, signal.SIGHUP):
@@ -121,25 +137,49 @@ class SecondProcess:
         for stream in (0, 1, 2):
             os.dup2(nowhere, stream)
         # a lock on a run folder ends with the process that holds it, and is held by every copy of its file
-        first = 3
-        for kept in sorted((given, self._turns[0], self._from_child.fileno())):
+        first, turns = 3, self._turns[0]
+        for kept in sorted((batches, turns, self._to_child.fileno(), self._from_child.fileno())):
             os.closerange(first, kept)
             first = kept + 1
         os.closerange(first, os.sysconf("SC_OPEN_MAX"))
         self._prepare()
-        with os.fdopen(given, "rb") as file:
-            content = file.read()
-        alone, tasks = pickle.loads(content) if content else ((), [])
-        for number in chain(alone, _turns(self._turns[0])) if tasks else ():
-            pickle.dump((number, tasks[number]()), self._from_child)
-            self._from_child.flush()
+        tasks: dict[int, Callable[[], Any]] = {}
+        waiting, read = [batches, turns], 0
+        while waiting:
+            ready, _, _ = select.select(waiting, (), ())
+            if batches in ready:
+                head = os.read(batches, _HEAD.size)
+                if not head:
+                    waiting.remove(batches)
+                    continue
+                length, count = _HEAD.unpack(head)
+                alone = os.read(batches, count) if count else b""
+                tasks |= pickle.loads(os.pread(self._to_child.fileno(), length, read))
+                read += length
+                for number in alone:
+                    self._do(number, tasks)
+                continue
+            try:
+                turn = os.read(turns, 1)
+            except BlockingIOError:  # the first process has taken it
+                continue
+            if not turn:
+                waiting.remove(turns)
+                continue
+            self._do(turn[0], tasks)
+
+    def _do(self, number: int, tasks: Mapping[int, Callable[[], Any]]) -> None:
+        """Do a task in the second process, and store its result."""
+        pickle.dump((number, tasks[number]()), self._from_child)
+        self._from_child.flush()
 
     def _nothing_more(self) -> None:
         """There are no further tasks: who waits for one is told so."""
         if self._sending:
             self._sending = False
             os.close(self._turns[1])
-            os.close(self._to_child)
+            os.close(self._batches)
+            self._to_child.close()
 
     def _ended(self, patience: float) -> None:
         """Wait for its end, and bring it about when it takes too long."""
@@ -155,9 +195,16 @@ class SecondProcess:
         os.close(self._turns[0])
 
 
-def _turns(pipe: int) -> Any:
+def _turns(pipe: int) -> Iterator[int]:
     """Numbers of tasks that nobody else has, until there are no more."""
-    while number := os.read(pipe, 1):
+    while True:
+        select.select([pipe], (), ())
+        try:
+            number = os.read(pipe, 1)
+        except BlockingIOError:  # the other process has taken it
+            continue
+        if not number:
+            return
         yield number[0]
 
 

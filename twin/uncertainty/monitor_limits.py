@@ -103,10 +103,15 @@ class MonitorLimits:
             quantity: its number.
         """
         split = self.splits[estimator or BEST]
-        shares = split.after if estimator else split.before
         total = (split.sigma if estimator else split.sigma_before)[quantity] ** 2
-        found = Split.by(shares, self.stated.labels)
+        found = self._by_label[estimator]
         return sorted(((name, float(value[quantity] / total)) for name, value in found.items()), key=lambda x: -x[1])
+
+    @cached_property
+    def _by_label(self) -> Mapping[str, dict[str, np.ndarray]]:
+        """Estimator, or empty for before a measurement -> label -> (Q,) its share of the variances."""
+        shares = {"": self.splits[BEST].before, **{name: split.after for name, split in self.splits.items()}}
+        return {name: Split.by(share, self.stated.labels) for name, share in shares.items()}
 
     @cached_property
     def gain(self) -> np.ndarray:

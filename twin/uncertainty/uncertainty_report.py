@@ -38,13 +38,16 @@ RARE = 1e-3
 """Chance that a spot leaves its CCD of which a reader need not know."""
 
 
-def limits_section(limits: MonitorLimits | None, lines: int = FEW, folded: int = 3) -> Section:
+def limits_section(
+    limits: MonitorLimits | None, lines: int = FEW, folded: int = 3, figure: str | None = None
+) -> Section:
     """What limits the readings: the figure and the tables.
 
     Args:
         limits: of the instrument, None where nothing is stated to move.
         lines: motions that are named of each quantity.
         folded: how many of its three tables a reader has to ask for.
+        figure: as of ``limits_svg`` where it has been drawn already.
     """
     title = "What limits the readings"
     if limits is None:
@@ -55,18 +58,18 @@ def limits_section(limits: MonitorLimits | None, lines: int = FEW, folded: int =
             "instrument: a file of scenes/library/disturbances or one of your own."
         )
         return Section(title, (unknown,))
-    figure = SvgFigure(
+    shown = SvgFigure(
         "limits",
         "What the measurement removes, and what remains",
         f"Prior: {limits.stated.name}. Left: standard deviation of every quantity's error after the "
         "measurement over that before it. Right: whose motions make up the variance that the posterior leaves, bodies "
         "of both cameras together.",
-        _limits_svg(limits),
+        limits_svg(limits) if figure is None else figure,
     )
     text = [" ".join(map(sentence, _verdict(limits)))]
     if limits.outside > RARE:
         text.append(f"{_lost(limits)}.")
-    return Section(title, tuple(text), (figure, _remedies(limits), _hidden(limits), _ledger(limits, lines)), folded)
+    return Section(title, tuple(text), (shown, _remedies(limits), _hidden(limits), _ledger(limits, lines)), folded)
 
 
 def uncertainty_report(run: UncertaintyRun) -> Report:
@@ -344,7 +347,7 @@ PALETTE = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.PURPLE, svg.SKY, 
 MARKS = "os^vDP*X"
 
 
-def _limits_svg(limits: MonitorLimits) -> str:
+def limits_svg(limits: MonitorLimits) -> str:
     """Left, of every quantity the standard deviations of all estimators over that before the measurement; right, the
     variance that the posterior leaves by bodies.
     """

@@ -5,37 +5,46 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from scenes.yaml.errors import nearest
-from twin.validation.checks.group import CheckGroup, group_of, matches
-from twin.validation.paper_000 import equations_000, figures, suppositions, table1
-from twin.validation.paper_001 import budget_checks, formulas, joint, table2
-from twin.validation.paper_001.ranges import ranges_group
-from twin.validation.paper_003 import fields, model
-from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks
-from twin.validation.paper_017 import bundle
+from scenes.yaml.named import Named
+from twin.validation.checks.row_names import matches, names_in_files
 
-GROUPS: tuple[CheckGroup, ...] = (
-    equations_000.GROUP,
-    suppositions.SUPPOSITIONS,
-    table1.GROUP,
-    figures.GROUP,
-    suppositions.USES,
-    formulas.GROUP,
-    ranges_group.GROUP,
-    joint.GROUP,
-    table2.GROUP,
-    budget_checks.GROUP,
-    model.GROUP,
-    fields.GROUP,
-    focus_checks.GROUP,
-    equations_004.GROUP,
-    turntable_checks.GROUP,
-    distortion_checks.GROUP,
-    group_of("004.figures"),
-    bundle.GROUP,
+if TYPE_CHECKING:  # all that the checks compute with
+    from twin.validation.checks.group import CheckGroup
+
+_GROUPS = (
+    Named("twin.validation.paper_000.equations_000:GROUP"),
+    Named("twin.validation.paper_000.suppositions:SUPPOSITIONS"),
+    Named("twin.validation.paper_000.table1:GROUP"),
+    Named("twin.validation.paper_000.figures:GROUP"),
+    Named("twin.validation.paper_000.suppositions:USES"),
+    Named("twin.validation.paper_001.formulas:GROUP"),
+    Named("twin.validation.paper_001.ranges.ranges_group:GROUP"),
+    Named("twin.validation.paper_001.joint:GROUP"),
+    Named("twin.validation.paper_001.table2:GROUP"),
+    Named("twin.validation.paper_001.budget_checks:GROUP"),
+    Named("twin.validation.paper_003.model:GROUP"),
+    Named("twin.validation.paper_003.fields:GROUP"),
+    Named("twin.validation.paper_004.focus_checks:GROUP"),
+    Named("twin.validation.paper_004.equations_004:GROUP"),
+    Named("twin.validation.paper_004.turntable_checks:GROUP"),
+    Named("twin.validation.paper_004.distortion_checks:GROUP"),
+    Named("twin.validation.paper_004.equations_004:FIGURES"),
+    Named("twin.validation.paper_017.bundle:GROUP"),
 )
-"""Every group, in the order in which they run. A new one is added here."""
+"""Where each group is. A new one is added here."""
+
+GROUPS: tuple[CheckGroup, ...]
+"""Every group, in the order in which they run; imported when it is asked for."""
+
+
+def __getattr__(name: str) -> Any:
+    if name != "GROUPS":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = tuple(named.get() for named in _GROUPS)
+    return found
 
 
 class UnknownCheck(Exception):
@@ -75,19 +84,38 @@ def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, .
         UnknownCheck: there is nothing under one of them.
     """
     require_unique(groups)
-    ids = [name for group in groups for check in group.checks for name in check.names]
     if only is None:
         return tuple(Selection(group, frozenset(group.ids)) for group in groups)
-    prefixes = [part.strip() for part in only.split(",")]
-    for prefix in prefixes:
-        if not any(matches(identifier, prefix) for identifier in ids):
-            raise UnknownCheck(_unknown(prefix, ids))
+    prefixes = _known(only, [name for group in groups for check in group.checks for name in check.names])
     out = []
     for group in groups:
         chosen = frozenset(c.id for c in group.checks if any(matches(n, p) for n in c.names for p in prefixes))
         if chosen:
             out.append(Selection(group, chosen))
     return tuple(out)
+
+
+def require_known(only: str | None) -> None:
+    """Refuse what `select` would refuse, without any group where none has been imported yet.
+
+    Raises:
+        UnknownCheck: there is nothing under one of the prefixes.
+    """
+    if only is not None and "GROUPS" not in globals():
+        _known(only, names_in_files())
+
+
+def _known(only: str, ids: Sequence[str]) -> list[str]:
+    """The prefixes, all of which have ids under them.
+
+    Raises:
+        UnknownCheck: one has not.
+    """
+    prefixes = [part.strip() for part in only.split(",")]
+    for prefix in prefixes:
+        if not any(matches(identifier, prefix) for identifier in ids):
+            raise UnknownCheck(_unknown(prefix, ids))
+    return prefixes
 
 
 def _unknown(prefix: str, ids: Sequence[str]) -> str:

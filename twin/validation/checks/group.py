@@ -26,11 +26,7 @@ from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table
 from twin.validation.checks.check import Check, CheckResult
-
-
-def matches(identifier: str, prefix: str) -> bool:
-    """Whether an id lies under a prefix: ``001.table3`` takes ``001.table3.x`` and itself, but not ``001.table33``."""
-    return identifier == prefix or identifier.startswith(f"{prefix}.")
+from twin.validation.checks.row_names import FILE, FOLDER, matches
 
 
 @dataclass(eq=False)
@@ -154,9 +150,6 @@ class CheckGroup:
         return tuple(check.id for check in self.checks)
 
 
-FILE = "printed.yaml"
-"""Name of the file in each paper's folder."""
-_FOLDER = Path(__file__).parents[1]
 _Seconds = Annotated[Number, Field(gt=0.0)]
 
 
@@ -293,7 +286,7 @@ def load_printed(paper: str) -> Printed:
     Raises:
         InputError: there is no file of that paper, or it cannot be read.
     """
-    return Printed(read_yaml(_FOLDER / f"paper_{paper}" / FILE))
+    return Printed(read_yaml(FOLDER / f"paper_{paper}" / FILE))
 
 
 def group_of(prefix: str, run: Run = lambda context: ()) -> CheckGroup:

@@ -399,3 +399,5 @@ def _solutions(context: Context, places: Callable[[Array], Array], edge: float) 
 
 
 GROUP = group_of("004.equations", run)
+FIGURES = group_of("004.figures")
+"""What is printed in figures without numbers: rows that nothing can be compared with."""
