@@ -147,10 +147,7 @@ def start(backend: Backend, source: Source, chosen: np.ndarray, total: int, seed
         total: paths of the run.
         seed: of the random numbers.
     """
-    import drjit as dr
-
-    numbers = backend.UInt(np.ascontiguousarray(chosen, np.uint32))
-    dr.make_opaque(numbers)
+    numbers = backend.opaque(chosen, backend.UInt)
     if isinstance(source, DiskSource):
         return _drawn(backend, source, numbers, total, seed)
     return Launch(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from typing import Any
@@ -15,6 +15,7 @@ from twin.path_tracing.clear_ways import ClearWays
 from twin.path_tracing.families import Touch, signature, touches
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, follow
 from twin.path_tracing.path_result import Collector, Key, PathResult, event_lists
+from twin.path_tracing.sequential import Step, go_on, pass_along, steps_of
 from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
 from twin.path_tracing.source import DiskSource, Source, pieces, start
 from twin.path_tracing.tables import ROWS_PER_SURFACE, SurfaceForm, upload, way_table
@@ -153,7 +154,13 @@ def _register(variant: str) -> Callable[..., Any]:
             raise NotImplementedError(f"{NAME} follows light from its sources; call launch")
 
         def launch(
-            self, scene: PreparedScene, features: Features, start: Launch, mean_weight: float, sinks: Sinks
+            self,
+            scene: PreparedScene,
+            features: Features,
+            start: Launch,
+            mean_weight: float,
+            sinks: Sinks,
+            steps: Sequence[Step] = (),
         ) -> float:
             """Trace paths to their end and write what they meet to the sinks; returns their power at the start."""
             import drjit as dr
@@ -170,8 +177,14 @@ def _register(variant: str) -> Callable[..., Any]:
             )
             with dr.suspend_grad():
                 dr.scatter_add(sinks.left, start.weight, backend.UInt(2))
-                follow(scene, features, limits, start, sinks)
-                dr.eval(sinks.arrays)
+                left: Launch | None = start
+                if steps:
+                    stretch = pass_along(scene, features, limits, start, sinks, steps)
+                    dr.eval(sinks.arrays, stretch.arrays)
+                    left = go_on(backend, steps, stretch)
+                if left is not None:
+                    follow(scene, features, limits, left, sinks)
+                    dr.eval(sinks.arrays)
             return float(sinks.left.numpy()[2])
 
         def to_string(self) -> str:
@@ -272,14 +285,14 @@ class PathTracer:
         total = self._total(source, paths)
         features = self.features(keep)
         collector = Collector(self.scenery, self._signatures, keep)
-        prepared, way = self._on_its_way(source, toward)
+        prepared, way, steps = self._on_its_way(source, toward)
         room = max(LEAST_ROOM, min(chunk, total) // (1 if keep else 2))
         for first, count in pieces(total, chunk):
             while True:
                 sinks = self._sinks(room)
                 numbers = np.arange(first, first + count)
                 light = replace(start(self.backend, source, numbers, total, seed), way=way)
-                emitted = self.integrator.launch(prepared, features, light, 1.0 / total, sinks)
+                emitted = self.integrator.launch(prepared, features, light, 1.0 / total, sinks, steps)
                 wanted = int(sinks.counter.numpy()[0])
                 if wanted <= sinks.room:
                     break
@@ -289,13 +302,22 @@ class PathTracer:
                 progress(first + count, total)
         return collector.result(self._ways(source, collector, total, seed))
 
-    def _on_its_way(self, source: Source, toward: str | None) -> tuple[PreparedScene, Any]:
-        """The scene with the way that a source's light takes first, and its number for all paths, 0 for none."""
+    def _on_its_way(self, source: Source, toward: str | None) -> tuple[PreparedScene, Any, tuple[Step, ...]]:
+        """The scene with the way that a source's light takes first, its number for all paths, 0 for none, and the
+        surfaces that nominal light meets in their order.
+        """
         import drjit as dr
 
         way = self._clear.from_source(source.patch, toward) if isinstance(source, DiskSource) else None
         tables = replace(self.prepared.tables, ways=self.backend.opaque(way_table(self._clear.ways, way)))
-        return replace(self.prepared, tables=tables), dr.opaque(self.backend.UInt, 0 if way is None else 1)
+        line = self._clear.line(toward) if isinstance(source, DiskSource) else []
+        steps: tuple[Step, ...] = ()
+        if line and isinstance(source, DiskSource):
+            numbers = [0 if way is None else 1, *(number + 2 if number >= 0 else 0 for number, _ in line[1:])]
+            known = list(zip(numbers, (patch for _, patch in line), strict=True))
+            codes = self.nominal[toward or next(iter(self.nominal))]
+            steps = steps_of(self.scenery, known, codes, source.centre)[: self.sampling.steps - 1]
+        return replace(self.prepared, tables=tables), dr.opaque(self.backend.UInt, 0 if way is None else 1), steps
 
     def _total(self, source: Source, paths: int | None) -> int:
         if isinstance(source, DiskSource):
