@@ -121,10 +121,13 @@ class PreparedScene:
     tables: layout.SceneTables
 
 
-def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: Launch, sinks: Sinks) -> None:
+def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: Launch, sinks: Sinks) -> Any:
     """Follow all paths to their end; nothing is evaluated yet.
 
     The weight that escapes to infinity and the weight still under way at the step limit go to the sinks as well.
+
+    Returns:
+        Steps that each path has taken from its start on.
     """
     import drjit as dr
 
@@ -150,6 +153,7 @@ def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: 
     escaped = out[8] & GONE != 0
     dr.scatter_add(sinks.left, out[2], backend.UInt(0), escaped)
     dr.scatter_add(sinks.left, out[2], backend.UInt(1), ~escaped & (out[2] > 0.0))
+    return out[9]
 
 
 def _step(

@@ -17,20 +17,23 @@ import numpy as np
 
 from optics.geometry.surface import SurfaceNumbers
 from optics.materials.finish import Finish
+from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
 from twin.path_tracing import tables as layout
 from twin.path_tracing.clear_ways import Patch
-from twin.path_tracing.families import Event, decode, signature
+from twin.path_tracing.families import Event, code, decode, signature
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, choose, shares
 from twin.path_tracing.meeting import Flight, Place, locate
 from twin.path_tracing.sinks import Arrival, Sinks, record
 from twin.path_tracing.spreading import divide
+from twin.path_tracing.thinning import Thinning
 
 GROUP = 4
 """Surfaces in a row that a packet passes without asking whether any of its paths is still there."""
 
 ENDED, MISSED, TURNED = range(3)
-"""Why a path has left: it has come to the detector, it does not meet the next surface, it goes another way there."""
+"""Why a path has left: the detector has absorbed it, it does not meet the next surface as usual, it goes another way
+there or has come to the end."""
 
 WORDS = 1
 """Steps of the random generator that a float64 takes."""
@@ -46,7 +49,8 @@ class Step:
     Attributes:
         surface: its number; aperture: the one of its clear apertures that is met.
         way: number of the clear way that leads to it, as in ``tables.way_table``, 0 for none.
-        code: of the event there, 0 at the detector.
+        code: of the event there.
+        detects: whether it is the detector at the end.
         front: whether it is met from +z.
         body: number of the glass body in which the path arrives, 0 in the open.
         clearance: how far beyond it a leaving path looks for the next surface, metres.
@@ -57,6 +61,7 @@ class Step:
     aperture: int
     way: int
     code: int
+    detects: bool
     front: bool
     body: int
     clearance: float
@@ -64,9 +69,9 @@ class Step:
     finish: Finish
 
     @property
-    def event(self) -> Event | None:
-        """What happens to nominal light, None at the detector."""
-        return decode(self.code)[1] if self.code else None
+    def event(self) -> Event:
+        """What happens to nominal light, at the detector to what it does not absorb."""
+        return decode(self.code)[1]
 
     @property
     def row(self) -> int:
@@ -85,10 +90,10 @@ class Step:
         return not self.total and (f.bare or sum(share > 0.0 for share in (f.reflectance, f.transmission, f.diffuse)) > 1)
 
     @property
-    def absorbs(self) -> bool:
-        """Whether something stays here."""
+    def stays(self) -> float:
+        """Share of the light that stays here, where it does not depend on the angle."""
         f = self.finish
-        return not f.bare and f.reflectance + f.transmission + f.diffuse < 1.0
+        return 0.0 if f.bare else 1.0 - f.reflectance - f.transmission - f.diffuse
 
 
 def steps_of(
@@ -105,16 +110,18 @@ def steps_of(
     out: list[Step] = []
     bodies = layout.glass_bodies(scenery.surfaces)
     inside, before = False, source
-    for (way, end), code in zip(line, (*codes, 0), strict=True):
+    for place, (way, end) in enumerate(line):
         s = scenery.surfaces[end.surface]
+        detects = place == len(codes)
+        event = code(scenery.parts.index(s.part), Event.REFLECT) if detects else codes[place]
         front = bool((end.middle - before) @ end.normal < 0.0)
         finish = s.front if front else s.back
         body = bodies.index(s.solid) + 1 if inside and s.solid is not None else 0
         form = layout.SurfaceForm.of([s])
-        step = Step(end.surface, end.aperture, way, code, front, body, s.clearance, form, finish)
+        step = Step(end.surface, end.aperture, way, event, detects, front, body, s.clearance, form, finish)
         if layout.measured(finish) or (inside and not body) or (step.event == Event.TRANSMIT and s.solid is None):
             break
-        if not code and not (front and s.detector is not None and finish.numbers[:4] == (0.0, 0.0, 0.0, 0.0)):
+        if detects and not (front and s.detector is not None):
             break
         out.append(step)
         inside ^= step.event == Event.TRANSMIT
@@ -211,49 +218,47 @@ class _Along:
         numbers: Any = OneSurface(self.prepared, step)
         here = replace(self.prepared, tables=numbers)
         at, arrives = self._meet(place, numbers, p, d, on)
-        why = dr.select(on & ~arrives, MISSED, why)
         before = at.row[layout.INDEX] if step.body else backend.Float(1.0)
         q, longer = dr.fma(d, at.distance, p), dr.fma(at.distance, before, length)
         known = replace(features, bare=step.finish.bare and not step.total, measured=False)
         inside = backend.Bool(step.body > 0)
         shared = shares(here, known, backend.UInt(step.row), arrives, at, inside, before)
-        stays = shared.stays(weight)
-        row = backend.UInt(step.row)
-        if step.event is None:
-            dr.scatter_add(self.sinks.absorbed, stays, row, arrives)
+        drawn = type(rng)(rng)
+        drawn.state = words
+        onward, follows = weight * shared.going_on, backend.Bool(True)
+        usual = follows
+        if features.branching:
+            if step.chooses:
+                drawn.state, pending = _ahead(drawn.state, rng.inc, pending), 0
+                chosen = choose(shared, weight, self.limits.floors[0], drawn, arrives)
+                onward, usual = chosen.weight, ~chosen.unlikely
+                follows = chosen.through if step.event == Event.TRANSMIT else chosen.reflecting
+            else:
+                pending += WORDS
+            if step.finish.scatter is not None:
+                drawn.state, pending = _ahead(drawn.state, rng.inc, pending), 0
+                floor = self.limits.scatter_floors[0]
+                scattering, onward = divide(drawn, arrives, arrives & follows, shared.scattered, floor, onward)
+                follows = follows & ~scattering
+            else:
+                pending += WORDS
+        usual = usual & (onward > 0.0)
+        if features.roulette:
+            usual = usual & (onward >= self.limits.weak)
+        ends = step.detects and step.stays == 1.0
+        goes = arrives if ends else arrives & follows & usual
+        stays, row = shared.stays(weight), backend.UInt(step.row)
+        if step.stays > 0.0:
+            dr.scatter_add(self.sinks.absorbed, stays, row, goes)
+        if step.detects:
             so_far = dr.uint64_array_t(backend.Float)(signature(s.code for s in self.steps[:place]))
             arrival = Arrival(at.x, at.y, stays, longer, so_far, backend.Bool(False), self.path)
-            record(
-                backend, self.prepared.tables, self.sinks, self.limits.room, at.kind, arrives, arrival, features.keep_nominal
-            )
-            return (p, d, weight, length, words, passed, dr.select(arrives, ENDED, why), on & False), pending
-        onward, goes, drawn = weight * shared.going_on, arrives, type(rng)(rng)
-        drawn.state = words
-        scatters = step.finish.scatter is not None
-        if features.branching:
-            if step.chooses or scatters:
-                drawn.state = _ahead(words, rng.inc, pending)
-                pending = 0
-            if step.chooses:
-                chosen = choose(shared, weight, self.limits.floors[0], drawn, arrives)
-                goes = goes & (chosen.through if step.event == Event.TRANSMIT else chosen.reflecting) & ~chosen.unlikely
-                onward = chosen.weight
-            else:
-                pending += WORDS
-            if scatters:
-                if not step.chooses:
-                    drawn.state = _ahead(drawn.state, rng.inc, pending)
-                    pending = 0
-                floor = self.limits.scatter_floors[0]
-                scattering, onward = divide(drawn, arrives, goes, shared.scattered, floor, onward)
-                goes = goes & ~scattering
-            else:
-                pending += WORDS
-        goes = goes & (onward > 0.0)
-        if features.roulette:
-            goes = goes & (onward >= self.limits.weak)
-        if step.absorbs:
-            dr.scatter_add(self.sinks.absorbed, stays, row, goes)
+            tables, room = self.prepared.tables, self.limits.room
+            record(backend, tables, self.sinks, room, at.kind, goes, arrival, features.keep_nominal)
+        # the loop decides what becomes of a path that is not as usual
+        why = dr.select(on & ~goes & ~(arrives & ~follows), MISSED, why)
+        if ends:
+            return (p, d, weight, length, words, passed, dr.select(goes, ENDED, why), goes & False), pending
         turned = dr.fma(at.normal, -2.0 * at.cosine, d)
         if step.event == Event.TRANSMIT:
             bent = dr.copysign(shared.bent, at.cosine)
@@ -351,22 +356,57 @@ class OneSurface:
         return self.prepared.backend.Float(float(value))
 
 
-def go_on(backend: Any, steps: Sequence[Step], stretch: Stretch) -> Launch | None:
-    """The paths that are not at their end, those beside each other that do alike; None where there is none.
+@dataclass(frozen=True, eq=False)
+class Left:
+    """Paths that have left the nominal way, those beside each other that do alike.
 
-    The stretch is evaluated.
+    Attributes:
+        passed: surfaces passed by each path of the launch, (N,).
+        turned: whether it turned away there, (N,).
+        chosen: places in the launch of the paths that go on.
+        chances: with which they were chosen.
     """
+
+    passed: np.ndarray
+    turned: np.ndarray
+    chosen: np.ndarray
+    chances: np.ndarray
+
+    @classmethod
+    def of(
+        cls, steps: Sequence[Step], stretch: Stretch, numbers: np.ndarray, thinning: Thinning | None, again: bool
+    ) -> Left:
+        """Choose among the paths of a stretch that is evaluated.
+
+        Args:
+            steps: of the nominal way.
+            stretch: the paths.
+            numbers: of the paths in the run, (N,).
+            thinning: how many are followed, None for all.
+            again: they are known to be followed.
+        """
+        passed, why = stretch.passed.numpy(), stretch.why.numpy()
+        # at the end of a way that does not end at a detector nothing has turned away
+        turned = (why == TURNED) & ((passed < len(steps)) | steps[-1].detects)
+        left = np.flatnonzero(why != ENDED)
+        chances = np.ones(len(left))
+        if thinning is not None:
+            chances = thinning.chances(numbers[left], passed[left], turned[left])
+            if not again:
+                kept = thinning.follows(numbers[left], chances)
+                left, chances = left[kept], chances[kept]
+        order = np.argsort((passed[left] * (TURNED + 1) + why[left]).astype(np.uint16), kind="stable")
+        return cls(passed, turned, left[order], chances[order])
+
+
+def go_on(backend: Backend, steps: Sequence[Step], stretch: Stretch, left: Left) -> Launch:
+    """The chosen paths where they have left the nominal way."""
     import drjit as dr
 
     launch = stretch.launch
     Float, UInt = backend.Float, backend.UInt
     UInt64 = dr.uint64_array_t(Float)
-    passed, why = stretch.passed.numpy(), stretch.why.numpy()
-    left = np.flatnonzero(why != ENDED)
-    if not len(left):
-        return None
-    order = np.argsort((passed[left] * (TURNED + 1) + why[left]).astype(np.uint16), kind="stable")
-    chosen = backend.opaque(left[order], UInt)
+    chosen = backend.opaque(left.chosen, UInt)
     place = dr.gather(UInt, stretch.passed, chosen)
 
     def by_place(kind: Any, values: Sequence[Any]) -> Any:
@@ -377,9 +417,9 @@ def go_on(backend: Any, steps: Sequence[Step], stretch: Stretch) -> Launch | Non
     factor, shift = (by_place(UInt64, [jump[k] for jump in jumps]) for k in range(2))
     rng = dr.gather(type(launch.rng), launch.rng, chosen)
     rng.state = rng.state * factor + rng.inc * shift
-    out = Launch(
+    return Launch(
         *(dr.gather(backend.Vector3, value, chosen) for value in (launch.position, launch.direction)),
-        dr.gather(Float, launch.weight, chosen),
+        dr.gather(Float, launch.weight, chosen) / backend.opaque(left.chances),
         dr.gather(UInt, launch.path, chosen),
         rng,
         dr.select(dr.gather(UInt, stretch.why, chosen) == TURNED, by_place(UInt, [*(s.way for s in steps), 0]), 0),
@@ -389,4 +429,3 @@ def go_on(backend: Any, steps: Sequence[Step], stretch: Stretch) -> Launch | Non
         by_place(UInt64, [signature(codes[:k]) for k in range(len(steps) + 1)]),
         place,
     )
-    return out

@@ -197,7 +197,8 @@ def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed:
     return Launch(position, direction, weight, numbers, rng)
 
 
-def pieces(total: int, size: int) -> Iterator[tuple[int, int]]:
-    """First number and count of launches of at most ``size`` paths."""
-    for first in range(0, total, size):
-        yield first, min(size, total - first)
+def pieces(total: int, size: int, cut: int = 0) -> Iterator[tuple[int, int]]:
+    """First number and count of launches of at most ``size`` paths, of which none goes across ``cut``."""
+    for begin, end in ((0, cut), (cut, total)):
+        for first in range(begin, end, size):
+            yield first, min(size, end - first)
