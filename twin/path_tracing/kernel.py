@@ -3,8 +3,9 @@
 In each step a path flies to the next surface (``meeting``), the surface shares its light out, and the path goes one of
 the ways that there are. Neighbouring paths are worked on together, in packets of the machine's vectors. A packet takes
 as long as its longest path, and all that any of its paths needs: what only some surfaces need (Newton's method,
-Fresnel's formulas, a lobe, a detector) is computed by packets that need it. Sources let neighbours start alike. Moving
-the paths that go on together after some steps gains a tenth more where light scatters and costs as much where not.
+Fresnel's formulas, a lobe, a detector) is computed by packets that need it. Sources let neighbours start alike, and
+paths that leave nominal light (``sequential``) are put beside those that do alike. Putting them together once more,
+after four more steps, would leave 9 percent fewer steps of packets and take as long as it saves, as measured.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """The way of nominal light, surface by surface in the known order: no loop, no search, and no table that paths read.
 
-Most paths of a source follow its nominal family for many surfaces. On clear ways the surface that comes next is known,
-and so are the side that is met, the glass, and the finish: all paths are computed with the same few numbers, which the
-kernel reads once. A path ends here before the first surface where it does anything else: where it misses the clear
-aperture, goes another way, is scattered, or is weak enough for roulette. It is as it was when it left the surface before,
-its random numbers included; ``kernel.follow`` takes it up there. So paths are the same with and without this part.
+Most paths of a source follow its nominal family for many surfaces. There the surface that comes next is known, and so
+are the side that is met, the glass, and the finish: all paths are computed with the same few numbers, which the kernel
+reads once. A path leaves before the first surface where it does anything else: where it misses the clear aperture,
+goes another way, is scattered, or is weak enough for roulette. It is as it was when it left the surface before, its
+random numbers included; ``kernel.follow`` takes it up there, beside paths that do alike. So paths are the same with
+and without this part.
 """
 
 from __future__ import annotations
@@ -87,7 +88,9 @@ class Step:
     def chooses(self) -> bool:
         """Whether light that goes on can go more than one way."""
         f = self.finish
-        return not self.total and (f.bare or sum(share > 0.0 for share in (f.reflectance, f.transmission, f.diffuse)) > 1)
+        return not self.total and (
+            f.bare or sum(share > 0.0 for share in (f.reflectance, f.transmission, f.diffuse)) > 1
+        )
 
     @property
     def stays(self) -> float:
@@ -184,7 +187,9 @@ def pass_along(
     p, d, weight, length, words, passed, why, _ = state
     rng = type(launch.rng)(launch.rng)
     rng.state = words
-    return Stretch(replace(launch, position=p, direction=d, weight=weight, length=length, rng=rng), passed, why, tuple(draws))
+    return Stretch(
+        replace(launch, position=p, direction=d, weight=weight, length=length, rng=rng), passed, why, tuple(draws)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,14 +234,14 @@ class _Along:
         usual = follows
         if features.branching:
             if step.chooses:
-                drawn.state, pending = _ahead(drawn.state, rng.inc, pending), 0
+                drawn.state, pending = advanced(drawn.state, rng.inc, pending), 0
                 chosen = choose(shared, weight, self.limits.floors[0], drawn, arrives)
                 onward, usual = chosen.weight, ~chosen.unlikely
                 follows = chosen.through if step.event == Event.TRANSMIT else chosen.reflecting
             else:
                 pending += WORDS
             if step.finish.scatter is not None:
-                drawn.state, pending = _ahead(drawn.state, rng.inc, pending), 0
+                drawn.state, pending = advanced(drawn.state, rng.inc, pending), 0
                 floor = self.limits.scatter_floors[0]
                 scattering, onward = divide(drawn, arrives, arrives & follows, shared.scattered, floor, onward)
                 follows = follows & ~scattering
@@ -267,7 +272,7 @@ class _Along:
         new = (dr.select(goes, a, b) for a, b in zip(after, (p, d, weight, length, words, passed), strict=True))
         return (*new, why, goes), pending
 
-    def _meet(self, place: int, numbers: OneSurface, p: Any, d: Any, on: Any) -> tuple[Place, Any]:
+    def _meet(self, place: int, numbers: Any, p: Any, d: Any, on: Any) -> tuple[Place, Any]:
         """Where paths meet the surface of a step, and which of them meet it as nominal light does."""
         import drjit as dr
 
@@ -290,7 +295,7 @@ class _Along:
         return at, there & (at.cosine < 0.0 if step.front else at.cosine >= 0.0)
 
 
-def _ahead(words: Any, increment: Any, steps: int) -> Any:
+def advanced(words: Any, increment: Any, steps: int) -> Any:
     """State of a random generator some steps later."""
     factor, shift = _jump(steps)
     kind = type(words)
@@ -388,15 +393,17 @@ class Left:
         passed, why = stretch.passed.numpy(), stretch.why.numpy()
         # at the end of a way that does not end at a detector nothing has turned away
         turned = (why == TURNED) & ((passed < len(steps)) | steps[-1].detects)
-        left = np.flatnonzero(why != ENDED)
-        chances = np.ones(len(left))
+        goes_on, chances = why != ENDED, np.ones(len(why))
         if thinning is not None:
-            chances = thinning.chances(numbers[left], passed[left], turned[left])
+            some = np.flatnonzero(turned)
+            chances[some] = thinning.chances(numbers[some], passed[some])
             if not again:
-                kept = thinning.follows(numbers[left], chances)
-                left, chances = left[kept], chances[kept]
+                goes_on[some] = thinning.follows(numbers[some], chances[some])
+        left = np.flatnonzero(goes_on)
+        # sorting 16 bits takes no comparisons
         order = np.argsort((passed[left] * (TURNED + 1) + why[left]).astype(np.uint16), kind="stable")
-        return cls(passed, turned, left[order], chances[order])
+        chosen = left[order]
+        return cls(passed, turned, chosen, chances[chosen])
 
 
 def go_on(backend: Backend, steps: Sequence[Step], stretch: Stretch, left: Left) -> Launch:
@@ -418,7 +425,8 @@ def go_on(backend: Backend, steps: Sequence[Step], stretch: Stretch, left: Left)
     rng = dr.gather(type(launch.rng), launch.rng, chosen)
     rng.state = rng.state * factor + rng.inc * shift
     return Launch(
-        *(dr.gather(backend.Vector3, value, chosen) for value in (launch.position, launch.direction)),
+        dr.gather(backend.Vector3, launch.position, chosen),
+        dr.gather(backend.Vector3, launch.direction, chosen),
         dr.gather(Float, launch.weight, chosen) / backend.opaque(left.chances),
         dr.gather(UInt, launch.path, chosen),
         rng,

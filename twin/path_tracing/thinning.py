@@ -2,10 +2,10 @@
 
 Paths that turn away at the same place of the nominal way form a class. Some classes bring light to the detectors, such
 as reflections inside a prism; others bring none, and may be long. With v the sum of the squared weights that a class
-brings and c the surfaces that it meets, the variance of a run in a given time is least where each class is followed with
-a probability that goes as sqrt(v / c) (Neyman, 1934, for strata of unequal costs). Those that go on carry more weight,
-so that all sums stay the same on average. Paths that miss a surface of the nominal way are all followed: they carry most
-of the light, and are short.
+brings and c the surfaces that it meets, the variance of a run in a given time is least where each class is followed
+with a probability that goes as sqrt(v / c) (Neyman, 1934, for strata of unequal costs). Those that go on carry more
+weight, so that all sums stay the same on average. Paths that miss a surface of the nominal way are all followed: they
+carry most of the light, and are short.
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ class Thinning:
     first: int
     seed: int
 
-    def chances(self, numbers: np.ndarray, passed: np.ndarray, turned: np.ndarray) -> np.ndarray:
-        """Probability of following each path, by its number, the surfaces passed and whether it turns away there."""
-        return np.where(turned & (numbers >= self.first), self.kept[passed], 1.0)
+    def chances(self, numbers: np.ndarray, passed: np.ndarray) -> np.ndarray:
+        """Probability of following each path that turns away, by its number and the surfaces passed."""
+        known = np.minimum(passed, len(self.kept) - 1)
+        return np.where((numbers < self.first) | (passed >= len(self.kept)), 1.0, self.kept[known])
 
     def follows(self, numbers: np.ndarray, chances: np.ndarray) -> np.ndarray:
         """Draw which paths are followed."""

@@ -232,6 +232,9 @@ CHUNK = 1 << 20
 """Paths of one launch: about 200 MB at work."""
 
 LEAST_ROOM = 1 << 14
+LEAST_ALONG = 1 << 16
+"""Paths of a run from which on they take the nominal way surface by surface: so many win the time that its kernel takes
+to be recorded, as measured. Fewer go through the loop alone; the paths are the same."""
 MOST_FAMILIES = 200
 """Families whose ways are looked up, the strongest first."""
 
@@ -312,7 +315,8 @@ class PathTracer:
         total = self._total(source, paths)
         features = self.features(keep)
         collector = Collector(self.scenery, self._signatures, keep)
-        prepared, way, steps = self._on_its_way(source, toward)
+        prepared, way = self._on_its_way(source, toward)
+        steps = self.nominal_steps(source, toward, total)
         room = max(LEAST_ROOM, min(chunk, total) // (1 if keep else 2))
         learning = round(total * self.sampling.first) if steps else 0
         thinning: Thinning | None = None
@@ -337,22 +341,31 @@ class PathTracer:
                 progress(first + count, total)
         return collector.result(self._ways(source, collector, total, seed, toward, thinning))
 
-    def _on_its_way(self, source: Source, toward: str | None) -> tuple[PreparedScene, Any, tuple[Step, ...]]:
-        """The scene with the way that a source's light takes first, its number for all paths, 0 for none, and the
-        surfaces that nominal light meets in their order.
+    def nominal_steps(self, source: Source, toward: str | None, paths: int) -> tuple[Step, ...]:
+        """Surfaces that nominal light of a source meets and that the paths of a run take in this order.
+
+        Args:
+            source: where they start.
+            toward: as of ``run``.
+            paths: of the run.
         """
+        line = self._clear.line(toward) if paths >= LEAST_ALONG else []
+        if not line or not isinstance(source, DiskSource):
+            return ()
+        way = self._clear.from_source(source.patch, toward)
+        numbers = [0 if way is None else 1, *(number + 2 if number >= 0 else 0 for number, _ in line[1:])]
+        known = list(zip(numbers, (patch for _, patch in line), strict=True))
+        codes = self.nominal[toward or next(iter(self.nominal))]
+        # the last step belongs to the loop, which ends paths there
+        return steps_of(self.scenery, known, codes, source.centre)[: self.sampling.steps - 1]
+
+    def _on_its_way(self, source: Source, toward: str | None) -> tuple[PreparedScene, Any]:
+        """The scene with the way that a source's light takes first, and its number for all paths, 0 for none."""
         import drjit as dr
 
         way = self._clear.from_source(source.patch, toward) if isinstance(source, DiskSource) else None
         tables = replace(self.prepared.tables, ways=self.backend.opaque(way_table(self._clear.ways, way)))
-        line = self._clear.line(toward) if isinstance(source, DiskSource) else []
-        steps: tuple[Step, ...] = ()
-        if line and isinstance(source, DiskSource):
-            numbers = [0 if way is None else 1, *(number + 2 if number >= 0 else 0 for number, _ in line[1:])]
-            known = list(zip(numbers, (patch for _, patch in line), strict=True))
-            codes = self.nominal[toward or next(iter(self.nominal))]
-            steps = steps_of(self.scenery, known, codes, source.centre)[: self.sampling.steps - 1]
-        return replace(self.prepared, tables=tables), dr.opaque(self.backend.UInt, 0 if way is None else 1), steps
+        return replace(self.prepared, tables=tables), dr.opaque(self.backend.UInt, 0 if way is None else 1)
 
     def _total(self, source: Source, paths: int | None) -> int:
         if isinstance(source, DiskSource):
@@ -411,7 +424,8 @@ class PathTracer:
         import drjit as dr
 
         count, most = len(numbers), self.sampling.steps
-        prepared, way, steps = self._on_its_way(source, toward)
+        prepared, way = self._on_its_way(source, toward)
+        steps = self.nominal_steps(source, toward, total)
         # each path has its own part of the log, whatever its number in the run
         own = dr.arange(self.backend.UInt, count)
         light = replace(start(self.backend, source, numbers, total, seed), path=own, way=way)
