@@ -4,7 +4,9 @@ of the loop with its search, one by one, and sums stay the same on average.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,12 +93,17 @@ def test_a_generator_jumps_over_numbers(backend, count: int) -> None:
     np.testing.assert_array_equal(rng.next_float64().numpy(), jumped.next_float64().numpy())
 
 
-def stray(backend, instrument, sampling: Sampling, paths: int, seed: int, **options) -> tuple[PathResult, str]:
-    scenery = build_scenery(instrument, {})
-    channel = instrument.channels[0]
-    toward = f"{channel.key}/area_ccd"
-    tracer = PathTracer(backend, scenery, monitor_families(scenery, instrument), sampling)
-    return tracer.run(pinhole(instrument, backend, {}, channel), paths, seed, toward=toward, **options), toward
+@pytest.fixture(scope="module")
+def stray(backend, gf7_pair) -> Callable[..., PathResult]:
+    """Runs with a sampling of the light of the first channel."""
+    scenery, channel = build_scenery(gf7_pair, {}), gf7_pair.channels[0]
+    families, source = monitor_families(scenery, gf7_pair), pinhole(gf7_pair, backend, {}, channel)
+    tracers = {sampling: PathTracer(backend, scenery, families, sampling) for sampling in (ALL, FAINT)}
+
+    def run(sampling: Sampling, paths: int, seed: int, **options: Any) -> PathResult:
+        return tracers[sampling].run(source, paths, seed, toward=f"{channel.key}/area_ccd", **options)
+
+    return run
 
 
 def weights(run: PathResult) -> dict[tuple[int, int, int], float]:
@@ -106,10 +113,10 @@ def weights(run: PathResult) -> dict[tuple[int, int, int], float]:
     return dict(zip(keys, d.weight.tolist(), strict=True))
 
 
-def test_thinning_keeps_the_light_and_takes_away_paths(backend, gf7_pair) -> None:
+def test_thinning_keeps_the_light_and_takes_away_paths(gf7_pair, stray) -> None:
     """Families of the same seeds: what both runs follow is the same, and the rest agrees within its standard error."""
-    paths = 4 * PATHS
-    (all_of_them, toward), (thinned, _) = (stray(backend, gf7_pair, s, paths, 1, keep=True) for s in (ALL, FAINT))
+    paths, toward = 4 * PATHS, f"{gf7_pair.channels[0].key}/area_ccd"
+    all_of_them, thinned = (stray(sampling, paths, 1, keep=True) for sampling in (ALL, FAINT))
     found = [weights(run) for run in (all_of_them, thinned)]
     both = found[0].keys() & found[1].keys()
     gain = np.array([found[1][key] / found[0][key] for key in both])
@@ -134,13 +141,13 @@ def test_thinning_keeps_the_light_and_takes_away_paths(backend, gf7_pair) -> Non
     assert thinned.balance.error == pytest.approx(0.0, abs=0.01)
     # other seeds are independent: all light beside nominal, on all detectors
     seeds = range(10, 16)
-    runs = [[sum(light(stray(backend, gf7_pair, s, PATHS, k)[0], "ghost")[:1]) for k in seeds] for s in (ALL, FAINT)]
+    runs = [[light(stray(sampling, PATHS, seed), "ghost")[0] for seed in seeds] for sampling in (ALL, FAINT)]
     spread = np.hypot(*(np.std(some, ddof=1) / np.sqrt(len(some)) for some in runs))
     assert abs(np.mean(runs[0]) - np.mean(runs[1])) < 4.0 * spread
 
 
-def test_thinned_paths_do_not_depend_on_the_chunk_and_are_found_again(backend, gf7_pair) -> None:
-    runs = [stray(backend, gf7_pair, FAINT, 2 * PATHS, 3, chunk=chunk)[0] for chunk in (1 << 20, 5000)]
+def test_thinned_paths_do_not_depend_on_the_chunk_and_are_found_again(stray) -> None:
+    runs = [stray(FAINT, 2 * PATHS, 3, chunk=chunk) for chunk in (1 << 20, 5000)]
     named = [{(f.detector, f.kind, f.touches): (f.count, f.energy) for f in run.families} for run in runs]
     assert named[0].keys() == named[1].keys()
     assert all(touches for _, _, touches in named[0])

@@ -228,7 +228,7 @@ def make_integrator(backend: Backend, sampling: Sampling) -> Any:
     return mi.load_dict({"type": NAME, **{name: n for name, n in asdict(sampling).items() if n is not None}})
 
 
-CHUNK = 1 << 20
+CHUNK = 1 << 19
 """Paths of one launch: about 200 MB at work."""
 
 LEAST_ROOM = 1 << 14
