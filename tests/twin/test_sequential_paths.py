@@ -53,6 +53,26 @@ def test_paths_along_nominal_light_are_those_of_a_search(backend, instrument, na
     assert [f.touches for f in runs[0].families] == [f.touches for f in runs[1].families]
 
 
+@pytest.mark.parametrize(
+    "sampling", [replace(ALL, roulette=0.2), Sampling(floor=0.999, second=0.5)], ids=["weak", "unlikely"]
+)
+def test_what_is_not_as_usual_on_nominal_light_is_left_to_the_loop(backend, gf7_pair, sampling: Sampling) -> None:
+    """Roulette among paths on their nominal way; nominal light that a floor makes likelier than it is."""
+    scenery, channel = build_scenery(gf7_pair, {}), gf7_pair.channels[0]
+    families, toward = monitor_families(scenery, gf7_pair), f"{channel.key}/area_ccd"
+    source = pinhole(gf7_pair, backend, {}, channel)
+    runs = [
+        PathTracer(backend, scenery, families, sampling, ways).run(source, PATHS, 4, keep=True, toward=toward)
+        for ways in (True, False)
+    ]
+    nominal = runs[0].nominal(toward)
+    assert nominal.count > 50
+    if sampling.roulette:
+        # without roulette these paths have a third of this weight
+        assert nominal.energy / nominal.count > 0.7 * sampling.roulette / PATHS
+    same(*runs)
+
+
 def test_paths_whose_first_surface_is_searched_are_those_of_a_search(backend, gf7_pair) -> None:
     """Prisms stand in the beam of a far point; all of the light ends on the focal plane, which absorbs it."""
     scenery = build_scenery(gf7_pair, {}, IDEAL, whole_focal_planes=True)
