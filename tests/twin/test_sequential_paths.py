@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion
-from scenes.models.scenery import build_scenery
+from optics.materials.finish import CoatingTable, Finish
+from scenes.models.scenery import Scenery, build_scenery
 from tests.twin.path_bench import IDEAL, scene_beam
 from tests.twin.test_clear_ways import same
 from twin.path_tracing.families import Event, nominal_codes
@@ -85,6 +86,44 @@ def test_paths_whose_first_surface_is_searched_are_those_of_a_search(backend, gf
     runs = [tracer.run(source, PATHS, 2, keep=True) for tracer in tracers]
     assert 0.8 * PATHS < runs[0].nominal(detector).count < PATHS
     same(*runs)
+
+
+@pytest.mark.parametrize(
+    ("metal", "steps"),
+    [
+        (Finish(reflectance=0.6, transmission=0.3), 26),  # what is not reflected totally there is left to the loop
+        (Finish(reflectance=0.5, diffuse=0.4), 26),
+        (Finish(transmission=0.9), 12),  # the central prism is met from outside
+        (Finish(diffuse=0.9), 4),  # no light is reflected
+        (Finish(reflectance=0.9, coating=CoatingTable(np.array([0.0, 1.0]), np.array([0.9, 0.8]))), 4),
+    ],
+    ids=["splitter", "matt", "glass", "white", "measured"],
+)
+def test_paths_at_other_finishes_of_glass_are_those_of_a_search(backend, gf7_pair, metal: Finish, steps: int) -> None:
+    """The fifth surface of nominal light is the mirror of a prism."""
+    scenery, channel = build_scenery(gf7_pair, {}, replace(IDEAL, metallised=metal)), gf7_pair.channels[0]
+    families, toward = monitor_families(scenery, gf7_pair), f"{channel.key}/area_ccd"
+    source = pinhole(gf7_pair, backend, {}, channel)
+    tracers = [PathTracer(backend, scenery, families, ways=ways) for ways in (True, False)]
+    assert len(tracers[0].nominal_steps(source, toward, PATHS)) == steps
+    same(*(tracer.run(source, PATHS, 4, keep=True, toward=toward) for tracer in tracers))
+
+
+def test_light_that_is_not_reflected_totally_is_left_to_the_loop(backend, gf7_pair) -> None:
+    """Glass of so low an index that its mirrors, which let light through, are met below the critical angle."""
+    finishes = replace(IDEAL, metallised=Finish(reflectance=0.6, transmission=0.3))
+    made = build_scenery(gf7_pair, {}, finishes)
+    thin = [replace(s, index=1.3) if s.index > 1.0 else s for s in made.surfaces]
+    scenery, channel = Scenery(tuple(thin), made.detectors), gf7_pair.channels[0]
+    families, toward = monitor_families(scenery, gf7_pair), f"{channel.key}/area_ccd"
+    source = pinhole(gf7_pair, backend, {}, channel)
+    tracers = [PathTracer(backend, scenery, families, ways=ways) for ways in (True, False)]
+    mirror = tracers[0].nominal_steps(source, toward, PATHS)[4]
+    assert mirror.total
+    runs = [tracer.run(source, PATHS, 4, keep=True, toward=toward) for tracer in tracers]
+    same(*runs)
+    part = scenery.surfaces[mirror.surface].part
+    assert runs[0].balance.absorbed[part] > 1e-3  # of total reflection nothing would stay
 
 
 def test_steps_say_what_nominal_light_does(backend, gf7_pair) -> None:

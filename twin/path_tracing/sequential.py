@@ -53,7 +53,7 @@ class Step:
         code: of the event there.
         detects: whether it is the detector at the end.
         front: whether it is met from +z.
-        body: number of the glass body in which the path arrives, 0 in the open.
+        body: number of the glass body in which the path arrives, 0 in the open; after: in which it leaves.
         clearance: how far beyond it a leaving path looks for the next surface, metres.
         form: its shape; finish: on the side that is met.
     """
@@ -65,6 +65,7 @@ class Step:
     detects: bool
     front: bool
     body: int
+    after: int
     clearance: float
     form: layout.SurfaceForm
     finish: Finish
@@ -88,15 +89,28 @@ class Step:
     def chooses(self) -> bool:
         """Whether light that goes on can go more than one way."""
         f = self.finish
-        return not self.total and (
-            f.bare or sum(share > 0.0 for share in (f.reflectance, f.transmission, f.diffuse)) > 1
-        )
+        ways = sum(share > 0.0 for share in (f.reflectance, f.transmission, f.diffuse))
+        return not self.total and (f.bare or ways > 1)
 
     @property
     def stays(self) -> float:
-        """Share of the light that stays here, where it does not depend on the angle."""
+        """Share of the light that stays here, where it does not depend on the angle; below a rounding nothing does."""
         f = self.finish
-        return 0.0 if f.bare else 1.0 - f.reflectance - f.transmission - f.diffuse
+        share = 0.0 if f.bare else 1.0 - f.reflectance - f.transmission - f.diffuse
+        return share if share > 1e-15 else 0.0
+
+    @property
+    def ends(self) -> bool:
+        """Whether no light goes on."""
+        return self.stays == 1.0
+
+    @property
+    def known(self) -> bool:
+        """Whether the finish lets nominal light do what it does, without a table."""
+        f = self.finish
+        share = f.transmission if self.event == Event.TRANSMIT else f.reflectance
+        possible = (self.total and not f.diffuse) or f.bare or share > 0.0 or (self.detects and self.ends)
+        return possible and not layout.measured(f)
 
 
 def steps_of(
@@ -112,23 +126,28 @@ def steps_of(
     """
     out: list[Step] = []
     bodies = layout.glass_bodies(scenery.surfaces)
-    inside, before = False, source
+    glass: str | None = None
+    before = source
     for place, (way, end) in enumerate(line):
         s = scenery.surfaces[end.surface]
         detects = place == len(codes)
         event = code(scenery.parts.index(s.part), Event.REFLECT) if detects else codes[place]
         front = bool((end.middle - before) @ end.normal < 0.0)
         finish = s.front if front else s.back
-        body = bodies.index(s.solid) + 1 if inside and s.solid is not None else 0
+        body = 0 if glass is None else bodies.index(glass) + 1
         form = layout.SurfaceForm.of([s])
-        step = Step(end.surface, end.aperture, way, event, detects, front, body, s.clearance, form, finish)
-        if layout.measured(finish) or (inside and not body) or (step.event == Event.TRANSMIT and s.solid is None):
+        through = decode(event)[1] == Event.TRANSMIT
+        onward = (None if glass is not None else s.solid) if through else glass
+        after = 0 if onward is None else bodies.index(onward) + 1
+        step = Step(end.surface, end.aperture, way, event, detects, front, body, after, s.clearance, form, finish)
+        # light in glass stays there up to one of its faces, all ways inside are clear, and glass is met from its front
+        sound = (s.solid == glass and way > 0) if glass is not None else (s.solid is None or front)
+        if not sound or not step.known or (through and s.solid is None):
             break
         if detects and not (front and s.detector is not None):
             break
         out.append(step)
-        inside ^= step.event == Event.TRANSMIT
-        before = end.middle
+        glass, before = onward, end.middle
     return tuple(out)
 
 
@@ -248,10 +267,11 @@ class _Along:
             else:
                 pending += WORDS
         usual = usual & (onward > 0.0)
+        if step.total:
+            usual = usual & (shared.bent <= 0.0)
         if features.roulette:
             usual = usual & (onward >= self.limits.weak)
-        ends = step.detects and step.stays == 1.0
-        goes = arrives if ends else arrives & follows & usual
+        goes = arrives if step.ends else arrives & follows & usual
         stays, row = shared.stays(weight), backend.UInt(step.row)
         if step.stays > 0.0:
             dr.scatter_add(self.sinks.absorbed, stays, row, goes)
@@ -262,7 +282,7 @@ class _Along:
             record(backend, tables, self.sinks, room, at.kind, goes, arrival, features.keep_nominal)
         # the loop decides what becomes of a path that is not as usual
         why = dr.select(on & ~goes & ~(arrives & ~follows), MISSED, why)
-        if ends:
+        if step.ends:
             return (p, d, weight, length, words, passed, dr.select(goes, ENDED, why), goes & False), pending
         turned = dr.fma(at.normal, -2.0 * at.cosine, d)
         if step.event == Event.TRANSMIT:
@@ -432,7 +452,7 @@ def go_on(backend: Backend, steps: Sequence[Step], stretch: Stretch, left: Left)
         rng,
         dr.select(dr.gather(UInt, stretch.why, chosen) == TURNED, by_place(UInt, [*(s.way for s in steps), 0]), 0),
         dr.gather(Float, launch.length, chosen),
-        by_place(UInt, [*(s.body for s in steps), 0]),
+        by_place(UInt, [0, *(s.after for s in steps)]),
         by_place(Float, [0.0, *(s.clearance for s in steps)]),
         by_place(UInt64, [signature(codes[:k]) for k in range(len(steps) + 1)]),
         place,
