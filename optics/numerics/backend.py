@@ -37,15 +37,16 @@ class Backend:
     Bool: Any
     Vector3: Any
 
-    def opaque(self, values: Any) -> Any:
-        """Upload numbers as kernel *inputs*: n numbers of any shape -> ``Float`` of width n.
+    def opaque(self, values: Any, kind: Any = None) -> Any:
+        """Upload numbers as kernel *inputs*: n numbers of any shape -> array of width n, by default a ``Float``.
 
         A Python float used directly would be compiled into the kernel as a literal, and each new value would compile a
         new kernel.
         """
         import drjit as dr
 
-        array = self.Float(_aligned(np.asarray(values, dtype=np.float64)))
+        kind = self.Float if kind is None else kind
+        array = kind(_aligned(np.asarray(values, dtype=dr.type_v(kind).name.lower())))
         dr.make_opaque(array)
         return array
 

@@ -9,7 +9,7 @@ misses them. This decides the time that a path takes, and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -114,24 +114,33 @@ class ClearWays:
             if part in met:
                 patches[part] += _patches(number, surface)
         self._obstacles = _Obstacles(surfaces)
-        self._first: dict[str, tuple[int, Patch]] = {}
+        self._lines: dict[str, list[tuple[int, Patch]]] = {}
         self.ways: list[Way] = []
         for name, chain in chains.items():
             line = _shortest([patches[part] for part in chain])
             if line:
-                self._first[name] = len(self.ways), line[0]
-                self._follow(line)
+                self._lines[name] = [(-1, line[0]), *self._follow(line)]
 
-    def _follow(self, line: Sequence[Patch]) -> None:
-        """Add the ways of a family."""
-        last: int | None = None
+    def _follow(self, line: Sequence[Patch]) -> Iterator[tuple[int, Patch]]:
+        """Add the ways of a family; their positions in the list of ways, -1 where there is none, and their ends."""
+        last = -1
         for start, end in pairwise(line):
             way = self._between(start, end)
             if way is not None:
-                if last is not None:
+                if last >= 0:
                     self.ways[last] = replace(self.ways[last], after=len(self.ways), behind=way.place % 2)
                 self.ways.append(way)
-            last = None if way is None else len(self.ways) - 1
+            last = -1 if way is None else len(self.ways) - 1
+            yield last, end
+
+    def line(self, family: str | None = None) -> list[tuple[int, Patch]]:
+        """The apertures that a family meets, up to its detector, each with the position of the way that leads there in
+        the list of ways, -1 for none; empty where nothing is known of it.
+
+        Args:
+            family: its detector, None for the first one.
+        """
+        return self._lines.get(family or next(iter(self._lines), ""), [])
 
     def from_source(self, start: Patch, family: str | None = None) -> Way | None:
         """The way from a source to the first surface of a family, None where there is none.
@@ -140,14 +149,10 @@ class ClearWays:
             start: the source's disk of places.
             family: its detector, None for the first one.
         """
-        if not self._first:
-            return None
-        after, end = self._first[family or next(iter(self._first))]
-        way = self._between(start, end)
-        if way is None:
-            return None
-        goes_on = after < len(self.ways) and self.ways[after].start == end.surface
-        return replace(way, after=after, behind=self.ways[after].place % 2) if goes_on else way
+        line = self.line(family)
+        way = self._between(start, line[0][1]) if line else None
+        after = line[1][0] if len(line) > 1 else -1
+        return way if way is None or after < 0 else replace(way, after=after, behind=self.ways[after].place % 2)
 
     def _between(self, start: Patch, end: Patch) -> Way | None:
         """The way from one aperture to another, inside their glass body or in the open."""

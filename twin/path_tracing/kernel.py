@@ -3,8 +3,9 @@
 In each step a path flies to the next surface (``meeting``), the surface shares its light out, and the path goes one of
 the ways that there are. Neighbouring paths are worked on together, in packets of the machine's vectors. A packet takes
 as long as its longest path, and all that any of its paths needs: what only some surfaces need (Newton's method,
-Fresnel's formulas, a lobe, a detector) is computed by packets that need it. Sources let neighbours start alike. Moving
-the paths that go on together after some steps gains a tenth more where light scatters and costs as much where not.
+Fresnel's formulas, a lobe, a detector) is computed by packets that need it. Sources let neighbours start alike, and
+paths that leave nominal light (``sequential``) are put beside those that do alike. Putting them together once more,
+after four more steps, would leave 9 percent fewer steps of packets and take as long as it saves, as measured.
 """
 
 from __future__ import annotations
@@ -83,8 +84,19 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Launch:
-    """Paths at their start: ``Vector3`` position and direction, weight, number of the path, random generator, and the
-    number of the way that they are on. Neighbours start alike.
+    """Paths at their start, or some surfaces after it. Neighbours should be alike.
+
+    Attributes:
+        position, direction: ``Vector3``.
+        weight: power.
+        path: number of the path.
+        rng: its random generator.
+        way: number of the way that it is on, 0 for none.
+        length: optical path so far, metres.
+        body: glass body that it is in, 0 for none.
+        ahead: how far ahead the search for the next surface starts, metres.
+        signature: of its events so far.
+        steps: how many these are.
     """
 
     position: Any
@@ -93,6 +105,11 @@ class Launch:
     path: Any
     rng: Any
     way: Any = 0
+    length: Any = 0.0
+    body: Any = 0
+    ahead: Any = 0.0
+    signature: Any = START
+    steps: Any = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +122,13 @@ class PreparedScene:
     tables: layout.SceneTables
 
 
-def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: Launch, sinks: Sinks) -> None:
+def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: Launch, sinks: Sinks) -> Any:
     """Follow all paths to their end; nothing is evaluated yet.
 
     The weight that escapes to infinity and the weight still under way at the step limit go to the sinks as well.
+
+    Returns:
+        Steps that each path has taken from its start on.
     """
     import drjit as dr
 
@@ -118,13 +138,13 @@ def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: 
         backend.Vector3(launch.position),
         backend.Vector3(launch.direction),
         backend.Float(launch.weight),
-        dr.zeros(backend.Float, n),  # optical path
-        dr.zeros(backend.UInt, n),  # glass body that the path is in, 0 for none
-        dr.zeros(backend.Float, n),  # how far ahead the search for the next surface starts
+        dr.zeros(backend.Float, n) + launch.length,
+        dr.zeros(backend.UInt, n) + launch.body,
+        dr.zeros(backend.Float, n) + launch.ahead,
         dr.zeros(backend.UInt, n) + launch.way,
-        dr.full(dr.uint64_array_t(backend.Float), START, n),
+        dr.zeros(dr.uint64_array_t(backend.Float), n) + launch.signature,
         dr.zeros(backend.UInt, n),  # what has happened to it, in bits
-        dr.zeros(backend.UInt, n),  # steps
+        dr.zeros(backend.UInt, n) + launch.steps,
         dr.full(backend.Bool, True, n),
         launch.rng,
     )
@@ -134,6 +154,7 @@ def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: 
     escaped = out[8] & GONE != 0
     dr.scatter_add(sinks.left, out[2], backend.UInt(0), escaped)
     dr.scatter_add(sinks.left, out[2], backend.UInt(1), ~escaped & (out[2] > 0.0))
+    return out[9]
 
 
 def _step(
@@ -181,9 +202,9 @@ def _step(
 
         # how the light is shared out
         row = layout.ROWS_PER_SURFACE * surface + dr.select(clear, dr.select(front, UInt(0), 1), 2)
-        shared = _shares(prepared, features, row, met, place, inside, before)
-        going_on = shared.reflected + shared.transmitted + shared.diffused
-        stays = dr.select(going_on < 1.0 - 1e-15, weight * (1.0 - going_on), 0.0)
+        shared = shares(prepared, features, row, met, place, inside, before)
+        going_on = shared.going_on
+        stays = shared.stays(weight)
         dr.scatter_add(sinks.absorbed, stays, row, met & (stays > 0.0))
         stray = history & STRAY != 0
         arrival = Arrival(place.x, place.y, stays, length, signature, stray, path)
@@ -195,17 +216,9 @@ def _step(
         if features.branching:
             unlikely = history // UNLIKELY & 3
             floor = _by_number(unlikely, limits.floors)
-            whole = dr.select(going_on > 0.0, 1.0 / going_on, 0.0)
-            shares = (shared.reflected, shared.transmitted, shared.diffused)
-            chances = [dr.select(s > 0.0, dr.maximum(s * whole, floor), 0.0) for s in shares]
-            every = chances[0] + chances[1] + chances[2]
-            u = rng.next_float64(met) * every
-            reflecting = u < chances[0]
-            through = ~reflecting & (u < chances[0] + chances[1])
-            diffusing = ~reflecting & ~through & (chances[2] > 0.0)
-            share = dr.select(reflecting, shared.reflected, dr.select(through, shared.transmitted, shared.diffused))
-            chance = dr.select(reflecting, chances[0], dr.select(through, chances[1], chances[2]))
-            onward = dr.select(chance > 0.0, weight * share * every / chance, 0.0)
+            chosen = choose(shared, weight, floor, rng, met)
+            reflecting, through, diffusing = chosen.reflecting, chosen.through, chosen.diffusing
+            onward = chosen.weight
             event = dr.select(
                 reflecting, UInt(int(Event.REFLECT)), dr.select(through, UInt(int(Event.TRANSMIT)), int(Event.DIFFUSE))
             )
@@ -228,7 +241,7 @@ def _step(
             )
             spreading = event >= int(Event.DIFFUSE)
             # light that is scattered goes on as its power does
-            more = dr.select(share * whole < floor, UInt(UNLIKELY), 0)
+            more = dr.select(chosen.unlikely, UInt(UNLIKELY), 0)
             more = dr.select(unlikely < 2, more, 0)
             history = dr.select(met, dr.select(spreading, STRAY + 2 * UNLIKELY, history + more), history)
         else:
@@ -266,7 +279,7 @@ def _by_number(number: Any, values: Sequence[Any]) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shares:
+class Shares:
     """What becomes of light that meets a surface: Dr.Jit arrays.
 
     Attributes:
@@ -285,10 +298,57 @@ class _Shares:
     bent: Any
     marks: Sequence[Any]
 
+    @property
+    def going_on(self) -> Any:
+        """Share that is not absorbed."""
+        return self.reflected + self.transmitted + self.diffused
 
-def _shares(
+    def stays(self, weight: Any) -> Any:
+        """Absorbed part of a weight."""
+        import drjit as dr
+
+        return dr.select(self.going_on < 1.0 - 1e-15, weight * (1.0 - self.going_on), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Which way paths go at a surface: Dr.Jit arrays.
+
+    Attributes:
+        reflecting, through, diffusing: masks.
+        weight: with which they go on.
+        unlikely: whether a floor made the way more likely than its share of the light.
+    """
+
+    reflecting: Any
+    through: Any
+    diffusing: Any
+    weight: Any
+    unlikely: Any
+
+
+def choose(shared: Shares, weight: Any, floor: Any, rng: Any, met: Any) -> Choice:
+    """Draw which way paths go that are at a surface, each by its share of the light and at least by ``floor``."""
+    import drjit as dr
+
+    going_on = shared.going_on
+    whole = dr.select(going_on > 0.0, 1.0 / going_on, 0.0)
+    parts = (shared.reflected, shared.transmitted, shared.diffused)
+    chances = [dr.select(s > 0.0, dr.maximum(s * whole, floor), 0.0) for s in parts]
+    every = chances[0] + chances[1] + chances[2]
+    u = rng.next_float64(met) * every
+    reflecting = u < chances[0]
+    through = ~reflecting & (u < chances[0] + chances[1])
+    diffusing = ~reflecting & ~through & (chances[2] > 0.0)
+    share = dr.select(reflecting, parts[0], dr.select(through, parts[1], parts[2]))
+    chance = dr.select(reflecting, chances[0], dr.select(through, chances[1], chances[2]))
+    onward = dr.select(chance > 0.0, weight * share * every / chance, 0.0)
+    return Choice(reflecting, through, diffusing, onward, share * whole < floor)
+
+
+def shares(
     prepared: PreparedScene, features: Features, row: Any, met: Any, place: Place, inside: Any, before: Any
-) -> _Shares:
+) -> Shares:
     """Look the finish of each path's row up."""
     import drjit as dr
 
@@ -331,4 +391,4 @@ def _shares(
             reflected, transmitted = dr.if_stmt(
                 (reflected, transmitted), some, fresnel, lambda *same: same, label="fresnel", mode="symbolic"
             )
-    return _Shares(reflected, transmitted, diffused, scattered, ratio, bent, marks)
+    return Shares(reflected, transmitted, diffused, scattered, ratio, bent, marks)

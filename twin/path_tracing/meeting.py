@@ -199,7 +199,7 @@ def locate(
     if not form.flat:
         curved = active & (kind & layout.Kind.CURVED != 0)
 
-        def refine(t: Any, x: Any, y: Any, cosine: Any, normal: Any, rest: Any) -> tuple[Any, ...]:
+        def refine(*plane: Any) -> tuple[Any, ...]:
             shape = tables.surface(surface, form, curved)
             s = near
             for _ in range(REFINEMENTS):
@@ -212,18 +212,21 @@ def locate(
             nx, ny, nz = nx * unit, ny * unit, nz * unit
             c = dr.fma(nx, toward.x, dr.fma(ny, toward.y, nz * toward.z))
             n = Vector3(*(dr.fma(g[a], nx, dr.fma(g[3 + a], ny, g[6 + a] * nz)) for a in range(3)))
-            new, old = (s, u, v, c, n, value), (t, x, y, cosine, normal, rest)
-            return tuple(dr.select(curved, a, b) for a, b in zip(new, old, strict=True))
+            new = (s, u, v, c, n, value)
+            return tuple(dr.select(curved, a, b) for a, b in zip(new, plane, strict=True)) if form.mixed else new
 
-        t, x, y, cosine, normal, rest = dr.if_stmt(
-            (t, x, y, cosine, normal, rest),
-            curved,
-            refine,
-            lambda *same: same,
-            arg_labels=("distance", "x", "y", "cosine", "normal", "rest"),
-            label="curved",
-            mode="symbolic",
-        )
+        if form.mixed:
+            t, x, y, cosine, normal, rest = dr.if_stmt(
+                (t, x, y, cosine, normal, rest),
+                curved,
+                refine,
+                lambda *same: same,
+                arg_labels=("distance", "x", "y", "cosine", "normal", "rest"),
+                label="curved",
+                mode="symbolic",
+            )
+        else:
+            t, x, y, cosine, normal, rest = refine()
     first, size = layout.APERTURES, layout.APERTURE
     within, again = (layout.within(x, y, g[k : k + size]) for k in (first, first + size))
     return Place(t, x, y, normal, cosine, within, again, dr.abs(rest) < EXACT, kind, g)

@@ -159,8 +159,8 @@ class Collector:
         self.paths = 0
         self._kept: list[dict[str, np.ndarray]] = []
 
-    def add(self, sinks: Sinks, emitted: float, paths: int) -> None:
-        """Add one launch."""
+    def add(self, sinks: Sinks, emitted: float, paths: int) -> tuple[np.ndarray, np.ndarray]:
+        """Add one launch; returns path numbers and weights of what was detected off the nominal families."""
         self.absorbed += sinks.absorbed.numpy().reshape(self.absorbed.shape)
         self.left += sinks.left.numpy()
         if self.images.size:
@@ -172,22 +172,23 @@ class Collector:
             if sums[detector, 0] > 0.0:
                 self._put(Key(detector, signature, NOMINAL), sums[detector, :SUMS], -1)
         count = int(sinks.counter.numpy()[0])
-        if count:
-            records = {name: array.numpy()[:count] for name, array in sinks.records.items()}
-            # threads write in any order
-            order = np.lexsort((records["length"], records["path"]))
-            records = {name: values[order] for name, values in records.items()}
-            if self.keep:
-                self._kept.append(records)
-            self._sort_in(records)
+        records = {name: array.numpy()[:count] for name, array in sinks.records.items()}
+        # threads write in any order
+        order = np.lexsort((records["length"], records["path"]))
+        records = {name: values[order] for name, values in records.items()}
+        if self.keep:
+            self._kept.append(records)
+        others = {name: values[records["kind"] != NOMINAL] for name, values in records.items()}
+        if len(others["path"]):
+            self._sort_in(others)
+        return others["path"], others["weight"]
 
     def _put(self, key: Key, sums: np.ndarray, example: int) -> None:
         self.sums[key] = self.sums.get(key, 0.0) + sums
         self.examples.setdefault(key, example)
 
-    def _sort_in(self, records: dict[str, np.ndarray]) -> None:
-        others = records["kind"] != NOMINAL
-        r = {name: values[others] for name, values in records.items()}
+    def _sort_in(self, r: dict[str, np.ndarray]) -> None:
+        """Add detections off the nominal families to the sums of theirs."""
         label = np.stack([r["signature"], r["detector"].astype(np.uint64), r["kind"].astype(np.uint64)], axis=-1)
         keys, first, family = np.unique(label, axis=0, return_index=True, return_inverse=True)
         family = family.ravel()

@@ -147,10 +147,7 @@ def start(backend: Backend, source: Source, chosen: np.ndarray, total: int, seed
         total: paths of the run.
         seed: of the random numbers.
     """
-    import drjit as dr
-
-    numbers = backend.UInt(np.ascontiguousarray(chosen, np.uint32))
-    dr.make_opaque(numbers)
+    numbers = backend.opaque(chosen, backend.UInt)
     if isinstance(source, DiskSource):
         return _drawn(backend, source, numbers, total, seed)
     return Launch(
@@ -200,7 +197,8 @@ def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed:
     return Launch(position, direction, weight, numbers, rng)
 
 
-def pieces(total: int, size: int) -> Iterator[tuple[int, int]]:
-    """First number and count of launches of at most ``size`` paths."""
-    for first in range(0, total, size):
-        yield first, min(size, total - first)
+def pieces(total: int, size: int, cut: int = 0) -> Iterator[tuple[int, int]]:
+    """First number and count of launches of at most ``size`` paths, of which none goes across ``cut``."""
+    for begin, end in ((0, cut), (cut, total)):
+        for first in range(begin, end, size):
+            yield first, min(size, end - first)

@@ -64,6 +64,33 @@ class TableDraw:
     cosine: Any
 
 
+def divide(
+    rng: Any, met: Any, specular: Any, share: Any, floor: Any, weight: Any, all_of_it: bool = False
+) -> tuple[Any, Any]:
+    """Draw which paths are scattered.
+
+    Args:
+        rng: random numbers.
+        met: paths that are at a surface.
+        specular: those of them that are reflected or transmitted.
+        share: of the light that is scattered.
+        floor: smallest probability of it where there is some.
+        weight: of the paths.
+        all_of_it: whether a surface may scatter all of the light.
+
+    Returns:
+        Which are scattered, and the weights.
+    """
+    import drjit as dr
+
+    chance = dr.select(share > 0.0, dr.maximum(share, floor), 0.0)
+    scattering = specular & (rng.next_float64(met) < chance)
+    # no path stays plain where all is scattered
+    left = dr.maximum(1.0 - chance, 1e-300) if all_of_it else 1.0 - chance
+    after = dr.select(scattering, weight * share / chance, weight)
+    return scattering, dr.select(specular & ~scattering, weight * (1.0 - share) / left, after)
+
+
 def spread(
     backend: Backend,
     rng: Any,
@@ -93,14 +120,8 @@ def spread(
     """
     import drjit as dr
 
-    chance = dr.select(share > 0.0, dr.maximum(share, floor), 0.0)
-    scattering = met & ~leaving.diffusing & (rng.next_float64(met) < chance)
-    plain = met & ~leaving.diffusing & ~scattering
-    weight = dr.select(scattering, leaving.weight * share / chance, leaving.weight)
-    # no path stays plain where all is scattered
-    # a table may scatter all
-    left = 1.0 - chance if drawn is None else dr.maximum(1.0 - chance, 1e-300)
-    weight = dr.select(plain, leaving.weight * (1.0 - share) / left, weight)
+    specular = met & ~leaving.diffusing
+    scattering, weight = divide(rng, met, specular, share, floor, leaving.weight, drawn is not None)
 
     def turn(direction: Any, event: Any, weight: Any, rng: Any) -> tuple[Any, Any, Any, Any]:
         scale, exponent, kind, area = lobe(scattering)

@@ -193,6 +193,8 @@ number of the part plus one, 15 reciprocal of the index, 16-25 two clear apertur
 the first way from each of the surface's places, 0 for none."""
 
 CLEARANCE, INDEX, PART, INVERSE, APERTURES, KIND, WAYS = 12, 13, 14, 15, 16, 26, 28
+KINDS = (20, 25, KIND)
+"""Which of them say of which kind something is."""
 
 CURVES = 2
 """Blocks of a curved surface: curvature, conic, A4, A6, A8."""
@@ -242,6 +244,7 @@ class SurfaceForm:
         figure_order: highest order of a polynomial figure, -1 when there is none.
         grid: some surface has a figure on a grid.
         flat: all surfaces are planes without figure.
+        mixed: some are and some are not.
     """
 
     even: int
@@ -249,6 +252,7 @@ class SurfaceForm:
     figure_order: int
     grid: bool
     flat: bool
+    mixed: bool
 
     @classmethod
     def of(cls, surfaces: Sequence[SceneSurface]) -> SurfaceForm:
@@ -256,9 +260,10 @@ class SurfaceForm:
         shapes = [s.surface for s in surfaces]
         order = max((f.order for s in shapes if (f := s.zernike_figure) is not None), default=-1)
         grid = any(s.grid_figure is not None for s in shapes)
-        flat = order < 0 and not grid and all(s.is_plane for s in shapes)
+        flat = [s.is_plane and s.figure is None for s in shapes]
         terms = kinds_of([term for s in shapes for term in s.terms])
-        return cls(max((len(s.even) for s in shapes), default=0), terms, order, grid, flat)
+        even = max((len(s.even) for s in shapes), default=0)
+        return cls(even, terms, order, grid, all(flat), any(flat) and not all(flat))
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,6 +300,8 @@ class SceneTables:
     pixels: Any
     ways: Any
     block: Any
+    host_rows: np.ndarray
+    host_finishes: np.ndarray
     measured: FinishTables | None = None
 
     def geometry(self, surface: Any, active: Any) -> list[Any]:
@@ -349,6 +356,11 @@ class SceneTables:
         return out
 
 
+def glass_bodies(surfaces: Sequence[SceneSurface]) -> list[str]:
+    """Glass bodies in the order of their numbers, which count from 1."""
+    return list(dict.fromkeys(s.solid for s in surfaces if s.solid is not None))
+
+
 def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways: Sequence[Way] = ()) -> SceneTables:
     """Tables of a scene.
 
@@ -364,7 +376,7 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways:
     import drjit as dr
 
     surfaces, detectors = scenery.surfaces, scenery.detectors
-    bodies = list(dict.fromkeys(s.solid for s in surfaces if s.solid is not None))
+    bodies = glass_bodies(surfaces)
     if len(bodies) > MOST_BODIES or len(detectors) > MOST_DETECTORS:
         raise ValueError(f"{len(bodies)} glass bodies, {len(detectors)} detectors: at most {MOST_BODIES} of each")
     unknown = sorted(set(nominal) - {d.name for d in detectors})
@@ -422,6 +434,8 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways:
         backend.UInt(place),
         backend.opaque(way_table(ways)),
         import_module(f"drjit.{backend.name}.ad").Array4f64,
+        rows,
+        finishes,
         upload_finishes(backend, surfaces),
     )
     dr.make_opaque(out.body_first, out.body_faces, out.nominal, out.pixels)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from typing import Any
@@ -15,9 +15,11 @@ from twin.path_tracing.clear_ways import ClearWays
 from twin.path_tracing.families import Touch, signature, touches
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, follow
 from twin.path_tracing.path_result import Collector, Key, PathResult, event_lists
+from twin.path_tracing.sequential import Left, Step, go_on, pass_along, steps_of
 from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
 from twin.path_tracing.source import DiskSource, Source, pieces, start
 from twin.path_tracing.tables import ROWS_PER_SURFACE, SurfaceForm, upload, way_table
+from twin.path_tracing.thinning import Followed, Thinning, learn
 
 VARIANTS = {"llvm": "llvm_ad_mono", "cuda": "cuda_ad_mono"}
 """Mitsuba's variant whose arrays are those of the backend; triangles are float32 in all of them."""
@@ -96,6 +98,8 @@ class Sampling:
             detector in the specular light's focus sees the innermost part of a lobe alone.
         roulette: relative to a path's mean weight at the start: below it a path is ended at random, and those that go
             on carry more; 0: never.
+        first: share of the paths from which a run learns where it is worth following paths that turn away from nominal
+            light (``thinning``); 0: all are followed.
     """
 
     steps: int = 96
@@ -105,10 +109,11 @@ class Sampling:
     scatter_floor: float = 0.0
     near: float = 0.0
     roulette: float = 0.0
+    first: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        shares = (*self.floors, self.scatter_floor, self.near)
+        shares = (*self.floors, self.scatter_floor, self.near, self.first)
         if self.steps < 1 or not all(0.0 <= share < 1.0 for share in shares) or self.roulette < 0.0:
             raise ValueError(f"impossible sampling: {self}")
 
@@ -131,8 +136,23 @@ class Sampling:
 BALANCED = Sampling()
 """Every way is drawn as the power goes."""
 
-FAINT = Sampling(floor=0.1, second=0.5, further=0.0, scatter_floor=0.02, near=0.5, roulette=1e-6)
+FAINT = Sampling(floor=0.1, second=0.5, further=0.0, scatter_floor=0.02, near=0.5, roulette=1e-6, first=1 / 16)
 """Weak ways are drawn more often: for ghosts and stray light."""
+
+
+@dataclass(frozen=True, eq=False)
+class Along:
+    """How the paths of a launch take the nominal way.
+
+    Attributes:
+        steps: its surfaces.
+        numbers: of the paths in the run, (N,).
+        thinning: of the paths that leave it, None for none.
+    """
+
+    steps: Sequence[Step]
+    numbers: np.ndarray
+    thinning: Thinning | None = None
 
 
 @cache
@@ -153,9 +173,19 @@ def _register(variant: str) -> Callable[..., Any]:
             raise NotImplementedError(f"{NAME} follows light from its sources; call launch")
 
         def launch(
-            self, scene: PreparedScene, features: Features, start: Launch, mean_weight: float, sinks: Sinks
-        ) -> float:
-            """Trace paths to their end and write what they meet to the sinks; returns their power at the start."""
+            self,
+            scene: PreparedScene,
+            features: Features,
+            start: Launch,
+            mean_weight: float,
+            sinks: Sinks,
+            along: Along | None = None,
+        ) -> Followed | None:
+            """Trace paths to their end and write what they meet to the sinks.
+
+            Returns:
+                What the paths have done along the nominal way and after it, None without one.
+            """
             import drjit as dr
 
             backend = scene.backend
@@ -170,9 +200,19 @@ def _register(variant: str) -> Callable[..., Any]:
             )
             with dr.suspend_grad():
                 dr.scatter_add(sinks.left, start.weight, backend.UInt(2))
-                follow(scene, features, limits, start, sinks)
-                dr.eval(sinks.arrays)
-            return float(sinks.left.numpy()[2])
+                if along is None:
+                    follow(scene, features, limits, start, sinks)
+                    dr.eval(sinks.arrays)
+                    return None
+                stretch = pass_along(scene, features, limits, start, sinks, along.steps)
+                dr.eval(sinks.arrays, stretch.arrays)
+                left = Left.of(along.steps, stretch, along.numbers, along.thinning, features.log)
+                steps = np.zeros(len(along.numbers))
+                if len(left.chosen):
+                    taken = follow(scene, features, limits, go_on(backend, along.steps, stretch, left), sinks)
+                    dr.eval(sinks.arrays, taken)
+                    steps[left.chosen] = taken.numpy() - left.passed[left.chosen]
+            return Followed(left.passed, left.turned, steps)
 
         def to_string(self) -> str:
             return f"{NAME}[{self.sampling}]"
@@ -188,10 +228,13 @@ def make_integrator(backend: Backend, sampling: Sampling) -> Any:
     return mi.load_dict({"type": NAME, **{name: n for name, n in asdict(sampling).items() if n is not None}})
 
 
-CHUNK = 1 << 20
+CHUNK = 1 << 19
 """Paths of one launch: about 200 MB at work."""
 
 LEAST_ROOM = 1 << 14
+LEAST_ALONG = 1 << 16
+"""Paths of a run from which on they take the nominal way surface by surface: so many win the time that its kernel takes
+to be recorded, as measured. Fewer go through the loop alone; the paths are the same."""
 MOST_FAMILIES = 200
 """Families whose ways are looked up, the strongest first."""
 
@@ -273,21 +316,48 @@ class PathTracer:
         features = self.features(keep)
         collector = Collector(self.scenery, self._signatures, keep)
         prepared, way = self._on_its_way(source, toward)
+        steps = self.nominal_steps(source, toward, total)
         room = max(LEAST_ROOM, min(chunk, total) // (1 if keep else 2))
-        for first, count in pieces(total, chunk):
+        learning = round(total * self.sampling.first) if steps else 0
+        thinning: Thinning | None = None
+        seen: list[tuple[Followed, np.ndarray, np.ndarray]] = []
+        for first, count in pieces(total, chunk, learning):
             while True:
                 sinks = self._sinks(room)
                 numbers = np.arange(first, first + count)
                 light = replace(start(self.backend, source, numbers, total, seed), way=way)
-                emitted = self.integrator.launch(prepared, features, light, 1.0 / total, sinks)
+                along = Along(steps, numbers, thinning) if steps else None
+                done = self.integrator.launch(prepared, features, light, 1.0 / total, sinks, along)
                 wanted = int(sinks.counter.numpy()[0])
                 if wanted <= sinks.room:
                     break
                 room = 2 * wanted  # the launch is the same when it is done again
-            collector.add(sinks, emitted, count)
+            brought = collector.add(sinks, float(sinks.left.numpy()[2]), count)
+            if done is not None and first < learning:
+                seen.append((done, *brought))
+                if first + count == learning:
+                    thinning = learn(seen, seed)
             if progress is not None:
                 progress(first + count, total)
-        return collector.result(self._ways(source, collector, total, seed))
+        return collector.result(self._ways(source, collector, total, seed, toward, thinning))
+
+    def nominal_steps(self, source: Source, toward: str | None, paths: int) -> tuple[Step, ...]:
+        """Surfaces that nominal light of a source meets and that the paths of a run take in this order.
+
+        Args:
+            source: where they start.
+            toward: as of ``run``.
+            paths: of the run.
+        """
+        line = self._clear.line(toward) if paths >= LEAST_ALONG else []
+        if not line or not isinstance(source, DiskSource):
+            return ()
+        way = self._clear.from_source(source.patch, toward)
+        numbers = [0 if way is None else 1, *(number + 2 if number >= 0 else 0 for number, _ in line[1:])]
+        known = list(zip(numbers, (patch for _, patch in line), strict=True))
+        codes = self.nominal[toward or next(iter(self.nominal))]
+        # the last step belongs to the loop, which ends paths there
+        return steps_of(self.scenery, known, codes, source.centre)[: self.sampling.steps - 1]
 
     def _on_its_way(self, source: Source, toward: str | None) -> tuple[PreparedScene, Any]:
         """The scene with the way that a source's light takes first, and its number for all paths, 0 for none."""
@@ -313,7 +383,15 @@ class PathTracer:
             self.backend, ROWS_PER_SURFACE * len(self.scenery.surfaces), len(detectors), pixels, room, log
         )
 
-    def _ways(self, source: Source, collector: Collector, total: int, seed: int) -> dict[Key, tuple[Touch, ...]]:
+    def _ways(
+        self,
+        source: Source,
+        collector: Collector,
+        total: int,
+        seed: int,
+        toward: str | None,
+        thinning: Thinning | None,
+    ) -> dict[Key, tuple[Touch, ...]]:
         """Events of the families: of the nominal ones as given, of the others by tracing one path of each again."""
         names = [d.name for d in self.scenery.detectors]
         ways = {
@@ -325,7 +403,7 @@ class PathTracer:
         if not keys:
             return ways
         examples = np.array([collector.examples[k] for k in keys], np.uint32)
-        for key, codes in zip(keys, self.events(source, examples, total, seed), strict=True):
+        for key, codes in zip(keys, self.events(source, examples, total, seed, toward, thinning), strict=True):
             # the path may have gone on from the detector: the family is what came before
             for n in range(len(codes) + 1):
                 if signature(codes[:n]) == key.signature:
@@ -333,13 +411,29 @@ class PathTracer:
                     break
         return ways
 
-    def events(self, source: Source, numbers: np.ndarray, total: int, seed: int) -> list[tuple[int, ...]]:
-        """Codes of all events of the paths of the given numbers of a run."""
+    def events(
+        self,
+        source: Source,
+        numbers: np.ndarray,
+        total: int,
+        seed: int,
+        toward: str | None = None,
+        thinning: Thinning | None = None,
+    ) -> list[tuple[int, ...]]:
+        """Codes of all events of the paths of the given numbers of a run; the other arguments are the run's."""
         import drjit as dr
 
-        count, steps = len(numbers), self.sampling.steps
+        count, most = len(numbers), self.sampling.steps
+        prepared, way = self._on_its_way(source, toward)
+        steps = self.nominal_steps(source, toward, total)
         # each path has its own part of the log, whatever its number in the run
-        light = replace(start(self.backend, source, numbers, total, seed), path=dr.arange(self.backend.UInt, count))
-        sinks = self._sinks(LEAST_ROOM, count * steps)
-        self.integrator.launch(self.prepared, self.features(log=True), light, 1.0 / total, sinks)
-        return list(event_lists(sinks.log.numpy(), count))
+        own = dr.arange(self.backend.UInt, count)
+        light = replace(start(self.backend, source, numbers, total, seed), path=own, way=way)
+        sinks = self._sinks(LEAST_ROOM, count * most)
+        along = Along(steps, numbers, thinning) if steps else None
+        done = self.integrator.launch(prepared, self.features(log=True), light, 1.0 / total, sinks, along)
+        logged = event_lists(sinks.log.numpy(), count)
+        if done is None:
+            return list(logged)
+        codes = tuple(step.code for step in steps)
+        return [codes[:passed] + after for passed, after in zip(done.passed, logged, strict=True)]
