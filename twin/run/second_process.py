@@ -156,8 +156,8 @@ class SecondProcess:
                 alone = os.read(batches, count) if count else b""
                 tasks |= pickle.loads(os.pread(self._to_child.fileno(), length, read))
                 read += length
-                for number in alone:
-                    self._do(number, tasks)
+                for own in alone:
+                    self._do(own, tasks)
                 continue
             try:
                 turn = os.read(turns, 1)

@@ -95,7 +95,7 @@ def _ticks_kept(figure: Figure) -> Iterator[None]:
     """While the figure is arranged or drawn, ticks and the places of their labels are worked out once for each size and
     view of their axes.
     """
-    every = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
+    every: list[Any] = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
     for axis in every:
         axis._update_ticks, axis._get_ticklabel_bboxes = _kept_of(axis)
     try:
