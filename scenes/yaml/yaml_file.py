@@ -27,8 +27,8 @@ MOST_VALUES = 100_000
 """Keys and values, which take some seconds to read."""
 DEEPEST = 32
 KEPT, LONGEST_KEPT = 64, 50_000
-"""How many texts read last are kept, of how many characters each at most: a command reads the same camera for each place
-that it stands in, and a script or a study the same files of the library again and again.
+"""How many texts read last are kept, of how many characters each at most: a command reads a camera for each place in
+which it stands, and a script or a study the same files of the library again and again.
 """
 SPACES = "spaces, for each level two more"
 

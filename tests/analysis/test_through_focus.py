@@ -266,6 +266,7 @@ def test_three_faults_are_told_and_more_are_counted(count, rest):
     assert list(caught.value.faults) == [(k,) for k in range(count)]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("unit", quick(1, [1e6, 1e3]))
 def test_the_unit_of_length_does_not_matter(unit):
     """Metres, millimetres, micrometres: the same vertices and the same faults, of clear and of faint curves."""

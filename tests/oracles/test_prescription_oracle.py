@@ -199,6 +199,7 @@ def stopped_as_batoid_stops(backend, name: str, rays: int) -> None:
         assert np.count_nonzero(through != expected) <= 1e-6 * rays
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["LSST/LSST_r.yaml"])
 def test_edges_stop_what_batoid_stops(backend, name: str) -> None:
     stopped_as_batoid_stops(backend, name, 20_000)

@@ -245,6 +245,7 @@ def test_spots_of_recovered_frames_and_of_tables_are_read(backend, tmp_path) -> 
         bench.data()
 
 
+@pytest.mark.second
 def test_an_instrument_is_found(whole) -> None:
     """Of a drawn instrument each combination and motion lies within what its sigma says, and order does not matter.
 
@@ -280,6 +281,7 @@ def test_a_gross_error_of_one_field_is_named(whole) -> None:
     assert np.max(np.abs(found.mean - clean.mean) / found.sigma) < 3.0
 
 
+@pytest.mark.second
 def test_moves_are_part_of_the_state(backend, tmp_path) -> None:
     """What was moved is known but for its error: the estimate after a move tells where the parts stood before, and how
     far the actuator really went.
@@ -582,6 +584,7 @@ def test_a_prior_of_nothing_is_refused(backend, tmp_path) -> None:
         bench_of(backend, tmp_path, {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "5 nm"}}}, nothing)
 
 
+@pytest.mark.second
 def test_measurements_that_contradict_each_other_are_refused(backend, tmp_path) -> None:
     """Ten readings of the line of sight by arcminutes apart, each with a sigma of an arcsecond."""
     sight = {

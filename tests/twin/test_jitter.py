@@ -204,6 +204,7 @@ def test_what_is_no_jitter_is_told(text: str, told: str) -> None:
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("frequency", quick(1, [62.0, 12.0]))
 def test_every_line_of_an_image_is_displaced_and_blurred_by_its_own_transfer(frequency: float) -> None:
     """A wave along the line, 0.3 cycles per pixel, under 32 stages: its amplitude in each line, over that without

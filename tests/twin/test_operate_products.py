@@ -329,6 +329,7 @@ def test_a_scene_of_another_instrument_is_refused(history: History, tmp_path: Pa
     assert "camera: gf7_pair" in (told.allowed or "")
 
 
+@pytest.mark.second
 def test_the_version_goes_with_the_record_and_the_plan(tmp_path: Path) -> None:
     record, backend = made(tmp_path / "record"), load_backend()
     record.take(given("reading", [Entry("monitor", "monitor", START, {"numbers": {}})]))
@@ -342,6 +343,7 @@ def test_the_version_goes_with_the_record_and_the_plan(tmp_path: Path) -> None:
     assert products_of(operation, record, START, None, backend).version not in (first, other)
 
 
+@pytest.mark.second
 def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
     """With motions that do not go on in time nothing else does."""
     told = SimpleNamespace(
@@ -409,6 +411,7 @@ def test_err_bias_is_the_scatter_of_points_of_drawn_cameras(one: Products) -> No
     assert line.ground.random_m == 0.0
 
 
+@pytest.mark.second
 def test_what_is_white_in_time_is_err_rand_and_not_applied(history: History) -> None:
     """The mirrors' mounts, once stated as white: whether an image is taken at a reading or a microsecond later makes no
     difference, though the estimate at the reading itself knows of them.
