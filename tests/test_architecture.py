@@ -88,6 +88,9 @@ def source_files() -> list[Path]:
     return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
 
+BY_NAME = "import_module", "__import__"
+
+
 @dataclass(frozen=True)
 class Content:
     """What is asked of a file of the source, which no test changes.
@@ -120,7 +123,7 @@ def content(path: Path) -> Content:
             # A relative import stays in its package.
             module = (node.module or "") if node.level == 0 else path.relative_to(ROOT).parts[0]
             names |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("importlib.import_module", "__import__"):
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in BY_NAME:
             first = node.args[0] if node.args else None
             if isinstance(first, ast.Constant) and isinstance(first.value, str):
                 names.add(first.value)

@@ -186,6 +186,7 @@ def _values(key: Key) -> Iterator[Any]:
         yield value
 
 
+@cache
 def examples(kind: str) -> dict[tuple[type[Spec], str], Example]:
     """Example of every key of one sort of file."""
     return {(section.model, key.name): example(kind, section, key) for section, key in every_key(MODELS[kind])}
