@@ -116,7 +116,7 @@ def test_bias_without_noise(name, limit, template, places, light):
     assert error.max() < 0.25 * found.sigma_row.min()
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", quick(2, ALL))
 def test_scatter_agrees_with_stated_sigma(name, template, places, before):
     found = measure(name, before, template)
     assert np.all(found.converged)

@@ -138,6 +138,7 @@ def test_sigma_agrees_with_scatter(frequency, step, half, noise):
     assert stats.chi2.sf(total, freedom) > FALSE_ALARM / 2
 
 
+@pytest.mark.second
 def test_spurious_resolution_is_not_the_peak():
     """Scans that show several bounces: the main peak is found wherever it lies, with noise, in any order of points."""
     rng = np.random.default_rng(3)

@@ -290,7 +290,7 @@ def test_levels_add() -> None:
 
 
 @pytest.mark.parametrize(
-    "target", [siemens_star(12, 2e-4, 1e-5), pinhole(4.4e-4), pinhole(9e-4)], ids=["star", "disk", "huge"]
+    "target", quick(1, [siemens_star(12, 2e-4, 1e-5), pinhole(4.4e-4), pinhole(9e-4)]), ids=["star", "disk", "huge"]
 )
 def test_default_guard(target: Target) -> None:
     """It agrees with copies 3 mm away to the stated error."""

@@ -359,6 +359,7 @@ class TestFace:
         assert found.residual_rms < 0.02 * np.std(z)
         assert np.max(np.abs(list(found.figure.values()))) < 1e3 * np.std(z)
 
+    @pytest.mark.second
     def test_uniform_growth_of_a_parabola_lengthens_its_radius(self) -> None:
         aperture, c = Circle(0.3), 1 / 3.0
         surface = Surface(c, -1.0)

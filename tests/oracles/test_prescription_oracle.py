@@ -132,7 +132,7 @@ LSST/Rubin_v3.14_y.yaml
 """.split()
 
 
-@pytest.mark.parametrize("name", BATOID)
+@pytest.mark.parametrize("name", quick(8, BATOID))
 def test_as_batoid_traces_its_telescopes(backend, name: str) -> None:
     """Places, directions and paths of rays over the whole pupil at the detector; a wavefront is their paths."""
     batoid = pytest.importorskip("batoid")

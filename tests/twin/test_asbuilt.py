@@ -179,6 +179,7 @@ def test_positions_are_those_of_the_bodies(whole) -> None:
     np.testing.assert_allclose(columns[:3, 3], np.cross([1.0, 0.0, 0.0], kind.nominal[0]))
 
 
+@pytest.mark.second
 def test_spots_and_temperatures_of_a_pair(backend, tmp_path) -> None:
     """Derivatives of spots by motions are those of automatic differentiation; a body's temperature is its own, or that
     of what carries it.
@@ -447,6 +448,7 @@ def test_files_of_the_laboratory_are_read(backend, tmp_path) -> None:
         bench_of(backend, tmp_path, measured, simulate=None)
 
 
+@pytest.mark.second
 def test_one_state_without_light_leaves_the_others(backend, tmp_path, monkeypatch) -> None:
     """Its merit is not known, those of the others are as alone, and the next move is still told."""
     measured = {"focus": {"collimator": {"fields": [[0, 0]], "sigma": "3 um"}}}

@@ -242,6 +242,7 @@ def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str
         assert message in re.sub(r"\s+", " ", bad.stderr)
 
 
+@pytest.mark.second
 def test_the_speed_of_light_is_not_passed_over(folder: Path, tmp_path: Path) -> None:
     """Nobody knows what the setting does to the geometry: the model leaves it out and says so."""
     scene = replace(SCENE, settings={"LIGHT_SPEED_SETTING": "true", "ATMOSPHERIC_REFRACTION_SETTING": "true"})

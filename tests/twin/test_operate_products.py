@@ -155,6 +155,7 @@ def found_at(operation: StandIn, time: int = START) -> EstimatedMotions:
     return EstimatedMotions.in_units(experiment().stated.components, motions.mean, motions.covariance)
 
 
+@pytest.mark.second
 def test_the_job_of_a_state_is_that_state(tmp_path: Path) -> None:
     found = found_at(stand_in(drawn(5)))
     text, left = state_file(found, experiment().thermal, "gf7_pair", "orbit", "remark\nmore")
@@ -447,6 +448,7 @@ def test_what_is_white_in_time_is_err_rand_and_not_applied(history: History) -> 
     assert beside.course.covariance[0, 0, 0] > 1.001 * at_once.course.covariance[0, 0, 0]
 
 
+@pytest.mark.second
 def test_models_see_what_the_changed_instrument_sees(one: Products, tmp_path: Path) -> None:
     """ISD and RPC of the product, read by independent programs, against exact chief rays of the true state: wrong by
     what ERR_BIAS says, where the models of the laboratory's cameras are wrong by several times more.
