@@ -31,7 +31,6 @@ from scenes.yaml.yaml_file import parse_yaml
 from tests.golden.fields import fields_file, fields_of, json_fields, kept_fields
 from tests.golden.golden import golden_file
 from tests.golden.jobs import ALL
-from tests.tiers import quick
 from twin.run.page import checksum
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -105,7 +104,7 @@ def test_every_key_of_the_json_schema_stands_in_the_reference(kind: str, pages: 
     assert set(keys(schema)) <= named
 
 
-@pytest.mark.parametrize("kind", quick(8, MODELS))
+@pytest.mark.parametrize("kind", MODELS)
 def test_every_example_is_taken_by_its_model(kind: str) -> None:
     """As it is shown: the line is read as YAML and put into the mapping that it is an example in."""
     for (model, name), example in examples(kind).items():
