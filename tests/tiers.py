@@ -49,9 +49,9 @@ LONGEST = (
     "twin/test_asbuilt_coverage.py",
     "twin/test_asbuilt.py",
     "twin/test_operate_products.py",
-    "hunt/test_hunt.py",
+    "twin/test_export.py",
 )
-"""Files whose tests of the first two tiers take half a minute and more together, longest first. Few tests they may be:
+"""Files whose tests of the first two tiers take about half a minute and more, longest first. Few tests they may be:
 by their number they would come last, and one process would wait for the other.
 """
 
