@@ -184,7 +184,7 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
         ("camtwin", "render", job, "--out", "a", "--frames", "1"),
         ("camtwin", "compare", "a", "a", "--out", "b"),
         ("camtwin", "study", own / "scenes/examples/study_smoke.yaml", "--workers", "2", "--out", "c", "--yes"),
-        ("camtwin", "verify", "b"),
+        ("camtwin", "verify", "a"),
         ("camtwin", "doctor", "--quick"),
         ("camtwin", "lab", "focus", own / "scenes/lab/measured/focus.yaml", "--out", "d"),
     ):
