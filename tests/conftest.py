@@ -19,6 +19,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera, load_instrument
 from scenes.specs.resolved import ResolvedJob, resolve_job
+from tests.tiers import longest_first
 from twin.monitor import monitor_experiment
 from twin.monitor.monitor_experiment import MonitorExperiment
 
@@ -62,11 +63,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """A slow case of a test of the second tier belongs to the third alone."""
+    """A slow case of a test of the second tier belongs to the third alone. Several processes begin with long files."""
     if config.option.markexpr == "second":
         slow = [item for item in items if item.get_closest_marker("slow")]
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if not item.get_closest_marker("slow")]
+    if hasattr(config, "workerinput"):
+        items[:] = longest_first(items)
 
 
 @pytest.hookimpl(trylast=True)

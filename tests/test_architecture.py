@@ -5,7 +5,8 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Set
+from dataclasses import dataclass
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -87,30 +88,50 @@ def source_files() -> list[Path]:
     return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
 
-@cache
-def parsed(path: Path) -> ast.Module:
-    """A file of the source, which no test changes."""
-    return ast.parse(path.read_text("utf-8"))
+BY_NAME = "import_module", "__import__"
 
 
-@cache
-def imported_modules(path: Path) -> set[str]:
-    """Names of everything a file imports, at any depth, also by importlib with a literal name; of what is imported from
-    a module, the module's and the one that it would have as a module of its own.
+@dataclass(frozen=True)
+class Content:
+    """What is asked of a file of the source, which no test changes.
+
+    Attributes:
+        imports: names of everything it imports, at any depth, also by importlib with a literal name; of what is
+            imported from a module, the module's and the one that it would have as a module of its own.
+        texts: line and content of every text that a program can show: docstrings are none.
     """
+
+    imports: frozenset[str]
+    texts: tuple[tuple[int, str], ...]
+
+
+@cache
+def content(path: Path) -> Content:
+    """Of one reading and one walk: trees of all files are too many to keep."""
     names: set[str] = set()
+    shown: dict[ast.Constant, tuple[int, str]] = {}
+    silent: set[ast.expr] = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.Import):
+        if isinstance(node, ast.Constant):
+            if isinstance(node.value, str):
+                shown[node] = (node.lineno, node.value)
+        elif isinstance(node, ast.Expr):
+            silent.add(node.value)
+        elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             # A relative import stays in its package.
             module = (node.module or "") if node.level == 0 else path.relative_to(ROOT).parts[0]
             names |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("importlib.import_module", "__import__"):
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in BY_NAME:
             first = node.args[0] if node.args else None
             if isinstance(first, ast.Constant) and isinstance(first.value, str):
                 names.add(first.value)
-    return names
+    return Content(frozenset(names), tuple(text for one, text in shown.items() if one not in silent))
+
+
+def imported_modules(path: Path) -> frozenset[str]:
+    return content(path).imports
 
 
 @cache
@@ -131,7 +152,7 @@ def project_imports() -> tuple[tuple[str, str], ...]:
     )
 
 
-def _finest(names: set[str]) -> Iterator[str]:
+def _finest(names: Set[str]) -> Iterator[str]:
     """The modules among names; a package counts only where nothing below it was meant, and one at the top never: every
     import of what is in it runs it.
     """
@@ -161,7 +182,7 @@ def computing() -> list[str]:
     ]
 
 
-def way_to(names: set[str], module: str, imports: dict[str, set[str]]) -> list[str]:
+def way_to(names: set[str], module: str, imports: Mapping[str, Set[str]]) -> list[str]:
     """Module -> ... -> what it imports of ``names``, the shortest way; empty for none."""
     ways, seen = [[module]], {module}
     for way in ways:
@@ -175,7 +196,7 @@ def way_to(names: set[str], module: str, imports: dict[str, set[str]]) -> list[s
 
 
 @cache
-def every_import() -> dict[str, set[str]]:
+def every_import() -> dict[str, frozenset[str]]:
     """Module -> all that it imports, of the project and of others."""
     return {module: imported_modules(ROOT / path) for module, path in modules().items()}
 
@@ -358,19 +379,6 @@ def test_a_cycle_would_be_found() -> None:
         TopologicalSorter({"a": {"b"}, "b": {"a"}}).prepare()
 
 
-def texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Line and content of every text that a program can show: docstrings are none."""
-    silent = {
-        node.value
-        for body in (getattr(n, "body", []) for n in ast.walk(tree))
-        for node in (body if isinstance(body, list) else [])
-        if isinstance(node, ast.Expr)
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in silent:
-            yield node.lineno, node.value
-
-
 OF_PAPERS = re.compile(r"\bpapers?\b|\bTable \d|\bFig\. \d", re.I)
 """A command's help cites where its method is from, in a text that ends with it; results never speak of papers."""
 
@@ -384,7 +392,7 @@ def test_general_commands_know_no_paper(room: str) -> None:
         f"{path.relative_to(ROOT)}:{line}: {text[:60]!r}"
         for path in files
         if path.name != "__main__.py"
-        for line, text in texts(parsed(path))
+        for line, text in content(path).texts
         if OF_PAPERS.search(text)
     ]
     assert not told, "\n".join(told)
@@ -405,7 +413,7 @@ def test_one_notation_for_units(room: str) -> None:
         if place.startswith("twin/validation/") or place == "analysis/mtf/mtf_command.py":
             # the latter reads what users write, in whichever letter
             continue
-        for line, text in texts(parsed(path)):
+        for line, text in content(path).texts:
             if any(sign in text for sign in OTHER_SIGNS) or (room == "twin" and UNIT_AFTER_COMMA.fullmatch(text)):
                 found.append(f"{place}:{line}: {text[:60]!r}")
     assert not found, "\n".join(found)

@@ -70,6 +70,7 @@ from scenes.yaml.file_kind import FileKind
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
+from tests.tiers import quick
 from tests.twin import test_path_figure as path_figure
 from tests.twin import test_prism_images
 from tests.twin.commands import invoke
@@ -229,7 +230,7 @@ def within_chance(chi2: float, freedom: int) -> bool:
 
 
 @extends(NOISE)
-@pytest.mark.parametrize(("toy", "number"), [(TwoLevels, 300.0), (Flicker, 0.05)])
+@pytest.mark.parametrize(("toy", "number"), quick(1, [(TwoLevels, 300.0), (Flicker, 0.05)]))
 def test_a_noise_term(toy: type, number: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames scatter by it, and spot centres scatter as the analysis says that knows its variance; one that does not is
     wrong.

@@ -28,6 +28,10 @@ FILES = [path for package in backend.PACKAGES for path in sorted((ROOT / package
 # --- what is rewritten -----------------------------------------------------------------------------------
 
 
+LOOK_FOR = "import_module", "files", "run_module", "find_spec"
+"""Functions that look for a module by its name."""
+
+
 def names_of_ours(text: str) -> list[str]:
     """Modules of the source tree that a module asks for by name: imported, or as text where a module is looked for."""
     found = []
@@ -36,9 +40,7 @@ def names_of_ours(text: str) -> list[str]:
             found.append(node.module or "")
         elif isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.Call) and re.search(
-            r"\b(import_module|files|run_module|find_spec)$", ast.unparse(node.func)
-        ):
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in LOOK_FOR:
             found += [one.value for one in node.args if isinstance(one, ast.Constant)]
         elif isinstance(node, ast.List | ast.Tuple):
             words = [one.value if isinstance(one, ast.Constant) else "" for one in node.elts]

@@ -1,5 +1,6 @@
-"""Cases of a test in more than one tier."""
+"""Cases of a test in more than one tier, and which files begin."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -30,3 +31,35 @@ def one_of_each(key: Callable[[Any], Any], cases: Iterable[Any]) -> list[Any]:
         marked.append(pytest.param(*values, marks=pytest.mark.slow if key(case) in seen else pytest.mark.second))
         seen.add(key(case))
     return marked
+
+
+LONGEST = (
+    "test_wheel.py",
+    "test_notebooks.py",
+    "twin/test_orbit_calibration.py",
+    "twin/test_spot_gradient.py",
+    "validation/test_mutations_001.py",
+    "twin/test_render_cli.py",
+    "twin/test_camera_instrument.py",
+    "twin/test_six_telescopes.py",
+    "twin/test_course.py",
+    "twin/test_study.py",
+    "validation/test_paper_000.py",
+    "validation/test_mutations_004.py",
+    "twin/test_asbuilt_coverage.py",
+    "twin/test_asbuilt.py",
+    "twin/test_operate_products.py",
+    "twin/test_export.py",
+)
+"""Files whose tests of the first two tiers take about half a minute and more, longest first. Few tests they may be:
+by their number they would come last, and one process would wait for the other.
+"""
+
+
+def longest_first(items: list[pytest.Item]) -> list[pytest.Item]:
+    """Tests file by file as processes shall take them: those that take longest, then those of most tests."""
+    files = [item.nodeid.partition("::")[0].removeprefix("tests/") for item in items]
+    count, rank = Counter(files), {name: k for k, name in enumerate(LONGEST)}
+    order = sorted(dict.fromkeys(files), key=lambda name: (rank.get(name, len(rank)), -count[name]))
+    place = {name: k for k, name in enumerate(order)}
+    return [item for _, item in sorted(zip(files, items, strict=True), key=lambda one: place[one[0]])]

@@ -119,7 +119,13 @@ def example(kind: str, section: Section, key: Key) -> Example:
     Raises:
         LookupError: none was found and none could be made up; `BY_HAND` is the place for one.
     """
-    model = section.model
+    return _example(kind, section.model, key.name)
+
+
+@cache
+def _example(kind: str, model: type[Spec], name: str) -> Example:
+    """Asked for by pages and, again and again, by tests."""
+    (key,) = (one for one in keys(model) if one.name == name)
     known = [(data, path) for data, path in _instances(kind).get(model, []) if key.name in data]
     elsewhere = [
         (data, path) for other in MODELS for data, path in _instances(other).get(model, []) if key.name in data

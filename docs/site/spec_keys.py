@@ -9,6 +9,7 @@ import types
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 from pydantic import TypeAdapter, WithJsonSchema
@@ -102,6 +103,7 @@ def _walk(model: type[Spec], place: str, places: dict[type[Spec], list[str]]) ->
             _walk(below, f"{place}.{key.name}{between}".lstrip("."), places)
 
 
+@cache
 def keys(model: type[Spec]) -> tuple[Key, ...]:
     """The keys of one mapping."""
     said = attributes(model)

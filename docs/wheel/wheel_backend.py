@@ -51,9 +51,9 @@ def rewritten(source: str) -> str:
         ValueError: ``import optics`` with a later ``optics.something``; the name would be another one.
     """
     lines = source.splitlines(keepends=True)
-    tree = ast.parse(source)
-    used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-    for node in ast.walk(tree):
+    nodes = list(ast.walk(ast.parse(source)))
+    used = {node.id for node in nodes if isinstance(node, ast.Name)}
+    for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.level == 0 and _ours(node.module or ""):
             _insert(lines, node.lineno, f"from {node.module}", "from ")
         elif isinstance(node, ast.Import):

@@ -299,10 +299,11 @@ def _shortest_number(value: float, unit: str, kind: Kind, within: float) -> str 
         exact = Decimal(value) / factor if unit not in _CELSIUS else Decimal(value) - _ZERO_CELSIUS
         for digits in range(1, 18):
             number = Decimal(f"{exact:.{digits}g}")
-            plain = -5 <= number.adjusted() <= 6
-            text = format(number, "f") if plain else format(number.normalize(), "e")
-            if abs(_to_si(text, unit, kind) - value) <= within:
-                return text
+            # as _to_si reads it
+            back = number * factor if unit not in _CELSIUS else number + _ZERO_CELSIUS
+            if abs(float(back) - value) <= within:
+                plain = -5 <= number.adjusted() <= 6
+                return format(number, "f") if plain else format(number.normalize(), "e")
     return None
 
 

@@ -9,6 +9,7 @@ parser's events, so a refusal comes before anything is unfolded.
 import io
 import re
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,10 @@ LARGEST_BYTES = 1_000_000
 MOST_VALUES = 100_000
 """Keys and values, which take some seconds to read."""
 DEEPEST = 32
+KEPT, LONGEST_KEPT = 64, 50_000
+"""How many texts read last are kept, of how many characters each at most: a command reads a camera for each place in
+which it stands, and a script or a study the same files of the library again and again.
+"""
 SPACES = "spaces, for each level two more"
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,30}")
@@ -65,6 +70,12 @@ def read_yaml(path: str | Path) -> YamlFile:
 
 def parse_yaml(text: str, file: str = "") -> YamlFile:
     """Read YAML from text; `file` is what error messages call it. Raises InputError as `read_yaml` does."""
+    data, lines = (_read_last if len(text) <= LONGEST_KEPT else _read)(text, file)
+    return YamlFile(file, _copied(data), dict(lines))
+
+
+def _read(text: str, file: str) -> tuple[Any, dict[KeyPath, int]]:
+    """Data and lines as of `YamlFile`."""
     builder = _Builder(file)
     try:
         for event in YAML(typ="safe", pure=True).parse(text):
@@ -81,7 +92,17 @@ def parse_yaml(text: str, file: str = "") -> YamlFile:
         raise InputError(Issue(f"not valid YAML: {str(error).splitlines()[0]}", file)) from None
     if builder.root is None:
         raise InputError(Issue("the file is empty", file, 1))
-    return YamlFile(file, builder.root, builder.lines)
+    return builder.root, builder.lines
+
+
+_read_last = lru_cache(maxsize=KEPT)(_read)
+
+
+def _copied(value: Any) -> Any:
+    """Data that whoever reads them may change."""
+    if isinstance(value, dict):
+        return {key: _copied(one) for key, one in value.items()}
+    return [_copied(one) for one in value] if isinstance(value, list) else value
 
 
 def _line_with_tab(text: str, last: int, column: int) -> int | None:

@@ -259,7 +259,7 @@ def test_stepwise_without_a_gauge_keeps_the_start_of_what_is_open():
     assert apart["Beijing pitch"] == pytest.approx(-100e-6 / 0.65, rel=1e-2)
 
 
-@pytest.mark.parametrize("robust", ["huber", "igg"])
+@pytest.mark.parametrize("robust", quick(1, ["huber", "igg"]))
 def test_wrong_matches_lose_their_weight(robust):
     """3 per cent of the image points are off by 10 to 60 px."""
     rng = np.random.default_rng(11)
@@ -354,6 +354,7 @@ def with_gross_errors(seed, share, robust, actual, views):
     return error / size @ np.linalg.solve(unit, error / size), len(error), found, lost
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("share", quick(1, [0.1, 0.0]))
 @pytest.mark.parametrize("robust", quick(1, ["huber", "igg"]))
 def test_robust_weights_and_variance_components_go_together(robust, share):
@@ -386,6 +387,7 @@ def test_64_runs_with_gross_errors_all_converge_within_their_sigmas(robust, shar
     assert 1 - 3.5 * np.sqrt(2 / size) < total / size < 1.15
 
 
+@pytest.mark.second
 def test_misfit_opens_nothing():
     """Noise of eight times the sigmas: the roll against y of the lines is then known to 0.12 mm, and solved for."""
     rng = np.random.default_rng(41)
@@ -536,6 +538,7 @@ def test_robust_weights_settle_where_others_hardly_check_a_point(robust, actual,
         assert lost[bad].mean() > 2 * lost[~bad].mean()
 
 
+@pytest.mark.second
 def test_standardised_residuals_do_not_depend_on_the_own_weight():
     """One image point gets any weight, the others keep theirs: its residual stays what the others say of it."""
     fields, noise, _ = sharply_measured(0.02, 0.02, 0.0)

@@ -7,6 +7,7 @@ from scipy.stats import chi2
 from analysis.orbit.angles import AngleError, along_track_angle, along_track_angles, angles_between, line_frame
 from analysis.orbit.planes import Station, Strip, fit_plane
 from tests.analysis.test_planes import ARCSEC, DEG, LINES, SCENE, descending_pass, noisy
+from tests.tiers import quick
 
 FALSE_ALARM = 1e-4
 PAIR = ((0, 1),)
@@ -41,7 +42,7 @@ def test_only_the_part_along_the_track_counts():
     assert dihedral == pytest.approx(np.hypot(30, 120) * ARCSEC, abs=0.1 * ARCSEC)
 
 
-@pytest.mark.parametrize("ahead", [0.0, 25 * DEG], ids=["parallel", "far apart"])
+@pytest.mark.parametrize("ahead", quick(1, [0.0, 25 * DEG]), ids=["parallel", "far apart"])
 def test_scatter_agrees_with_covariance(ahead):
     """Chi-square of 300 draws, and their mean. The unsigned angle of parallel planes is folded: it never comes near
     zero, where the signed one is unbiased."""

@@ -97,6 +97,7 @@ def test_fourier_series_needs_no_closed_curve() -> None:
     assert np.max(np.abs(made(BETWEEN) - wave(BETWEEN))) < 0.02
 
 
+@pytest.mark.second
 def test_network_follows_the_wave() -> None:
     made = fit("network", ANGLE, noisy(0.02, 5), 0.02, seed=1)
     assert made.settings["converged"] >= 1
@@ -176,6 +177,7 @@ def test_cross_validation_does_not_see_what_it_predicts(name: str) -> None:
         assert changed.residual[i - 1] - plain.residual[i - 1] == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.second
 def test_cross_validation_states_its_noise() -> None:
     """Residuals of straight lines through points of a straight line are noise alone; one residual of each of 300."""
     squares = 0.0

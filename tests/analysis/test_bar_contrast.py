@@ -248,6 +248,7 @@ def test_sigma_agrees_with_the_scatter(f, use_model):
         assert low < np.sum((found - found.mean()) ** 2) / np.mean([b.frequency_sigma[k] ** 2 for b in bars]) < high
 
 
+@pytest.mark.second
 def test_noise_bias_follows_from_the_scatter_of_the_phase():
     """A vector of length A that swings by a phase of rms p is longer by A p^2 / 2 on the average."""
     bars = repeats(60.0, True)

@@ -59,6 +59,7 @@ def same(found, other):
         assert found.groups[name].redundancy == pytest.approx(group.redundancy, rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.second
 @one_blas_thread()
 def test_shares_that_went_through_bytes_give_the_same_adjustment():
     block = spoilt()

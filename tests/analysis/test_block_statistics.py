@@ -58,7 +58,7 @@ def _two_sided(square, freedom):
 _ALARM = 1e-4
 
 
-@pytest.mark.parametrize("law", [WHITE, WALK], ids=["white", "walk"])
+@pytest.mark.parametrize("law", quick(1, [WHITE, WALK]), ids=["white", "walk"])
 def test_chi_square_and_check_points_with_and_without_all_sensors(law):
     for missing in ((), SENSORS):
         assert min(judged(law, missing, 12, 4)) > _ALARM

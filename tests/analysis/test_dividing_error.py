@@ -123,6 +123,7 @@ def test_sign() -> None:
     assert np.max(np.abs(reading - true)) > 0.2 * ARCSEC
 
 
+@pytest.mark.second
 def test_misfits_are_told_apart() -> None:
     """A constant that the calibration does not share, and an error that is new at every reading."""
     angle = 0.5 * (ANGLE[1:] + ANGLE[:-1])

@@ -16,6 +16,7 @@ from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.noise import NoiseModel
 from optics.geometry.pose import rotation_matrix
 from tests.analysis.texture_image import Texture
+from tests.tiers import quick
 
 NOISE = NoiseModel(0.06, 16.0, 0.0, 64.0, 0.01, 5.0, 4095.0)
 FORMULAS = {"paper_single": paper_single, "paper_joint": paper_joint, "derived": derived}
@@ -37,7 +38,7 @@ def arrays(*shape: int, most: float = 1.0) -> st.SearchStrategy[np.ndarray]:
 PLACE = st.floats(30.0, 34.0)
 
 
-@pytest.mark.parametrize("estimate", [energy_centroid, gaussian_fit])
+@pytest.mark.parametrize("estimate", quick(1, [energy_centroid, gaussian_fit]))
 @settings(max_examples=12)
 @given(row=PLACE, column=PLACE, down=st.integers(-6, 6), across=st.integers(-6, 6))
 def test_a_spot_that_moves_by_whole_pixels(estimate, row, column, down, across) -> None:
@@ -189,6 +190,7 @@ SEEN = np.array([[60.2, 59.6], [52.7, 66.1]])
 PATCHES = TEXTURE.patches(SEEN)
 
 
+@pytest.mark.second
 @settings(max_examples=10)
 @given(down=st.integers(-9, 9), across=st.integers(-9, 9), gain=st.floats(0.5, 2.0), offset=st.floats(-200.0, 500.0))
 def test_matching_follows_the_image_and_knows_no_radiometry(down, across, gain, offset) -> None:

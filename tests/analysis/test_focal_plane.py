@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from analysis.focal_plane.plane_fit import LineLevel, ObservabilityError, fit_focal_plane
+from tests.tiers import quick
 
 FALSE_ALARM = 1e-6
 ARCMIN = np.pi / 10800
@@ -105,7 +106,7 @@ def test_scatter_agrees_with_covariance():
     assert sigma[0] == pytest.approx(np.sqrt(design @ fits[0].covariance @ design), rel=1e-12)
 
 
-@pytest.mark.parametrize("extra", [0.0, 12 * UM])
+@pytest.mark.parametrize("extra", quick(1, [0.0, 12 * UM]))
 def test_predicted_defocus_after_the_correction(extra):
     """True defocus that remains when the fitted motion is made: 400 assemblies with chips that stand up or down by
     `extra`, each measured with noise. The prediction's error has the covariance stated.

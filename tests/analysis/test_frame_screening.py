@@ -59,6 +59,7 @@ def test_pieces_change_nothing(count: int, moving: float, real: bool, monkeypatc
     assert len(told) > 2 * passes
 
 
+@pytest.mark.second
 def test_memory_does_not_grow_with_the_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """But for a few numbers of each frame: not by a quarter of what more frames take as they were recorded."""
     monkeypatch.setattr(frame_screening, "_HELD", 1 << 16)

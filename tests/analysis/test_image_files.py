@@ -213,6 +213,7 @@ def test_only_what_is_asked_for_is_decoded(tmp_path):
     assert ImageFile.open(tmp_path / "b.tif").frames(Region(0, 0, 8, 8)).shape == (40, 8, 8)
 
 
+@pytest.mark.second
 def test_spoilt_files_are_refused_in_one_sentence(tmp_path):
     """Random bytes changed, and files cut off: pixels or an ImageError, nothing else."""
     tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack")

@@ -11,6 +11,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, fit_screened
 from analysis.spots.spot_positions import SeriesNoise, SpotError
 from analysis.spots.spot_template import SpotTemplate
+from tests.tiers import quick
 
 NOISE = NoiseModel(0.16, 12.0, 0.5, 100.0, 0.005, 5.0, 16100.0)
 SHAPE = (64, 64)
@@ -48,7 +49,7 @@ def core(place, radius):
     return np.hypot(row - place[0], column - place[1]) < radius
 
 
-@pytest.mark.parametrize("case", ["alike", "core", "holes"])
+@pytest.mark.parametrize("case", quick(1, ["alike", "core", "holes"]))
 def test_influence_of_the_image_before_is_the_derivative_of_the_shift(case):
     """Whole chains, learning included, with the image before changed by a little noise along and against, of the
     frequencies that learning passes and of all others.

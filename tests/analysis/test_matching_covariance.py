@@ -45,7 +45,7 @@ def judged(pair: Pair, options: MatchOptions | None = None):
     return used, error, 0.5 * square, found
 
 
-@pytest.mark.parametrize("changes", quick(2, SMALL), ids=str)
+@pytest.mark.parametrize("changes", quick(1, SMALL), ids=str)
 def test_errors_keep_in_their_covariances(changes) -> None:
     """64 points: three standard deviations of the mean half of chi-square of those accepted, 1 of a point, beyond what
     is asked for: one false alarm in 700 where it lies at the limit.
@@ -58,6 +58,7 @@ def test_errors_keep_in_their_covariances(changes) -> None:
     assert (np.abs(error[used]).max(axis=1) > 0.5).mean() < 0.05
 
 
+@pytest.mark.second
 def test_steps_of_depth_are_refused_or_widened() -> None:
     """A photograph with smooth disparity and edges of depth of 2 px; a tenth of its windows holds an edge."""
     used, error, _square, found = judged(photographed(noise=2.0, relief=0.3, step=2.0))
@@ -100,6 +101,7 @@ def test_windows_too_weak_to_show_a_step_are_refused_only_where_others_have_one(
         assert not (textured(8, noise=noise).matched().reason == Reason.UNTESTED).any()
 
 
+@pytest.mark.second
 def test_turned_and_brighter_pairs_say_the_same() -> None:
     """Rows and columns are alike; a gain and an offset change nothing."""
     pair = textured(6, **EASY | {"noise": 0.5})

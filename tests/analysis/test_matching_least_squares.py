@@ -75,6 +75,7 @@ def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
     assert np.all(np.isnan(fits.place[5:]))
 
 
+@pytest.mark.second
 def test_as_many_steps_as_were_counted_are_enough(clean, templates):
     """Each limit refuses the fits that need more. Where the smoothing is chosen anew the steps begin anew, too, and the
     limit holds for either."""
@@ -138,6 +139,7 @@ def test_reference_of_finer_pixels(texture, clean):
     assert limits(2 * len(PLACES))[0] < chi_square(fits.place - PLACES, fits.covariance()) < limits(2 * len(PLACES))[1]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("seed", quick(1, [21, 22]))
 def test_covariance_with_noise(clean, templates, seed):
     """Shot noise and 20 electrons of read noise on contrast 120; spline errors are a tenth of the sigma."""

@@ -66,6 +66,7 @@ def test_thirty_per_cent_wrong_patches(texture, frame, points):
     assert (~alone.accepted & ~wrong[some]).sum() < 0.02 * (~wrong).sum()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("slope", "contrast", "lost"), quick(1, [(2.0, 120.0, 0.1), (1.0, 40.0, 0.1)]))
 def test_wrong_patches_in_worse_texture(slope, contrast, lost):
     """Noise of 0.9 times the contrast; and a soft texture in which other places correlate by 0.8."""

@@ -230,6 +230,7 @@ def long_camera(focal=5.5):
     return models, 0.8 * half / focal * 500e3
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("count", quick(1, [6, 200]))
 def test_a_long_camera_is_calibrated_and_what_launch_tells_is_marked(count):
     """f of 5.5 m is known to 0.2 mm by 200 points, a quarter of a pixel at the ends of the line: refused as open when f

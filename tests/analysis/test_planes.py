@@ -181,7 +181,7 @@ def test_coefficients_solve_the_papers_least_squares():
 
 
 @pytest.mark.parametrize("sigma_station", quick(1, [0.1, 0.0, 1.0]))
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", quick(1, METHODS))
 def test_scatter_agrees_with_sigma(method, sigma_station):
     """400 draws: chi-square of (alpha, beta) with their covariance, and of the residuals; false alarm 1e-6 each."""
     rng = np.random.default_rng([5, int(10 * sigma_station)])
@@ -239,6 +239,7 @@ def test_alpha_and_beta_share_the_error_of_the_station():
     assert abs(shared[0, 1]) > 0.3 * np.sqrt(shared[0, 0] * shared[1, 1])
 
 
+@pytest.mark.second
 def test_full_covariances():
     """Errors ten times larger in height than in plan, and different from point to point. 300 draws match the sigmas,
     and the normal minimises the weighted distances, whose weights turn with it (gradient by differences).
@@ -351,6 +352,7 @@ def _local(scene, turn):
     return np.zeros(3), np.eye(3), points, scene.tangents, turn @ scene.up
 
 
+@pytest.mark.second
 def test_bias_estimate_of_a_steep_plane():
     """A plane 0.02 deg from the vertical of its frame: the mean error of 4000 explicit fits is the bias that they state
     (known to first order of the attenuation), within 5 of its standard errors and a tenth.

@@ -91,6 +91,7 @@ def test_covariance_is_that_of_a_numerical_jacobian():
     assert found == pytest.approx(signs @ part @ signs.T, rel=1e-4)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("sigma_station", "sigma_image"), quick(1, [(1.0, 3e-6), (0.0, 0.0)]))
 def test_scatter_agrees_with_covariance(sigma_station, sigma_image):
     """Draws with points of 1.5 m and tangents of 0.3 pixel: chi-square of all unknowns and of the residuals."""

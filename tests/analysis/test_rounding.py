@@ -83,6 +83,7 @@ def shape():
     return SpotTemplate.from_image(airy(73.7, 73.2, (148, 148)), 73.7, 73.2, SHAPE)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("peak", quick(1, [2000.0, 50000.0]))
 def test_shifts_of_coarse_spots_have_the_stated_sigma(shape, peak):
     """8 bits, 0.03 DN of noise, 100 frames, spots of 125 and of 5 DN: chi-square was 5 and 74 times its degrees of

@@ -200,6 +200,7 @@ def test_a_jump_is_told_and_counts_as_if_it_had_been_known() -> None:
     assert np.allclose(found.filtered.total[after], known.filtered.total[after], rtol=1e-6)
 
 
+@pytest.mark.second
 def test_no_jump_is_told_where_none_is() -> None:
     """40 series of 30 readings at a chance of one in a thousand each."""
     for seed in range(40):

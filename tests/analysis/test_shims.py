@@ -157,6 +157,7 @@ def test_level_turn_is_made_by_hand():
     assert piston.change == pytest.approx(np.full(4, 0.3 * MM * np.cos(20 * DEG)), rel=1e-12)
 
 
+@pytest.mark.second
 def test_rounding_statistics():
     """500 random motions: errors of the thickness uniform within half a step (variance step^2/12), and the motion that
     rounding leaves as these errors propagate by hand to a body on four pads.

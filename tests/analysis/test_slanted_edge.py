@@ -126,7 +126,7 @@ def chi_square_limits(count):
 
 
 @pytest.mark.parametrize("pitch", [PAN, MULTISPECTRAL])
-@pytest.mark.parametrize("size", [64, 96, 128])
+@pytest.mark.parametrize("size", quick(1, [64, 96, 128]))
 @pytest.mark.parametrize("degrees", [2, 3, 5, 7, 10])
 def test_perfect_pupil(degrees, size, pitch):
     image = edge_image(degrees, size, pitch=pitch)
@@ -270,6 +270,7 @@ def test_sigma_agrees_with_the_scatter(contrast_e, use_model):
     assert all(edge.sigma[0] < 1e-9 for edge in edges)
 
 
+@pytest.mark.second
 def test_the_line_is_that_of_least_squares():
     """Residuals say nothing more of its offset and slope: in units of what noise alone would make of them, second
     order and the finer knots of the last spread function are left."""
@@ -294,6 +295,7 @@ def test_no_bias_where_the_signal_is_long():
         assert abs(mtf.mean() - truth) < 5 * edges[0].sigma[k] / math.sqrt(len(edges)) + ACCURACY
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("k", [32, 40, 64])
 def test_noise_bias_at_low_light(k):
     """Some 12 grey values of noise on a contrast of 100: the MTF is too long, by what Rice's distribution says."""
@@ -337,6 +339,7 @@ def test_frames_and_fixed_pattern_enter_the_sigma():
     assert measure_edge(image, noise=uneven, frames=16).sigma[16] > 2 * many.sigma[16]
 
 
+@pytest.mark.second
 def test_noise_is_estimated_on_both_sides():
     model, dark, contrast = detector(4000)
     edges = repeats(4000, use_model=False)

@@ -116,7 +116,7 @@ def test_bias_without_noise(name, limit, template, places, light):
     assert error.max() < 0.25 * found.sigma_row.min()
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", quick(2, ALL))
 def test_scatter_agrees_with_stated_sigma(name, template, places, before):
     found = measure(name, before, template)
     assert np.all(found.converged)
@@ -186,6 +186,7 @@ def test_the_bound_of_an_image_is_that_of_its_shape(template):
     assert np.diagonal(found, axis1=1, axis2=2) == pytest.approx(np.diagonal(bound, axis1=1, axis2=2), rel=5e-3)
 
 
+@pytest.mark.second
 def test_order_of_the_estimators(template, before):
     """No estimator states less than the likelihood; the energy centroid, which weighs dark pixels as much, is far
     worse.
@@ -210,6 +211,7 @@ def test_every_spot_needs_a_template_that_exists(template):
             maximum_likelihood_fit(mean, FRAMES, NOISE, template, np.array(wrong))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("elliptical", quick(1, [True, False]))
 def test_a_gaussian_fits_in_chi_square(elliptical):
     """100 Gaussian spots of about 100 degrees of freedom each, in a window whose soft edge is a third of its pixels: 5

@@ -113,6 +113,7 @@ def test_gain_in_height_is_large_for_slow_errors_only(noise, least, most):
     assert ratio < 1.0
 
 
+@pytest.mark.second
 def test_the_datum_keeps_its_prior():
     """A common roll is left to the prior to some per cent, ends of the pass apart; a common pitch is told."""
     found = adjusted(make_rays(strip(5, 600, 15.0), np.random.default_rng(5), SLOW), SLOW)

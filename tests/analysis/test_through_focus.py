@@ -138,6 +138,7 @@ def test_sigma_agrees_with_scatter(frequency, step, half, noise):
     assert stats.chi2.sf(total, freedom) > FALSE_ALARM / 2
 
 
+@pytest.mark.second
 def test_spurious_resolution_is_not_the_peak():
     """Scans that show several bounces: the main peak is found wherever it lies, with noise, in any order of points."""
     rng = np.random.default_rng(3)
@@ -266,6 +267,7 @@ def test_three_faults_are_told_and_more_are_counted(count, rest):
     assert list(caught.value.faults) == [(k,) for k in range(count)]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("unit", quick(1, [1e6, 1e3]))
 def test_the_unit_of_length_does_not_matter(unit):
     """Metres, millimetres, micrometres: the same vertices and the same faults, of clear and of faint curves."""

@@ -36,7 +36,7 @@ LIGHT = {
 }
 
 
-@pytest.mark.parametrize("light", LIGHT)
+@pytest.mark.parametrize("light", quick(3, LIGHT))
 def test_the_pupil_is_found_by_its_light(light):
     """To a tenth of a pixel where a radius has a hundred: half a pixel in the edge's steps, of which there are many."""
     rng = np.random.default_rng(5)

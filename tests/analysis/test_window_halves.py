@@ -6,6 +6,7 @@ from scipy import stats
 
 from analysis.matching.window_checks import FALSE_ALARM, STEP, WindowHalves, relief_field, risk, window_halves
 from tests.analysis.test_residual_correlation import SIDE, designs, fitted
+from tests.tiers import quick
 
 COUNT = 2000
 NONE = np.zeros(COUNT)
@@ -34,7 +35,7 @@ def test_differences_of_halves_keep_in_their_covariances():
     assert COUNT * 0.02 < (chance < 0.05).sum() < COUNT * 0.05 + 4 * np.sqrt(COUNT * 0.05)
 
 
-@pytest.mark.parametrize("split", range(4))
+@pytest.mark.parametrize("split", quick(1, range(4)))
 def test_a_step_between_halves_is_found_as_often_as_the_power_says(split):
     """A step of STEP along rows between halves, in noise that the weakest split can hardly see it in."""
     row, column = np.mgrid[:SIDE, :SIDE] - SIDE // 2
@@ -50,6 +51,7 @@ def test_a_step_between_halves_is_found_as_often_as_the_power_says(split):
     assert found > power.mean() - 4 * np.sqrt(0.25 / COUNT)
 
 
+@pytest.mark.second
 def test_one_displacement_of_the_window_is_no_step():
     """The common fit takes it all; what all windows have of relief raises the chance and lowers the power."""
     still, variance = halved(3)

@@ -11,6 +11,7 @@ from optics.design.merit_function import MeritFunction, Operands
 from optics.design.optimiser import DesignError
 from optics.design.starts import drawn_start, search
 from scenes.models.camera_design import beams_of, camera_of, prescription_of
+from tests.tiers import quick
 
 MIRRORS = ("M1", "M2", "M3")
 EVERY = (
@@ -38,7 +39,7 @@ def beams(gf7):
     return beams_of(gf7.spec)
 
 
-@pytest.mark.parametrize("measure", ["wavefront", "spot"])
+@pytest.mark.parametrize("measure", quick(1, ["wavefront", "spot"]))
 def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) -> None:
     operands = Operands(650e-9, principal_distance=5.5, measure=measure, distortion=1.0)
     merit = MeritFunction.of(backend, start, beams, operands)
@@ -89,6 +90,7 @@ def test_a_detuned_camera_comes_back(backend, gf7, beams) -> None:
     assert found.evaluations < 30
 
 
+@pytest.mark.second
 def test_a_detuned_camera_gets_its_focal_length_back(backend, gf7, beams) -> None:
     """The principal distance as a constraint: held to 2 um, with curvatures that made it 1 % wrong."""
     variables = [Variable("M1", "curvature"), Variable("M3", "curvature"), Variable("image", "z"), *CONICS]
@@ -101,6 +103,7 @@ def test_a_detuned_camera_gets_its_focal_length_back(backend, gf7, beams) -> Non
     assert found.after.errors.max() < 0.05
 
 
+@pytest.mark.second
 def test_anamorphism_as_a_constraint(backend, gf7, beams) -> None:
     """gf7 images 2.8 % larger across the line than along it; held to 2 %, at the same f along the line."""
     nominal = prescription_of(gf7.spec)

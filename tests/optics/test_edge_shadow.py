@@ -78,6 +78,7 @@ def test_shadows_are_what_edges_block(edges) -> None:
         assert np.mean(expected) == pytest.approx(np.mean(found), abs=1.5e-3)
 
 
+@pytest.mark.second
 def test_no_light_is_taken_twice() -> None:
     """Pieces do not overlap: their areas within the stop add up to what the raster has."""
     edges = [

@@ -9,6 +9,7 @@ from optics.numerics import quadrature
 from optics.targets.target_image import EdgeProfile, target_image
 from optics.targets.target_shapes import Target, bar_group, pinhole, siemens_star, slanted_edge
 from optics.waves.diffraction import Grid, airy
+from tests.tiers import quick
 
 WAVELENGTH, F_NUMBER, PITCH = 650e-9, 9.2, 7e-6
 CUTOFF = 1.0 / (WAVELENGTH * F_NUMBER)
@@ -80,7 +81,7 @@ def deep_polygon(edge: HalfPlane, half_length: float, depth: float) -> Polygon:
     return Polygon(np.concatenate([ends, ends[::-1] + depth * edge.normal]))
 
 
-@pytest.mark.parametrize("direction", ["x", "y"])
+@pytest.mark.parametrize("direction", quick(1, ["x", "y"]))
 def test_half_plane_is_a_huge_polygon(direction: str) -> None:
     x, y = centred(24, PITCH), centred(20, PITCH)
     target = slanted_edge(TILT, direction)
@@ -200,7 +201,7 @@ def test_coarse_pixels_against_a_fine_raster() -> None:
     assert got.max() > 0.5
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.3])
+@pytest.mark.parametrize("angle", quick(1, [0.0, 0.3]))
 def test_bars_have_the_fundamental_of_the_transfer_function(angle: float) -> None:
     """A square wave of unit height has the amplitude 2/pi; its harmonics from the third on lie beyond the cut-off."""
     frequency = 65e3
@@ -289,7 +290,7 @@ def test_levels_add() -> None:
 
 
 @pytest.mark.parametrize(
-    "target", [siemens_star(12, 2e-4, 1e-5), pinhole(4.4e-4), pinhole(9e-4)], ids=["star", "disk", "huge"]
+    "target", quick(1, [siemens_star(12, 2e-4, 1e-5), pinhole(4.4e-4), pinhole(9e-4)]), ids=["star", "disk", "huge"]
 )
 def test_default_guard(target: Target) -> None:
     """It agrees with copies 3 mm away to the stated error."""

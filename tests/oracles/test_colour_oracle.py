@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from scenes.models.camera_model import CameraModel, field_direction
 from scenes.models.camera_sharpness import FieldBeams, FocalPlane
 from tests.oracles.peers import LENSES
 from tests.scenes.lens.colour_cameras import KINDS, colour_camera
+from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.colour import FOCUS_RINGS, axial_colour, lateral_colour, spectral_mtfs, spectral_psfs
 
@@ -43,7 +45,13 @@ def traced(model: CameraModel, peer: Any, field: tuple[float, float], stop: np.n
     return peer(met - way[:, None] * direction, direction, wavelength)
 
 
-@pytest.fixture(scope="module", params=[(kind, peer) for peer in LENSES for kind in KINDS], ids="-".join)
+CASES = sorted(product(KINDS, LENSES), key=lambda case: case not in list(zip(KINDS, LENSES, strict=False)))
+"""Every lens by every program, those first that have each once."""
+LONG = [*map(pytest.param, CASES[:3]), *(pytest.param(case, marks=pytest.mark.slow) for case in CASES[3:])]
+"""Of tests of a second and more: the third tier has all others."""
+
+
+@pytest.fixture(scope="module", params=quick(3, [pytest.param(case) for case in CASES]), ids="-".join)
 def case(request: pytest.FixtureRequest, backend) -> tuple[CameraOptics, Any]:
     kind, peer = request.param
     if peer != "numpy":
@@ -99,6 +107,7 @@ def test_the_glass_of_batoids_lsst_comes_along() -> None:
 
 
 @pytest.mark.second
+@pytest.mark.parametrize("case", LONG, indirect=True, ids="-".join)
 def test_mtf_over_the_light_of_batoids_wavefronts(case, backend) -> None:
     """Each wavelength's pupil on a grid of direction cosines with its true edge, shifted against itself and summed."""
     optics, peer = case

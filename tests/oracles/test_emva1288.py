@@ -6,6 +6,7 @@ same dark and flat frames.
 
 import logging
 import math
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -16,8 +17,11 @@ from scenes.specs.load import load_detector
 from twin.run.data_files import FrameFacts, tiff
 from twin.sensors.area_detector import EmvaDetector
 
-pytest.importorskip("emva1288", reason="emva1288 not installed (extra `oracles`)")
-pytestmark = pytest.mark.oracle
+# not imported here: each process that runs tests collects this file
+pytestmark = [
+    pytest.mark.oracle,
+    pytest.mark.skipif(find_spec("emva1288") is None, reason="emva1288 not installed (extra `oracles`)"),
+]
 
 SIDE, EXPOSURE, STACK = 192, 0.01, 24
 PIXELS = SIDE * SIDE

@@ -132,7 +132,7 @@ LSST/Rubin_v3.14_y.yaml
 """.split()
 
 
-@pytest.mark.parametrize("name", BATOID)
+@pytest.mark.parametrize("name", quick(8, BATOID))
 def test_as_batoid_traces_its_telescopes(backend, name: str) -> None:
     """Places, directions and paths of rays over the whole pupil at the detector; a wavefront is their paths."""
     batoid = pytest.importorskip("batoid")
@@ -199,6 +199,7 @@ def stopped_as_batoid_stops(backend, name: str, rays: int) -> None:
         assert np.count_nonzero(through != expected) <= 1e-6 * rays
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["LSST/LSST_r.yaml"])
 def test_edges_stop_what_batoid_stops(backend, name: str) -> None:
     stopped_as_batoid_stops(backend, name, 20_000)

@@ -25,7 +25,7 @@ TREES = st.recursive(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.dictionaries(TEXT, TREES, min_size=1, max_size=4))
 def test_yaml(data) -> None:
     found = parse_yaml(dump_yaml(data)).data

@@ -16,6 +16,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.obstruction import RAYS, find_obstructions
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_camera, load_instrument
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 
 PAIR = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
 PAIR = re.sub(r", tilt: \[[^]]*\]", "", PAIR)  # prisms square to the beam, for round numbers
@@ -250,7 +251,9 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "line", "words"), REFUSED, ids=[words[0].split(":")[0] for _, _, words in REFUSED])
+@pytest.mark.parametrize(
+    ("changes", "line", "words"), quick(6, REFUSED), ids=[words[0].split(":")[0] for _, _, words in REFUSED]
+)
 def test_what_cannot_be_built_is_bad_input(changes, line, words, tmp_path) -> None:
     """Exit code 2, the file with its line and key, and nothing written."""
     changed(tmp_path, *changes)

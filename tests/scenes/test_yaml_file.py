@@ -7,7 +7,7 @@ import pytest
 
 from scenes.yaml import yaml_file
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import LARGEST_BYTES, dump_yaml, parse_yaml, read_yaml
+from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
 
 BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 
@@ -116,6 +116,22 @@ def test_plain_data_with_lines() -> None:
     assert [yaml.data[key] for key in ("on", "n", "text", "no")] == [True, None, "1", 1000.0]
     assert yaml.lines["b", 1, "d"] == 4
     assert yaml.lines["on",] == 5
+
+
+def test_what_was_read_before_is_the_readers_own() -> None:
+    """A text that is read again is not parsed again; what the first reader did to its data does not stand in them."""
+    text = "a: {b: [1, {c: 2}]}\n"
+    first = parse_yaml(text, "first.yaml")
+    first.data["a"]["b"][1]["c"] = 3
+    first.data["a"]["b"].append(4)
+    first.lines.clear()
+    for file in ("first.yaml", "second.yaml"):
+        again = parse_yaml(text, file)
+        assert again == YamlFile(file, {"a": {"b": [1, {"c": 2}]}}, again.lines)
+        assert again.lines[("a", "b", 1, "c")] == 1
+    for file in ("first.yaml", "second.yaml", "first.yaml"):
+        with pytest.raises(InputError, match=rf"^{file}:2: "):
+            parse_yaml("a: 1\na: 2\n", file)
 
 
 def test_a_byte_order_mark_is_fine(tmp_path: Path) -> None:

@@ -179,6 +179,7 @@ def test_positions_are_those_of_the_bodies(whole) -> None:
     np.testing.assert_allclose(columns[:3, 3], np.cross([1.0, 0.0, 0.0], kind.nominal[0]))
 
 
+@pytest.mark.second
 def test_spots_and_temperatures_of_a_pair(backend, tmp_path) -> None:
     """Derivatives of spots by motions are those of automatic differentiation; a body's temperature is its own, or that
     of what carries it.
@@ -245,6 +246,7 @@ def test_spots_of_recovered_frames_and_of_tables_are_read(backend, tmp_path) -> 
         bench.data()
 
 
+@pytest.mark.second
 def test_an_instrument_is_found(whole) -> None:
     """Of a drawn instrument each combination and motion lies within what its sigma says, and order does not matter.
 
@@ -280,6 +282,7 @@ def test_a_gross_error_of_one_field_is_named(whole) -> None:
     assert np.max(np.abs(found.mean - clean.mean) / found.sigma) < 3.0
 
 
+@pytest.mark.second
 def test_moves_are_part_of_the_state(backend, tmp_path) -> None:
     """What was moved is known but for its error: the estimate after a move tells where the parts stood before, and how
     far the actuator really went.
@@ -445,6 +448,7 @@ def test_files_of_the_laboratory_are_read(backend, tmp_path) -> None:
         bench_of(backend, tmp_path, measured, simulate=None)
 
 
+@pytest.mark.second
 def test_one_state_without_light_leaves_the_others(backend, tmp_path, monkeypatch) -> None:
     """Its merit is not known, those of the others are as alone, and the next move is still told."""
     measured = {"focus": {"collimator": {"fields": [[0, 0]], "sigma": "3 um"}}}
@@ -582,6 +586,7 @@ def test_a_prior_of_nothing_is_refused(backend, tmp_path) -> None:
         bench_of(backend, tmp_path, {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "5 nm"}}}, nothing)
 
 
+@pytest.mark.second
 def test_measurements_that_contradict_each_other_are_refused(backend, tmp_path) -> None:
     """Ten readings of the line of sight by arcminutes apart, each with a sigma of an arcsecond."""
     sight = {

@@ -141,6 +141,7 @@ def test_despace_as_paraxial_rays_have_it(run: JobRun) -> None:
     assert [abs(camera[key]) < 1e-9 for key in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec")] == [True] * 3
 
 
+@pytest.mark.second
 def test_a_tilted_secondary_turns_the_line_of_sight(backend) -> None:
     """By twice its angle times its distance from the image, over the focal length; about its vertex."""
     spec = load_camera(RC)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scenes.specs.measured.orbit_data import LineTimesFileSpec
 from scenes.specs.measured.pass_files import PlatformFilesSpec
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from tests.twin.dimap_bench import Oracle, Scene, clock, dimap, rpc, write
 from twin.orbit.conventions.pass_readings import read_line_clocks
 from twin.orbit.export.rational_polynomial import RationalPolynomial
@@ -106,7 +107,7 @@ def test_midnight_within_a_scene_changes_nothing(tmp_path: Path) -> None:
         assert np.abs(late.ground(row, column, height) - noon.ground(row, column, height)).max() < 3e-5
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", quick(1, SCENES))
 def test_the_rpc_of_the_same_file_agrees(tmp_path: Path, name: str) -> None:
     """The polynomials go into the product's file by the project's fitter, and come back as the user reads them."""
     scene = SCENES[name]

@@ -11,6 +11,7 @@ import pyproj
 import pytest
 
 import twin.orbit.__main__ as command
+from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from tests.twin.dimap_bench import Scene, rpc, write
 from tests.twin.line_scanner_model import LineScannerModel
@@ -75,7 +76,7 @@ def test_a_scene_becomes_models(folder: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(there, (row, column), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["shift", "affine"])
+@pytest.mark.parametrize("kind", quick(1, ["shift", "affine"]))
 def test_control_points_correct_the_polynomials(folder: Path, tmp_path: Path, kind: str) -> None:
     arguments = ("--control", folder / "points.gcp", "--correction", kind)
     result = run("export", folder / "DIM_SCENE.XML", *arguments, "--out", tmp_path / "out")
@@ -130,6 +131,7 @@ def test_a_map_of_the_accuracy(folder: Path, tmp_path: Path) -> None:
     assert len(table) == 1 + 13 * 13
 
 
+@pytest.mark.second
 def test_what_control_determines_is_not_what_the_camera_leaves_open(folder: Path, tmp_path: Path) -> None:
     arguments = ("--control", folder / "points.gcp", "--attitude-sigma", "2 arcsec", "--image-sigma", "0.5")
     result = run("export", folder / "DIM_SCENE.XML", *arguments, "--out", tmp_path / "out", "--quiet")
@@ -180,6 +182,7 @@ def test_control_points_that_do_not_correct(folder: Path, tmp_path: Path, edit, 
     assert "p.gcp" in result.stderr
 
 
+@pytest.mark.second
 def test_gcp_files_as_others_write_them(folder: Path, tmp_path: Path) -> None:
     """Commas, comments, a header with the system, several images in a row, a path before the image's name."""
     text = (folder / "points.gcp").read_text()
@@ -204,7 +207,7 @@ def test_gcp_files_as_others_write_them(folder: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(found[name], found["plain"], rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("form", ["a_RPC.TXT", "RPC_SCENE.XML", "a.tif"])
+@pytest.mark.parametrize("form", quick(1, ["a_RPC.TXT", "RPC_SCENE.XML", "a.tif"]))
 def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str) -> None:
     """The same polynomials from three formats take the same correction, as the scene's own do."""
     model = read_rpc(folder / "RPC_SCENE.XML")
@@ -239,6 +242,7 @@ def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str
         assert message in re.sub(r"\s+", " ", bad.stderr)
 
 
+@pytest.mark.second
 def test_the_speed_of_light_is_not_passed_over(folder: Path, tmp_path: Path) -> None:
     """Nobody knows what the setting does to the geometry: the model leaves it out and says so."""
     scene = replace(SCENE, settings={"LIGHT_SPEED_SETTING": "true", "ATMOSPHERIC_REFRACTION_SETTING": "true"})

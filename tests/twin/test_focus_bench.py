@@ -16,6 +16,7 @@ from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import ROOT
 from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import resolve_focus
+from tests.tiers import quick
 from twin.laboratory.focus_bench import BudgetLine, FocusBench, Site
 from twin.sensors.line_ccd import band_wavelengths
 from twin.targets.target_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
@@ -74,7 +75,7 @@ def places(bench: FocusBench) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("defocus", "tolerance"),
-    [(0.0, TABLE), (37.4e-6, TABLE), (-112.3e-6, TABLE), (0.5876e-3, TABLE), (-0.8e-3, OUTSIDE)],
+    quick(4, [(0.0, TABLE), (37.4e-6, TABLE), (-112.3e-6, TABLE), (0.5876e-3, TABLE), (-0.8e-3, OUTSIDE)]),
 )
 def test_tables(bench, defocus: float, tolerance: float) -> None:
     """Between the table's samples, near its end and beyond it, up to the cut-off and beyond."""

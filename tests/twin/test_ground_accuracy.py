@@ -97,6 +97,7 @@ def test_draws_of_a_wrong_camera_have_the_stated_covariance(sensors) -> None:
     assert found.ce90[k] > level_ground.ce90[k]
 
 
+@pytest.mark.second
 def test_intersected_points_against_least_squares(sensors) -> None:
     """Each error by itself, found anew: wrong sensors image a point, the right ones intersect it in the images."""
     pair = {name: sensors[name] for name in ("nadir", "forward", "backward")}
@@ -144,6 +145,7 @@ def test_intersected_points_against_least_squares(sensors) -> None:
         np.testing.assert_allclose(got / np.outer(scale, scale), wanted / np.outer(scale, scale), atol=2e-3)
 
 
+@pytest.mark.second
 def test_three_lines_know_heights_better_than_two(sensors) -> None:
     only = uncertainty(platform=np.zeros((6, 6)), interior=np.zeros((3, 3)))
     two = intersected_accuracy({n: sensors[n] for n in ("nadir", "forward")}, only, HEIGHT)

@@ -34,6 +34,7 @@ def test_bounds_are_held_to_their_rounding_and_say_what_left_them() -> None:
         hold_equal("light", np.array([0.5]), 0.6, "rays", 0.01)
 
 
+@pytest.mark.second
 def test_an_mtf_above_one_or_above_the_perfect_one_is_none(telescope, monkeypatch) -> None:
     few = np.array([0.0, 2e4, 3e4])  # uneven, for the way by pieces
     mtf = telescope.mtf((1.0, 0.0), few)

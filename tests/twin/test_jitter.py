@@ -88,6 +88,7 @@ def test_its_limits_are_a_linear_smear_and_a_bessel_function() -> None:
     assert np.isclose(light.mean(1.0 / STEP * 3.0), 0.0, atol=1e-9)  # whole cycles in every step
 
 
+@pytest.mark.second
 def test_bands_and_lines_together_against_drawn_motions() -> None:
     """The expectation over draws of a band and a line: 4000 of them leave 0.3/sqrt(4000)."""
     light, random = Collection(32, STEP), np.random.default_rng(3)
@@ -204,6 +205,7 @@ def test_what_is_no_jitter_is_told(text: str, told: str) -> None:
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("frequency", quick(1, [62.0, 12.0]))
 def test_every_line_of_an_image_is_displaced_and_blurred_by_its_own_transfer(frequency: float) -> None:
     """A wave along the line, 0.3 cycles per pixel, under 32 stages: its amplitude in each line, over that without

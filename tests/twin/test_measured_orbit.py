@@ -27,6 +27,7 @@ from scenes.specs.orbit.angle import EffectsSpec
 from scenes.specs.orbit.setup import resolve_angle, resolve_calibration, resolve_simulate
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back, scaled, set_keys, small
 from twin.orbit.angle.angle_run import run_angle
@@ -645,7 +646,7 @@ def test_points_of_simulated_images_are_exported_where_they_were_found(tmp_path)
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"effects": {"corrected": False}}, {"errors": {"points": "0.1 m"}, "time": "7 s"}]
+    "changes", quick(1, [{}, {"effects": {"corrected": False}}, {"errors": {"points": "0.1 m"}, "time": "7 s"}])
 )
 def test_angles_of_a_simulation_and_of_its_exported_files(tmp_path, changes) -> None:
     """Planes, along the track and resection: values to the rounding of a coordinate in the ITRS, 1e-9 m and 2e-15 rad

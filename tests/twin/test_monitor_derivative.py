@@ -45,6 +45,7 @@ def test_image_derivative_is_what_images_do(path):
     assert np.count_nonzero(strong) >= 9  # the check sees most motions well above its noise
 
 
+@pytest.mark.second
 def test_centroid_of_the_image_moves_as_the_rays_do(path):
     """Theorem: the energy centroid of a diffraction image is the mean of the rays. The window cuts some far tail."""
     exact = photon_derivative(path, MOTIONS)

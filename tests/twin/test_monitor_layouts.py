@@ -213,6 +213,7 @@ def test_bodies_of_one_channel_are_told_from_shared_ones() -> None:
     assert not any(is_own(body) for body in ("base/forward/M1", "base/central_prism", "base/forward/focal_plane"))
 
 
+@pytest.mark.second
 def test_beams_that_stand_in_each_other_are_not_combined(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
     assert not touching(facts[0], facts[1])
     # CCDs of 1.152 mm at 5.51 m and fields near 1.22 deg have room from 0.0120 deg on
@@ -341,6 +342,7 @@ def test_layouts_with_ghosts_are_left_out(whole: MonitorDesignRun, monkeypatch: 
     assert [point.name for point in again.points] == [point.name for point in whole.points]
 
 
+@pytest.mark.second
 def test_a_start_that_throws_a_ghost_is_refused_with_both_bodies_and_the_line(
     setup: MonitorDesignSetup, tmp_path: Path
 ) -> None:

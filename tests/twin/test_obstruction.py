@@ -126,6 +126,7 @@ def test_shadows_on_the_stop_end_at_its_edge(chord: float) -> None:
         assert np.sum(shadows.weights * (shadows.points / turn).real) == pytest.approx(moment, abs=1e-8)
 
 
+@pytest.mark.second
 def test_a_state_with_shadows_is_the_same_alone_and_among_others(gf7_pair, backend) -> None:
     """Others have other shadows or none. Pieces are made small alike for a whole batch; integrals over them, small or
     not, are right to 2e-7.

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import binom
 
 from scenes.yaml.errors import Problem
+from tests.tiers import quick
 from tests.twin.operation_records import (
     DAY,
     START,
@@ -101,6 +102,7 @@ def test_drawn_lives_are_covered(known, tmp_path) -> None:
         assert np.all(ratio < 6.0), name
 
 
+@pytest.mark.second
 def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> None:
     """One by one with the estimate asked for in between, all at once, or some late: the same to the bit."""
     plan, _, stated = known
@@ -135,7 +137,7 @@ def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> N
     assert estimate.again().follow().to_dict() == result
 
 
-@pytest.mark.parametrize(("slips", "apart", "wider"), [(False, 0.2, 0.2), (True, 0.3, 2.0)])
+@pytest.mark.parametrize(("slips", "apart", "wider"), quick(1, [(False, 0.2, 0.2), (True, 0.3, 2.0)]))
 def test_a_part_of_the_past_is_that_of_the_whole(
     known, tmp_path, monkeypatch, slips: bool, apart: float, wider: float
 ) -> None:

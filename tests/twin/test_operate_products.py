@@ -155,6 +155,7 @@ def found_at(operation: StandIn, time: int = START) -> EstimatedMotions:
     return EstimatedMotions.in_units(experiment().stated.components, motions.mean, motions.covariance)
 
 
+@pytest.mark.second
 def test_the_job_of_a_state_is_that_state(tmp_path: Path) -> None:
     found = found_at(stand_in(drawn(5)))
     text, left = state_file(found, experiment().thermal, "gf7_pair", "orbit", "remark\nmore")
@@ -329,6 +330,7 @@ def test_a_scene_of_another_instrument_is_refused(history: History, tmp_path: Pa
     assert "camera: gf7_pair" in (told.allowed or "")
 
 
+@pytest.mark.second
 def test_the_version_goes_with_the_record_and_the_plan(tmp_path: Path) -> None:
     record, backend = made(tmp_path / "record"), load_backend()
     record.take(given("reading", [Entry("monitor", "monitor", START, {"numbers": {}})]))
@@ -342,6 +344,7 @@ def test_the_version_goes_with_the_record_and_the_plan(tmp_path: Path) -> None:
     assert products_of(operation, record, START, None, backend).version not in (first, other)
 
 
+@pytest.mark.second
 def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
     """With motions that do not go on in time nothing else does."""
     told = SimpleNamespace(
@@ -409,6 +412,7 @@ def test_err_bias_is_the_scatter_of_points_of_drawn_cameras(one: Products) -> No
     assert line.ground.random_m == 0.0
 
 
+@pytest.mark.second
 def test_what_is_white_in_time_is_err_rand_and_not_applied(history: History) -> None:
     """The mirrors' mounts, once stated as white: whether an image is taken at a reading or a microsecond later makes no
     difference, though the estimate at the reading itself knows of them.
@@ -444,6 +448,7 @@ def test_what_is_white_in_time_is_err_rand_and_not_applied(history: History) -> 
     assert beside.course.covariance[0, 0, 0] > 1.001 * at_once.course.covariance[0, 0, 0]
 
 
+@pytest.mark.second
 def test_models_see_what_the_changed_instrument_sees(one: Products, tmp_path: Path) -> None:
     """ISD and RPC of the product, read by independent programs, against exact chief rays of the true state: wrong by
     what ERR_BIAS says, where the models of the laboratory's cameras are wrong by several times more.

@@ -223,6 +223,7 @@ def test_the_command_writes_the_report_of_the_newest_day(life, tmp_path):
         assert {one["kind"] for one in history.alarms()} == {"jump"}
 
 
+@pytest.mark.second
 def test_the_report_of_a_past_day_is_what_was_known_then(life, tmp_path):
     record, _ = life
     for day, jumps in (("2026-04-20", False), ("2026-04-22", True)):
@@ -262,6 +263,7 @@ def test_what_cannot_be_reported_is_told(life, tmp_path, words, said):
     assert not out.exists()
 
 
+@pytest.mark.second
 def test_a_place_that_cannot_be_written_and_a_record_without_a_plan_are_told(life, tmp_path, history):
     assert run(life[0], "--out", tmp_path / "no" / "r.html").exit_code == 1
     told = run(Path(history.url.removeprefix("sqlite:///")).parent)

@@ -407,6 +407,7 @@ def test_who_says_nothing_locks_nobody_out(port):
 
 
 # --- on the estimate itself -------------------------------------------------------------------------------------------
+@pytest.mark.second
 def test_what_is_drawn_is_what_the_estimate_says(tmp_path):
     place, _ = lived(tmp_path)
     with History(str(place)) as history:

@@ -81,6 +81,7 @@ def test_an_oscillation_of_the_body_is_found_about_its_axes() -> None:
     assert numbers["oscillations"][0]["true_amplitude_arcsec"] == pytest.approx({"roll": 2.4, "pitch": 1.0})
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("pair", "blind"), quick(1, [(("blue", "green"), 8.223), (("green", "red"), 9.765)]))
 def test_two_bands_are_blind_at_the_inverse_of_their_gap(pair: tuple[str, str], blind: float) -> None:
     """An oscillation of 1 px there is not found by the two, but by all four."""

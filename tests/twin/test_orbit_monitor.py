@@ -301,6 +301,7 @@ def test_smoothed_heights(stated) -> None:
         assert one.consistency.degrees % 8 == 0
 
 
+@pytest.mark.second
 def test_contradictions_stand_in_the_report(stated) -> None:
     chosen = stated.smoothing[1200.0]
     assert not monitor_report(stated).warnings

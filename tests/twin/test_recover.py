@@ -19,6 +19,7 @@ from analysis.spots.noise import NoiseModel
 from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.main_job.monitor_reading import stated
@@ -68,6 +69,7 @@ def test_rendered_frames_give_the_main_jobs_numbers_to_the_last_digit(run, image
     assert "truth" not in report.verdict
 
 
+@pytest.mark.second
 def test_packed_fits_and_listed_files_are_the_same_measurement(run, images, backend, tmp_path):
     """LZW TIFF, FITS cubes, one file a frame, a CSV table: to the bit."""
     first = tifffile.imread(images / "forward_left_before.tiff")
@@ -144,6 +146,7 @@ def test_without_an_instrument_its_geometry_and_a_learnt_shape_will_do(run, imag
         np.testing.assert_array_less(np.abs(one.vector - other.vector), 3.0 * np.sqrt(2.0) * one.sigma_noise)
 
 
+@pytest.mark.second
 def test_dark_and_flat_frames_take_the_pattern_off(run, images, backend, tmp_path):
     """Corrected frames of spots that moved by many pixels have less noise of pattern; photon transfer gives the data
     sheet.
@@ -214,16 +217,23 @@ def burnt(frames):
 
 @pytest.mark.parametrize(
     ("change", "problem", "remedy"),
-    [
-        (no_spot, "no spot", "the right file, with the light on"),
-        (at_the_edge, "too near the edge", "10 pixels or more inside"),
-        (half_dark, "6 of 9 frames hold less than half of the light", "with the light on"),
-        (burnt, "too much of the spot is missing (saturation", "less light"),
-        (lambda f: f[:, :20], "frames of 20 x 96 pixels", "24 rows and columns or more"),
-        (lambda f: np.pad(f, ((0, 0), (0, 9), (0, 0))), "do not lie on the CCD of 96 x 96 pixels", "with its offset"),
-        (lambda f: np.stack([f, f, f], -1), "colours", "raw frames of a CCD"),
-        (lambda f: np.where(f == f.max(), 1e30, f), "grey values up to 1e+30", "at most 4.29497e+09"),
-    ],
+    quick(
+        3,
+        [
+            (no_spot, "no spot", "the right file, with the light on"),
+            (at_the_edge, "too near the edge", "10 pixels or more inside"),
+            (half_dark, "6 of 9 frames hold less than half of the light", "with the light on"),
+            (burnt, "too much of the spot is missing (saturation", "less light"),
+            (lambda f: f[:, :20], "frames of 20 x 96 pixels", "24 rows and columns or more"),
+            (
+                lambda f: np.pad(f, ((0, 0), (0, 9), (0, 0))),
+                "do not lie on the CCD of 96 x 96 pixels",
+                "with its offset",
+            ),
+            (lambda f: np.stack([f, f, f], -1), "colours", "raw frames of a CCD"),
+            (lambda f: np.where(f == f.max(), 1e30, f), "grey values up to 1e+30", "at most 4.29497e+09"),
+        ],
+    ),
 )
 def test_frames_that_cannot_be_used_are_refused_by_name(run, images, backend, tmp_path, change, problem, remedy):
     spoilt(tmp_path, images, "backward_right_after.tiff", change)

@@ -87,48 +87,47 @@ def frames_of(folder: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def first(tmp_path_factory):
-    """A run: the folder and what was printed."""
+def computed(tmp_path_factory):
+    """A run: the folder, what was printed, and what was computed."""
     place = tmp_path_factory.mktemp("first")
-    done = run(EXAMPLE, "--out", place / "run", "--frames", FRAMES, "--seed", 5, "--json")
-    assert done.exit_code == 0, done.stderr
-    return place / "run", done.stdout, done.stderr
-
-
-@pytest.fixture(scope="module")
-def stored(tmp_path_factory):
-    """Two runs inside this process, one folder each, and what they computed: the first run again, and another seed."""
-    place = tmp_path_factory.mktemp("stored")
     kept = []
 
     def keep(*arguments, **options):
         kept.append(render_job(*arguments, **options))
         return kept[-1]
 
-    def repeat(config: Path):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(twin.main_job.render_command, "render_job", keep)
-            patch.setenv(LIMIT, "1")  # without a second process
-            again = run(config, "--out", place / "again", "--quiet")
-            patch.delenv(LIMIT)
-            other = run(EXAMPLE, "--out", place / "other", "--frames", FRAMES, "--seed", 6)
-        return place, again, other, kept
-
-    return repeat
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(twin.main_job.render_command, "render_job", keep)
+        done = run(EXAMPLE, "--out", place / "run", "--frames", FRAMES, "--seed", 5, "--json")
+    assert done.exit_code == 0, done.stderr
+    return place / "run", done.stdout, done.stderr, kept[0]
 
 
 @pytest.fixture(scope="module")
-def repeated(first, stored):
-    return stored(first[0] / "config.yaml")
+def first(computed):
+    """Its folder and what was printed."""
+    return computed[:3]
+
+
+@pytest.fixture(scope="module")
+def repeated(first, tmp_path_factory):
+    """Two more runs, one folder each: the first run again, and another seed."""
+    place = tmp_path_factory.mktemp("repeated")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(LIMIT, "1")  # without a second process
+        again = run(first[0] / "config.yaml", "--out", place / "again", "--quiet")
+        patch.delenv(LIMIT)
+        other = run(EXAMPLE, "--out", place / "other", "--frames", FRAMES, "--seed", 6)
+    return place, again, other
 
 
 @pytest.fixture
-def ready(repeated, monkeypatch):
+def ready(computed, monkeypatch):
     """The computation is replaced by one that is done already, and what is drawn of it by empty files, for tests of
     what comes before and after it.
     """
-    _, _, _, kept = repeated
-    monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept[0])
+    kept = computed[3]
+    monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept)
 
     def few(run):
         return {SUMMARY: bytes, IRRADIANCE: drawings(run)[IRRADIANCE]}
@@ -156,9 +155,9 @@ def test_a_drawing_that_fails_is_a_note_and_a_file_that_fails_is_left_out():
 
 
 @pytest.mark.slow
-def test_what_cannot_be_drawn_costs_nothing_else(repeated, tmp_path, monkeypatch):
+def test_what_cannot_be_drawn_costs_nothing_else(computed, tmp_path, monkeypatch):
     """A figure has a note in its place, a file is left out; exit code and manifest say so."""
-    kept = repeated[3][0]
+    kept = computed[3]
     for name in ("_summary", "_motions"):
         monkeypatch.setattr(f"twin.main_job.render_drawings.{name}", no_font)
     monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept)
@@ -173,9 +172,9 @@ def test_what_cannot_be_drawn_costs_nothing_else(repeated, tmp_path, monkeypatch
     assert "no such font &lt;x&gt;</text>" in (tmp_path / "run" / "report.html").read_text("utf-8")
 
 
-def test_all_that_is_drawn_can_be_sent_to_the_second_process(repeated):
+def test_all_that_is_drawn_can_be_sent_to_the_second_process(computed):
     """What cannot is drawn by the first process alone: a run that is right and takes twice as long."""
-    kept = repeated[3][0]
+    kept = computed[3]
     assert kept.recovery.curvature  # also with the motions that were traced again
     early = instrument_drawings(kept.experiment.instrument, kept.experiment.backend, kept.state)
     sent = pickle.loads(pickle.dumps((early, drawings(kept), limits_drawing(kept.limits))))
@@ -294,7 +293,7 @@ def test_report_needs_nothing_from_outside(first):
 def test_config_repeats_the_run_bit_for_bit(first, repeated):
     """The config of a run with --seed and --frames holds both, so that it alone repeats the run."""
     folder, _, _ = first
-    place, again, _, _ = repeated
+    place, again, _ = repeated
     assert again.exit_code == 0
     for name in ("truth.json", "recovered.json", "config.yaml"):
         assert (place / "again" / name).read_bytes() == (folder / name).read_bytes()
@@ -317,14 +316,14 @@ def test_what_is_drawn_does_not_depend_on_who_draws_it(first, repeated):
 
 @pytest.mark.second
 def test_quiet_says_nothing(repeated):
-    _, again, _, _ = repeated
+    _, again, _ = repeated
     assert (again.stdout, again.stderr) == ("", "")
 
 
 @pytest.mark.second
 def test_another_seed_is_other_noise_on_the_same_truth(first, repeated):
     folder, _, _ = first
-    place, _, other, _ = repeated
+    place, _, other = repeated
     assert other.exit_code == 0
     assert (place / "other/truth.json").read_bytes() == (folder / "truth.json").read_bytes()
     one, two = frames_of(folder), frames_of(place / "other")
@@ -335,7 +334,7 @@ def test_another_seed_is_other_noise_on_the_same_truth(first, repeated):
 @pytest.mark.second
 def test_the_table_is_readable_in_a_narrow_terminal(repeated):
     """No number is cut, and the table fits into 80 columns."""
-    place, _, other, _ = repeated
+    place, _, other = repeated
     assert "…" not in other.stdout
     assert str(place / "other") in other.stdout.replace("\n", "")
     truth = json.loads((place / "other/truth.json").read_text())

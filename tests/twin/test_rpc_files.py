@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from tests.twin.dimap_bench import Scene, rpc, write
 from twin.orbit.export.polynomial_control import controlled, image_slope, polynomial_correction
 from twin.orbit.export.rational_polynomial import RationalPolynomial
@@ -109,7 +110,7 @@ def test_slopes_are_those_of_the_rigorous_sensor(sensor, model: RationalPolynomi
         np.testing.assert_allclose(found[:, :, k], (ends[0] - ends[1]) / 10.0, rtol=0, atol=2e-7)
 
 
-@pytest.mark.parametrize("kind", ["shift", "affine"])
+@pytest.mark.parametrize("kind", quick(1, ["shift", "affine"]))
 def test_a_known_bias_is_recovered_within_its_sigma(sensor, model: RationalPolynomial, kind: str) -> None:
     """Over 200 draws of points, with errors in the image and on the ground: chi-square of the corrected polynomials'
     errors at places that no point stands at. The false alarm of all bounds is 1e-4.

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from scenes.kinds.file_kinds import FILE_KINDS
+from tests.tiers import quick
 from tests.twin.study_bench import ROOT
 from twin.run.cluster import _children_deaf_to_ctrl_c
 from twin.run.console import PROGRAMS as ALL_PROGRAMS
@@ -178,7 +179,7 @@ def test_a_bad_file_of_every_kind_waits_for_nothing_that_computes(tmp_path: Path
         assert "no_such_key: unknown key; found 'no_such_key'" in told
 
 
-@pytest.mark.parametrize("command", ["status", "ingest", "forecast", "report", "products"])
+@pytest.mark.parametrize("command", quick(1, ["status", "ingest", "forecast", "report", "products"]))
 def test_a_record_that_is_not_there_waits_for_no_database(command: str, tmp_path: Path) -> None:
     words = [command, str(tmp_path / "none"), *(["a.yaml"] if command == "ingest" else [])]
     found = loaded(REFUSED, json.dumps([("record", "twin.operate.__main__", words)]))

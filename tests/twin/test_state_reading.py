@@ -43,6 +43,7 @@ def test_a_reading_is_the_main_jobs_whatever_was_read_before(job, reader, backen
     assert np.array_equal(found.recovery.shift_covariance, run.recovery.shift_covariance)
 
 
+@pytest.mark.second
 def test_without_noise_the_model_reads_what_its_motions_do(reader) -> None:
     """A shift of a focal plane is a motion of the model's own; what is not linear in it, and the change of the spot's
     shape, are below 1e-3 of it. The same light is the same reading; at rest there is none.

@@ -153,6 +153,7 @@ def test_jobs_made_quickly_are_those_that_the_schema_reads(study) -> None:
     assert quantity_at(PerturbationSpec, ("pivot",)) is None
 
 
+@pytest.mark.second
 def test_a_response_may_be_a_difference(study, backend) -> None:
     """What is recovered minus what is true; where one of them is not there, the run fails."""
     outcomes = study.setup.job.evaluate(study.setup.tree, [study.plan.run(k) for k in range(3)], backend)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from scenes.specs.orbit.scene import ControlSpec, LightSpec, TerrainSpec, TextureSpec
+from tests.tiers import quick
 from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame, SplineGrid, correlated_field, fractal_field
 from twin.orbit.ground.orthophoto import SCALE, make_control
@@ -30,7 +31,7 @@ def test_local_coordinates_are_exact() -> None:
     assert np.linalg.norm(steps[3] - steps[2]) == pytest.approx(2.0, rel=1e-9)
 
 
-@pytest.mark.parametrize("spec", [TerrainSpec(), FRACTAL], ids=["real", "fractal"])
+@pytest.mark.parametrize("spec", quick(1, [TerrainSpec(), FRACTAL]), ids=["real", "fractal"])
 def test_one_function(spec: TerrainSpec) -> None:
     """On a grid and at places the same number, to rounding; slopes are its derivatives; it goes on beyond its edges."""
     terrain = Terrain.from_spec(spec, 4000.0, SEED)
@@ -90,6 +91,7 @@ def test_a_correlated_field_has_its_covariance() -> None:
     assert white.std() == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.second
 def test_reflectance() -> None:
     """Mean and contrast as asked for, within what 100 fields' chance and clipping leave, 20%; the same seed gives the
     same ground, and a date on which a quarter has changed leaves the rest alone."""

@@ -87,6 +87,7 @@ def test_without_tolerances_the_camera_is_the_designed_one(bench: ToleranceBench
     np.testing.assert_array_equal(values[0], values[1])
 
 
+@pytest.mark.second
 def test_a_camera_is_that_of_the_main_program(bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path) -> None:
     """The worst camera, written as a job, traced by everything that other commands use."""
     found = draw_samples(bench.setup, bench, backend, 20, 3, Workforce())
@@ -107,6 +108,7 @@ def test_a_camera_is_that_of_the_main_program(bench: ToleranceBench, drawn: np.n
     assert values[6] == pytest.approx(abs(gamma), rel=1e-6, abs=1e-12)
 
 
+@pytest.mark.second
 def test_order_and_company_do_not_matter(bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path) -> None:
     turned = dict(reversed(BUDGET["tolerances"].items()))
     other = ToleranceBench(budget(tmp_path, tolerances=turned), backend)

@@ -157,6 +157,7 @@ def test_without_errors_the_truth_comes_out() -> None:
     assert np.max(np.abs(left[inside])) < 1e-3 * ARCSEC
 
 
+@pytest.mark.second
 def test_contract(run: TurntableRun) -> None:
     result = json.loads(json.dumps(TURNTABLE(run), allow_nan=False))
     assert set(result["fits"]) == set(FITS) == set(result["truth"]["fits"])
@@ -177,12 +178,14 @@ def test_contract(run: TurntableRun) -> None:
     assert sum(not k for p in result["points"] for k in p["kept"]) == result["rejected"]
 
 
+@pytest.mark.second
 def test_network_weights_stay_within_the_points(run: TurntableRun) -> None:
     """A linearisation with more effective parameters than points would be one at no minimum."""
     for fit in run.fits.values():
         assert 2.0 < fit.effective_parameters < 41.0 + 1e-6
 
 
+@pytest.mark.second
 def test_report(run: TurntableRun) -> None:
     parts = turntable_report(run).sections
     artefacts = [artefact for part in parts for artefact in part.artefacts]

@@ -172,6 +172,7 @@ def test_states_do_not_depend_on_how_many_are_drawn_at_once(monkeypatch):
     assert np.all(other.errors[BEST] != whole.errors[BEST])
 
 
+@pytest.mark.second
 def test_shares_add_up_to_the_variance_and_known_motions_take_theirs_away():
     for disturbances in ("orbit", TOGETHER):
         _, limits = bench("gf7_pair", disturbances)

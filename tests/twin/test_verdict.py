@@ -183,6 +183,7 @@ def test_figure_errors(job, figure, words) -> None:
     assert words in all_of(told)
 
 
+@pytest.mark.second
 def test_heat(job) -> None:
     told = judge(job("{base/forward: {temperature: {change: 1 K, gradient: [1 K/m, 0 K/m, 0 K/m]}}}"))
     two_sentences(told.verdict)
@@ -200,6 +201,7 @@ def test_lost_light_is_told(job) -> None:
     two_sentences(dimmed.verdict)
 
 
+@pytest.mark.second
 def test_a_course_is_judged_over_its_times(job) -> None:
     course = (
         "course: {times: [0 min, 10 min, 20 min], temperature: {base/forward: "
@@ -269,6 +271,7 @@ EXAMPLE = (
 )
 
 
+@pytest.mark.second
 def test_what_is_stated_stands_in_the_sentence(job) -> None:
     """No reading of the example is beyond 3 total sigma, and the reader sees which body limits the angle."""
     run = job(EXAMPLE, LAUNCH, frames=9)

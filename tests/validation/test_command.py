@@ -194,6 +194,11 @@ def test_only_selected_groups_run(backend):
     assert [result.id for result in validation.results] == ["001.table3.b"]
 
 
+def test_every_change_passes_the_checks_of_all_papers_once() -> None:
+    named = re.findall(r"^\S+ -m twin\.validate --fast --only (\S+)", (ROOT / ".ci/run").read_text("utf-8"), re.M)
+    assert sorted(",".join(named).split(",")) == sorted({one.prefix.partition(".")[0] for one in registry.GROUPS})
+
+
 def test_list(fake):
     fake(GOOD, OTHER)
     result = run("--list")
