@@ -32,7 +32,7 @@ targets hold for the machine of reference. What the wall clock measures is not j
 
 Examples:
 
-  python -m tests.benchmarks                        all, some ten minutes on two cores\n
+  python -m tests.benchmarks                        all, some forty minutes on two cores\n
   python -m tests.benchmarks --list                 what there is\n
   python -m tests.benchmarks --only trace,psf       some of it\n
   python -m tests.benchmarks --quick                small sizes: does everything run?\n

@@ -73,7 +73,7 @@ BENCHMARKS = (
     Benchmark("live", "the live twin: from a slider to painted spots and readings", live_speed.measure, 75, 30),
     Benchmark("large", "a study of ten thousand states", large_speed.measure, 200, 25),
     Benchmark(
-        "growth", "how processor time grows with states, pixels, bodies and frames", growth_speed.measure, 300, 8
+        "growth", "how processor time grows with states, pixels, bodies and frames", growth_speed.measure, 550, 8
     ),
     Benchmark(
         "start",

@@ -28,7 +28,7 @@ CAMERAS = ("gf7", "gf7_conic")
 SURFACES = 4
 RAYS, QUICK_RAYS = 1_000_000, 50_000
 ROUNDS, REPEATS = 9, 5
-PACE = pace(arithmetic=0.5, memory=0.5)
+PACE = pace(arithmetic=0.7, memory=0.3)
 
 
 def launch(bench: Workbench, model: CameraModel, rays: int) -> tuple[np.ndarray, np.ndarray]:

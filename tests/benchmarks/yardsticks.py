@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import median
+from statistics import mean
 from typing import Any
 
 import numpy as np
@@ -118,7 +118,7 @@ def _arithmetic() -> Callable[[], float]:
 
     def take() -> float:
         with one_kernel_thread():
-            return processor_time(multiply, 10)
+            return processor_time(multiply, 30)
 
     return take
 
@@ -126,7 +126,7 @@ def _arithmetic() -> Callable[[], float]:
 def _python() -> Callable[[], float]:
     def take() -> float:
         with one_blas_thread():
-            return processor_time(interpreted)
+            return processor_time(interpreted, 3)
 
     return take
 
@@ -150,7 +150,7 @@ YARDSTICKS = {
     for one in (
         Yardstick("python", "Python objects and small arrays", _python),
         # the memory of the copy is given back between looks, so that a benchmark that counts memory does not count it
-        Yardstick("memory", "a copy of 64 MiB", lambda: lambda: processor_time(copy())),
+        Yardstick("memory", "a copy of 64 MiB", lambda: lambda: processor_time(copy(), 2)),
         Yardstick("arithmetic", "fused multiply-adds in registers", _arithmetic),
         Yardstick("start", "a process that imports NumPy", lambda: _start),
         Yardstick("compile", "a kernel of 1200 operations compiled by LLVM", lambda: _compile),
@@ -215,5 +215,5 @@ class Watch:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Yardstick -> the middle one of those that were taken."""
-        return {name: median(taken) for name, taken in self._taken.items() if taken}
+        """Yardstick -> the mean of those that were taken: work takes long enough for good and bad moments."""
+        return {name: mean(taken) for name, taken in self._taken.items() if taken}
