@@ -82,12 +82,24 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         numbers[3:3] = [
             Number("poppy_seconds", seconds, "  poppy, same samples, same pixels", "s", PACE, clock=True),
             Number(
-                "ratio_poppy", seconds / spent["twin"].wall_s, "  times poppy, same samples", least=True, limited=True
+                "ratio_poppy",
+                seconds / spent["twin"].wall_s,
+                "  times poppy, same samples",
+                least=True,
+                limited=True,
+                clock=True,
             ),
             Number("poppy_difference", same, "  difference from poppy's image, of the peak"),
         ]
         ratio = seconds / spent["quadrature"].wall_s
         numbers.append(
-            Number("quadrature_ratio_poppy", ratio, "  times poppy with the samples above", least=True, limited=True)
+            Number(
+                "quadrature_ratio_poppy",
+                ratio,
+                "  times poppy with the samples above",
+                least=True,
+                limited=True,
+                clock=True,
+            )
         )
     return Speed(tuple(numbers), tuple(notes))

@@ -128,7 +128,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
             ratio = spent[peer].wall_s / twin.wall_s
             judged = peer != "batoid_all_cores"
             text = f"  times {peer.replace('_', ' ')}"
-            numbers.append(Number(f"{key}ratio_{peer}", ratio, text, least=True, limited=judged))
+            numbers.append(Number(f"{key}ratio_{peer}", ratio, text, least=True, limited=judged, clock=True))
             numbers.append(
                 Number(f"{key}{peer}_threads", spent[peer].threads, f"  threads of {peer.replace('_', ' ')}")
             )

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 CAMERA_BYTES, CAMERA_SECONDS = 158e6, 3.0
 """Of an optimisation, whatever it optimises, and what it takes beside its starts; bytes and seconds."""
-START_SECONDS = 18.0
+START_SECONDS = 11.5
 """Seconds of a start; each searches until it is settled."""
 
 
@@ -25,9 +25,9 @@ def camera_design_cost(setup: CameraDesignSetup) -> Cost:
     return Cost(CAMERA_BYTES, CAMERA_SECONDS + setup.test.starts * START_SECONDS)
 
 
-LAYOUT_BYTES, LAYOUT_SECONDS = 400e6, 20.0
+LAYOUT_BYTES, LAYOUT_SECONDS = 340e6, 10.0
 """Of a search for layouts with few beams; bytes and seconds."""
-BEAM_SECONDS, BUILT_SECONDS, COMPARED_SECONDS, REFINED_SECONDS = 0.3, 2.0, 1e-3, 20.0
+BEAM_SECONDS, BUILT_SECONDS, COMPARED_SECONDS, REFINED_SECONDS = 0.56, 0.2, 1e-3, 20.0
 """Seconds of a beam that is tried alone, of a layout that is built as a whole, of a combination that is compared, and
 of a step of refinement.
 """
