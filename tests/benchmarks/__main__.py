@@ -133,8 +133,8 @@ def main(
             raise InputErrorText("--loosen belongs to --tighten, and needs a reason: --why TEXT")
         if tighten and quick:
             raise InputErrorText("limits hold for full sizes: --tighten without --quick")
-        limits = Limits.read()
         turns = [run(todo, quick, errors) for _ in range(rounds if tighten else 1)]
+        limits = Limits.read()
         if tighten:
             limits, lines = limits.tightened(turns, Origin.here(machine), dict.fromkeys(loosen or (), why))
             limits.write()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -79,6 +80,9 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     """Seconds of the whole command."""
     with tempfile.TemporaryDirectory() as name:
         home = Path(name)
+        run_job(home, home / "first")  # Python compiles the modules
+        shutil.rmtree(home / ".drjit")
+        bench.look()
         cold, cold_cpu = run_job(home, home / "cold")
         assert any((home / ".drjit").iterdir())
         (home / "bad.yaml").write_text(BAD, "utf-8")
