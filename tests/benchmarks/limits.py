@@ -173,7 +173,9 @@ class Limits:
                 continue
             values = [self.value(_numbered(speed, number.key), speed) for speed in speeds]
             new, old = self._standing_on(values, number, speeds, origin), found.get(key)
-            if old is not None and key not in loosened and not keeps(new.bound, old.bound, old.least):
+            wider = old is not None and not keeps(new.bound, old.bound, old.least)
+            same = old is not None and old.reached is not None and new.bound == old.bound  # its reason stays, too
+            if old is not None and key not in loosened and (wider or same):
                 lines.append(f"{key}: stays {old.text}, reached {_least_of(new):.3g} (--loosen {key} --why TEXT)")
                 continue
             if old is not None and key in loosened:

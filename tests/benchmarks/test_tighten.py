@@ -75,6 +75,9 @@ def test_a_limit_becomes_wider_by_name_and_keeps_the_reason() -> None:
     after, _ = limits(ms=12.0).tightened(rounds(20.0), TODAY, {"some.ms": "more rays"})
     assert after.limits["some.ms"].bound == 24.0
     assert after.limits["some.ms"].why == "loosened from 12: more rays"
+    again, lines = after.tightened(rounds(20.0), TODAY, {})
+    assert again == after
+    assert lines[0].startswith("some.ms: stays <= 24")
     with pytest.raises(InputErrorText, match=r"no limit some\.other; there are some\.ms"):
         limits().tightened(rounds(1.0), TODAY, {"some.other": "why not"})
 
