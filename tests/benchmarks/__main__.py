@@ -12,10 +12,11 @@ from rich.progress import Progress
 
 from scenes.yaml.standard_output import FAILURE
 from tests.benchmarks.beside import compared, print_pairs, sources_of
+from tests.benchmarks.limits import Limits, Origin
 from tests.benchmarks.machine import Machine
 from tests.benchmarks.number import Speed
 from tests.benchmarks.page import Page
-from tests.benchmarks.registry import BENCHMARKS, Benchmark, running_order
+from tests.benchmarks.registry import BENCHMARKS, Benchmark, measured, running_order
 from tests.benchmarks.workbench import Workbench
 from twin.run.cli import InputErrorText, explained, progress_columns
 from twin.run.durable import exit_on_terminate
@@ -25,16 +26,21 @@ HELP = """Measure how fast everything is, in one run, and hold it against its li
 Ratios to other people's software are taken in turns with it, so that a busy machine is busy for both; software that is
 not installed is skipped by name (pip install '.[oracles]'). For numbers to quote, let nothing else run.
 
+Times are told as measured, and as they would be on the machine of reference: fixed calculations, which run before,
+between and after the turns of a benchmark, say how much slower this one is. Limits (tests/benchmarks/limits.json) and
+targets hold for the machine of reference. What the wall clock measures is not judged while other programs run.
+
 Examples:
 
-  python -m tests.benchmarks                        all, some ten minutes on two cores\n
+  python -m tests.benchmarks                        all, some forty minutes on two cores\n
   python -m tests.benchmarks --list                 what there is\n
   python -m tests.benchmarks --only trace,psf       some of it\n
   python -m tests.benchmarks --quick                small sizes: does everything run?\n
   python -m tests.benchmarks --json > speed.json    numbers on stdout, progress on stderr\n
-  python -m tests.benchmarks --beside v1.0 --only monitor    an older commit in turns with these sources: ratios
+  python -m tests.benchmarks --beside v1.0 --only monitor    an older commit in turns with these sources: ratios\n
+  python -m tests.benchmarks --tighten --only monitor,start    limits of what three rounds reach
 
-Exit code: 0 all limits are met (a quick run judges none), 1 one is missed, 2 bad input.
+Exit code: 0 all limits that are judged are met (a quick run judges none), 1 one is missed, 2 bad input.
 """
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -66,7 +72,7 @@ def run(todo: list[Benchmark], quick: bool, errors: Console) -> dict[str, Speed]
             bar.update(task, description=one.name)
             if not errors.is_terminal:
                 errors.print(f"{number}/{len(todo)} {one.name}: {one.text}; about {left:.0f} s left", soft_wrap=True)
-            found[one.name] = one.measure(bench, quick)
+            found[one.name] = measured(one, bench, quick)
             left -= cost[one.name]
             bar.advance(task, cost[one.name])
     return {one.name: found[one.name] for one in todo}
@@ -101,7 +107,14 @@ def main(
         str | None,
         typer.Option(metavar="COMMIT", help="Run these sources and a commit's in turns; no limit is judged."),
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Of both, with --beside.")] = 3,
+    rounds: Annotated[int, typer.Option(min=1, help="Of both, with --beside; of all, with --tighten.")] = 3,
+    tighten: Annotated[
+        bool, typer.Option("--tighten", help="Set limits to what is reached and 20 %; none becomes wider.")
+    ] = False,
+    loosen: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Let this limit become wider, as monitor.cpu_ms_per_state.")
+    ] = None,
+    why: Annotated[str, typer.Option(metavar="TEXT", help="The reason, kept beside the limit.")] = "",
     show: Annotated[bool, typer.Option("--list", help="Print the names and what they measure.")] = False,
 ) -> None:
     """Measure, print, judge."""
@@ -116,7 +129,18 @@ def main(
             against(beside, [one.name for one in todo], rounds, quick, as_json, (console, errors))
             return
         machine = Machine.here()
-        page = Page(machine, run(todo, quick, errors), quick)
+        if loosen and not (tighten and why):
+            raise InputErrorText("--loosen belongs to --tighten, and needs a reason: --why TEXT")
+        if tighten and quick:
+            raise InputErrorText("limits hold for full sizes: --tighten without --quick")
+        turns = [run(todo, quick, errors) for _ in range(rounds if tighten else 1)]
+        limits = Limits.read()
+        if tighten:
+            limits, lines = limits.tightened(turns, Origin.here(machine), dict.fromkeys(loosen or (), why))
+            limits.write()
+            for line in lines:
+                errors.print(line, markup=False, highlight=False, soft_wrap=True)
+        page = Page(machine, turns[-1], quick, limits)
     if as_json:
         json.dump(page.data, sys.stdout, indent=2, allow_nan=False)
         sys.stdout.write("\n")

@@ -23,7 +23,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from tests.benchmarks.page import shown
+from tests.benchmarks.number import shown
 from twin.run.cli import BAD_INPUT, InputErrorText, print_whole
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,6 +86,13 @@ def sources_of(commit: str) -> Iterator[tuple[str, Path]]:
 
 def _git(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=False)
+
+
+def commit_here() -> str:
+    """The commit of these sources, ``with changes`` where files differ from it; empty where this is no checkout."""
+    name = _git("rev-parse", "--short=12", "HEAD").stdout.strip()
+    changed = _git("status", "--porcelain", "--untracked-files=no", ":!tests/benchmarks/limits.json").stdout.strip()
+    return f"{name} with changes" if name and changed else name
 
 
 def numbers_of(sources: Path, name: str, quick: bool) -> Numbers | None:

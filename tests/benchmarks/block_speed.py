@@ -33,14 +33,15 @@ from tests.analysis.drawn_blocks import (
     drawn_process,
     project,
 )
-from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.yardsticks import pace
 
 TIES, QUICK_TIES = 1_000_000, 20_000
 """Of the largest of three sizes; the others have a quarter and a half."""
-MINUTES, GIB = 10.0, 8.0
-GROWS = Limit(2.6)
-"""Growth from half a million points to a million over that from a quarter to a half; the clock of a busy machine."""
+PACE = pace(memory=0.5, python=0.25, arithmetic=0.25)
+WANTED_S = 600.0
+"""Of the wall clock, for the largest."""
 ROWS, COLUMNS = 5, 10
 """Passes along and across: each takes two scenes."""
 SWATH, LENGTH = 30e3, 30e3
@@ -150,6 +151,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     numbers, results = [], []
     for ties in sizes:
         command = [sys.executable, "-m", "tests.benchmarks.block_speed", str(ties)]
+        bench.look()
         made = subprocess.run(command, check=True, capture_output=True, text=True)
         one = json.loads(made.stdout)
         results.append(one)
@@ -160,17 +162,18 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         what = (
             f"{ties:,} tie points in 100 scenes, {int(one['images']):,} image points, {int(one['unknowns'])} unknowns"
         )
-        limits = (Limit(60.0 * MINUTES), Limit(GIB)) if largest else (None, None)
+        wanted = WANTED_S if largest else None
         numbers += [
-            Number(f"ties_{ties}_s", one["wall_s"], what, "s", limits[0]),
-            Number(f"ties_{ties}_cpu_s", one["cpu_s"], "  of the processor", "s"),
-            Number(f"ties_{ties}_GiB", one["memory_GiB"], "  memory of the process", "GiB", limits[1]),
+            Number(f"ties_{ties}_s", one["wall_s"], what, "s", PACE, target=wanted, clock=True),
+            Number(f"ties_{ties}_cpu_s", one["cpu_s"], "  of the processor", "s", PACE, limited=largest),
+            Number(f"ties_{ties}_GiB", one["memory_GiB"], "  memory of the process", "GiB", limited=largest),
         ]
     if not quick:
         for key, text in (("cpu_s", "time of the processor"), ("memory_GiB", "memory")):
             a, b, c = (one[key] for one in results)
             # the second half of a million points against the quarter before it: 2 where the growth is linear
-            numbers.append(Number(f"{key}_grows", (c - b) / (b - a), f"  growth of the {text}, 2 is linear", "", GROWS))
+            grows = (c - b) / (b - a)
+            numbers.append(Number(f"{key}_grows", grows, f"  growth of the {text}, 2 is linear", limited=True))
     return Speed(tuple(numbers))
 
 

@@ -11,9 +11,10 @@ import numpy as np
 from optics.numerics import quadrature
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.yardsticks import pace
 from twin.monitor.monitor_derivative import every_motion, ray_tangents, spot_gradient
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import line_family, other_motions
@@ -22,7 +23,7 @@ RULE, QUICK_RULE = (158, 632), (16, 64)
 """Rings and arms: 100 000 rays in each of 4 channels; few."""
 ROUNDS = 3
 FORWARD_MOTIONS = 2
-LIMIT = 30.0
+PACE = pace(arithmetic=0.5, memory=0.5)
 
 
 def measure(bench: Workbench, quick: bool) -> Speed:
@@ -48,16 +49,16 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         "forward": Work(lambda _: ray_tangents(path, few)),
     }
     in_turns(works, 1)  # compiles
-    spent = in_turns(works, 1 if quick else ROUNDS)
+    spent = in_turns(works, 1 if quick else ROUNDS, bench.look)
     one = spent["trace"].cpu_s
     per_motion = spent["forward"].cpu_s / one / len(few)
-    total, limit = path.nodes.count * len(path.channels), Limit(LIMIT)
+    total = path.nodes.count * len(path.channels)
     text = f"Jacobian of 8 coordinates by {{}} motions, reverse, {total} rays"
     return Speed(
         (
-            Number("forward_trace_cpu_ms", 1e3 * one, f"monitor trace, {total} rays, processor time", "ms"),
-            Number("reverse_traces", spent["some"].cpu_s / one, text.format(len(some)), "traces", limit),
-            Number("reverse_every_traces", spent["every"].cpu_s / one, text.format(len(every)), "traces", limit),
+            Number("forward_trace_cpu_ms", 1e3 * one, f"monitor trace, {total} rays, processor time", "ms", PACE),
+            Number("reverse_traces", spent["some"].cpu_s / one, text.format(len(some)), "traces", limited=True),
+            Number("reverse_every_traces", spent["every"].cpu_s / one, text.format(len(every)), "traces", limited=True),
             Number("forward_traces_per_motion", per_motion, "  forward mode, each motion", "traces"),
         )
     )

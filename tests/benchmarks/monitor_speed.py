@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,20 +9,21 @@ import numpy as np
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
-from tests.benchmarks.number import Limit, Number, Speed
-from tests.benchmarks.stopwatch import Spent, Work, in_turns
+from tests.benchmarks.number import Number, Speed
+from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.yardsticks import pace
 from twin.monitor.observation import Observing, StateReader, observe, one_detector
 from twin.sensors.poisson_numbers import poisson_numbers
 
 STATES, QUICK_STATES = 200, 25
 FRAMES = 9
-ROUNDS, MOST_ROUNDS = 3, 10
-LIMIT_MS = 12.0
-"""Wall time on two cores."""
-LIMIT_ONE_MS, LIMIT_FRAMES_MS = 45.0, 60.0
-"""Wall time of one state alone: from expected images, and with nine noisy frames."""
-LIMIT_POISSON_NS = 20.0
+ROUNDS = 5
+PACE = pace(python=0.4, arithmetic=0.4, memory=0.2)
+ALONE = pace(python=0.7, arithmetic=0.3)
+DRAWN = pace(arithmetic=1.0)
+WANTED_MS = 8.0
+"""Processor time of a state of a batch."""
 
 
 def random_states(count: int, seed: int) -> list[State]:
@@ -47,11 +47,8 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     def batch(_: Any) -> list[Any]:
         return list(observe(setup, states, Observing(one_detector(setup, FRAMES, 1), stated=False)))
 
-    def quiet(best: Mapping[str, Spent]) -> bool:
-        return 1e3 * best["batch"].wall_s / count <= LIMIT_MS
-
-    rounds, most = (1, 1) if quick else (ROUNDS, MOST_ROUNDS)
-    spent = in_turns({"batch": Work(batch)}, rounds, most, quiet)["batch"]
+    rounds = 1 if quick else ROUNDS
+    spent = in_turns({"batch": Work(batch)}, rounds, bench.look)["batch"]
     assert sum(len(found.numbers) for found in spent.result) == count
     wall, cpu = 1e3 * spent.wall_s / count, 1e3 * spent.cpu_s / count
     reader = StateReader(setup, FRAMES, 1)
@@ -59,25 +56,23 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     def one(noise: bool) -> Work:
         return Work(lambda state: reader.read(state, noise), lambda: random_states(1, 3)[0], 1 if quick else 10)
 
-    def quick_enough(best: Mapping[str, Spent]) -> bool:
-        return 1e3 * best["one"].wall_s <= LIMIT_ONE_MS and 1e3 * best["frames"].wall_s <= LIMIT_FRAMES_MS
-
     for noise in (True, False):
         reader.read(states[0], noise)
-    alone = in_turns({"one": one(False), "frames": one(True)}, rounds, most, quick_enough)
+    alone = in_turns({"one": one(False), "frames": one(True)}, rounds, bench.look)
     light = setup.nominal_photons * setup.detector.quantum_efficiency
     rng = np.random.Generator(np.random.SFC64(1))
-    drawn = in_turns({"numbers": Work(lambda _: [poisson_numbers(one, FRAMES, rng) for one in light])}, rounds)
+    drawn = in_turns(
+        {"numbers": Work(lambda _: [poisson_numbers(one, FRAMES, rng) for one in light])}, rounds, bench.look
+    )
+    expected, noisy = (1e3 * alone[name].cpu_s for name in ("one", "frames"))
     numbers = 1e9 * drawn["numbers"].cpu_s / (FRAMES * light.size)
     return Speed(
         (
-            Number("states_per_s", 1e3 / wall, f"monitor states, batch of {count}", "states/s"),
-            Number("ms_per_state", wall, "  wall time of a state", "ms", Limit(LIMIT_MS)),
-            Number("cpu_ms_per_state", cpu, "  processor time of a state", "ms"),
-            Number("one_ms", 1e3 * alone["one"].wall_s, "  one alone, expected images", "ms", Limit(LIMIT_ONE_MS)),
-            Number(
-                "frames_ms", 1e3 * alone["frames"].wall_s, "  one alone, noisy frames", "ms", Limit(LIMIT_FRAMES_MS)
-            ),
-            Number("poisson_ns", numbers, "  a Poisson number, processor time", "ns", Limit(LIMIT_POISSON_NS)),
+            Number("states_per_s", 1e3 / wall, f"monitor states, batch of {count}", "states/s", PACE, True, clock=True),
+            Number("ms_per_state", wall, "  wall time of a state", "ms", PACE, limited=True, clock=True),
+            Number("cpu_ms_per_state", cpu, "  processor time", "ms", PACE, limited=True, target=WANTED_MS),
+            Number("one_ms", expected, "  one alone, expected images: processor time", "ms", ALONE, limited=True),
+            Number("frames_ms", noisy, "  one alone, noisy frames: processor time", "ms", ALONE, limited=True),
+            Number("poisson_ns", numbers, "  a Poisson number, processor time", "ns", DRAWN, limited=True),
         )
     )

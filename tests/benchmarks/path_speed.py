@@ -14,9 +14,10 @@ import numpy as np
 
 from scenes.models.instrument_model import Instrument
 from scenes.models.scenery import build_scenery
-from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.yardsticks import pace
 from tests.twin.path_bench import IDEAL, scene_beam
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.source import DiskSource
@@ -26,9 +27,10 @@ from twin.path_tracing.tracer import PathTracer
 INSTRUMENTS = ("gf7_pair", "monitor_pair")
 PATHS, PATHS_BACK, QUICK_PATHS = 1 << 19, 1 << 18, 1 << 15
 CORES = 2
-ROUNDS, MOST_ROUNDS = 3, 15
-LEAST_IMAGING, LEAST_OUT_AND_BACK = 4.7e6, 1.5e6
-STRAY_PATHS, STRAY_SIGMA, MOST_STRAY_S = 1 << 19, 1e-7, 8.5
+ROUNDS = 7
+PACE = pace(arithmetic=0.6, memory=0.4)
+WANTED = {"out_and_back": 2.5e6}
+STRAY_PATHS, STRAY_SIGMA = 1 << 19, 1e-7
 """Paths of one source, and the standard deviation, in spots, that its stray light on its area CCD is to have."""
 
 
@@ -80,31 +82,24 @@ def stray(bench: Workbench, chosen: Instrument, paths: int) -> Callable[[int], f
 def measure(bench: Workbench, quick: bool) -> Speed:
     """Paths per second of two cores, and processor time for a standard deviation of stray light."""
     numbers = []
-    kinds = (("imaging", imaging, PATHS, LEAST_IMAGING), ("out_and_back", out_and_back, PATHS_BACK, LEAST_OUT_AND_BACK))
-    for name, (kind, prepare, full, least) in itertools.product(INSTRUMENTS[:1] if quick else INSTRUMENTS, kinds):
+    kinds = (("imaging", imaging, PATHS), ("out_and_back", out_and_back, PATHS_BACK))
+    for name, (kind, prepare, full) in itertools.product(INSTRUMENTS[:1] if quick else INSTRUMENTS, kinds):
         paths = QUICK_PATHS if quick else full
         run, seeds = prepare(bench, bench.instrument(name), paths), itertools.count()
-        limit = Limit(least, least=True)
         work = Work(lambda _, run=run, seeds=seeds: run(next(seeds)))
 
-        def rate(best: Any, paths: int = paths) -> float:
-            return paths * CORES / float(best["paths"].cpu_s)
-
-        spent = in_turns(
-            {"paths": work},
-            1 if quick else ROUNDS,
-            0 if quick else MOST_ROUNDS,
-            lambda best, rate=rate, limit=limit: limit.met(rate(best) / 1.05),
-        )
+        spent = in_turns({"paths": work}, 1 if quick else ROUNDS, bench.look)["paths"]
+        rate = paths * CORES / spent.cpu_s
+        wanted = WANTED.get(kind) if name == INSTRUMENTS[0] else None
         key = "" if name == INSTRUMENTS[0] else f"{name}_"
         text = f"paths of {name}, {kind.replace('_', ' ')}, two cores"
-        numbers.append(Number(f"{key}{kind}_paths_per_s", rate(spent), text, "paths/s", limit))
+        numbers.append(Number(f"{key}{kind}_paths_per_s", rate, text, "paths/s", PACE, True, True, wanted))
     faint, seeds = (
         stray(bench, bench.instrument(INSTRUMENTS[0]), QUICK_PATHS if quick else STRAY_PATHS),
         itertools.count(),
     )
-    spent = in_turns({"stray": Work(lambda _: faint(next(seeds)))}, 1 if quick else ROUNDS)["stray"]
+    spent = in_turns({"stray": Work(lambda _: faint(next(seeds)))}, 1 if quick else ROUNDS, bench.look)["stray"]
     text = f"processor time for stray light of one source to {STRAY_SIGMA:g} of a spot"
     seconds = spent.cpu_s * spent.result / STRAY_SIGMA**2
-    numbers.append(Number("stray_s", seconds, text, "s", Limit(MOST_STRAY_S)))
+    numbers.append(Number("stray_s", seconds, text, "s", PACE, limited=True))
     return Speed(tuple(numbers))

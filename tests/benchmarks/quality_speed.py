@@ -12,18 +12,16 @@ import numpy as np
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
-from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.yardsticks import pace
 from twin.monitor.image_quality import quality_dicts
 from twin.study.runs.render_base import BLOCK
 
 BLOCKS, QUICK_BLOCKS = 4, 1
 ROUNDS = 5
-LIMIT = 2.0
-"""Processor time with shadows over that without: what shadows cost before their overlaps were worked out together for
-all states. Now 1.5 to 1.8; 1.2 would take geometry that is shared between states.
-"""
+PACE = pace(python=0.4, arithmetic=0.4, memory=0.2)
 
 
 def random_states(count: int, seed: int) -> list[State]:
@@ -51,16 +49,33 @@ def measure(bench: Workbench, quick: bool) -> Speed:
 
     works = {"shadows": Work(lambda _: all_blocks(True)), "free": Work(lambda _: all_blocks(False))}
     in_turns(works, 1)  # compiles, and finds the bodies
-    spent = in_turns(works, 1 if quick else ROUNDS)
+    spent = in_turns(works, 1 if quick else ROUNDS, bench.look)
     lost = [s["cameras"]["forward"]["light_lost"]["centre"] for block in spent["shadows"].result for s in block]
     assert min(lost) > 0.05
     count = len(blocks) * BLOCK
     shadows, free = (spent[name] for name in ("shadows", "free"))
     return Speed(
         (
-            Number("states_per_s", count / shadows.wall_s, f"image quality with shadows, {BLOCK} at once", "states/s"),
-            Number("cpu_ms_per_state", 1e3 * shadows.cpu_s / count, "  processor time of a state", "ms"),
-            Number("free_cpu_ms_per_state", 1e3 * free.cpu_s / count, "  of a state without shadows", "ms"),
-            Number("ratio_free", shadows.cpu_s / free.cpu_s, "  with shadows over without", "", Limit(LIMIT)),
+            Number(
+                "states_per_s",
+                count / shadows.wall_s,
+                f"image quality with shadows, {BLOCK} at once",
+                "states/s",
+                PACE,
+                True,
+                clock=True,
+            ),
+            Number(
+                "cpu_ms_per_state", 1e3 * shadows.cpu_s / count, "  processor time of a state", "ms", PACE, limited=True
+            ),
+            Number(
+                "free_cpu_ms_per_state",
+                1e3 * free.cpu_s / count,
+                "  of a state without shadows",
+                "ms",
+                PACE,
+                limited=True,
+            ),
+            Number("ratio_free", shadows.cpu_s / free.cpu_s, "  with shadows over without", limited=True),
         )
     )

@@ -29,9 +29,10 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import FURTHER_STEPS, NEWTON_STEPS
 from optics.waves.diffraction import image
 from optics.waves.field_samples import FieldSamples
-from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.yardsticks import COPY_BYTES, FMA_FLOPS, copy, fused_multiplies, pace
 from twin.monitor.image_sampling import disagreement
 from twin.monitor.monitor_beams import MAP_TERMS
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -39,10 +40,9 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 STATES, QUICK_STATES = 40, 8
 FRAMES, SEED = 9, 1
 ROUNDS, QUICK_ROUNDS = 5, 1
+PACE = pace(python=0.4, arithmetic=0.4, memory=0.2)
 TURN, SHIFT = 1e-6, 2e-7
 """Motions of every body, radians and metres rms."""
-LEAST_SHARE = 0.12
-"""Of the peak, of all parts together."""
 _FUNCTION, _WORD, _NORMAL = 8, 10, 15
 
 
@@ -77,27 +77,11 @@ class Part:
 
 def peaks(rounds: int) -> tuple[float, float]:
     """Operations a second of one core by fused multiply-adds, and bytes a second of one copy, by processor time."""
-    import drjit as dr
-    from drjit.llvm import Float64
-
-    width, chains, length = 1 << 14, 8, 64
-    start, factor = dr.opaque(Float64, 0.5, width), dr.opaque(Float64, 0.999, width)
-
-    def multiply(_: Any) -> None:
-        values = [start + 0.01 * k for k in range(chains)]
-        for _ in range(length):
-            values = [dr.fma(value, factor, start) for value in values]
-        dr.eval(sum(values[1:], values[0]))
-        dr.sync_thread()
-
-    source = np.ones(1 << 24)
-    target = np.empty_like(source)
+    multiply, copied = fused_multiplies(), copy()
+    works = {"fma": Work(lambda _: multiply(), repeats=50), "copy": Work(lambda _: copied(), repeats=5)}
     with one_kernel_thread():
-        multiply(None)
-        spent = in_turns(
-            {"fma": Work(multiply, repeats=50), "copy": Work(lambda _: np.copyto(target, source), repeats=3)}, rounds
-        )
-    return 2.0 * width * chains * length / spent["fma"].cpu_s, 2.0 * source.nbytes / spent["copy"].cpu_s
+        spent = in_turns(works, rounds)
+    return FMA_FLOPS / spent["fma"].cpu_s, COPY_BYTES / spent["copy"].cpu_s
 
 
 def crossing_flops(structure: Structure) -> float:
@@ -263,8 +247,8 @@ def table(parts: Sequence[Part], spent: Mapping[str, float], flops: float, copie
     for part in parts:
         least = max(part.flops / flops, part.bytes / copied)
         what = f"  {part.text} ({1e-6 * part.flops:.3g} Mflop, {1e-6 * part.bytes:.2g} MB)"
-        numbers.append(Number(f"{part.key}_ms", 1e3 * spent[part.key], what, "ms"))
-        numbers.append(Number(f"{part.key}_share", least / spent[part.key], "    share of the peak"))
+        numbers.append(Number(f"{part.key}_ms", 1e3 * spent[part.key], what, "ms", PACE))
+        numbers.append(Number(f"{part.key}_share", least / spent[part.key], "    share of the peak", least=True))
     return numbers
 
 
@@ -281,16 +265,25 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         for work in (whole, *(one.do for one in works.values())):
             work(None)
         flops, copied = peaks(rounds)
-        spent = in_turns({**works, "whole": Work(whole)}, rounds)
+        spent = in_turns({**works, "whole": Work(whole)}, rounds, bench.look)
     seconds = {key: one.cpu_s / count for key, one in spent.items()}
     together = sum(seconds[part.key] for part in parts)
     least = sum(max(part.flops / flops, part.bytes / copied) for part in parts)
     head = (
-        Number("flops_per_s", flops, "peak of one core: fused multiply-adds in registers, float64", "flop/s"),
-        Number("bytes_per_s", copied, "  copy, read and written", "B/s"),
-        Number("cpu_ms_per_state", 1e3 * seconds["whole"], f"a state of {count}, every body moving", "ms"),
-        Number("parts_ms", 1e3 * together, "  all parts, each by itself", "ms"),
-        Number("least_ms", 1e3 * least, "  at the peak", "ms"),
-        Number("share", float(least / seconds["whole"]), "  share of the peak", "", Limit(LEAST_SHARE, least=True)),
+        Number(
+            "flops_per_s", flops, "peak of one core: fused multiply-adds in registers, float64", "flop/s", least=True
+        ),
+        Number("bytes_per_s", copied, "  copy, read and written", "B/s", least=True),
+        Number(
+            "cpu_ms_per_state",
+            1e3 * seconds["whole"],
+            f"a state of {count}, every body moving",
+            "ms",
+            PACE,
+            limited=True,
+        ),
+        Number("parts_ms", 1e3 * together, "  all parts, each by itself", "ms", PACE),
+        Number("least_ms", 1e3 * least, "  at the peak", "ms", PACE),
+        Number("share", float(least / seconds["whole"]), "  share of the peak", least=True, limited=True),
     )
     return Speed((*head, *table(parts, seconds, flops, copied)))

@@ -1,11 +1,14 @@
-"""Time of some work: wall time, and processor time of all threads of this process."""
+"""Time of some work: wall time, and processor time of all threads; and what other programs take meanwhile."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
+
+import psutil
 
 
 @dataclass(frozen=True)
@@ -53,26 +56,52 @@ def timed(work: Work) -> Spent:
     return Spent(min(wall), min(cpu), max(c / w for c, w in zip(cpu, wall, strict=True)), result)
 
 
-def in_turns(
-    works: Mapping[str, Work], rounds: int, most: int = 0, enough: Callable[[Mapping[str, Spent]], bool] | None = None
-) -> dict[str, Spent]:
+def in_turns(works: Mapping[str, Work], rounds: int, look: Callable[[], None] = lambda: None) -> dict[str, Spent]:
     """Least times of several works, taken in turns, so that a busy machine is busy for all of them.
 
     Args:
         works: name -> work.
         rounds: of all works.
-        most: further rounds, up to so many in all, while the times are not ``enough``: on a machine that others use
-            too the shortest times speak of the neighbours until an undisturbed round comes.
-        enough: judges the least times so far.
+        look: what is done before each work, outside the time: to take the yardsticks.
     """
     best: dict[str, Spent] = {}
-    for turn in range(max(rounds, most)):
-        if turn >= rounds and (enough is None or enough(best)):
-            break
+    for _ in range(rounds):
         for name, work in works.items():
+            look()
             now, old = timed(work), best.get(name)
             if old is not None:
                 wall, cpu = min(now.wall_s, old.wall_s), min(now.cpu_s, old.cpu_s)
                 now = Spent(wall, cpu, max(now.threads, old.threads), now.result)
             best[name] = now
     return best
+
+
+def processor_s() -> float:
+    """Processor time of this process and of all that it started, those that have ended included, seconds."""
+    own = psutil.Process()
+    spent = 0.0
+    for process in (own, *own.children(recursive=True)):
+        with suppress(psutil.NoSuchProcess):
+            times = process.cpu_times()
+            spent += times.user + times.system + times.children_user + times.children_system
+    return spent
+
+
+class OtherPrograms:
+    """What other programs take of the machine from now on."""
+
+    def __init__(self) -> None:
+        self._begun = self._now()
+
+    @staticmethod
+    def _now() -> tuple[float, float, float]:
+        times = psutil.cpu_times()
+        idle = times.idle + getattr(times, "iowait", 0.0)
+        guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # which `user` counts, too
+        return sum(times) - guests, idle, processor_s()
+
+    @property
+    def share(self) -> float:
+        """Of all cores together, 0 to 1; what the hypervisor gave to others is among it."""
+        every, idle, own = (now - then for now, then in zip(self._now(), self._begun, strict=True))
+        return min(1.0, max(0.0, every - idle - own) / every) if every > 0.0 else 0.0

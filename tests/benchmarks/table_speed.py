@@ -12,15 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from scenes.specs.measured.orbit_data import ConventionsSpec
 from scenes.yaml.csv_table import read_table
-from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.yardsticks import pace
 from twin.laboratory.measured_readings import read_comparisons
 from twin.orbit.measured.measurement_tables import COLUMNS, CONVENTIONS
 from twin.orbit.measured.platform_readings import platform_of
 
 ROWS, QUICK_ROWS = 1_000_000, 20_000
-LIMIT_S = 20.0
-"""Of either: read in seconds, on a slow machine too."""
+PACE = pace(python=0.8, memory=0.2)
 
 
 def attitude(folder: Path, rows: int) -> Callable[[], int]:
@@ -61,7 +61,6 @@ def _written(file: Path, head: str, *columns: np.ndarray) -> None:
 def measure(bench: Workbench, quick: bool) -> Speed:
     """Seconds of a processor to read either; writing is not counted."""
     rows = QUICK_ROWS if quick else ROWS
-    limit = None if quick else Limit(LIMIT_S)
     numbers = []
     with TemporaryDirectory() as name:
         for key, text, prepare in (
@@ -69,9 +68,10 @@ def measure(bench: Workbench, quick: bool) -> Speed:
             ("comparisons", "comparisons of a turntable", comparisons),
         ):
             read = prepare(Path(name), rows)
+            bench.look()
             begun = time.process_time()
             count = read()
             seconds = time.process_time() - begun
             assert count == rows
-            numbers.append(Number(f"{key}_s", seconds, f"{text}, {rows:,} rows", "s", limit))
+            numbers.append(Number(f"{key}_s", seconds, f"{text}, {rows:,} rows", "s", PACE, limited=True))
     return Speed(tuple(numbers))

@@ -18,16 +18,17 @@ from optics.numerics.threads import cores
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, field_direction
-from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Spent, Work, in_turns
 from tests.benchmarks.workbench import Workbench, absent, installed
+from tests.benchmarks.yardsticks import pace
 from tests.oracles.peers import batoid_camera, batoid_rays, optiland_camera, optiland_rays
 
 CAMERAS = ("gf7", "gf7_conic")
 SURFACES = 4
 RAYS, QUICK_RAYS = 1_000_000, 50_000
-ROUNDS, MOST_ROUNDS, REPEATS = 5, 15, 5
-LEAST_RATIO = 15.0
+ROUNDS, REPEATS = 9, 5
+PACE = pace(arithmetic=0.7, memory=0.3)
 
 
 def launch(bench: Workbench, model: CameraModel, rays: int) -> tuple[np.ndarray, np.ndarray]:
@@ -109,27 +110,25 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     numbers: list[Number] = []
     notes = [absent(peer) for peer in ("batoid", "optiland") if not installed(peer)]
     rays = QUICK_RAYS if quick else RAYS
-    limit = Limit(LEAST_RATIO, least=True)
     for name in CAMERAS:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba's remarks on optiland's code
-
-            def enough(best: Any) -> bool:
-                named = [k for k in ("batoid", "optiland") if k in best]
-                return all(limit.met(best[k].wall_s / best["twin"].wall_s) for k in named)
-
-            todo = works(bench, bench.camera(name), rays)
-            spent = in_turns(todo, 1 if quick else ROUNDS, 0 if quick else MOST_ROUNDS, enough)
+            spent = in_turns(works(bench, bench.camera(name), rays), 1 if quick else ROUNDS, bench.look)
         check_same_work(spent)
         key = "" if name == CAMERAS[0] else f"{name}_"
         twin = spent["twin"]
         rate = rays * SURFACES / twin.wall_s
-        numbers.append(Number(f"{key}ray_surfaces_per_s", rate, f"trace of {name}", "ray-surfaces/s"))
+        each = 1e9 * twin.cpu_s / (rays * SURFACES)
+        numbers += [
+            Number(f"{key}ray_surfaces_per_s", rate, f"trace of {name}", "ray-surfaces/s", PACE, True, clock=True),
+            Number(f"{key}cpu_ns", each, "  processor time of a ray at a surface", "ns", PACE, limited=True),
+        ]
         numbers.append(Number(f"{key}threads", twin.threads, "  threads at work"))
         for peer in [k for k in spent if k != "twin"]:
             ratio = spent[peer].wall_s / twin.wall_s
-            judged = None if peer == "batoid_all_cores" else limit
-            numbers.append(Number(f"{key}ratio_{peer}", ratio, f"  times {peer.replace('_', ' ')}", "", judged))
+            judged = peer != "batoid_all_cores"
+            text = f"  times {peer.replace('_', ' ')}"
+            numbers.append(Number(f"{key}ratio_{peer}", ratio, text, least=True, limited=judged, clock=True))
             numbers.append(
                 Number(f"{key}{peer}_threads", spent[peer].threads, f"  threads of {peer.replace('_', ' ')}")
             )

@@ -2,8 +2,8 @@
 
 The last line of stdout is JSON: exit code, seconds of the processor (also those of processes that it started and
 waited for, by themselves) and of the clock, bytes at most above those of the imported program, bytes that a monitor's
-job was estimated to take, and bytes and seconds of one core that the command was said to take before it started (0
-where nothing was).
+job was estimated to take, bytes and seconds of one core that the command was said to take before it started (0 where
+nothing was), by the mean of the machine's paces before and after it, and these paces.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import json
 import resource
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 BEFORE = {"twin.render": "twin.main_job.render_command", "twin.study": "twin.study.study_command"}
@@ -45,10 +45,11 @@ def taken(command: str, arguments: list[str]) -> dict[str, Any]:
     said, required = [cost.Cost(0.0, 0.0)], cost.require_memory
 
     def checked(asked: cost.Cost) -> None:
-        said.append(replace(asked, seconds=asked.seconds * cost.pace()))
+        said.append(asked)
         required(asked)
 
     cost.require_memory = checked
+    paces = [cost.pace()]
     start, clock, processor = resident("VmRSS"), time.monotonic(), time.process_time()
     code: Any = 0
     try:
@@ -62,8 +63,11 @@ def taken(command: str, arguments: list[str]) -> dict[str, Any]:
     others = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = {"clock": time.monotonic() - clock, "processor": time.process_time() - processor}
     seconds["others"] = others.ru_utime + others.ru_stime
-    told = {"told_bytes": said[-1].bytes, "told_seconds": said[-1].seconds}
-    return {"code": code, **seconds, "used": resident("VmHWM") - start, "estimated": estimates[-1], **told}
+    used = resident("VmHWM") - start
+    # a machine that others use as well changes its pace meanwhile
+    paces.append(cost.pace())
+    told = {"told_bytes": said[-1].bytes, "told_seconds": said[-1].seconds * mean(paces), "paces": paces}
+    return {"code": code, **seconds, "used": used, "estimated": estimates[-1], **told}
 
 
 if __name__ == "__main__":

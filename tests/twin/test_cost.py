@@ -1,5 +1,7 @@
 """What a command says of memory and time before it starts; that it takes so much is in tests/limits/test_costs.py."""
 
+import subprocess
+import sys
 from io import StringIO
 from pathlib import Path
 
@@ -51,6 +53,21 @@ def test_the_pace_of_this_machine() -> None:
     moment.
     """
     assert 0.1 < cost.pace() < 10.0
+
+
+def test_the_pace_does_not_depend_on_what_the_process_did_before() -> None:
+    """An array that is given back lets the allocator keep memory: arrays made anew then take less time."""
+    measure = (
+        "import numpy as np\n"
+        "from twin.run.cost import pace\n"
+        "first = min(pace() for _ in range(3))\n"
+        "for _ in range(2):\n"
+        "    large = np.ones(3_000_000)\n"
+        "    del large\n"
+        "print(min(pace() for _ in range(3)) / first)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", measure], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert 0.85 < float(done.stdout) < 1.18
 
 
 def test_more_memory_than_there_is_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

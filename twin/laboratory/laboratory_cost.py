@@ -52,9 +52,9 @@ def focus_cost(setup: ExperimentSetup[Any]) -> Cost:
     return Cost(needed(test.frames), FOCUS_SECONDS + seconds, lower)
 
 
-DISTORTION_STARTED, DISTORTION_SECONDS = 245e6, 3.6
+DISTORTION_STARTED, DISTORTION_SECONDS = 245e6, 4.7
 """Of a test of few points and sets; bytes and seconds."""
-SPOT_PIXEL, SPOT_SECONDS = 33.0, 5e-3
+SPOT_PIXEL, SPOT_SECONDS = 33.0, 1.1e-3
 """Bytes per pixel of the mean image of a spot, and seconds of a spot beside its frames."""
 
 

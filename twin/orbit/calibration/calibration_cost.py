@@ -17,7 +17,7 @@ POINT, POINT_SECONDS = 5.4e3, 5e-4
 """Bytes and seconds per point in each line and field."""
 TIE, TIE_SECONDS = 1.7e5, 0.011
 """Bytes and seconds per tie point of a strip in each line and field, with the splines that it determines."""
-FIELD_SECONDS, REPEATED_SECONDS = 2.2, 0.13
+FIELD_SECONDS, REPEATED_SECONDS = 0.6, 0.3
 """Seconds of a field beside its points, in the campaign itself, with what limits it, and in one that is repeated."""
 
 
