@@ -11,6 +11,7 @@ from xml.sax.saxutils import escape
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from scenes.models.instrument_model import Instrument
+from scenes.yaml.named import Named
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import Undrawn
@@ -80,7 +81,7 @@ def limits_drawing(limits: MonitorLimits | None) -> dict[str, Callable[[], Any]]
     """The same of what limits the readings, of which nothing is drawn where no prior is stated."""
     if limits is None:
         return {}
-    return _tried_each({LIMITS: partial(_call, "twin.uncertainty.uncertainty_report", "limits_svg", limits)})
+    return _tried_each({LIMITS: partial(Named("twin.uncertainty.uncertainty_report:limits_svg"), limits)})
 
 
 def _tried_each(drawing: Mapping[str, Callable[[], Any]]) -> dict[str, Callable[[], Any]]:
