@@ -45,7 +45,7 @@ CUTS = (
 """Functions that begin the long computations."""
 SOONER = (
     "twin.design.monitor_design.LayoutBench",
-    "scenes.models.thermal_model.ThermalModel._response",
+    "scenes.models.thermal_model.ThermalModel._bent",
     "optics.waves.transfer._correlate",
 )
 """Parts of building that take seconds, finite elements and transfer functions: most mutants stop before them."""
