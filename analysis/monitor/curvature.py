@@ -133,15 +133,12 @@ def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[st
     out: dict[str, Retraced] = {}
     for titles in ways.values():
         states = [wanted[title][0].state(row) for title in titles for row in wanted[title][1]]
-        ends = np.cumsum([len(wanted[title][1]) for title in titles])
-        all_of_them = wanted[titles[0]][0].trace(states) if states else None
-        for title, last in zip(titles, ends.tolist(), strict=True):
-            model, amounts = wanted[title]
-            own = slice(last - len(amounts), last)
-            if all_of_them is None or not len(amounts):
-                out[title] = Retraced(np.empty((0, len(model.spots))), np.empty((0, len(model.parameters))))
-            else:
-                out[title] = Retraced(all_of_them.spots[own], all_of_them.parameters[own])
+        model = wanted[titles[0]][0]
+        nothing = Retraced(np.empty((0, len(model.spots))), np.empty((0, len(model.parameters))))
+        found, end = model.trace(states) if states else nothing, 0
+        for title in titles:
+            own = slice(end, end + len(wanted[title][1]))
+            out[title], end = Retraced(found.spots[own], found.parameters[own]), own.stop
     return out
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from contextlib import suppress
 from functools import cache
 
 KEPT = 32 << 20
@@ -21,16 +22,13 @@ _SAID = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
 
 
 @cache
-def keep_freed_memory() -> bool:
-    """Keep up to ``IDLE`` bytes of freed memory in this process from now on.
-
-    Returns:
-        Whether it is so: False with another C library than GNU's, or where the environment says otherwise.
+def keep_freed_memory() -> None:
+    """Keep up to ``IDLE`` bytes of freed memory in this process from now on; nothing is done with another C library
+    than GNU's, or where the environment says otherwise.
     """
     if sys.platform != "linux" or any(name in os.environ for name in _SAID):
-        return False
-    try:
+        return
+    with suppress(OSError, AttributeError):
         change = ctypes.CDLL("libc.so.6").mallopt
-    except (OSError, AttributeError):
-        return False
-    return bool(change(_MMAP_THRESHOLD, KEPT)) and bool(change(_TRIM_THRESHOLD, IDLE))
+        change(_MMAP_THRESHOLD, KEPT)
+        change(_TRIM_THRESHOLD, IDLE)

@@ -3,9 +3,9 @@
 A *system* is one sequence in one perturbed state. Sequences of the same structure (same kinds of surface in the same
 order) can be batched together: the two cameras of an instrument, left and right channels, hundreds of states.
 
-Most states only move bodies, warm them, and change the index of glass. Then the numbers are those of the design, which
-an assembly keeps; frames are written over them, each number of a body that has grown is multiplied by a power of its
-size, and indices are added. Only elements of another shape are worked out one by one.
+The assembly keeps the numbers of the design. States are written over them: frames, indices and their gradients, radii,
+conic constants and Zernike figures; and each number of a body that has grown goes with a power of its size. Elements
+are worked out one by one only for derivatives and for figures on a grid.
 """
 
 from __future__ import annotations

@@ -233,17 +233,21 @@ class _Way:
                 None for a single system.
         """
         table, grids, stride, start, systems = numbers
-        lookup = _Lookup(self, table, stride, start, self._system(rays[0], shared), form[0][0].frame.x.shift)
+        own = self._system(rays[0], shared) if systems is None else systems
+        lookup = _Lookup(self.backend, table, stride, start, own, form[0][0].frame.x.shift)
         hits: list[Any] = []
         outside: list[Any] = []
         for first in range(0, len(self.structure), self.section):
             leg = range(first, min(first + self.section, len(self.structure)))
+            last = leg.stop == len(self.structure)
+            elements = [lookup(form[0][i]) for i in leg]
+            pose = lookup(form[1]) if self.world and last else None
             if systems is not None:
-                rays = self._one_by_one(leg, form, (table, grids, stride, systems), rays, shared, hits, outside)
+                rays = self._one_by_one(leg, elements, pose, grids, rays, (systems, shared), hits, outside)
                 continue
-            rays = self._along(leg, [lookup(form[0][i]) for i in leg], grids, rays, hits)
-            if leg.stop == len(self.structure):
-                rays = self._at_end(rays, lookup(form[1]) if self.world else None, outside)
+            rays = self._along(leg, elements, grids, rays, hits)
+            if last:
+                rays = self._at_end(rays, pose, outside)
             self._launch(leg, form, lookup, rays, hits, outside)
         return rays, hits, tuple(outside) if self.world else None
 
@@ -311,26 +315,34 @@ class _Way:
         return p, d, path, valid
 
     def _one_by_one(
-        self, leg: range, form: Any, numbers: Any, rays: Any, shared: Any, hits: list[Any], outside: list[Any]
+        self,
+        leg: range,
+        elements: Sequence[ElementNumbers],
+        pose: FrameNumbers | None,
+        grids: Any,
+        rays: Any,
+        owned: tuple[Any, Any],
+        hits: list[Any],
+        outside: list[Any],
     ) -> Any:
         """A leg along which each lane of the processor takes all rays of one system, one after the other.
 
         It reads the system's numbers once. Where each lane has a ray of its own, it looks up all of them, which takes
         more time than the rays.
+
+        Args:
+            leg: of the elements.
+            elements: their numbers, each (B,).
+            pose: of the last element where rays in the world are wanted at its end, likewise.
+            grids: as of ``through``.
+            rays: likewise.
+            owned: the systems' own places, and the rays of each.
+            hits: to which hit points are added.
+            outside: likewise rays in the world.
         """
         import drjit as dr
 
-        backend = self.backend
-        table, grids, stride, systems = numbers
-
-        def own(part: Any) -> Any:
-            return map_leaves(
-                lambda place: dr.gather(backend.Float, table, systems + backend.UInt(place) * stride), part
-            )
-
-        elements = [own(form[0][i]) for i in leg]
-        last = leg.stop == len(self.structure)
-        pose = own(form[1]) if self.world and last else None
+        systems, shared = owned
         first = systems * shared
         kept = sum(i in self.keep for i in leg)
         made = self._room(rays[0].x, 2 + kept + 2 * (pose is not None))
@@ -341,14 +353,14 @@ class _Way:
             own_hits: list[Any] = []
             own_outside: list[Any] = []
             end = self._along(leg, elements, grids, mine, own_hits)
-            if last:
+            if leg.stop == len(self.structure):
                 end = self._at_end(end, pose, own_outside)
             for target, value in zip(made, (*end, *own_hits, *own_outside), strict=True):
                 dr.scatter(target, value, at)
             return (place + 1,)
 
         (ended,) = dr.while_loop(
-            (dr.zeros(backend.UInt, dr.width(systems)),), lambda place: place < shared, ray, mode="symbolic"
+            (dr.zeros(self.backend.UInt, dr.width(systems)),), lambda place: place < shared, ray, mode="symbolic"
         )
         dr.eval(made, ended)
         hits += made[4 : 4 + kept]
@@ -439,22 +451,22 @@ def _lanes(systems: UploadedSystems, rays: int) -> Any:
 
 
 class _Lookup:
-    """Numbers of each ray's system, element after element.
+    """Numbers of each ray's or lane's system, element after element.
 
     The row at which they begin goes along with the rays from kernel to kernel. Were it written into a kernel, no two
     elements could share one.
 
     Args:
-        way: of the rays.
+        backend: of the rays.
         numbers: as of ``UploadedSystems``.
         stride: how many systems there are, as an array of width 1; None for a single one.
         start: where the first element's numbers begin, likewise; None for the beginning.
-        system: of each ray; None for a single one.
+        system: of each ray, or of each lane; None for a single one.
         row: at which the numbers of the first element begin.
     """
 
-    def __init__(self, way: _Way, numbers: Any, stride: Any, start: Any, system: Any, row: int) -> None:
-        self._number, self._count = way.backend.Float, way.backend.UInt
+    def __init__(self, backend: Backend, numbers: Any, stride: Any, start: Any, system: Any, row: int) -> None:
+        self._number, self._count = backend.Float, backend.UInt
         self._numbers, self._stride, self._system, self._row = numbers, stride, system, row
         self.place = None if isinstance(numbers, tuple) else system if start is None else system + start
 

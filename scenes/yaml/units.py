@@ -299,9 +299,7 @@ def _shortest_number(value: float, unit: str, kind: Kind, within: float) -> str 
         exact = Decimal(value) / factor if unit not in _CELSIUS else Decimal(value) - _ZERO_CELSIUS
         for digits in range(1, 18):
             number = Decimal(f"{exact:.{digits}g}")
-            # as _to_si reads it
-            back = number * factor if unit not in _CELSIUS else number + _ZERO_CELSIUS
-            if abs(float(back) - value) <= within:
+            if abs(_in_si(number, unit, factor) - value) <= within:
                 plain = -5 <= number.adjusted() <= 6
                 return format(number, "f") if plain else format(number.normalize(), "e")
     return None
@@ -322,9 +320,12 @@ def _to_si(number: str, unit: str, kind: Kind) -> float:
             value = Decimal(number)
         except InvalidOperation:  # pragma: no cover (the pattern admits only decimals)
             raise Problem("not a number", shown(number), kind.allowed) from None
-        if unit in _CELSIUS:
-            return float(value + _ZERO_CELSIUS)
-        return float(value * factor)
+        return _in_si(value, unit, factor)
+
+
+def _in_si(number: Decimal, unit: str, factor: Decimal) -> float:
+    """The value of a number of a unit, which is worth ``factor``."""
+    return float(number + _ZERO_CELSIUS if unit in _CELSIUS else number * factor)
 
 
 def _look_up_checked(unit: str, kind: Kind) -> tuple[Decimal, str]:

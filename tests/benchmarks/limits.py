@@ -20,6 +20,7 @@ from tests.benchmarks.beside import commit_here
 from tests.benchmarks.machine import Machine
 from tests.benchmarks.number import Number, Speed, keeps
 from twin.run.cli import InputErrorText
+from twin.run.durable import write_safely
 
 FILE = Path(__file__).with_name("limits.json")
 MARGIN = 0.2
@@ -124,7 +125,7 @@ class Limits:
             "reference": {"machine": self.machine, "yardsticks": dict(self.yardsticks)},
             "limits": {key: one.data for key, one in sorted(self.limits.items())},
         }
-        file.write_text(json.dumps(data, indent=2) + "\n", "utf-8")
+        write_safely(file, (json.dumps(data, indent=2) + "\n").encode())
 
     def value(self, number: Number, speed: Speed) -> float:
         """A number on the machine of reference."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import ConvexHull, Delaunay
 from typer.testing import CliRunner
 
@@ -62,6 +63,26 @@ def test_separation_of_cubes(move, want) -> None:
     turn = rotation_matrix(np.array([0.3, -1.2, 0.7]))
     assert separation(cube() @ turn.T, (cube() + move) @ turn.T) == pytest.approx(want, abs=1e-12)
     assert separation((cube() + move) @ turn.T, cube() @ turn.T) == pytest.approx(want, abs=1e-12)
+
+
+def test_separations_are_those_of_trimesh() -> None:
+    """Of boxes of all shapes, flat ones among them: the nearest point of the hull of all differences."""
+    rng = np.random.default_rng(11)
+    apart = 0
+    for _ in range(60):
+        first, second = (
+            cube() @ np.diag(10.0 ** rng.uniform(-3.0, 0.0, 3)) @ rotation_matrix(rng.standard_normal(3)).T
+            for _ in range(2)
+        )
+        second = second + 1.5 * rng.standard_normal(3)
+        between = (second[:, None] - first).reshape(-1, 3)
+        triangles = between[ConvexHull(between).simplices]
+        nearest = trimesh.triangles.closest_point(triangles, np.zeros((len(triangles), 3)))
+        found = separation(first, second)
+        if found > 0.0:
+            apart += 1
+            assert found == pytest.approx(np.min(np.linalg.norm(nearest, axis=-1)), abs=1e-12)
+    assert apart > 30
 
 
 def test_separation_of_crossed_edges() -> None:
