@@ -331,6 +331,8 @@ def test_summary_picture(run, tmp_path):
     assert image.shape[1] == 1400
     assert 600 < image.shape[0] < 1600
     assert image.std() > 20
+    # no note below the table runs over the edge
+    assert np.all(image[-int(0.06 * image.shape[0]) :, -12:] == 255)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from textwrap import wrap
+
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -16,6 +19,8 @@ from twin.run.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, LIGHT, VERMILION,
 
 WIDTH, DPI = 14.0, 100
 """Inches and dots per inch: 1400 px wide."""
+NOTE, LONGEST_NOTE = 0.85, 150
+"""Height of a note's line, in lines of the table, and characters that the width holds."""
 FIRST = 0.22
 """Where the column of the truth ends, part of the width."""
 REACH = 2.2
@@ -32,9 +37,9 @@ def _draw(run: RenderRun) -> Figure:
     channels = run.experiment.path.channels
     columns = max(len(channels), 1)
     table = result_tables(run)[-1]
-    lines = 1 + len(table.bands) + len(table.rows)
+    lines, notes = 1 + len(table.bands) + len(table.rows), _notes(run)
     picture = WIDTH / columns
-    heights = (2.0 * picture + 0.5, 0.27 * lines + 0.73)
+    heights = (2.0 * picture + 0.5, 0.27 * (lines + NOTE * len(notes)) + 0.27)
     figure = Figure(figsize=(WIDTH, sum(heights)), facecolor="white")
     top = heights[0] / sum(heights)
     before, after = mean_images(run)
@@ -60,8 +65,15 @@ def _draw(run: RenderRun) -> Figure:
                 # many pictures are narrow
                 text = "{} camera, {} spot" if columns <= 4 else "{}, {}"
                 axes.set_title(text.format(channel.camera, channel.name), fontsize=13 if columns <= 4 else 10, pad=7)
-    _table(figure, table, 1.0 - top - 0.1 / sum(heights), run)
+    _table(figure, table, 1.0 - top - 0.1 / sum(heights), run, notes)
     return figure
+
+
+def _notes(run: RenderRun) -> list[str]:
+    """Lines below the table: on what sigma rests, and what the marks say."""
+    limit = f" {sentence(limited(run))}" if limited(run) else ""
+    texts = f"{assumed(run.reading)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"
+    return [line for text in texts for line in wrap(text, LONGEST_NOTE)]
 
 
 def _scale_bar(axes: Axes, run: RenderRun, column: float, row: float, half: float) -> None:
@@ -72,12 +84,12 @@ def _scale_bar(axes: Axes, run: RenderRun, column: float, row: float, half: floa
     axes.text(x, y - 0.05 * half, text, color="white", ha="right", va="bottom", fontsize=10)
 
 
-def _table(figure: Figure, table: Table, top: float, run: RenderRun) -> None:
-    """Recovered against true, drawn as text on a grid of lines."""
+def _table(figure: Figure, table: Table, top: float, run: RenderRun, notes: Sequence[str]) -> None:
+    """Recovered against true, drawn as text on a grid of lines, with notes below."""
     axes = figure.add_axes((0.0, 0.0, 1.0, top), xlim=(0.0, 1.0))
     axes.set_axis_off()
     count = 1 + len(table.bands) + len(table.rows)
-    axes.set_ylim(count + 2.05, 0.0)
+    axes.set_ylim(count + 0.35 + NOTE * len(notes), 0.0)
     estimators = list(run.estimators.values())
     # columns share the width that is left by the names and the truth
     step = (0.99 - FIRST) / len(estimators)
@@ -101,7 +113,6 @@ def _table(figure: Figure, table: Table, top: float, run: RenderRun) -> None:
             mark, colour = ("▲", VERMILION) if cell.look == "far" else ("●", BLUE)
             axes.text(x, y, mark, fontsize=10, ha="right", va="center", color=colour)
     y = count + 0.7
-    limit = f" {sentence(limited(run))}" if limited(run) else ""
-    for line in (f"{assumed(run.reading)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"):
+    for line in notes:
         axes.text(0.01, y, line, fontsize=10.5, ha="left", va="center", color=GREY)
-        y += 0.85
+        y += NOTE
