@@ -251,7 +251,7 @@ def state_of(
 def states_of(
     amounts: np.ndarray, components: Sequence[Component], thermal: ThermalModel, motions: State | None = None
 ) -> list[State]:
-    """The S states in which components have amounts (S, M), as ``state_of`` makes one: a state of many costs a fifth
+    """The S states in which components have amounts (S, M), as ``state_of`` makes one: a state of many costs a third
     of one alone.
     """
     heat: dict[str, Temperatures] = {}
