@@ -53,7 +53,7 @@ class MotionModel:
         spots: A, (D, P) px per unit of each motion.
         parameters: B, (4 K, P) rad and m, likewise.
         amounts: covariance of the shifts (S, D, D), px^2 -> G, (S, P, D) units per px.
-        state: amounts (P,) -> the state that they make.
+        states: amounts (S, P) -> the states that they make.
         trace: S states -> what they do. Models that have the same one are traced together.
         near_px: states in which no spot moves by more are taken as linear and not traced, px.
     """
@@ -61,7 +61,7 @@ class MotionModel:
     spots: Array
     parameters: Array
     amounts: Callable[[Array], Array]
-    state: Callable[[Array], Any]
+    states: Callable[[Array], Sequence[Any]]
     trace: Callable[[Sequence[Any]], Retraced]
     near_px: float = 0.0
 
@@ -132,7 +132,7 @@ def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[st
         ways.setdefault(id(model.trace), []).append(title)
     out: dict[str, Retraced] = {}
     for titles in ways.values():
-        states = [wanted[title][0].state(row) for title in titles for row in wanted[title][1]]
+        states = [state for title in titles for state in wanted[title][0].states(wanted[title][1])]
         model = wanted[titles[0]][0]
         nothing = Retraced(np.empty((0, len(model.spots))), np.empty((0, len(model.parameters))))
         found, end = model.trace(states) if states else nothing, 0
@@ -193,7 +193,7 @@ class _Steps:
             if not len(left):
                 break
             x = self.step(x, last, left)
-            now = model.trace([model.state(row) for row in x])
+            now = model.trace(model.states(x))
             change = self.in_sigmas(now.parameters - last.parameters, left)
             done = np.all(change <= _REST, axis=1)
             out[left[done]], rests[left[done]] = now.parameters[done], True

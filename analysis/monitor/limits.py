@@ -486,5 +486,5 @@ def _half_widths(sigma: Array, level: float) -> Array:
         step = np.maximum(level - held, 0.0) / np.where(slope > 0.0, slope, np.inf)
         width = width + step
         if np.all(step <= _ROUNDING * width):
-            break
-    return width
+            return width
+    raise ArithmeticError(f"half widths of heavy tails: Newton's method finds no end in {_STEPS} steps")

@@ -369,17 +369,24 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
 
 def composed(states: Sequence[State], bodies: Mapping[str, Body]) -> State:
     """One state that does several, each on top of the one before it, as ``compose`` has it of two."""
-    along: dict[str, list[Motion]] = {}
-    for state in states:
-        for path, motion in state.items():
-            along.setdefault(path, []).append(motion)
-    out = {path: motions[0] for path, motions in along.items()}
+    return each_composed([states], bodies)[0]
+
+
+def each_composed(several: Sequence[Sequence[State]], bodies: Mapping[str, Body]) -> list[State]:
+    """The same of some sequences of states: one state for each, worked out together."""
+    along: list[dict[str, list[Motion]]] = [{} for _ in several]
+    for own, states in zip(along, several, strict=True):
+        for state in states:
+            for path, motion in state.items():
+                own.setdefault(path, []).append(motion)
+    out = [{path: motions[0] for path, motions in own.items()} for own in along]
     # the second motions of all bodies together, then the third ones
-    for k in range(1, max(map(len, along.values()), default=0)):
-        paths = [path for path, motions in along.items() if len(motions) > k]
-        pairs = [(out[path], along[path][k]) for path in paths]
-        out.update(zip(paths, _both(pairs, [bodies[path] for path in paths]), strict=True))
-    return out
+    for k in range(1, max((len(motions) for own in along for motions in own.values()), default=0)):
+        places = [(s, path) for s, own in enumerate(along) for path, motions in own.items() if len(motions) > k]
+        pairs = [(out[s][path], along[s][path][k]) for s, path in places]
+        for (s, path), motion in zip(places, _both(pairs, [bodies[path] for _, path in places]), strict=True):
+            out[s][path] = motion
+    return [*out]
 
 
 def _both(pairs: Sequence[tuple[Motion, Motion]], bodies: Sequence[Body]) -> list[Motion]:

@@ -12,9 +12,8 @@ from itertools import combinations
 import numpy as np
 from scipy.linalg import block_diag
 
-from optics.geometry.pose import triple
-from optics.geometry.tree import ORIGIN, Motion, State, composed
-from optics.thermal.heat import Temperature
+from optics.geometry.tree import ORIGIN, Motion, State, each_composed
+from optics.thermal.heat import Temperature, Temperatures
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
@@ -246,20 +245,28 @@ def state_of(
         thermal: of the instrument.
         motions: what else happens; it acts on top of the same body's motion.
     """
-    heat: dict[str, Temperature] = {}
-    moves: list[State] = []
+    return states_of(np.asarray(amounts)[None], components, thermal, motions)[0]
+
+
+def states_of(
+    amounts: np.ndarray, components: Sequence[Component], thermal: ThermalModel, motions: State | None = None
+) -> list[State]:
+    """The S states in which components have amounts (S, M), as ``state_of`` makes one: a state of many costs a third
+    of one alone.
+    """
+    heat: dict[str, Temperatures] = {}
+    moves: list[list[State]] = [[] for _ in amounts]
     bodies = {body.path: body for body in thermal.instrument.assembly.tree.bodies}
     for (_, body, pivot), group in _groups(components):
-        values = {(components[k].kind, components[k].axis): float(amounts[k]) for k in group}
+        values = {(components[k].kind, components[k].axis): amounts[:, k] for k in group}
         field = _field(values)
         if field is not None:
-            heat[body] = heat.get(body, Temperature()) + field
-        motion = _motion(values, pivot)
-        if motion is not None:
-            moves.append({body: motion})
+            heat[body] = heat[body] + field if body in heat else field
+        for s, motion in enumerate(_motions(values, pivot)):
+            moves[s].append({body: motion})
     if heat:
-        moves = [thermal.state(heat, composed(moves, bodies))]
-    return composed([*moves, motions or {}], bodies)
+        moves = [[state] for state in thermal.states(heat, each_composed(moves, bodies))]
+    return each_composed([[*own, motions or {}] for own in moves], bodies)
 
 
 def _groups(components: Sequence[Component]) -> Iterator[tuple[tuple[str, str, str], list[int]]]:
@@ -269,31 +276,44 @@ def _groups(components: Sequence[Component]) -> Iterator[tuple[tuple[str, str, s
     yield from groups.items()
 
 
-def _field(values: Mapping[tuple[str, int], float]) -> Temperature | None:
+Values = Mapping[tuple[str, int], np.ndarray]
+"""Kind and axis of components of one body -> their amounts in S states, (S,)."""
+
+
+def _three(values: Values, kind: str) -> np.ndarray:
+    """(S, 3) of the three axes."""
+    out = np.zeros((len(next(iter(values.values()))), 3))
+    for axis in range(3):
+        if (kind, axis) in values:
+            out[:, axis] = values[kind, axis]
+    return out
+
+
+def _field(values: Values) -> Temperatures | None:
     if not any(kind in HEAT for kind, _ in values):
         return None
-    gradient = triple(values.get(("gradient", a), 0.0) for a in range(3))
-    return Temperature(values.get(("temperature", 0), 0.0), gradient)
+    gradient = _three(values, "gradient")
+    return Temperatures(values.get(("temperature", 0), np.zeros(len(gradient))), gradient)
 
 
-def _motion(values: Mapping[tuple[str, int], float], pivot: str) -> Motion | None:
+def _motions(values: Values, pivot: str) -> list[Motion]:
+    """Motions of a body in S states; none of one that only heat moves."""
     if all(kind in HEAT for kind, _ in values):
-        return None
-
-    def three(kind: str) -> tuple[float, float, float]:
-        return triple(values.get((kind, a), 0.0) for a in range(3))
-
-    return Motion(
-        rotate=three("rotate"),
-        shift=three("shift"),
-        pivot=pivot,
-        scale=values.get(("scale", 0), 0.0),
-        figure={axis: value for (kind, axis), value in values.items() if kind == "figure"},
-        index=values.get(("index", 0), 0.0),
-        index_gradient=three("index_gradient"),
-        radius=values.get(("radius", 0), 0.0),
-        conic=values.get(("conic", 0), 0.0),
-    )
+        return []
+    vectors = (map(tuple, _three(values, kind).tolist()) for kind in ("rotate", "shift", "index_gradient"))
+    numbers = {kind: own.tolist() for (kind, _), own in values.items() if kind in ("scale", "index", "radius", "conic")}
+    figures = {axis: own.tolist() for (kind, axis), own in values.items() if kind == "figure"}
+    return [
+        Motion(
+            rotate,
+            shift,
+            pivot,
+            index_gradient=slope,
+            figure={axis: own[s] for axis, own in figures.items()},
+            **{kind: own[s] for kind, own in numbers.items()},
+        )
+        for s, (rotate, shift, slope) in enumerate(zip(*vectors, strict=True))
+    ]
 
 
 CAMERA = "<camera>"

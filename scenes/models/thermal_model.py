@@ -13,6 +13,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import repeat
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -21,14 +23,14 @@ from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose, triple
 from optics.geometry.solid import Solid, solid_mesh
 from optics.geometry.surface import Surface
-from optics.geometry.tree import ORIGIN, Body, Motion, State, composed
+from optics.geometry.tree import ORIGIN, Body, Motion, State, each_composed
 from optics.materials.glass import WarmGlass, glass
 from optics.materials.material import Material, TemperatureRange, material
 from optics.numerics.array_math import turned
 from optics.numerics.physical_error import PhysicalError
 from optics.thermal.deformation import Displaced, FaceChange, Formula, face_change
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
-from optics.thermal.heat import Temperature, carried_motion
+from optics.thermal.heat import Temperature, Temperatures, carried_motion
 from optics.thermal.thermo_elastic import ElasticBody, Kinematic, free_linear_field
 from scenes.models.instrument_model import Instrument
 from scenes.models.lens_heat import Lens, lenses_of
@@ -45,37 +47,53 @@ TERMS = 15
 
 @dataclass(frozen=True, eq=False)
 class _Response:
-    """What gradients of 1 K/m along x, y and z of a body do to one of its faces.
+    """What gradients of 1 K/m along x, y and z of a body do to its F faces.
 
     Attributes:
-        rotate, shift: (3, 3), a row for each gradient, radians and metres.
-        terms: Noll indices of the figures; figures: (3, of these), metres.
+        terms: body of each face -> Noll indices of its figures.
+        numbers: rotation vector, shift and figures of one face after the other, radians and metres, a column for each
+            gradient.
     """
 
-    rotate: np.ndarray
-    shift: np.ndarray
-    terms: tuple[int, ...]
-    figures: np.ndarray
+    terms: Mapping[str, tuple[int, ...]]
+    numbers: np.ndarray
 
     @classmethod
-    def of(cls, units: Sequence[FaceChange]) -> _Response:
-        """From the changes by the three gradients."""
-        terms = tuple(sorted({j for unit in units for j in unit.figure}))
-        figures = np.array([[unit.figure.get(j, 0.0) for j in terms] for unit in units]).reshape(3, -1)
-        return cls(np.array([unit.rotate for unit in units]), np.array([unit.shift for unit in units]), terms, figures)
+    def of(cls, units: Sequence[Mapping[str, FaceChange]]) -> _Response:
+        """From the changes of all faces by the three gradients."""
+        terms = {face: tuple(sorted({j for unit in units for j in unit[face].figure})) for face in units[0]}
+        numbers = [
+            [
+                n
+                for f, own in terms.items()
+                for n in (*u[f].rotate, *u[f].shift, *(u[f].figure.get(j, 0.0) for j in own))
+            ]
+            for u in units
+        ]
+        return cls(terms, np.array(numbers).T)
 
-    def to(self, gradient: np.ndarray) -> Motion:
-        """The motion of the face by a gradient (3,), K/m."""
-        rotate, shift, amplitudes = (turned(part.T, gradient) for part in (self.rotate, self.shift, self.figures))
-        figure = {j: a for j, a in zip(self.terms, amplitudes.tolist(), strict=True) if a}
-        return Motion(rotate=triple(rotate), shift=triple(shift), figure=figure)
-
-
-"""Body of a face -> what a gradient of 1 K/m along each axis of the solid's frame does to it."""
+    def to(self, gradient: np.ndarray) -> dict[str, list[Motion | None]]:
+        """The motions of the faces by gradients (S, 3), K/m; none in a state without one."""
+        rows, bent = turned(self.numbers, gradient).tolist(), np.any(gradient, axis=1).tolist()
+        out: dict[str, list[Motion | None]] = {}
+        start = 0
+        for face, terms in self.terms.items():
+            a, b, c = start, start + 3, start + 6
+            start = c + len(terms)
+            out[face] = [
+                Motion(tuple(n[a:b]), tuple(n[b:c]), figure={j: x for j, x in zip(terms, n[c:start], strict=True) if x})
+                if yes
+                else None
+                for n, yes in zip(rows, bent, strict=True)
+            ]
+        return out
 
 
 Held = tuple[ElasticBody, Kinematic]
 """Finite elements and what holds them."""
+Field = TypeVar("Field", Temperature, Temperatures)
+Moves = Mapping[str, Sequence[Motion | None]]
+"""Body path -> its motion in each state, None where it has none."""
 
 
 class TemperatureError(PhysicalError, ValueError):
@@ -130,7 +148,7 @@ class ThermalModel:
         every = (lens for name, model in instrument.cameras.items() for lens in lenses_of(name, model, self._bodies))
         self.lenses: dict[str, Lens] = {lens.path: lens for lens in every}
         self._lens_of = {face: lens for lens in self.lenses.values() for face in lens.faces}
-        self._responses: dict[str, dict[str, _Response]] = {}
+        self._responses: dict[str, _Response] = {}
         self._extents: dict[str, np.ndarray] = {}
         self._carried: dict[str, _Carried] = {}
         self._inside: dict[str, tuple[str, ...]] = {}
@@ -175,15 +193,22 @@ class ThermalModel:
         """A solid and those that are pieces of it."""
         return [solid for piece, solid in self.solids.items() if self._owner(piece) == path]
 
-    def fields(self, temperatures: Mapping[str, Temperature]) -> dict[str, Temperature]:
-        """Every warmed body's field in its own frame, its own or inherited."""
-        out: dict[str, Temperature] = {}
+    def fields(self, temperatures: Mapping[str, Field], pieces: bool = True) -> dict[str, Field]:
+        """Every warmed body's field in its own frame, its own or inherited.
+
+        Args:
+            temperatures: of the bodies that have one of their own.
+            pieces: also of the bodies that are pieces of a solid or a lens.
+        """
+        out: dict[str, Field] = {}
         for path, body in self._bodies.items():
+            if not pieces and self._owner(path) not in (None, path):
+                continue
             if path in temperatures:
                 out[path] = temperatures[path]
             elif body.parent in out:
                 out[path] = out[body.parent].seen_from(body.pose)
-        for lens in self.lenses.values():
+        for lens in self.lenses.values() if pieces else ():
             if lens.path in out:
                 out.update({face: out[lens.path].seen_from(pose) for face, pose in lens.faces.items()})
         return out
@@ -210,9 +235,9 @@ class ThermalModel:
                 )
                 raise TemperatureError(f"{path}: {self.lenses[path].unknown}", origin, remedy)
             self._check_known(path, field, origin)
-            if path in self.solids and self.solids[path].transparent:
+            if path in self.solids and self.solids[path].transparent and field != Temperature():
                 try:
-                    self._index(path, field)
+                    list(self._indices(path, Temperatures.of([field])))
                 except ValueError as error:
                     raise TemperatureError(f"{path}: {error}", origin, "a glass with known dn/dT") from error
 
@@ -279,42 +304,68 @@ class ThermalModel:
             motions: what else happens; it acts on top of the thermal motion of the same body.
             progress: called with the path of each body whose finite-element solution begins.
         """
-        fields = self.fields(temperatures)
-        thermal: list[State] = []
-        for path, field in fields.items():
-            if self._owner(path) in (None, path) and field != Temperature():
-                thermal += self._warmed(path, field, progress)
-        return composed([*thermal, motions or {}], self._bodies)
+        one = {path: Temperatures.of([field]) for path, field in temperatures.items()}
+        return self.states(one, [motions or {}], progress)[0]
 
-    def _warmed(self, path: str, field: Temperature, progress: Callable[[str], None]) -> list[State]:
-        """What a body's field does to the body itself, to its faces and to what it carries: the last one first."""
+    def states(
+        self,
+        temperatures: Mapping[str, Temperatures],
+        motions: Sequence[State],
+        progress: Callable[[str], None] = lambda path: None,
+    ) -> list[State]:
+        """S perturbed states together, as ``state`` makes one.
+
+        Args:
+            temperatures: body path -> its fields in the S states, in its own frame.
+            motions: what else happens in each.
+            progress: as for one.
+        """
+        fields = self.fields(temperatures, pieces=False)
+        change, gradient = (np.array([getattr(f, n) for f in fields.values()]) for n in ("change", "gradient"))
+        warm = (change != 0.0) | np.any(gradient, axis=-1)
+        thermal: list[list[State]] = [[] for _ in motions]
+        for (path, field), states in zip(fields.items(), warm, strict=True):
+            own = np.flatnonzero(states)
+            for part in self._warmed(path, field[own], progress) if len(own) else ():
+                for k, s in enumerate(own.tolist()):
+                    thermal[s].append({moved: m for moved, each in part.items() if (m := each[k]) is not None})
+        return each_composed([[*heat, more] for heat, more in zip(thermal, motions, strict=True)], self._bodies)
+
+    def _warmed(self, path: str, field: Temperatures, progress: Callable[[str], None]) -> list[Moves]:
+        """What a body's fields do to the body itself, to its faces and to what it carries: the last one first."""
         if path in self.lenses:
             return self._warmed_lens(self.lenses[path], field, progress)
         body, stuff = self._bodies[path], self.materials[path]
         pivot = _mount(body)
         about = np.array(body.pivots[pivot])
-        gradient = np.array(field.gradient)
-        own = Motion(pivot=pivot, stretch=stuff.expansion * field.at(about))
-        bent = bool(np.any(gradient)) and stuff.expansion != 0.0
-        if path in self.solids and self.solids[path].transparent:
-            change, slope = self._index(path, field)
-            own = Motion(pivot=pivot, stretch=own.stretch, index=change, index_gradient=slope)
-        out: dict[str, Motion] = {path: own}
+        stretch = stuff.expansion * field.at(about)
+        stretches, unchanged = stretch.tolist(), repeat((0.0, (0.0, 0.0, 0.0)), len(stretch))
+        glassy = path in self.solids and self.solids[path].transparent
+        indices = self._indices(path, field) if glassy else unchanged
+        out: dict[str, Sequence[Motion | None]] = {
+            path: [
+                Motion(pivot=pivot, stretch=grown, index=change, index_gradient=slope)
+                for grown, (change, slope) in zip(stretches, indices, strict=True)
+            ]
+        }
         if path in self.solids or path in self.mirrors:
             # the tree's stretch carries what stands on a body and does not enlarge it; faces and footprints are its own
-            out.update(dict.fromkeys(self._within(path), Motion(stretch=own.stretch)))
-            return [self._bent(path, gradient, progress), out] if bent else [out]
+            inside = tuple(Motion(stretch=grown) for grown in stretches)
+            out.update(dict.fromkeys(self._within(path), inside))
+            return [*self._bent(path, field.gradient, progress), out]
         carried = self._carried_by(path)
         for lens in carried.lenses:
-            out.update(lens.carried(*carried_motion(stuff.expansion, gradient, lens.mount - about), own.stretch))
-        turn, move = carried_motion(stuff.expansion, gradient, carried.place - about)
+            moves = zip(*carried_motion(stuff.expansion, field.gradient, lens.mount - about), stretches, strict=True)
+            faces = [lens.carried(*each) for each in moves]
+            out.update({face: [own.get(face) for own in faces] for face in lens.faces})
+        turn, move = carried_motion(stuff.expansion, field.gradient[:, None], carried.place - about)
         # the tree's stretch carries the child's origin, but what moves with this body is the child's mount
         rotate = turned(carried.inward, turn)
-        shift = turned(carried.inward, move) + own.stretch * carried.mount
-        moved = np.any(turn, axis=1) | np.any(shift, axis=1)
-        for k in np.flatnonzero(moved).tolist():
-            child = carried.bodies[k]
-            out[child.path] = Motion(rotate=triple(rotate[k]), shift=triple(shift[k]), pivot=_mount(child))
+        shift = turned(carried.inward, move) + stretch[:, None, None] * carried.mount
+        moved = np.any(turn, axis=2) | np.any(shift, axis=2)
+        for k in np.flatnonzero(np.any(moved, axis=0)).tolist():
+            child, places = carried.bodies[k], zip(*(a[:, k].tolist() for a in (moved, rotate, shift)), strict=True)
+            out[child.path] = [Motion(tuple(r), tuple(s), _mount(child)) if yes else None for yes, r, s in places]
         return [out]
 
     def _carried_by(self, path: str) -> _Carried:
@@ -334,33 +385,35 @@ class ThermalModel:
             self._inside[path] = tuple(other for other in self._bodies if other.startswith(f"{path}/"))
         return self._inside[path]
 
-    def _warmed_lens(self, lens: Lens, field: Temperature, progress: Callable[[str], None]) -> list[State]:
-        """What a lens's field does to its faces and to its index."""
+    def _warmed_lens(self, lens: Lens, field: Temperatures, progress: Callable[[str], None]) -> list[Moves]:
+        """What a lens's fields do to its faces and to its index."""
         assert lens.glass is not None
-        here, gradient = self.reference + field.change, np.array(field.gradient)
-        out: State = lens.grown(lens.glass.expansion * field.at(lens.middle))
-        index = lens.glass.change(self.reference, here), triple(lens.glass.slope(here) * gradient)
-        out = {**out, lens.path: replace(out[lens.path], index=index[0], index_gradient=index[1])}
-        bent = bool(np.any(gradient)) and lens.glass.expansion != 0.0
-        return [self._bent(lens.path, gradient, progress), out] if bent else [out]
+        here = (self.reference + field.change).tolist()
+        grown = [lens.grown(stretch) for stretch in (lens.glass.expansion * field.at(lens.middle)).tolist()]
+        for own, temperature, gradient in zip(grown, here, field.gradient, strict=True):
+            index = lens.glass.change(self.reference, temperature), triple(lens.glass.slope(temperature) * gradient)
+            own[lens.path] = replace(own[lens.path], index=index[0], index_gradient=index[1])
+        return [
+            *self._bent(lens.path, field.gradient, progress),
+            {face: [own[face] for own in grown] for face in lens.faces},
+        ]
 
-    def _index(self, path: str, field: Temperature) -> tuple[float, tuple[float, float, float]]:
-        """Change of index at a solid's origin, and its gradient, 1/m."""
+    def _indices(self, path: str, field: Temperatures) -> Iterator[tuple[float, tuple[float, float, float]]]:
+        """Changes of index at a solid's origin, and their gradients, 1/m."""
         kind, wavelength = glass(self.solids[path].material), self.instrument.spec.autocollimator.wavelength
-        if field.change == 0.0 and not any(field.gradient):
-            return 0.0, (0.0, 0.0, 0.0)
-        here = self.reference + field.change
-        change = kind.vacuum_index(wavelength, here) - kind.vacuum_index(wavelength, self.reference)
-        slope = kind.dn_dt(wavelength, here)
-        return change, triple(slope * np.array(field.gradient))
+        at_rest = kind.vacuum_index(wavelength, self.reference)
+        for here, gradient in zip((self.reference + field.change).tolist(), field.gradient, strict=True):
+            slope = kind.dn_dt(wavelength, here)
+            yield kind.vacuum_index(wavelength, here) - at_rest, triple(slope * gradient)
 
-    def _bent(self, path: str, gradient: np.ndarray, progress: Callable[[str], None]) -> State:
-        """What a gradient (3,), K/m, does to the faces of a body."""
+    def _bent(self, path: str, gradient: np.ndarray, progress: Callable[[str], None]) -> list[Moves]:
+        """What gradients (S, 3), K/m, do to the faces of a body; nothing where none bends it."""
+        if self.materials[path].expansion == 0.0 or not np.any(gradient):
+            return []
         if path not in self._responses:
             progress(path)
-            changes = [self.changes(path, moved) for moved in self.unit_displacements(path)]
-            self._responses[path] = {face: _Response.of([one[face] for one in changes]) for face in changes[0]}
-        return {face: response.to(gradient) for face, response in self._responses[path].items()}
+            self._responses[path] = _Response.of([self.changes(path, at) for at in self.unit_displacements(path)])
+        return [self._responses[path].to(gradient)]
 
     def surface(self, face: str) -> Surface:
         """Nominal shape of the optical face of a body."""

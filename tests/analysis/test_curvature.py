@@ -31,7 +31,7 @@ def model(trace=lambda x: Retraced(spots(x), parameters(x))):
         A,
         B,
         lambda noise: np.broadcast_to(inverse, (len(noise), 4, 4)),
-        state=lambda row: row,
+        states=lambda rows: rows,
         trace=lambda states: trace(np.array(states)),
     )
 

@@ -14,7 +14,7 @@ from analysis.monitor.curvature import MotionModel, Retraced
 from analysis.monitor.disturbances import Disturbances
 from optics.geometry.tree import Motion, State
 from optics.numerics.physical_error import PhysicalError
-from scenes.models.disturbances import StatedMotions, state_of
+from scenes.models.disturbances import StatedMotions, states_of
 from scenes.models.thermal_model import ThermalModel
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import ElementaryMotion, line_family
@@ -50,9 +50,9 @@ def motion_models(
     trace = partial(_traced, path, sight)
     out = {"model": _of_families(cameras, trace)}
     if stated is not None and disturbances is not None:
-        state = partial(_stated_state, stated, thermal)
+        states = partial(_stated_states, stated, thermal)
         out["posterior"] = MotionModel(
-            disturbances.spots, disturbances.parameters, disturbances.best_amounts, state, trace, NEAR
+            disturbances.spots, disturbances.parameters, disturbances.best_amounts, states, trace, NEAR
         )
     return out
 
@@ -60,9 +60,9 @@ def motion_models(
 # What a model calls are functions of the module: a run is sent to the process that draws it, with all that it holds.
 
 
-def _stated_state(stated: StatedMotions, thermal: ThermalModel, row: np.ndarray) -> State:
-    """The state of one row of stated amounts, (P,)."""
-    return state_of(row * stated.sigma, stated.components, thermal)
+def _stated_states(stated: StatedMotions, thermal: ThermalModel, amounts: np.ndarray) -> list[State]:
+    """The states of stated amounts (S, P), standard deviations."""
+    return states_of(amounts * stated.sigma, stated.components, thermal)
 
 
 def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequence[State]], Retraced]) -> MotionModel:
@@ -93,10 +93,14 @@ def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray)
     return out
 
 
-def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> State:
-    """The state in which motions of some bodies, all about one pivot of each, have some amounts, SI."""
+def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> list[State]:
+    """The states in which motions of some bodies, all about one pivot of each, have some amounts (S, P), SI."""
+    return [_one_together(motions, row) for row in amounts.tolist()]
+
+
+def _one_together(motions: Sequence[ElementaryMotion], amounts: Sequence[float]) -> State:
     out: dict[str, Motion] = {}
-    for motion, amount in zip(motions, amounts.tolist(), strict=True):
+    for motion, amount in zip(motions, amounts, strict=True):
         new, old = motion.motion(amount), out.get(motion.body, Motion(pivot=motion.pivot))
         out[motion.body] = Motion(
             rotate=_sum(old.rotate, new.rotate),

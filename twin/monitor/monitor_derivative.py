@@ -28,7 +28,7 @@ from optics.raytrace.derivatives import RayTangents, jvp, vjp
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.diffraction import PupilTangent, image_derivative
-from scenes.models.disturbances import Component, StatedMotions, state_of
+from scenes.models.disturbances import Component, StatedMotions, states_of
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import TimeLawSpec
@@ -399,7 +399,7 @@ def _by_differences(
     """Derivatives of spots (2 C, M), px, and parameters (4 K, M) per SI unit."""
     steps = np.array([STEPS[c.kind] for c in components])
     # all bodies have a temperature of their own in every state, as in states that are drawn, so that none inherits one
-    states = [state_of(row, components, thermal) for row in np.concatenate([np.diag(steps), np.diag(-steps)])]
+    states = states_of(np.concatenate([np.diag(steps), np.diag(-steps)]), components, thermal)
     place = path.coarse_trace(states).place
     count = len(components)
     rows = np.moveaxis(place, 1, 2).reshape(-1, 2 * count)
@@ -436,11 +436,9 @@ def derivative_changes(
     components = stated.components
     steps = np.array([{**STEPS, **SMALL}[c.kind] for c in components])
     heat = [c for c in components if c.kind in STEPS]
+    warmed = iter(states_of(np.diag([STEPS[c.kind] for c in heat]), heat, thermal))
     singles = [
-        state_of(steps[k] * np.array([c is one for one in heat]), heat, thermal)
-        if c.kind in STEPS
-        else _elementary(c).state(float(steps[k]))
-        for k, c in enumerate(components)
+        next(warmed) if c.kind in STEPS else _elementary(c).state(float(steps[k])) for k, c in enumerate(components)
     ]
     bodies = {body.path: body for body in path.instrument.assembly.tree.bodies}
     roots = {name: f"{BASE}/{name}" for name in path.instrument.cameras}

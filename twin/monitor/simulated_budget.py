@@ -20,7 +20,7 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
 from optics.thermal.heat import Temperature
-from scenes.models.disturbances import state_of
+from scenes.models.disturbances import states_of
 from scenes.specs.error_budget import ErrorBudgetSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import ResolvedJob
@@ -156,7 +156,7 @@ class ErrorBudget:
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(7, stream)))
         stated = self.stated.of_causes(causes)
         amounts = stated.draw(rng, trials)
-        return [state_of(row, stated.components, self.experiment.thermal) for row in amounts]
+        return states_of(amounts, stated.components, self.experiment.thermal)
 
     def grown_focal_planes(self, warmer: float) -> tuple[float, float]:
         """True change of d_f when every focal plane is warmer, and what paper 001, eq. (7) reads, metres.

@@ -18,7 +18,7 @@ from analysis.monitor.recovery import Recovery
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores
 from scenes.models.camera_sharpness import blur_warnings
-from scenes.models.disturbances import state_of
+from scenes.models.disturbances import states_of
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue
 from twin.monitor.image_sampling import ImageChecks
@@ -170,7 +170,7 @@ def run_states(
     how = Observing(record, experiment.resolved.job.analysis.centroid, CHUNK, leave=lambda number, why: None)
     for first in range(0, count, CHUNK):
         advance(STATES, first, count)
-        states = [state_of(row, stated.components, experiment.thermal) for row in amounts[first : first + CHUNK]]
+        states = states_of(amounts[first : first + CHUNK], stated.components, experiment.thermal)
         place = experiment.path.coarse_trace(states).place
         kept = np.flatnonzero(np.all(np.abs(place) <= half, axis=(0, 2)))
         # streams of its own for each state, whichever others were lost

@@ -16,7 +16,7 @@ from analysis.monitor.recovery import MeasuredSpots, joint, judged_spots
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.units import ARCSEC
-from scenes.models.disturbances import state_of
+from scenes.models.disturbances import states_of
 from scenes.models.instrument_model import MisplacedError
 from scenes.specs.instrument import BASE
 from scenes.yaml.errors import InputError
@@ -167,7 +167,7 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
         return before, experiment.expected_frames(photons)
 
     amounts = experiment.stated.draw(np.random.default_rng(1), _STATES)
-    states = [state_of(row, experiment.stated.components, experiment.thermal) for row in amounts]
+    states = states_of(amounts, experiment.stated.components, experiment.thermal)
     how = Observing(record, centroid, max(1, _PIXELS // nominal.size), stated=False, frames=frames)
     try:
         seen = [found.recovery.shift_covariance for found in observe(experiment, states, how)]

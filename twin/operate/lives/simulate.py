@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.models.disturbances import state_of
+from scenes.models.disturbances import states_of
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.main_job.monitor_reading import MonitorReading, stated
@@ -127,7 +127,7 @@ def recorded(plan: OperationSetup, experiment: MonitorExperiment, what: Simulati
     advance(RENDER, 0, len(life.times))
     for first in range(0, len(life.times), chunk):
         piece = np.arange(first, min(first + chunk, len(life.times)))
-        states = [state_of(life.acting[k], life.components, experiment.thermal) for k in piece]
+        states = states_of(life.acting[piece], life.components, experiment.thermal)
         for found in observe(experiment, states, how, piece):
             suspects = crosstalk(experiment, found.recovery.shift_covariance[0]) if suspects is None else suspects
             readings += _readings(experiment, found, what.frames, suspects)

@@ -23,7 +23,7 @@ from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import Motion, State, compose
 from optics.numerics.threads import cores, one_blas_thread
-from scenes.models.disturbances import state_of
+from scenes.models.disturbances import states_of
 from scenes.models.drawn_motions import drawn_motions
 from scenes.specs.course import moment
 from scenes.specs.orbit.loop import OrbitLoopSpec
@@ -117,8 +117,8 @@ def drifting_states(spec: OrbitLoopSpec, experiment: MonitorExperiment, seed: in
     )
     bodies = {body.path: body for body in experiment.instrument.assembly.tree.bodies}
     out = []
-    for time, row in zip(times.tolist(), amounts, strict=True):
-        state = state_of(row, stated.components, experiment.thermal)
+    drawn = states_of(amounts, stated.components, experiment.thermal)
+    for time, state in zip(times.tolist(), drawn, strict=True):
         for path, motion in spec.motion.items():
             share = motion.share(time)
             rotate, shift = ((share * v[0], share * v[1], share * v[2]) for v in (motion.rotate, motion.shift))

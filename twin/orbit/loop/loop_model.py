@@ -16,7 +16,7 @@ import numpy as np
 from analysis.monitor.disturbances import Disturbances
 from optics.geometry.tree import State, compose
 from optics.numerics.frozen_map import FrozenMap
-from scenes.models.disturbances import Component, state_of
+from scenes.models.disturbances import Component, states_of
 from scenes.specs.motion_text import AXES, node_named
 from scenes.specs.orbit.loop import CorrectionSpec
 from scenes.specs.orbit.monitor import PARAMETERS
@@ -218,11 +218,10 @@ def _singles(components: Sequence[Component], experiment: MonitorExperiment) -> 
     """States in which one component alone has its standard deviation."""
     # all bodies have a temperature of their own, as in states that are drawn, so that none inherits one
     heat = [one for one in components if one.kind in STEPS]
-    out = []
-    for one in components:
-        if one.kind in STEPS:
-            amounts = np.array([one.sigma * (one is other) for other in heat])
-            out.append(state_of(amounts, heat, experiment.thermal))
-        else:
-            out.append(ElementaryMotion(one.body, one.kind, one.axis, one.pivot).state(one.sigma))
-    return out
+    warmed = iter(states_of(np.diag([one.sigma for one in heat]), heat, experiment.thermal))
+    return [
+        next(warmed)
+        if one.kind in STEPS
+        else ElementaryMotion(one.body, one.kind, one.axis, one.pivot).state(one.sigma)
+        for one in components
+    ]
