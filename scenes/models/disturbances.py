@@ -276,11 +276,11 @@ def _groups(components: Sequence[Component]) -> Iterator[tuple[tuple[str, str, s
     yield from groups.items()
 
 
-Values = Mapping[tuple[str, int], np.ndarray]
+_Values = Mapping[tuple[str, int], np.ndarray]
 """Kind and axis of components of one body -> their amounts in S states, (S,)."""
 
 
-def _three(values: Values, kind: str) -> np.ndarray:
+def _three(values: _Values, kind: str) -> np.ndarray:
     """(S, 3) of the three axes."""
     out = np.zeros((len(next(iter(values.values()))), 3))
     for axis in range(3):
@@ -289,14 +289,14 @@ def _three(values: Values, kind: str) -> np.ndarray:
     return out
 
 
-def _field(values: Values) -> Temperatures | None:
+def _field(values: _Values) -> Temperatures | None:
     if not any(kind in HEAT for kind, _ in values):
         return None
     gradient = _three(values, "gradient")
     return Temperatures(values.get(("temperature", 0), np.zeros(len(gradient))), gradient)
 
 
-def _motions(values: Values, pivot: str) -> list[Motion]:
+def _motions(values: _Values, pivot: str) -> list[Motion]:
     """Motions of a body in S states; none of one that only heat moves."""
     if all(kind in HEAT for kind, _ in values):
         return []

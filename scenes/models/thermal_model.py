@@ -91,8 +91,8 @@ class _Response:
 
 Held = tuple[ElasticBody, Kinematic]
 """Finite elements and what holds them."""
-Field = TypeVar("Field", Temperature, Temperatures)
-Moves = Mapping[str, Sequence[Motion | None]]
+_Field = TypeVar("_Field", Temperature, Temperatures)
+_Moves = Mapping[str, Sequence[Motion | None]]
 """Body path -> its motion in each state, None where it has none."""
 
 
@@ -193,14 +193,14 @@ class ThermalModel:
         """A solid and those that are pieces of it."""
         return [solid for piece, solid in self.solids.items() if self._owner(piece) == path]
 
-    def fields(self, temperatures: Mapping[str, Field], pieces: bool = True) -> dict[str, Field]:
+    def fields(self, temperatures: Mapping[str, _Field], pieces: bool = True) -> dict[str, _Field]:
         """Every warmed body's field in its own frame, its own or inherited.
 
         Args:
             temperatures: of the bodies that have one of their own.
             pieces: also of the bodies that are pieces of a solid or a lens.
         """
-        out: dict[str, Field] = {}
+        out: dict[str, _Field] = {}
         for path, body in self._bodies.items():
             if not pieces and self._owner(path) not in (None, path):
                 continue
@@ -331,7 +331,7 @@ class ThermalModel:
                     thermal[s].append({moved: m for moved, each in part.items() if (m := each[k]) is not None})
         return each_composed([[*heat, more] for heat, more in zip(thermal, motions, strict=True)], self._bodies)
 
-    def _warmed(self, path: str, field: Temperatures, progress: Callable[[str], None]) -> list[Moves]:
+    def _warmed(self, path: str, field: Temperatures, progress: Callable[[str], None]) -> list[_Moves]:
         """What a body's fields do to the body itself, to its faces and to what it carries: the last one first."""
         if path in self.lenses:
             return self._warmed_lens(self.lenses[path], field, progress)
@@ -385,7 +385,7 @@ class ThermalModel:
             self._inside[path] = tuple(other for other in self._bodies if other.startswith(f"{path}/"))
         return self._inside[path]
 
-    def _warmed_lens(self, lens: Lens, field: Temperatures, progress: Callable[[str], None]) -> list[Moves]:
+    def _warmed_lens(self, lens: Lens, field: Temperatures, progress: Callable[[str], None]) -> list[_Moves]:
         """What a lens's fields do to its faces and to its index."""
         assert lens.glass is not None
         here = (self.reference + field.change).tolist()
@@ -406,7 +406,7 @@ class ThermalModel:
             slope = kind.dn_dt(wavelength, here)
             yield kind.vacuum_index(wavelength, here) - at_rest, triple(slope * gradient)
 
-    def _bent(self, path: str, gradient: np.ndarray, progress: Callable[[str], None]) -> list[Moves]:
+    def _bent(self, path: str, gradient: np.ndarray, progress: Callable[[str], None]) -> list[_Moves]:
         """What gradients (S, 3), K/m, do to the faces of a body; nothing where none bends it."""
         if self.materials[path].expansion == 0.0 or not np.any(gradient):
             return []
