@@ -7,7 +7,7 @@ import pytest
 
 from optics.geometry.tree import Motion, State, compose, each_composed
 from optics.thermal.heat import Temperature, Temperatures
-from scenes.models.disturbances import stated_motions, states_of
+from scenes.models.disturbances import HEAT, UNITS, Component, stated_motions, states_of
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.instrument import InstrumentSpec
@@ -96,3 +96,19 @@ def test_sequences_are_composed_each_by_itself(stated) -> None:
     assert found[:2] == [{}, {"base": turn}]
     agree(found[2], compose(compose({"base": turn}, {"base": move}, bodies), {"base": turn}, bodies))
     assert found[3] == {"base": move}
+
+
+def test_every_kind_of_component_is_moved_by_its_amount(stated) -> None:
+    _, heat = stated
+    body = "base/forward/M2"
+    axes = {"rotate": range(3), "shift": range(3), "index_gradient": range(3), "figure": (5, 8)}
+    places = [(kind, axis) for kind in UNITS if kind not in (*HEAT, "abbe") for axis in axes.get(kind, (0,))]
+    components = [Component("own", body, kind, axis, "centre", 1.0) for kind, axis in places]
+    amounts = 1e-6 * np.arange(1.0, 2 * len(places) + 1).reshape(2, -1)
+    for row, state in zip(amounts.tolist(), states_of(amounts, components, heat), strict=True):
+        own = dict(zip(places, row, strict=True))
+        vectors = {kind: tuple(own[kind, a] for a in range(3)) for kind in ("rotate", "shift", "index_gradient")}
+        numbers = {kind: own[kind, 0] for kind in ("scale", "index", "radius", "conic")}
+        assert state == {
+            body: Motion(pivot="centre", figure={a: own["figure", a] for a in (5, 8)}, **vectors, **numbers)
+        }
