@@ -10,6 +10,8 @@ TOLERANCE = 1e-12
 """Relative: some thousand roundings of float64, which another order of the same sums can bring about."""
 OF_THE_WHOLE = ("relative_error",)
 """Keys of what is left of a balance of light: the rounding of its sums, which go by threads, is one of the whole, 1."""
+OF_THE_LIGHT = "of the light"
+"""Unit in which a check states the same."""
 BITWISE, CLOSE, DIFFERENT = "equal bitwise", "equal to 1e-12", "different"
 ABSENT = "absent"
 
@@ -105,12 +107,14 @@ def _walk(old: Any, new: Any, place: str, limits: tuple[float, float], found: li
             if old != new:
                 found.append(Difference(place, _told(old), _told(new), _summaries_close(old, new, tolerance)))
             return
+        told = old.get("unit") == new.get("unit") == OF_THE_LIGHT
         for key in [*old, *(key for key in new if key not in old)]:
             below = f"{place} / {key}" if place else str(key)
             if key not in old or key not in new:
                 found.append(Difference(below, old.get(key, ABSENT), new.get(key, ABSENT)))
             else:
-                _walk(old[key], new[key], below, (tolerance, max(scale, 1.0) if key in OF_THE_WHOLE else scale), found)
+                whole = key in OF_THE_WHOLE or (told and key == "value")
+                _walk(old[key], new[key], below, (tolerance, max(scale, 1.0) if whole else scale), found)
     elif isinstance(old, list) and isinstance(new, list):
         for k in range(max(len(old), len(new))):
             below = f"{place}[{k}]"

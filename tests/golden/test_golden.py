@@ -180,6 +180,15 @@ def test_last_digits_are_told_from_changes(both) -> None:
     assert numbers == {key: key.split(":")[0] for key, _, _ in PAIRS}
 
 
+def test_what_is_left_of_a_balance_is_measured_against_all_light() -> None:
+    """In the file of stray light and where the run states it as a check; 2e-12 of the light is a change in both."""
+    for key, more in (("relative_error", {}), ("value", {"unit": "of the light"})):
+        old, close, far = ({key: 4e-3 + error, **more} for error in (0.0, 2e-14, 2e-12))
+        assert (compare(old, close).status, compare(old, far).status) == (CLOSE, DIFFERENT)
+    old, new = ({"value": 4e-3 + error, "unit": "sigma"} for error in (0.0, 2e-14))
+    assert compare(old, new).status == DIFFERENT
+
+
 PAIRS = (
     (f"{BITWISE}: nan", math.nan, math.nan),
     (f"{CLOSE}: last digit", 1.0, math.nextafter(1.0, 2.0)),
