@@ -10,16 +10,24 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
+LONG = ("orbit_calibration", "trade_study")
+"""Most of a minute each: of the third tier."""
 MOST_SECONDS = 60.0
 """Of the processor, all processes together, with kernels compiled; not on the clock, for a machine may be busy."""
 
 
 def test_there_are_six() -> None:
     assert len(NOTEBOOKS) == 6
+    assert {path.stem for path in NOTEBOOKS} > set(LONG)
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem in LONG else pytest.mark.second)
+        for path in NOTEBOOKS
+    ],
+)
 def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     notebook = nbformat.read(path, as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells)

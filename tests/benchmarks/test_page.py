@@ -50,7 +50,7 @@ def test_json_is_all_of_stdout_and_progress_is_on_stderr(quick) -> None:
     assert "s left" in quick.stderr
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_absent_peers_are_named_and_the_others_compared(quick) -> None:
     data = json.loads(quick.stdout)
     for part, peer in (("trace", "batoid"), ("trace", "optiland"), ("psf", "poppy")):

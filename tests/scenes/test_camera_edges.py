@@ -245,7 +245,7 @@ def test_light_of_a_cut_pupil_is_that_of_traced_rays(cut, monkeypatch) -> None:
         cut.pupils([(1.0, 0.0)])
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_a_report_has_the_mtf_of_a_cut_pupil(tmp_path: Path) -> None:
     (tmp_path / "two.yaml").write_text(CAMERA)
     invoke(twin.camera.__main__.app, tmp_path / "two.yaml", "--out", tmp_path / "run", "--quiet")

@@ -56,7 +56,9 @@ def test_the_pace_of_this_machine() -> None:
 
 
 def test_the_pace_does_not_depend_on_what_the_process_did_before() -> None:
-    """An array that is given back lets the allocator keep memory: arrays made anew then take less time."""
+    """An array that is given back lets the allocator keep memory: arrays made anew then take less time. That
+    would be so in every process; that other programs leave more of the machine while one measures is not.
+    """
     measure = (
         "import numpy as np\n"
         "from twin.run.cost import pace\n"
@@ -66,8 +68,13 @@ def test_the_pace_does_not_depend_on_what_the_process_did_before() -> None:
         "    del large\n"
         "print(min(pace() for _ in range(3)) / first)\n"
     )
-    done = subprocess.run([sys.executable, "-c", measure], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert 0.85 < float(done.stdout) < 1.18
+    ratios = []
+    for _ in range(4):
+        done = subprocess.run([sys.executable, "-c", measure], cwd=ROOT, capture_output=True, text=True, check=True)
+        ratios.append(float(done.stdout))
+        if 0.85 < ratios[-1] < 1.18:
+            break
+    assert 0.85 < ratios[-1] < 1.18, ratios
 
 
 def test_more_memory_than_there_is_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

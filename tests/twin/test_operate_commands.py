@@ -238,7 +238,7 @@ def test_who_has_seen_which_alarm(words: tuple[object, ...], text: str, record: 
     assert (done.exit_code, text in done.stderr) == (2, True), done.stderr
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_kills_while_a_record_is_followed(record: Path, life: Path, tmp_path: Path) -> None:
     """What the estimate is, and which alarms there are, does not depend on where it was killed before."""
     run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
