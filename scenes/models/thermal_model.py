@@ -339,9 +339,9 @@ class ThermalModel:
         pivot = _mount(body)
         about = np.array(body.pivots[pivot])
         stretch = stuff.expansion * field.at(about)
-        stretches, unchanged = stretch.tolist(), repeat((0.0, (0.0, 0.0, 0.0)), len(stretch))
+        stretches = stretch.tolist()
         glassy = path in self.solids and self.solids[path].transparent
-        indices = self._indices(path, field) if glassy else unchanged
+        indices = self._indices(path, field) if glassy else repeat((0.0, (0.0, 0.0, 0.0)), len(stretches))
         out: dict[str, Sequence[Motion | None]] = {
             path: [
                 Motion(pivot=pivot, stretch=grown, index=change, index_gradient=slope)

@@ -389,6 +389,24 @@ def _elementary(component: Component) -> ElementaryMotion:
     return ElementaryMotion(component.body, component.kind, component.axis, component.pivot, component.name)
 
 
+def single_states(components: Sequence[Component], amounts: np.ndarray, thermal: ThermalModel) -> list[State]:
+    """M states, in each of which one component alone has its amount.
+
+    Args:
+        components: M of them.
+        amounts: (M,), SI.
+        thermal: of the instrument.
+    """
+    warm = np.array([c.kind in STEPS for c in components], bool)
+    heat = [c for c in components if c.kind in STEPS]
+    # all bodies have a temperature of their own in every state, as in states that are drawn, so that none inherits one
+    warmed = iter(states_of(np.diag(amounts[warm]), heat, thermal))
+    return [
+        next(warmed) if own else _elementary(c).state(amount)
+        for c, own, amount in zip(components, warm.tolist(), amounts.tolist(), strict=True)
+    ]
+
+
 def _by_differences(
     components: Sequence[Component],
     path: MonitorPath,
@@ -435,11 +453,7 @@ def derivative_changes(
     """
     components = stated.components
     steps = np.array([{**STEPS, **SMALL}[c.kind] for c in components])
-    heat = [c for c in components if c.kind in STEPS]
-    warmed = iter(states_of(np.diag([STEPS[c.kind] for c in heat]), heat, thermal))
-    singles = [
-        next(warmed) if c.kind in STEPS else _elementary(c).state(float(steps[k])) for k, c in enumerate(components)
-    ]
+    singles = single_states(components, steps, thermal)
     bodies = {body.path: body for body in path.instrument.assembly.tree.bodies}
     roots = {name: f"{BASE}/{name}" for name in path.instrument.cameras}
 

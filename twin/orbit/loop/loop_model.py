@@ -16,7 +16,6 @@ import numpy as np
 from analysis.monitor.disturbances import Disturbances
 from optics.geometry.tree import State, compose
 from optics.numerics.frozen_map import FrozenMap
-from scenes.models.disturbances import Component, states_of
 from scenes.specs.motion_text import AXES, node_named
 from scenes.specs.orbit.loop import CorrectionSpec
 from scenes.specs.orbit.monitor import PARAMETERS
@@ -24,7 +23,7 @@ from scenes.specs.orbit.setup import LoopSetup
 from scenes.specs.perturbation import not_allowed
 from scenes.yaml.errors import InputError, Problem, unknown
 from twin.monitor.image_quality import ImageQuality, image_quality
-from twin.monitor.monitor_derivative import STEPS, spot_jacobian
+from twin.monitor.monitor_derivative import single_states, spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion
 from twin.monitor.truth import truth_jacobian
@@ -155,7 +154,7 @@ def loop_model(setup: LoopSetup, experiment: MonitorExperiment) -> LoopModel:
     test, cameras = setup.test, tuple(experiment.instrument.cameras)
     named = {name: _mechanism(setup, experiment, name, test.corrections[name]) for name in sorted(test.corrections)}
     bodies = tuple(motion for motion in named.values() if motion is not None)
-    singles = _singles(motions.components, experiment)
+    singles = single_states(motions.components, motions.sigma, experiment.thermal)
     sizes = np.concatenate([motions.sigma, [_DISTANCE[m.kind] for m in bodies]])
     states = [{}, *singles, *(motion.state(_DISTANCE[motion.kind]) for motion in bodies)]
     foci = defocus(image_quality(experiment.instrument, experiment.backend, states, FOCUS_FIELDS, obstruction=False))
@@ -212,16 +211,3 @@ def _mechanism(
     if pivot not in nodes[path].known_pivots:
         raise test.error(unknown("this node has no such pivot", pivot, nodes[path].known_pivots), key)
     return ElementaryMotion(path, kind, AXES[axis], pivot, f"{path} {kind} {axis}")
-
-
-def _singles(components: Sequence[Component], experiment: MonitorExperiment) -> list[State]:
-    """States in which one component alone has its standard deviation."""
-    # all bodies have a temperature of their own, as in states that are drawn, so that none inherits one
-    heat = [one for one in components if one.kind in STEPS]
-    warmed = iter(states_of(np.diag([one.sigma for one in heat]), heat, experiment.thermal))
-    return [
-        next(warmed)
-        if one.kind in STEPS
-        else ElementaryMotion(one.body, one.kind, one.axis, one.pivot).state(one.sigma)
-        for one in components
-    ]
