@@ -71,7 +71,7 @@ def sources_of(commit: str) -> Iterator[tuple[str, Path]]:
     """
     found = _git("rev-parse", "--verify", "--quiet", f"{commit}^{{commit}}")
     if found.returncode:
-        raise InputErrorText(f"no commit {commit} in {ROOT}; --beside needs a checkout with its history")
+        raise InputErrorText(f"no commit {commit} in {ROOT}; --beside needs git and a checkout with its history")
     name = found.stdout.strip()
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "old"
@@ -85,7 +85,11 @@ def sources_of(commit: str) -> Iterator[tuple[str, Path]]:
 
 
 def _git(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=False)
+    """What git says; where there is none, as of a command that fails."""
+    try:
+        return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=False)
+    except FileNotFoundError as error:
+        return subprocess.CompletedProcess(["git", *arguments], 127, stdout="", stderr=str(error))
 
 
 def commit_here() -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.beside import ROOT, Pair, compared, numbers_of, sources_of
+from tests.benchmarks.beside import ROOT, Pair, commit_here, compared, numbers_of, sources_of
 from twin.run.cli import InputErrorText
 
 OLD = Path("/old")
@@ -50,6 +50,13 @@ def test_no_ratio_to_nothing() -> None:
 
 def test_a_commit_that_is_not_there_is_bad_input() -> None:
     with pytest.raises(InputErrorText, match="no commit nowhere"), sources_of("nowhere"):
+        pass
+
+
+def test_without_git(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert commit_here() == ""
+    with pytest.raises(InputErrorText, match="--beside needs git"), sources_of("HEAD"):
         pass
 
 
