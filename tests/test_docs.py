@@ -381,6 +381,8 @@ def test_a_wrong_command_line_is_found(line: str) -> None:
 NOT_RUN = {
     "python -m twin.camera my_camera.yaml": "a file of the reader's; tests/twin/test_camera_command.py refocuses one",
     "python -m twin.camera camera.yaml": "a file that the lines before it make; tests/scenes/lens makes some",
+    "python -m twin.camera runs/": "a run folder of the reader's own; tests/twin/test_camera_instrument.py opens one",
+    "python -m twin.live gf7_pair": "serves until its last page is closed; tests/twin/test_live_process.py opens one",
     "python -m twin.compare RUN1": "run folders of the reader's own; tests/twin/test_compare.py compares some",
     "python -m twin.export": "run folders of the reader's own; tests/twin/test_run_export.py exports some",
     "python -m twin.operate": "a record of the reader's own; tests/twin/test_operate.py and those beside it make some",
