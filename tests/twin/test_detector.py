@@ -184,6 +184,30 @@ def test_kernels_make_the_frames_of_numpy(dark_noise_e, monkeypatch):
         ccd.expose(photons, pattern, 7, 0.01, seeds)
 
 
+@pytest.mark.parametrize(("kept", "drawn"), [(0, 21), (2 * 7 * 41 * 31, 15), (1 << 22, 8)])
+@pytest.mark.parametrize("dark_noise_e", [0.0, 9.0])
+def test_exposures_of_one_seed_share_what_is_drawn_and_not_their_light(dark_noise_e, kept, drawn, monkeypatch):
+    """Bit for bit the frames of one exposure after the other, also where huge means draw numbers in between."""
+    ccd = detector(full_well_e=2e5, system_gain_dn_per_e=0.3, dark_noise_e=dark_noise_e)
+    dim = np.geomspace(1e-3, 4e3, 3 * 41 * 31).reshape(3, 41, 31)
+    huge = np.geomspace(1e-3, 4e5, 3 * 41 * 31).reshape(3, 41, 31)
+    photons = np.stack([dim, huge, dim[::-1], dim, 1.1 * dim, 2.0 * dim, huge])
+    seeds = [5, 5, 5, 6, 5, 6, 6]
+    pattern = ccd.fixed_pattern((3, 41, 31), 3)
+    monkeypatch.setattr(area_detector, "FEWEST", 0)
+    alone = [ccd.expose(light, pattern, 7, 0.01, seed) for light, seed in zip(photons, seeds, strict=True)]
+    monkeypatch.setattr(exposure_kernel, "_TOGETHER", 2 * 7 * 41 * 31)
+    monkeypatch.setattr(exposure_kernel, "_MOST_KEPT", kept)
+    times, words_of = [], exposure_kernel.words_of
+    monkeypatch.setattr(exposure_kernel, "words_of", lambda *how: times.append(how) or words_of(*how))
+    for threads in (1, 4):
+        times.clear()
+        np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, seeds, threads), alone)
+        assert len(times) == drawn
+    monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 3 * 41 * 31)
+    np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, seeds), alone)
+
+
 def test_images_are_independent():
     """Neighbouring images of one call: correlation of their noise within 5 sigma of zero (false alarm 6e-7)."""
     sensor = counter()

@@ -518,8 +518,9 @@ def test_command(full, tmp_path: Path) -> None:
     for errors in (data["before"], *data["schemes"].values()):
         assert tuple(errors) == FIELDS
         assert all({"plan_rms_m", "height_rms_m"} == set(e) for e in errors.values())
-    assert data["verdict"]["before"] is False
-    assert data["verdict"]["schemes"]["4"] is True
+    assert data["map_limits"]["before"] is False
+    assert data["map_limits"]["schemes"]["4"] is True
+    assert isinstance(data["verdict"], str)
     assert "nadir x" in data["null_vectors"][0]["change"]
     tables = {"schemes", "plan", "height", "interior", "biases", "fields", "correlations", "third-differences"}
     tables |= {"campaigns", "repeatability", "bias-fits", "light", "light-pixels", "datum", "chip-steps"}

@@ -105,6 +105,13 @@ def test_a_verdict_is_two_sentences_at_most(verdict: str) -> None:
         Report("Level", verdict, (), (), table, ())
 
 
+def test_numbers_have_no_verdict_but_the_reports() -> None:
+    told = Report("Level", "It holds.", (), (), Table("readings", "Readings", "", ("number",), []), ())
+    assert told.told({"a": 1, "verdict": "It holds."}) == told.told({"a": 1}) == {"a": 1, "verdict": "It holds."}
+    with pytest.raises(ValueError, match="verdict"):
+        told.told({"verdict": {"before": False}})
+
+
 def test_statements_become_a_verdict_and_what_follows_it() -> None:
     assert answer("Heights err by 3 m.", "", "the rest is 0.5 m") == ("Heights err by 3 m. The rest is 0.5 m.", ())
     assert answer("it is", "MTF falls", "Δα is read", "base/forward moves") == (

@@ -158,8 +158,8 @@ def test_a_drawing_that_fails_is_a_note_and_a_file_that_fails_is_left_out():
 def test_what_cannot_be_drawn_costs_nothing_else(computed, tmp_path, monkeypatch):
     """A figure has a note in its place, a file is left out; exit code and manifest say so."""
     kept = computed[3]
-    for name in ("_summary", "_motions"):
-        monkeypatch.setattr(f"twin.main_job.render_drawings.{name}", no_font)
+    for name in ("summary_plot.summary_png", "spot_plots.motion_map_svg"):
+        monkeypatch.setattr(f"twin.main_job.{name}", no_font)
     monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept)
     done = run(EXAMPLE, "--out", tmp_path / "run", "--frames", FRAMES, "--quiet")
     assert done.exit_code == 1

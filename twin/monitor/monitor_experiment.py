@@ -4,7 +4,7 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import cached_property
 
@@ -74,7 +74,7 @@ class MonitorExperiment:
             require_memory(resolved, self.size(), self.detector)
         self._deformed: dict[tuple[str, DeformationSpec], NodalDeformation] = {}
         self._heated: dict[tuple[str, TableTemperatureSpec], HeatedBody] = {}
-        self._patterns: dict[int, FixedPattern] = {}
+        self._patterns: dict[int | tuple[int, ...], FixedPattern] = {}
 
     @property
     def monitored(self) -> bool:
@@ -319,32 +319,53 @@ class MonitorExperiment:
         column = float(core.sum(axis=0) @ np.arange(image.shape[1]) / core.sum())
         return SpotTemplate.from_image(image, row, column, self.path.shape)
 
-    def pattern(self, seed: int) -> FixedPattern:
-        """PRNU and DSNU of all area CCDs; the same before and after."""
-        found = self._patterns.get(seed)
+    def pattern(self, seed: int | Sequence[int]) -> FixedPattern:
+        """PRNU and DSNU of all area CCDs, (C, rows, columns); the same before and after. Those of several seeds one
+        after the other, (seeds, C, rows, columns).
+        """
+        key = tuple(seed) if isinstance(seed, Sequence) else seed
+        found = self._patterns.get(key)
         if found is None:
-            found = self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), stream(seed, 0))
+            found = self._drawn_pattern(key)
             # kept for one seed at a time: states that are exposed one by one would each draw it anew
-            self._patterns = {seed: found}
+            self._patterns = {key: found}
         return found
 
-    def frames_before(self, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> np.ndarray:
-        """Frames of the nominal state with the given stray photons, uint16 (C, frames, rows, columns)."""
-        photons = self.nominal_photons + stray
-        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, stream(seed, 1))
+    def _drawn_pattern(self, seed: int | tuple[int, ...]) -> FixedPattern:
+        if isinstance(seed, tuple):
+            every = [self._drawn_pattern(one) for one in seed]
+            return FixedPattern(np.stack([one.gain for one in every]), np.stack([one.offset_e for one in every]))
+        return self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), stream(seed, 0))
 
-    def frames_after(self, photons: np.ndarray, frames: int, seed: int, first: int | np.ndarray = 0) -> np.ndarray:
+    def frames_before(self, frames: int, seed: int | Sequence[int], stray: np.ndarray | float = 0.0) -> np.ndarray:
+        """Frames of the nominal state with the given stray photons, uint16 (C, frames, rows, columns).
+
+        Args:
+            frames: of each CCD.
+            seed: of CCDs and noise. Of several seeds the frames of each, (seeds, C, frames, rows, columns).
+            stray: photons beside those of the spots.
+        """
+        photons = self.nominal_photons + stray
+        if not isinstance(seed, Sequence):
+            return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, stream(seed, 1))
+        every, own = np.broadcast_to(photons, (len(seed), *photons.shape)), [stream(one, 1) for one in seed]
+        return self.detector.expose(every, self.pattern(seed), frames, self.exposure, own)
+
+    def frames_after(
+        self, photons: np.ndarray, frames: int, seed: int | Sequence[int], first: int | np.ndarray = 0
+    ) -> np.ndarray:
         """Frames of perturbed states, uint16 (S, C, frames, rows, columns).
 
         Args:
             photons: expected photons per pixel and frame, (S, C, rows, columns).
             frames: per state.
-            seed: as for ``frames_before``; state number first + s draws from a stream of its own, so that the frames of
-                a state do not depend on how a series is cut into pieces.
+            seed: as for ``frames_before``, or one for each state; state number first + s draws from a stream of its
+                own, so that the frames of a state do not depend on how a series is cut into pieces.
             first: number of the first state, or of each, (S,).
         """
         numbers = first if isinstance(first, np.ndarray) else first + np.arange(len(photons))
-        own = [stream(seed, 2, int(number)) for number in numbers]
+        seeds = seed if isinstance(seed, Sequence) else [seed] * len(photons)
+        own = [stream(one, 2, int(number)) for one, number in zip(seeds, numbers, strict=True)]
         return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, own)
 
     def expected_frames(self, photons: np.ndarray) -> np.ndarray:

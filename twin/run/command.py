@@ -58,7 +58,7 @@ def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, 
     from twin.run import reference_frames
     from twin.run.page import RunFacts, write_test
 
-    told = {**numbers, "verdict": report.verdict}
+    told = report.told(numbers)
     known = {"started": session.started, "seconds": session.seconds, "backend": session.backend.name}
     write_test(kind, told, report, RunFacts(**{**known, **facts}), session.folder)
     return Result(

@@ -92,6 +92,19 @@ class Report:
         """All that it shows, the main table first."""
         return (self.summary, *(artefact for section in self.sections for artefact in section.artefacts))
 
+    def told(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Numbers of the run with the verdict beside them.
+
+        Args:
+            numbers: by their keys.
+
+        Raises:
+            ValueError: they have a verdict of their own, which would be lost.
+        """
+        if numbers.get("verdict", self.verdict) != self.verdict:
+            raise ValueError("the key 'verdict' of a run's numbers is for the sentence of its report")
+        return {**numbers, "verdict": self.verdict}
+
     def __post_init__(self) -> None:
         """Refuse a verdict of more than two sentences, and two artefacts of one name: they would be one file."""
         if not self.verdict.endswith(".") or len(re.findall(r"[.!?]\s+[A-Z]", self.verdict)) >= MOST_SENTENCES:

@@ -109,7 +109,7 @@ def perform(
     told = (seeded.to_yaml(), f"twin.{program}", started, seconds, backend, number, command)
     facts = RunFacts(*told, named=seeded.plain())
     shown = with_warnings(procedure.report(run), given)
-    numbers = {**procedure.numbers(run), "verdict": shown.verdict}
+    numbers = shown.told(procedure.numbers(run))
     return TestResult(name, numbers, shown, setup, run, facts, procedure.kind)
 
 

@@ -9,14 +9,17 @@ table leaves open with the distribution function between its rows. Some of ten t
 the bounds of these approximations.
 
 All frames of a pixel share its mean, so that a kernel runs over the pixels of some images, frame after frame: then no
-number has to be gathered but those of the table.
+number has to be gathered but those of the table. Images of one stream share their numbers, too, which are then drawn
+once.
 """
 
 from __future__ import annotations
 
+import threading
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -46,6 +49,9 @@ _TOGETHER = 1 << 20
 """Numbers that are drawn and read out at once; their words and normal numbers take 16 MiB, and as much again while the
 next are drawn.
 """
+
+_MOST_KEPT = 1 << 22
+"""Numbers of streams of several images that are kept until all of these are exposed; they take 64 MiB."""
 
 _LANES = 16
 """Numbers of pixels are rounded up to a multiple of this, so that each frame begins at an aligned address."""
@@ -101,7 +107,8 @@ class Reading:
 
         Args:
             expected: number of an image -> its expected electrons, and ``shift`` as of ``read_out``, P numbers each.
-            streams: of the I images, each a stream of words, of Poisson numbers of huge means and of normal numbers.
+            streams: of the I images, each a stream of words, of Poisson numbers of huge means and of normal numbers;
+                some may be the same.
             out: the frames, (I, F, P) uint16.
             together: frames of an image that are done at once.
             threads: that draw.
@@ -111,6 +118,7 @@ class Reading:
         size = min(images, max(1, _TOGETHER // (together * pixels)))
         pieces = (images > size) + (frames > together)
         rooms = [_Numbers.room(together, size * pixels, self.sigma_e > 0) for _ in range(min(2, 1 + pieces))]
+        same = {} if together < frames else _same_numbers(streams, _MOST_KEPT // (frames * pixels))
         # the next numbers are drawn while kernels work on the last ones
         drawn: _Drawn | None = None
         with one_kernel_thread(), ThreadPoolExecutor(threads) as pool:
@@ -121,7 +129,10 @@ class Reading:
                     numbers = rooms[(first // size * len(range(0, frames, together)) + start // together) % len(rooms)]
                     numbers.expect(expected, some)
                     if group is None:
-                        group = _Group(self, numbers, [streams[k] for k in some], together, frames, pixels)
+                        own = [streams[k] for k in some]
+                        group = _Group(
+                            self, numbers, own, [same.get(_key(one)) for one in own], together, frames, pixels
+                        )
                     following = group.draw(numbers, out[some.start : some.stop, start : start + together], pool)
                     if drawn is not None:
                         drawn.read_out()
@@ -171,6 +182,50 @@ class _Numbers:
                 row[place * values.size : (place + 1) * values.size] = values.reshape(-1)
 
 
+@dataclass(eq=False)
+class _SameNumbers:
+    """Random numbers of a stream of several images, none of whose means is huge: whoever comes first draws them.
+
+    Attributes:
+        words, normals: of all frames, (frames, pixels); None before they are drawn, normals also without read noise.
+    """
+
+    words: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    drawing: threading.Lock = field(default_factory=threading.Lock)
+
+    def put(self, numbers: _Numbers, own: slice, count: int, draw: Callable[[], None]) -> None:
+        """Put the numbers where an image has its own.
+
+        Args:
+            numbers: of a group of images.
+            own: the image's lanes.
+            count: of frames.
+            draw: draws them to this place.
+        """
+        with self.drawing:
+            if self.words is None:
+                draw()
+                self.words = numbers.words[:count, own].copy()
+                if numbers.normals is not None:
+                    self.normals = numbers.normals[:count, own].copy()
+                return
+        numbers.words[:count, own] = self.words
+        if numbers.normals is not None:
+            numbers.normals[:count, own] = self.normals
+
+
+def _key(stream: np.random.SeedSequence) -> tuple[object, ...]:
+    """What two streams of the same numbers have in common."""
+    return str(stream.entropy), stream.spawn_key, stream.pool_size
+
+
+def _same_numbers(streams: Sequence[np.random.SeedSequence], most: int) -> dict[tuple[object, ...], _SameNumbers]:
+    """Room for the numbers of each stream of several images, of so many streams at most."""
+    several = [key for key, times in Counter(map(_key, streams)).items() if times > 1]
+    return {key: _SameNumbers() for key in several[:most]}
+
+
 class _Group:
     """Some images whose frames are drawn together, and their streams."""
 
@@ -179,11 +234,12 @@ class _Group:
         how: Reading,
         numbers: _Numbers,
         streams: Sequence[np.random.SeedSequence],
+        same: Sequence[_SameNumbers | None],
         together: int,
         frames: int,
         pixels: int,
     ) -> None:
-        self.how, self.pixels = how, pixels
+        self.how, self.pixels, self.same = how, pixels, same
         self.huge: list[np.ndarray] = []
         self.sources = []
         self.last: list[Future[np.ndarray | None] | None] = [None] * len(streams)
@@ -213,11 +269,21 @@ class _Group:
             before.result()  # another thread may still draw the image's last frames from the same streams
         words, huge, rng = self.sources[image]
         own, which = self.own(image), self.huge[image]
-        numbers.words[:count, own] = words_of(words, count, self.pixels)
-        found = huge.poisson(numbers.mean[own][which], (count, which.size)) if which.size else None
-        if numbers.normals is not None:
-            for row in numbers.normals[:count]:
-                rng.standard_normal(out=row[own])
+        found: np.ndarray | None = None
+
+        def draw() -> None:
+            nonlocal found
+            numbers.words[:count, own] = words_of(words, count, self.pixels)
+            found = huge.poisson(numbers.mean[own][which], (count, which.size)) if which.size else None
+            if numbers.normals is not None:
+                for row in numbers.normals[:count]:
+                    rng.standard_normal(out=row[own])
+
+        # numbers of huge means are drawn before the normal ones, which then are this image's own
+        if (same := self.same[image]) is None or which.size:
+            draw()
+        else:
+            same.put(numbers, own, count, draw)
         return found
 
 

@@ -117,7 +117,7 @@ STRIPS: Record[CalibrationRun] = Record(
     ),
     Quantity("datum", lambda run: {d.name: d for d in _strips(run).datum}, record=DATUM_SIGMA),
 )
-VERDICT: Record[CalibrationRun] = Record(
+MAP_LIMITS: Record[CalibrationRun] = Record(
     "Which schemes meet the limits of a map in every field.",
     Quantity("scale", lambda run: "1:50000", "of the map"),
     Quantity("plan_limit_m", lambda run: run.setup.test.limits.plan, "largest RMS error in plan"),
@@ -520,5 +520,5 @@ CALIBRATION: Record[CalibrationRun] = Record(
     Quantity("campaigns", lambda run: None if run.repeats is None else run, record=CAMPAIGNS),
     Quantity("monitoring", lambda run: run.monitoring, record=MONITORING),
     Quantity("strips", lambda run: None if run.strips is None else run, record=STRIPS),
-    Quantity("verdict", lambda run: run, record=VERDICT),
+    Quantity("map_limits", lambda run: run, record=MAP_LIMITS),
 )

@@ -124,11 +124,13 @@ def _run_together(
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         own = [runs[k] for k in numbers]
-        # runs that share their noise have the same frames before, which are then measured once
-        first = [before(run.frames, run.seed) for run in (own[:1] if shared else own)]
-        pairs = zip(photons, own, strict=True)
-        after = [experiment.frames_after(one[None], run.frames, run.seed) for one, run in pairs]
-        return first[0] if shared else np.stack(first), np.concatenate(after)
+        if shared:
+            # the same noise after, and the same frames before, which are then measured once
+            frames, seed = own[0].frames, own[0].seed
+            return before(frames, seed), experiment.frames_after(photons, frames, seed, np.zeros(len(own), int))
+        seeds = [run.seed for run in own]
+        first = experiment.frames_before(own[0].frames, seeds)
+        return first, experiment.frames_after(photons, own[0].frames, seeds, np.zeros(len(own), int))
 
     how = Observing(record, runs[0].resolved.job.analysis.centroid, len(runs), leave=leave)
     for found in observe(experiment, [run.state for run in runs], how):
