@@ -106,8 +106,8 @@ class Reading:
         Args:
             of: array of a number over the states -> what takes its place.
         """
-        numbers = {name: of(getattr(self, name)) for name in ("true", "value", "error", "sigma", "noise")}
-        return replace(self, **numbers)
+        numbers = of(self.true), of(self.value), of(self.error), of(self.sigma), of(self.noise)
+        return Reading(self.group, self.parameter, self.estimator, *numbers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,16 +182,20 @@ class ReadingTable:
             if truth:
                 group.setdefault(truth, {}).setdefault(key, plain(row.true))
             read = group.setdefault(row.estimator, {})
-            read |= {key: plain(row.value), f"{key}_sigma": plain(row.sigma), f"{key}_sigma_noise": plain(row.noise)}
+            read[key] = plain(row.value)
+            read[f"{key}_sigma"], read[f"{key}_sigma_noise"] = plain(row.sigma), plain(row.noise)
         for estimator, left in self.left.items():
             out[GROUND_GROUP][estimator] |= {key: plain(value) for key, value in left.items()}
         return out
 
     def true(self) -> dict[str, Any]:
         """The true changes as JSON files nest them: as `groups`, without estimators."""
-        found = self.groups("true")
-        cameras = {name: group["true"] for name, group in found.pop("cameras").items()}
-        return {"cameras": cameras, **{name: group["true"] for name, group in found.items()}}
+        out: dict[str, Any] = {"cameras": {}}
+        for row in self.rows:
+            group = out["cameras"].setdefault(row.camera, {}) if row.camera else out.setdefault(row.group, {})
+            if row.parameter.key not in group:
+                group[row.parameter.key] = plain(row.true)
+        return out
 
     @staticmethod
     def joined(parts: Sequence[ReadingTable]) -> ReadingTable:
