@@ -93,7 +93,8 @@ else
     # Only files whose checksum the lock has, and no package that would run a program of its own to be built: what a lock
     # file does not name is not installed, whoever asks for it. What is there already is not fetched again.
     locked() {
-        .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes --only-binary :all: "$@" \
+        .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile \
+            --no-deps --require-hashes --only-binary :all: "$@" \
             || fail "pip could not install the packages of $lock; run this again to go on. (If it speaks of hashes: the package
        index sent another file than the one that was locked. Do not install that file; see docs/installed.md)"
     }
@@ -112,6 +113,9 @@ else
     # The project itself, by the setuptools that is there now, which warns of names that folders and packages share.
     PYTHONWARNINGS=ignore .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . \
         || fail "pip could not install the project itself"
+    # Byte code, on all cores; pip would make it on one. A file of a package that no Python can compile, as templates are,
+    # is not imported either.
+    .venv/bin/python -m compileall -qq -j 0 .venv/lib $(ls -d .venv/peers 2>/dev/null) >/dev/null || true
     echo "$state $layers" >"$stamp"
 fi
 

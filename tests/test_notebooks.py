@@ -10,8 +10,8 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
-LONG = ("orbit_calibration", "trade_study")
-"""Most of a minute each: of the third tier."""
+LONG = ("heat", "orbit_calibration", "targets_mtf", "trade_study")
+"""Twenty seconds to a minute each: of the third tier."""
 MOST_SECONDS = 60.0
 """Of the processor, all processes together, with kernels compiled; not on the clock, for a machine may be busy."""
 

@@ -180,15 +180,9 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
     assert len(files) > 400
     assert [path for path in files if not (own / path).is_file()] == []
     job = own / "scenes/examples/perturb.yaml"
-    for words in (
-        ("camtwin", "render", job, "--out", "a", "--frames", "1"),
-        ("camtwin", "compare", "a", "a", "--out", "b"),
-        ("camtwin", "verify", "a"),
-        ("camtwin", "doctor", "--quick"),
-    ):
-        done = run(installed, tmp_path, *words)
-        assert done.returncode == 0, done.stdout + done.stderr
-    assert all((tmp_path / name / "report.html").is_file() for name in ("a", "b"))
+    done = run(installed, tmp_path, "camtwin", "render", job, "--out", "a", "--frames", "1")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "a/report.html").is_file()
     manifest = json.loads((tmp_path / "a/manifest.json").read_text("utf-8"))
     assert (manifest["program"], manifest["versions"]["space-camera-twin"]) == ("twin.render", version())
     assert manifest["provenance"]["source"] == program_digest()
@@ -201,8 +195,17 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
 
 @pytest.mark.slow
 def test_longer_commands_of_the_wheel(installed: Path, tmp_path: Path) -> None:
-    """One that starts processes of its own, and one with measured data."""
+    """Those that read a run, one that starts processes of its own, and one with measured data."""
     own = installed / backend.PREFIX
+    for words in (
+        ("render", own / "scenes/examples/perturb.yaml", "--out", "a", "--frames", "1"),
+        ("compare", "a", "a", "--out", "b"),
+        ("verify", "a"),
+        ("doctor", "--quick"),
+    ):
+        done = run(installed, tmp_path, "camtwin", *words)
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "b/report.html").is_file()
     for words in (
         ("study", own / "scenes/examples/study_smoke.yaml", "--workers", "2", "--yes"),
         ("lab", "focus", own / "scenes/lab/measured/focus.yaml"),

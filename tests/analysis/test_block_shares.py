@@ -68,7 +68,7 @@ def test_shares_that_went_through_bytes_give_the_same_adjustment():
     same(adjust_block(block, robust="reject", pool=Posted(3)), whole)
 
 
-@pytest.mark.second
+@pytest.mark.slow
 @one_blas_thread()
 def test_workers_of_the_engine_of_studies_give_the_same_adjustment():
     block = spoilt()

@@ -197,7 +197,7 @@ def test_frequencies_that_cannot_be_looked_at_are_told() -> None:
         periodogram(unseen, 1.0, 2.0)
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_a_wrong_variance_of_one_kind_spoils_no_rate() -> None:
     """Two axes, each seen by observations of its own, one of them four times as noisy as its covariances say: taken for
     alike, false alarms are too many; with a factor for each kind they keep to the rate.

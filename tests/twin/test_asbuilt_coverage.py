@@ -129,7 +129,7 @@ def test_figures_that_the_prior_does_not_have_are_told(backend, tmp_path) -> Non
     assert np.sum(tally.agrees) <= 1
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_sigmas_hold_for_some_cameras(backend, tmp_path) -> None:
     """The same for twelve cameras: nearly all lie within 95 %."""
     tally = judged(coverage_bench(backend, tmp_path, FIVE), np.random.default_rng(3), 12)

@@ -69,7 +69,7 @@ def test_motions_of_a_telescope_by_hand(tmp_path, backend) -> None:
     assert set(found.method[:, 2]) == {TRACED}
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_images_of_a_telescope(tmp_path, backend) -> None:
     """A despace of M2 moves the focus by m^2 + 1, less what it adds of spherical aberration to a ring's best focus."""
     job = JOB + "perturb: [M2 shift z 5 um]\n"
@@ -108,7 +108,7 @@ def test_lenses_have_derivatives_too(tmp_path, backend) -> None:
     assert entry(found, "df", "m2z") == pytest.approx(by_hand, rel=1e-6)
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_a_table_of_states_is_a_course(tmp_path, backend) -> None:
     """What a job without a monitor is told to write in place of a course: every row is one state."""
     (tmp_path / "course.csv").write_text("time_s,despace,heat\n0,0 um,0 K\n60,5 um,1 K\n120,9 um,1.5 K\n", "utf-8")

@@ -63,7 +63,7 @@ def same(words: tuple[str, ...], folder: Path) -> None:
     assert first.keys() == second.keys()
 
 
-@pytest.mark.second
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_threads_change_no_byte(name, tmp_path) -> None:
     same(RUNS[name], tmp_path)

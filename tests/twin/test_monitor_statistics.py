@@ -67,7 +67,7 @@ def test_scatter_of_the_intersection_angle_agrees_with_sigma(runs):
     assert low < total < high
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_maximum_likelihood_reaches_the_cramer_rao_bound(runs):
     """Pooled over 16 coordinates: 3200 deviations, standard error of the ratio 1.3%; limits 10% above, 5% below."""
     setup, _, recovered, clean_before, clean_after = runs
@@ -105,9 +105,9 @@ def test_frames_before_and_after_have_noise_of_their_own(experiment):
 
 
 @pytest.mark.second
-def test_default_light_does_not_saturate(runs):
-    setup, photons, *_ = runs
-    frames = setup.frames_after(photons, FRAMES, 0)[0]
+def test_default_light_does_not_saturate(experiment):
+    setup = experiment("gf7_pair")
+    frames = setup.frames_after(setup.nominal_photons[None], FRAMES, 0)[0]
     assert not setup.detector.saturated(frames).any
     peak = mean_frames(frames).max(axis=(1, 2))
     assert np.all(peak > 0.3 * setup.detector.saturation_dn)

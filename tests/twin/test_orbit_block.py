@@ -212,7 +212,7 @@ def test_worth_of_monitor_and_laser_beside_what_gf7_reports(tmp_path):
 MEASURED = SCENES / "orbit" / "measured" / "adjust.yaml"
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_measured_passes_as_their_calibration_has_them():
     """The tables of the shipped campaign: two image points of control points were moved by some pixels."""
     found = run_adjustment(resolve_any_adjust(MEASURED), None, 0)

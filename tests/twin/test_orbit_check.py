@@ -285,7 +285,7 @@ def test_files_that_are_wrong_are_refused_by_file_and_line(files, tmp_path: Path
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_places_in_images_of_a_gcp_file(files: tuple[Path, dict[str, Any]]) -> None:
     """The .gcp of the Ames Stereo Pipeline holds ground points and image points; the answer is that of the tables."""
     folder, _ = files

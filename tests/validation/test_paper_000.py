@@ -95,7 +95,7 @@ def test_every_check_is_listed():
     assert {name: verdict for name, (_, _, verdict) in FOUND.items()} == {name: expected[name] for name in FOUND}
 
 
-@pytest.mark.second
+@pytest.mark.slow
 @pytest.mark.parametrize("identifier", FOUND)
 def test_what_is_found(validation, identifier):
     value, accuracy, verdict = FOUND[identifier]
@@ -108,7 +108,7 @@ def test_what_is_found(validation, identifier):
         assert result.measured == pytest.approx(value, abs=accuracy)
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_artefacts(validation):
     shown = {a.name: a for run in validation.runs for a in run.artefacts}
     assert set(shown) == {"table1", "fig3", "fig4", "fig5", "places", "readings", "changes"}
