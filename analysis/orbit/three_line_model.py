@@ -24,6 +24,7 @@ step through it gives derivatives to rounding; `partials` has them in closed for
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,6 +50,7 @@ BIAS = ("roll", "pitch", "yaw")
 DRIFT = ("d_alpha", "d_beta", "d_gamma", "d_f")
 _DRIFT_AXIS = (1, 0, 2)
 _NEXT = ((1, 2), (2, 0), (0, 1))
+_UNIT = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,10 +126,10 @@ class LineModel:
             raise ValueError(f"line model: a drift is (4,) {', '.join(DRIFT)}, found {change.shape}")
         return replace(self, drift=change)
 
-    @property
+    @cached_property
     def axes(self) -> Array:
         """(3, 3) rotation from the axes of the drifted camera to the body's."""
-        return np.asarray(self.to_body @ self._turned())
+        return np.asarray(self.to_body @ self._turned)
 
     @property
     def principal_distance(self) -> Array:
@@ -153,7 +155,7 @@ class LineModel:
             UndeterminedError: a ground point behind a camera.
         """
         f, mounted = self.principal_distance, (body - self.position) @ self.to_body
-        a, b, c = np.ascontiguousarray((mounted @ self._turned()).T)
+        a, b, c = np.ascontiguousarray((mounted @ self._turned).T)
         if np.any(c <= 0):
             raise UndeterminedError("three-line model: a ground point lies behind a camera")
         place = image - self.interior[1:]
@@ -163,17 +165,26 @@ class LineModel:
         own = np.zeros((len(c), 2, 3))
         own[:, 0, 0] = own[:, 1, 1] = f / c
         own[:, :, 2] = (-f / c)[:, None] * along
-        swung = np.concatenate([self._turned(k) for k in range(3)], axis=1)
+        swung = np.concatenate(self._turned_slopes, axis=1)
         swung = (mounted @ swung).reshape(-1, 3, 3).swapaxes(1, 2)
         by_drift = np.concatenate([own @ swung, along[:, :, None]], axis=2)
         return Seen(place * grown[:, None] + f * along, (own.reshape(-1, 3) @ self.axes.T).reshape(-1, 2, 3), by_drift)
 
-    def _turned(self, slope: int | None = None) -> Array:
-        """Rx(d_beta) Ry(d_alpha) Rz(d_gamma), or its derivative by one of DRIFT."""
-        chain: list[np.ndarray] = [np.eye(3)] * 3
-        for k, axis in enumerate(_DRIFT_AXIS):
-            chain[axis] = _turn_slope(axis, self.drift[k]) if k == slope else _turn(axis, self.drift[k])
+    @cached_property
+    def _turned(self) -> Array:
+        """Rx(d_beta) Ry(d_alpha) Rz(d_gamma)."""
+        chain = {axis: _turn(axis, self.drift[k]) for k, axis in enumerate(_DRIFT_AXIS)}
         return np.asarray(chain[0] @ chain[1] @ chain[2])
+
+    @cached_property
+    def _turned_slopes(self) -> tuple[Array, ...]:
+        """Its derivatives by d_alpha, d_beta, d_gamma."""
+        turn = {axis: _turn(axis, self.drift[k]) for k, axis in enumerate(_DRIFT_AXIS)}
+        out = []
+        for k, own in enumerate(_DRIFT_AXIS):
+            chain = {**turn, own: _turn_slope(own, self.drift[k])}
+            out.append(np.asarray(chain[0] @ chain[1] @ chain[2]))
+        return tuple(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,31 +320,37 @@ def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: 
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
     turn = bias_rotation(bias)
     mounted = (q @ turn - camera.position) @ camera.to_body
-    a, b, c = (mounted @ camera._turned()).T
+    a, b, c = (mounted @ camera._turned).T
     if np.any(c <= 0):
         raise UndeterminedError("three-line model: a ground point lies behind a camera")
     x, y = rays.image[:, 0] - x0, rays.image[:, 1] - y0
     square = x * x + y * y
     grown = 1.0 + square * (camera.k1 + camera.k2 * square)
     slope = 2.0 * (camera.k1 + 2.0 * camera.k2 * square)
-    by_x = -np.stack([grown + slope * x * x, slope * x * y], axis=-1)
-    by_y = -np.stack([slope * x * y, grown + slope * y * y], axis=-1)
-    interior = np.stack([np.stack([a / c, b / c], axis=-1), by_x, by_y], axis=-1)
-    zero = np.zeros_like(c)
-    image = f * np.stack([np.stack([1 / c, zero, -a / c**2], -1), np.stack([zero, 1 / c, -b / c**2], -1)], axis=1)
+    kind = np.result_type(a, f, x)
+    interior, image = np.empty((len(c), 2, 3), kind), np.zeros((len(c), 2, 3), kind)
+    interior[:, 0, 0], interior[:, 1, 0] = a / c, b / c
+    interior[:, 0, 1], interior[:, 1, 2] = -(grown + slope * x * x), -(grown + slope * y * y)
+    interior[:, 1, 1] = interior[:, 0, 2] = -(slope * x * y)
+    image[:, 0, 0] = image[:, 1, 1] = f * (1 / c)
+    image[:, 0, 2], image[:, 1, 2] = f * (-a / c**2), f * (-b / c**2)
     to_body = image @ camera.axes.T  # by the point in the body frame of the true attitude
     roll, pitch, yaw = bias
-    turned = []
+    turns, turned = [_turn(0, roll), _turn(1, pitch), _turn(2, yaw)], np.empty((len(q), 3, 3), kind)
     for axis in range(3):
-        chain = [_turn(0, roll), _turn(1, pitch), _turn(2, yaw)]
+        chain = [*turns]
         chain[axis] = _turn_slope(axis, bias[axis])
-        turned.append(q @ (chain[0] @ chain[1] @ chain[2]))
+        turned[:, :, axis] = q @ (chain[0] @ chain[1] @ chain[2])
     to_measured = to_body @ turn.T  # by the point in the body frame of the measured attitude
-    spun = np.stack([np.cross(q, axis) for axis in np.eye(3)], axis=-1)
-    swung = np.stack([mounted @ camera._turned(k) for k in range(3)], axis=-1)
+    spun = np.zeros((len(q), 3, 3), kind)  # the products of q with the axes, column by column
+    for axis, (i, j) in enumerate(_NEXT):
+        spun[:, i, axis], spun[:, j, axis] = q[:, j], -q[:, i]
+    swung = np.empty((len(q), 3, 3), kind)
+    for axis, by_axis in enumerate(camera._turned_slopes):
+        swung[:, :, axis] = mounted @ by_axis
     return Partials(
         interior=interior,
-        bias=to_body @ np.stack(turned, axis=-1),
+        bias=to_body @ turned,
         ground=to_measured @ np.swapaxes(rays.attitude, 1, 2),
         attitude=to_measured @ spun,
         drift=np.concatenate([image @ swung, interior[:, :, :1]], axis=2),
@@ -344,7 +361,7 @@ def _turn(axis: int, angle: float | complex) -> np.ndarray:
     """Right-handed rotation about a coordinate axis; the angle may be complex."""
     i, j = _NEXT[axis]
     cos, sin = np.cos(angle), np.sin(angle)
-    turn = np.eye(3, dtype=np.result_type(cos, np.float64))
+    turn = _UNIT.astype(complex) if np.iscomplexobj(angle) else _UNIT.copy()
     turn[i, i] = turn[j, j] = cos
     turn[i, j], turn[j, i] = -sin, sin
     return turn

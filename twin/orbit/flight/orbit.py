@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +34,8 @@ TOLERANCE = 1e-12
 
 _ABSOLUTE = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3]) * 1e-5
 _LONGEST_STEP = 60.0
+_MOST_KEPT = 1 << 14
+"""Times whose positions and velocities an orbit keeps until others are asked for."""
 _POLAR_RADIUS = EQUATORIAL_RADIUS * (1.0 - FLATTENING)
 
 
@@ -122,6 +124,9 @@ class Orbit:
     rotation: EarthRotation
     backward: Any
     forward: Any
+    _last: dict[str, tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def equatorial(self, seconds: Any) -> tuple[np.ndarray, np.ndarray]:
         """Position (..., 3), metres, and velocity (..., 3), m/s, in the frame of integration: z along the celestial
@@ -151,12 +156,21 @@ class Orbit:
 
     def itrs(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Position, metres, velocity against the turning Earth and velocity against the stars, m/s, all (..., 3) in
-        axes of the ITRS; raises as `equatorial`.
+        axes of the ITRS, not to be written to; raises as `equatorial`.
         """
-        r, v = self.gcrs(seconds)
-        matrix = self.rotation.matrix(seconds)
+        t = np.asarray(seconds, dtype=np.float64)
+        # position, velocity and attitude are asked for one after the other at the same times
+        if (known := self._last.get("itrs")) is not None and np.array_equal(known[0], t):
+            return known[1]
+        r, v = self.gcrs(t)
+        matrix = self.rotation.matrix(t)
         position, inertial = (np.einsum("...ij,...j->...i", matrix, a) for a in (r, v))
-        return position, inertial - np.cross(self.rotation.rate(seconds), position), inertial
+        found = position, inertial - np.cross(self.rotation.rate(t), position), inertial
+        for one in found:
+            one.flags.writeable = False
+        if t.size <= _MOST_KEPT:
+            self._last["itrs"] = t.copy(), found
+        return found
 
 
 def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Orbit:
