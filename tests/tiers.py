@@ -19,12 +19,13 @@ def quick(count: int, cases: Iterable[Any]) -> list[Any]:
     return [*sets[:count], *rest]
 
 
-def one_of_each(key: Callable[[Any], Any], cases: Iterable[Any]) -> list[Any]:
+def one_of_each(key: Callable[[Any], Any], cases: Iterable[Any], long: Iterable[Any] = ()) -> list[Any]:
     """Cases for ``parametrize``: the second tier takes the first case of each key, the third tier all others.
 
-    A case of several parameters is a tuple; ``key`` gets the case as it is.
+    A case of several parameters is a tuple; ``key`` gets the case as it is. All cases of the keys ``long``, which take
+    half a minute each, are of the third tier.
     """
-    seen: set[Any] = set()
+    seen: set[Any] = {*long}
     marked = []
     for case in cases:
         values = case if isinstance(case, tuple) else (case,)

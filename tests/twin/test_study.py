@@ -186,7 +186,7 @@ async def greet(address: str, security: Security | None) -> object:
         return await asyncio.wait_for(it.identity(), 5)
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_a_corrupt_chunk_is_computed_again(done) -> None:
     """A damaged chunk, a half-written file and a torn line of the index; afterwards every byte is as it was."""
     folder, path, _ = done
