@@ -12,7 +12,9 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import write_study
 from twin.main_job.render_job import render_job
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
+from twin.study.runs import render_base
 from twin.study.runs.base_job import BlockResult, Failure, Run, leaf
 from twin.study.runs.engine import check_responses
 from twin.study.runs.plan import Plan
@@ -78,11 +80,29 @@ def test_a_state_among_others_has_the_truth_that_it_has_alone(study, backend) ->
 
 
 @pytest.mark.second
-def test_the_same_block_gives_the_same_bits(study, backend) -> None:
+def test_the_same_block_gives_the_same_bits(study, backend, monkeypatch) -> None:
+    """Also where its runs, each with noise of its own, are exposed a few at a time."""
     runs = next(study.plan.runs_of(range(1, 2)))
+    assert len({run.seed for run in runs}) == len(runs)
     one = study.setup.job.evaluate(study.setup.tree, runs, backend)
     two = study.setup.job.evaluate(study.setup.tree, runs, backend)
     assert one == two
+    monkeypatch.setattr(render_base, "_PIXELS_TOGETHER", 3 * 4 * 48 * 48)
+    assert study.setup.job.evaluate(study.setup.tree, runs, backend) == one
+
+
+@pytest.mark.second
+def test_frames_of_several_seeds_are_those_of_each(study, backend) -> None:
+    experiment = MonitorExperiment(read_job(study.setup.tree), backend)
+    seeds, numbers = [3, 4, 3], np.array([0, 0, 7])
+    photons = np.stack([share * experiment.nominal_photons for share in (1.0, 0.5, 0.7)])
+    before, after = experiment.frames_before(2, seeds), experiment.frames_after(photons, 2, seeds, numbers)
+    for k, seed in enumerate(seeds):
+        np.testing.assert_array_equal(before[k], experiment.frames_before(2, seed))
+        alone = experiment.frames_after(photons[k : k + 1], 2, seed, int(numbers[k]))
+        np.testing.assert_array_equal(after[k : k + 1], alone)
+    assert (before[0] != before[1]).any()
+    assert (after[0] != after[2]).any()
 
 
 @pytest.mark.second

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,9 +128,12 @@ def _run_together(
             # the same noise after, and the same frames before, which are then measured once
             frames, seed = own[0].frames, own[0].seed
             return before(frames, seed), experiment.frames_after(photons, frames, seed, np.zeros(len(own), int))
-        seeds = [run.seed for run in own]
-        first = experiment.frames_before(own[0].frames, seeds)
-        return first, experiment.frames_after(photons, own[0].frames, seeds, np.zeros(len(own), int))
+        first, after = [], []
+        for part in _pieces(len(own), max(1, _PIXELS_TOGETHER // photons[0].size)):
+            seeds = [run.seed for run in own[part]]
+            first.append(experiment.frames_before(own[0].frames, seeds))
+            after.append(experiment.frames_after(photons[part], own[0].frames, seeds, np.zeros(len(seeds), int)))
+        return np.concatenate(first), np.concatenate(after)
 
     how = Observing(record, runs[0].resolved.job.analysis.centroid, len(runs), leave=leave)
     for found in observe(experiment, [run.state for run in runs], how):
@@ -139,6 +142,14 @@ def _run_together(
             told = found.truth.at(one), found.recovery.at(one)
             out[k] = monitor_results(run.resolved, experiment, run.state, run.frames, run.seed, *told)
     return out
+
+
+_PIXELS_TOGETHER = 1 << 19
+"""Pixels whose fixed patterns are held at once, 8 MiB: of as many states of noise of their own as have them."""
+
+
+def _pieces(count: int, size: int) -> Iterator[slice]:
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
 def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) -> list[Outcome]:
