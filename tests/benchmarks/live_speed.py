@@ -1,7 +1,11 @@
-"""The live twin: from the touch of a slider to painted spots and readings, in a browser beside it on the same cores."""
+"""The live twin: from a state that is sent to the server's answer, and where there is Chromium, from the touch of a
+slider to painted spots and readings, in a browser beside it on the same cores.
+"""
 
 from __future__ import annotations
 
+import re
+import time
 from typing import Any
 
 import numpy as np
@@ -9,7 +13,8 @@ import numpy as np
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.benchmarks.yardsticks import pace
-from tests.twin.live_page import CHROMIUM, FLAGS, Page, running
+from tests.twin.live_client import connect, numbered, state
+from tests.twin.live_page import CHROMIUM, FLAGS, Command, Page, running
 
 PACE = pace(python=0.6, arithmetic=0.4)
 MEDIAN_MS, NOISY_MS = 30.0, 40.0
@@ -18,6 +23,8 @@ KNOB, FAR = "base/forward/M2 shift z", 3.0
 """What is moved, and how far: the light of one camera, as nearly all knobs do."""
 OF_ALL, WARM = "base temperature", 0.1
 """The light of all cameras, and every body of both."""
+WARM_UP = 5
+"""States that are not counted: the first ones compile kernels."""
 MOVE = """async ([count, knob, far]) => {
   const slider = document.querySelector(`#tree .knob[data-knob="${knob}"] input[type=range]`);
   const from = liveTwin.latencies.length;
@@ -51,12 +58,16 @@ DRAG = """async ([seconds, knob, far]) => {
 
 
 def measure(bench: Workbench, quick: bool) -> Speed:
-    """Milliseconds in the page's own clock, from the input event to the task after the frame that shows the answer."""
+    """Milliseconds of the server's answers, and in the page's own clock from the input event to the task after the
+    frame that shows the answer.
+    """
+    moves, seconds = (40, 2.0) if quick else (300, 8.0)
+    with running("gf7_pair", "--port", "0", "--stay") as command:
+        answers = _answers(command, moves, bench)
     if CHROMIUM is None:
-        return Speed((), ("Chromium is not installed: the live twin was not measured",))
+        return Speed(answers, ("Chromium is not installed: what a page takes beside was not measured",))
     from playwright.sync_api import sync_playwright
 
-    moves, seconds = (40, 2.0) if quick else (300, 8.0)
     with running("gf7_pair", "--port", "0") as command, sync_playwright() as made:
         browser = made.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = Page(browser, command.address)
@@ -82,6 +93,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     of = f"of {moves} moves of a slider"
     return Speed(
         (
+            *answers,
             Number(
                 "median_ms",
                 clean[0],
@@ -114,3 +126,31 @@ def measure(bench: Workbench, quick: bool) -> Speed:
 def _percentiles(page: Any, moves: int, knob: str, far: float) -> tuple[float, float]:
     took = np.array(page.page.evaluate(MOVE, [moves, knob, far]))
     return float(np.median(took)), float(np.percentile(took, 95.0))
+
+
+def _answers(command: Command, moves: int, bench: Workbench) -> tuple[Number, ...]:
+    """The server's answers to states that follow each other as those of a slider do."""
+    where = re.search(r":(\d+)/\?token=(\S+)", command.address)
+    assert where is not None
+    kinds = (
+        ("answer_ms", KNOB, FAR, 0, "a state sent to the server's answer, expected image: median", MEDIAN_MS),
+        ("answer_all_ms", OF_ALL, WARM, 0, "  the base warmed, and with it every body", None),
+        ("answer_noisy_ms", KNOB, FAR, 9, "  with 9 noisy frames, all estimators", NOISY_MS),
+    )
+    out, number = [], 0
+    with connect(int(where[1]), where[2]) as line:
+        for key, knob, far, frames, text, target in kinds:
+            took = []
+            bench.look()
+            for k in range(moves + WARM_UP):
+                number += 1
+                asked = {knob: far * float(np.sin(k / 5))}
+                begun = time.perf_counter()
+                line.send(state(number, knobs=asked, noise=frames > 0, frames=max(1, frames), seed=5))
+                while isinstance(told := line.recv(120.0), str) or numbered(told) != number:
+                    pass
+                took.append(time.perf_counter() - begun)
+                time.sleep(0.02)
+            median = 1e3 * float(np.median(took[WARM_UP:]))
+            out.append(Number(key, median, text, "ms", PACE, limited=target is not None, target=target, clock=True))
+    return tuple(out)

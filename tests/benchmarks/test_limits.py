@@ -19,7 +19,7 @@ def test_limits_are_met(bench, one) -> None:
         pytest.importorskip("batoid" if one.name == "trace" else "poppy", reason="the comparison needs it")
     speed, limits = measured(one, bench, False), Limits.read()
     numbers = [number for number in speed.numbers if number.limited]
-    assert numbers or one.name == "live"  # without a browser
+    assert numbers
     unlimited = [n.key for n in numbers if limits.limit(one.name, n) is None and not n.clock]
     assert not unlimited
     missed = {

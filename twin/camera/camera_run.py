@@ -444,7 +444,6 @@ CAMERA: Record[CameraRun] = Record(
     Quantity("camera", lambda run: run.camera.name),
     Quantity("instrument", lambda run: run.setup.where or None, "that the camera is mounted in"),
     Quantity("mounted", lambda run: run.setup.mounted, "its name there"),
-    Quantity("verdict", verdict),
     Quantity("wfe_worst_waves", lambda run: run.worst[0], "largest wavefront error over the field, rms"),
     Quantity("worst_field", lambda run: run.worst[1], "where it is"),
     Quantity(
