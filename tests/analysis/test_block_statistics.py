@@ -93,7 +93,7 @@ SLOW = Law("attitude", "slow", (0.4 * ARCSEC,) * 3, 2.0, 60.0)
 JITTER = Term(Law("jitter", "jitter", (0.6 * ARCSEC,) * 3, 2.0, 40.0, 0.65))
 
 
-@pytest.mark.second
+@pytest.mark.slow
 @one_blas_thread()
 def test_jitter_as_an_unknown_makes_the_sigmas_right_and_without_it_the_block_is_refused():
     """0.65 Hz, 0.6 arcsec rms: 0.5 px. Without it chi-square and check points contradict the sigmas."""

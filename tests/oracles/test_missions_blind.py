@@ -484,10 +484,8 @@ def lost(right: Score, wrong: Score) -> float:
     return float(loss.mean() / (loss.std(ddof=1) / math.sqrt(len(loss))))
 
 
-@pytest.mark.second
-@pytest.mark.parametrize(
-    "name", ["drift twice too long", pytest.param("scatter 20 % too small", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["drift twice too long", "scatter 20 % too small"])
 def test_the_innovations_show_a_misstatement(name: str) -> None:
     """Chi-square over degrees of freedom is above its limit of 1 in 1000 where misstated, and below it where not.
 

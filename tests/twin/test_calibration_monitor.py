@@ -158,7 +158,7 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
     return path
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_command(tmp_path: Path) -> None:
     path = write(
         tmp_path,

@@ -97,7 +97,7 @@ def test_images_that_stand_apart_blur_what_they_make_together(achromat) -> None:
         polychromatic_transfer(pupils, frequency, colours[:1], np.ones(1), np.zeros(1))
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) -> None:
     light = SpectrumSpec.evenly(500e-9, 640e-9)
     frequency = np.array([0.0, 30e3, 70e3])

@@ -300,7 +300,7 @@ def test_a_file_is_exported_without_images() -> None:
     assert export.lines["nadir"].window.frame is None
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_the_run_folder_of_a_test_of_angles_is_its_file(tmp_path: Path) -> None:
     """Camera, orbit and moment of the run; so are the models."""
     file = tmp_path / "angle.yaml"

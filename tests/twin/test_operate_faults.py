@@ -72,7 +72,7 @@ def exported(place: Path | str) -> bytes:
         return b"".join(TABLE_FORMATS["csv"](one) for one in tables(history))
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_kill_at_three_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
     killed(3, tmp_path, whole)
 

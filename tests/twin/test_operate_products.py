@@ -173,7 +173,7 @@ def test_the_job_of_a_state_is_that_state(tmp_path: Path) -> None:
         np.testing.assert_allclose(read, meant, rtol=1e-9, atol=1e-15)
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_spots_of_the_rendered_state_are_those_that_were_measured(history: History, tmp_path: Path) -> None:
     """A state is drawn and its frames are read; twin.render of the product's job gives the spots of that reading."""
     state = state_of(drawn(7)[0], experiment().stated.components, experiment().thermal)

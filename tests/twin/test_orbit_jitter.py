@@ -142,7 +142,7 @@ def test_a_hundred_passes_without_jitter_in_figures() -> None:
         assert power <= stats.chi2.ppf(1.0 - 1e-3, len(found) * one.before.order), frequency
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_what_is_exported_gives_the_same_oscillations(tmp_path: Path) -> None:
     path = tmp_path / "pass.yaml"
     ask = {"highest": "6 Hz", "height": "300 m", "spline": {"interval": "0.2 s", "sigma": "3 arcsec"}}

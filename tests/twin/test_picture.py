@@ -170,7 +170,7 @@ def test_colours(backend, gf7_pair, paths):
     assert (image.max(axis=-1) < 80).sum() > 5  # black housings
 
 
-@pytest.mark.second
+@pytest.mark.slow
 def test_a_seed_gives_the_same_picture(backend, gf7_pair, paths):
     first, again, other = (render_shot(gf7_pair, paths, backend, SMALL[2], seed).astype(int) for seed in (7, 7, 8))
     assert np.array_equal(first, again)

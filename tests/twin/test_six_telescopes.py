@@ -32,8 +32,7 @@ def files(tmp_path_factory, backend) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("name", "runs"),
     [
-        pytest.param("ritchey_chretien", 6, marks=pytest.mark.second),
-        pytest.param("schmidt_cassegrain", 6, marks=pytest.mark.slow),
+        *(pytest.param(name, 6, marks=pytest.mark.slow) for name in ("ritchey_chretien", "schmidt_cassegrain")),
         *(pytest.param(name, 500, marks=pytest.mark.slow) for name in SIX),
     ],
 )

@@ -246,7 +246,7 @@ def run(tmp_path, *words):
     return invoke(command.app, *words, "--out", tmp_path / "out")
 
 
-@pytest.mark.parametrize("states", quick(0, [2, 8]))
+@pytest.mark.parametrize("states", quick(0, [2, pytest.param(8, marks=pytest.mark.slow)]))
 def test_the_command_says_what_limits(tmp_path, states):
     result = run(tmp_path, "gf7_pair", "--states", str(states), "--seed", "5")
     assert result.exit_code == 0, result.output

@@ -1,7 +1,7 @@
 """Every formula of paper 000, broken on purpose: at least one verdict of its checks must turn.
 
 Measurements are drawn once; a mutation is patched in where the checks look the formula up.
-The first one of each formula belongs to the second tier, which .ci/run runs; all others, and that unbroken formulas
+The first one of the paper belongs to the second tier, which .ci/run runs; all others, and that unbroken formulas
 turn nothing (twin.validate shows it), to the third.
 
 What no check can see, and why: the sign and a factor of (3), whose right side is zero; the modulus in (6) and (7), for
@@ -10,7 +10,6 @@ Figs. 3 to 5, for the text prints signs, orders and ratios only.
 """
 
 from dataclasses import replace
-from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -248,7 +247,7 @@ def test_without_mutation_all_is_as_expected(quick):
     assert verdicts(named) == {name: EXPECTED[name] for name in named}
 
 
-@pytest.mark.parametrize(("formula", "mutation"), one_of_each(itemgetter(0), MUTATIONS))
+@pytest.mark.parametrize(("formula", "mutation"), one_of_each(lambda _: "000", MUTATIONS))
 def test_a_broken_formula_turns_a_verdict(formula, mutation, quick):
     patch, turned = MUTATIONS[formula, mutation]
     patch(quick)

@@ -5,13 +5,12 @@ Not listed, for nothing can be seen of them: the sign of all third differences (
 stepwise solution at half their length (they end at the same place, later), and the sign of pitch in the open
 combination (the rank is the same).
 
-The first one of each formula belongs to the second tier, which .ci/run runs; all others, and that unbroken formulas
+The first one of the paper belongs to the second tier, which .ci/run runs; all others, and that unbroken formulas
 turn nothing (twin.validate shows it), to the third.
 """
 
 from dataclasses import replace
 from functools import cache
-from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -378,7 +377,7 @@ def test_unbroken_formulas_turn_nothing(turned):
     assert turned({i for row in MUTATIONS.values() for _, ids in row.values() for i in ids}) == set()
 
 
-@pytest.mark.parametrize(("formula", "name"), one_of_each(itemgetter(0), CASES))
+@pytest.mark.parametrize(("formula", "name"), one_of_each(lambda _: "003", CASES))
 def test_a_broken_formula_turns_a_verdict(formula, name, turned, monkeypatch):
     broken, ids = MUTATIONS[formula][name]
     if formula in ("003.table3", "003.fig4", "003.scheme", "003.accuracy"):

@@ -4,13 +4,12 @@ them is broken.
 Not listed, for nothing can be seen of them: the two edges' vertices swapped (best focus is their mean), the sign of an
 MTF (it is a modulus), and in (4) the two sums swapped, which is its sign.
 
-The first one of each formula belongs to the second tier, which .ci/run runs; all others, and that unbroken formulas
+The first one of the paper belongs to the second tier, which .ci/run runs; all others, and that unbroken formulas
 turn nothing (twin.validate shows it), to the third.
 """
 
 import dataclasses
 from functools import cache
-from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -364,7 +363,7 @@ def test_unbroken_formulas_turn_nothing(turned):
     assert turned(",".join((SPOTS, PLAN, TABLE1, REPEATS, TESTED, TABLE2))) == set()
 
 
-@pytest.mark.parametrize(("formula", "mutation"), one_of_each(itemgetter(0), MUTATIONS, ["focus vertex"]))
+@pytest.mark.parametrize(("formula", "mutation"), one_of_each(lambda _: "004", MUTATIONS))
 def test_a_broken_formula_turns_verdicts(formula, mutation, turned, monkeypatch):
     patch, only, ids = MUTATIONS[formula, mutation]
     patch(monkeypatch)
