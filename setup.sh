@@ -98,13 +98,18 @@ else
             || fail "pip could not install the packages of $lock; run this again to go on. (If it speaks of hashes: the package
        index sent another file than the one that was locked. Do not install that file; see docs/installed.md)"
     }
+    # Byte code on all cores, for users who cannot write here; pip would make it on one. Files of packages that no Python can
+    # compile, as templates are, are not imported either.
+    compiled() { .venv/bin/python -m compileall -qq -j 0 "$@" >/dev/null 2>&1 || true; }
     # pip first and alone: it should not replace itself while it installs others
     locked -r "$lock/install.txt"
+    locked -r "$lock/runtime.txt"
+    compiled .venv/lib & # while the rest is fetched
     files=()
     for layer in $layers; do
-        case "$layer" in install | peers) ;; *) files+=(-r "$lock/$layer.txt") ;; esac
+        case "$layer" in install | runtime | peers) ;; *) files+=(-r "$lock/$layer.txt") ;; esac
     done
-    locked "${files[@]}"
+    [ ${#files[@]} = 0 ] || locked "${files[@]}"
     if [ "$layers" = "$all" ]; then
         # ray-optics would bring Qt; the tests find it where they look for it, and nothing else does
         rm -rf .venv/peers
@@ -113,9 +118,8 @@ else
     # The project itself, by the setuptools that is there now, which warns of names that folders and packages share.
     PYTHONWARNINGS=ignore .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . \
         || fail "pip could not install the project itself"
-    # Byte code on all cores, where pip would make it on one, for users who cannot write here. A file of a package that no
-    # Python can compile, as templates are, is not imported either. What tests need is compiled when it is first imported.
-    [ "$layers" = "$all" ] || .venv/bin/python -m compileall -qq -j 0 .venv/lib >/dev/null || true
+    wait
+    [ "$layers" != "$all" ] || compiled .venv/lib .venv/peers
     echo "$state $layers" >"$stamp"
 fi
 
