@@ -36,23 +36,22 @@ def one_of_each(key: Callable[[Any], Any], cases: Iterable[Any], long: Iterable[
 
 LONGEST = (
     "test_wheel.py",
-    "test_notebooks.py",
-    "twin/test_orbit_calibration.py",
     "twin/test_spot_gradient.py",
+    "twin/test_orbit_calibration.py",
     "validation/test_mutations_001.py",
-    "twin/test_render_cli.py",
-    "twin/test_camera_instrument.py",
-    "twin/test_six_telescopes.py",
-    "twin/test_course.py",
+    "test_extension_points.py",
     "twin/test_study.py",
-    "validation/test_paper_000.py",
-    "validation/test_mutations_004.py",
-    "twin/test_asbuilt_coverage.py",
-    "twin/test_asbuilt.py",
-    "twin/test_operate_products.py",
-    "twin/test_export.py",
+    "twin/test_camera_instrument.py",
+    "twin/test_focus_alignment.py",
+    "test_notebooks.py",
+    "twin/test_render_cli.py",
+    "twin/test_scripting.py",
+    "twin/test_lab_command.py",
+    "validation/test_paper_004.py",
+    "twin/test_operate_faults.py",
+    "twin/test_target_job.py",
 )
-"""Files whose tests of the first two tiers take about half a minute and more, longest first. Few tests they may be:
+"""Files whose tests of the first two tiers take about twenty seconds and more, longest first. Few tests they may be:
 by their number they would come last, and one process would wait for the other.
 """
 

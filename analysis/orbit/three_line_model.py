@@ -173,18 +173,20 @@ class LineModel:
     @cached_property
     def _turned(self) -> Array:
         """Rx(d_beta) Ry(d_alpha) Rz(d_gamma)."""
-        chain = {axis: _turn(axis, self.drift[k]) for k, axis in enumerate(_DRIFT_AXIS)}
-        return np.asarray(chain[0] @ chain[1] @ chain[2])
+        return bias_rotation(self._turns)
 
     @cached_property
     def _turned_slopes(self) -> tuple[Array, ...]:
         """Its derivatives by d_alpha, d_beta, d_gamma."""
-        turn = {axis: _turn(axis, self.drift[k]) for k, axis in enumerate(_DRIFT_AXIS)}
-        out = []
-        for k, own in enumerate(_DRIFT_AXIS):
-            chain = {**turn, own: _turn_slope(own, self.drift[k])}
-            out.append(np.asarray(chain[0] @ chain[1] @ chain[2]))
-        return tuple(out)
+        slopes = _rotation_slopes(self._turns)
+        return tuple(slopes[axis] for axis in _DRIFT_AXIS)
+
+    @property
+    def _turns(self) -> Array:
+        """(3,) of the drift about x, y and z."""
+        turns = np.empty(3, self.drift.dtype)
+        turns[list(_DRIFT_AXIS)] = self.drift[:3]
+        return turns
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,6 +286,17 @@ def bias_rotation(bias: ArrayLike) -> Array:
     return np.asarray(_turn(0, roll) @ _turn(1, pitch) @ _turn(2, yaw))
 
 
+def _rotation_slopes(bias: Array) -> list[Array]:
+    """Derivatives of `bias_rotation` by roll, pitch and yaw."""
+    turns = [_turn(axis, angle) for axis, angle in enumerate(bias)]
+    out = []
+    for axis, angle in enumerate(bias):
+        chain = [*turns]
+        chain[axis] = _turn_slope(axis, angle)
+        out.append(chain[0] @ chain[1] @ chain[2])
+    return out
+
+
 def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Array:
     """Left sides of the two conditions, metres in the image: (n, 2), zero for perfect data.
 
@@ -335,19 +348,13 @@ def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: 
     image[:, 0, 0] = image[:, 1, 1] = f * (1 / c)
     image[:, 0, 2], image[:, 1, 2] = f * (-a / c**2), f * (-b / c**2)
     to_body = image @ camera.axes.T  # by the point in the body frame of the true attitude
-    roll, pitch, yaw = bias
-    turns, turned = [_turn(0, roll), _turn(1, pitch), _turn(2, yaw)], np.empty((len(q), 3, 3), kind)
-    for axis in range(3):
-        chain = [*turns]
-        chain[axis] = _turn_slope(axis, bias[axis])
-        turned[:, :, axis] = q @ (chain[0] @ chain[1] @ chain[2])
+    turned, swung = np.empty((2, len(q), 3, 3), kind)
+    for axis, (by_bias, by_drift) in enumerate(zip(_rotation_slopes(bias), camera._turned_slopes, strict=True)):
+        turned[:, :, axis], swung[:, :, axis] = q @ by_bias, mounted @ by_drift
     to_measured = to_body @ turn.T  # by the point in the body frame of the measured attitude
     spun = np.zeros((len(q), 3, 3), kind)  # the products of q with the axes, column by column
     for axis, (i, j) in enumerate(_NEXT):
         spun[:, i, axis], spun[:, j, axis] = q[:, j], -q[:, i]
-    swung = np.empty((len(q), 3, 3), kind)
-    for axis, by_axis in enumerate(camera._turned_slopes):
-        swung[:, :, axis] = mounted @ by_axis
     return Partials(
         interior=interior,
         bias=to_body @ turned,

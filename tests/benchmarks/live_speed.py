@@ -4,7 +4,6 @@ slider to painted spots and readings, in a browser beside it on the same cores.
 
 from __future__ import annotations
 
-import re
 import time
 from typing import Any
 
@@ -63,13 +62,19 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     """
     moves, seconds = (40, 2.0) if quick else (300, 8.0)
     with running("gf7_pair", "--port", "0", "--stay") as command:
-        answers = _answers(command, moves, bench)
+        numbers = _answers(command, moves, bench)
+        if CHROMIUM is not None:
+            numbers += _painted(command, moves, seconds, bench)
         command.end()  # by itself, so that its time is not counted as that of other programs
-    if CHROMIUM is None:
-        return Speed(answers, ("Chromium is not installed: what a page takes beside was not measured",))
+    without = () if CHROMIUM else ("Chromium is not installed: what a page takes beside was not measured",)
+    return Speed(numbers, without)
+
+
+def _painted(command: Command, moves: int, seconds: float, bench: Workbench) -> tuple[Number, ...]:
+    """From the touch of a slider to what the page shows."""
     from playwright.sync_api import sync_playwright
 
-    with running("gf7_pair", "--port", "0") as command, sync_playwright() as made:
+    with sync_playwright() as made:
         browser = made.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = Page(browser, command.address)
         page.ready()
@@ -91,37 +96,33 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         frames = page.page.evaluate("liveTwin.last.readings.frames")
         page.close()
         browser.close()
-        command.end()
     of = f"of {moves} moves of a slider"
-    return Speed(
-        (
-            *answers,
-            Number(
-                "median_ms",
-                clean[0],
-                f"slider to spots and readings, expected image: median {of}",
-                "ms",
-                PACE,
-                limited=True,
-                target=MEDIAN_MS,
-                clock=True,
-            ),
-            Number("slow_ms", clean[1], "the same: 95th percentile", "ms", PACE, limited=True, clock=True),
-            Number("all_ms", every[0], "the base warmed, and with it every body: median", "ms", PACE, clock=True),
-            Number(
-                "noisy_ms",
-                noisy[0],
-                f"with {frames} noisy frames, all estimators: median",
-                "ms",
-                PACE,
-                limited=True,
-                target=NOISY_MS,
-                clock=True,
-            ),
-            Number("noisy_slow_ms", noisy[1], "the same: 95th percentile", "ms", PACE, clock=True),
-            # the page asks 60 times a second at most, so that a faster machine need not give more
-            Number("rate", rate, "updates while a slider is dragged", "1/s", PACE, True, limited=True, clock=True),
-        )
+    return (
+        Number(
+            "median_ms",
+            clean[0],
+            f"slider to spots and readings, expected image: median {of}",
+            "ms",
+            PACE,
+            limited=True,
+            target=MEDIAN_MS,
+            clock=True,
+        ),
+        Number("slow_ms", clean[1], "the same: 95th percentile", "ms", PACE, limited=True, clock=True),
+        Number("all_ms", every[0], "the base warmed, and with it every body: median", "ms", PACE, clock=True),
+        Number(
+            "noisy_ms",
+            noisy[0],
+            f"with {frames} noisy frames, all estimators: median",
+            "ms",
+            PACE,
+            limited=True,
+            target=NOISY_MS,
+            clock=True,
+        ),
+        Number("noisy_slow_ms", noisy[1], "the same: 95th percentile", "ms", PACE, clock=True),
+        # the page asks 60 times a second at most, so that a faster machine need not give more
+        Number("rate", rate, "updates while a slider is dragged", "1/s", PACE, True, limited=True, clock=True),
     )
 
 
@@ -132,15 +133,13 @@ def _percentiles(page: Any, moves: int, knob: str, far: float) -> tuple[float, f
 
 def _answers(command: Command, moves: int, bench: Workbench) -> tuple[Number, ...]:
     """The server's answers to states that follow each other as those of a slider do."""
-    where = re.search(r":(\d+)/\?token=(\S+)", command.address)
-    assert where is not None
     kinds = (
         ("answer_ms", KNOB, FAR, 0, "a state sent to the server's answer, expected image: median", MEDIAN_MS),
         ("answer_all_ms", OF_ALL, WARM, 0, "  the base warmed, and with it every body", None),
         ("answer_noisy_ms", KNOB, FAR, 9, "  with 9 noisy frames, all estimators", NOISY_MS),
     )
     out, number = [], 0
-    with connect(int(where[1]), where[2]) as line:
+    with connect(*command.place) as line:
         for key, knob, far, frames, text, target in kinds:
             took = []
             bench.look()

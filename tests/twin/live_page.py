@@ -53,6 +53,13 @@ class Command:
                 return
         raise AssertionError(f"no address: {self.said}")
 
+    @property
+    def place(self) -> tuple[int, str]:
+        """Port and token."""
+        found = re.search(r":(\d+)/\?token=(\S+)", self.address)
+        assert found is not None
+        return int(found[1]), found[2]
+
     def memory(self) -> int:
         """Bytes that the server and the process that computes hold."""
         pids = [self.process.pid, *self._children(self.process.pid)]

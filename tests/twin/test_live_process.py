@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import time
 
@@ -14,18 +13,11 @@ pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
 pytest.importorskip("websockets.sync.client", reason="the extra `live` is not installed")
 
 from tests.twin.live_client import connect, numbered, state
-from tests.twin.live_page import Command, running
+from tests.twin.live_page import running
 
 PROMPT = 2.0
 """Seconds within which a page is told that its readings do not come."""
 KNOBS = {"base/forward/M2 shift z": 2.0}
-
-
-def place(command: Command) -> tuple[int, str]:
-    """Port and token."""
-    found = re.search(r":(\d+)/\?token=(\S+)", command.address)
-    assert found is not None
-    return int(found[1]), found[2]
 
 
 def reading(message: bytes) -> dict:
@@ -53,7 +45,7 @@ def answer(ws, n: int, seconds: float = 120.0) -> dict:
 
 @pytest.mark.slow
 def test_a_stopped_and_a_killed_process_are_told_and_the_state_stays():
-    with running("gf7_pair", "--port", "0", "--stay") as command, connect(*place(command)) as ws:
+    with running("gf7_pair", "--port", "0", "--stay") as command, connect(*command.place) as ws:
         ws.recv(5)
         ws.send(state(1, knobs=KNOBS, frames=9, seed=5))
         expected = answer(ws, 1)
@@ -103,7 +95,7 @@ def test_a_stopped_and_a_killed_process_are_told_and_the_state_stays():
 @pytest.mark.slow
 def test_values_of_a_studys_factors_stay_when_the_process_is_started_again():
     with running("scenes/examples/study_aperture.yaml", "--port", "0", "--stay") as command:
-        with connect(*place(command)) as ws:
+        with connect(*command.place) as ws:
             greeting = json.loads(ws.recv(5))
             name, first = greeting["factors"][0]["name"], greeting["factors"][0]["now"]
             ws.send(json.dumps({"type": "factors", "values": {name: 0.9 * first}}))

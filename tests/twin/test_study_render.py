@@ -12,9 +12,9 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import write_study
 from twin.main_job.render_job import render_job
+from twin.monitor import monitor_memory
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
-from twin.study.runs import render_base
 from twin.study.runs.base_job import BlockResult, Failure, Run, leaf
 from twin.study.runs.engine import check_responses
 from twin.study.runs.plan import Plan
@@ -87,7 +87,7 @@ def test_the_same_block_gives_the_same_bits(study, backend, monkeypatch) -> None
     one = study.setup.job.evaluate(study.setup.tree, runs, backend)
     two = study.setup.job.evaluate(study.setup.tree, runs, backend)
     assert one == two
-    monkeypatch.setattr(render_base, "_PIXELS_TOGETHER", 3 * 4 * 48 * 48)
+    monkeypatch.setattr(monitor_memory, "LARGEST_FRAMES", 3 * 9 * 4 * 48 * 48)  # a frame and a fixed pattern each
     assert study.setup.job.evaluate(study.setup.tree, runs, backend) == one
 
 

@@ -100,6 +100,14 @@ class Reading:
         """Value, sigma and unit."""
         return f"{self.shown(self.value)} ± {self.shown(self.sigma)} {self.parameter.unit}"
 
+    def place(self, nested: dict[str, Any]) -> dict[str, Any]:
+        """Its group in JSON files as `ReadingTable.groups` nests them, which is made if it is not there.
+
+        Args:
+            nested: groups, with ``cameras`` among them.
+        """
+        return nested["cameras"].setdefault(self.camera, {}) if self.camera else nested.setdefault(self.group, {})
+
     def each(self, of: Callable[[Any], Any]) -> Reading:
         """Row of the same reading with its numbers replaced.
 
@@ -177,8 +185,7 @@ class ReadingTable:
         """
         out: dict[str, Any] = {"cameras": {}}
         for row in self.rows:
-            key = row.parameter.key
-            group = out["cameras"].setdefault(row.camera, {}) if row.camera else out.setdefault(row.group, {})
+            key, group = row.parameter.key, row.place(out)
             if truth:
                 group.setdefault(truth, {}).setdefault(key, plain(row.true))
             read = group.setdefault(row.estimator, {})
@@ -192,7 +199,7 @@ class ReadingTable:
         """The true changes as JSON files nest them: as `groups`, without estimators."""
         out: dict[str, Any] = {"cameras": {}}
         for row in self.rows:
-            group = out["cameras"].setdefault(row.camera, {}) if row.camera else out.setdefault(row.group, {})
+            group = row.place(out)
             if row.parameter.key not in group:
                 group[row.parameter.key] = plain(row.true)
         return out

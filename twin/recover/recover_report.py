@@ -28,7 +28,6 @@ def recover_numbers(run: RecoverRun) -> dict[str, Any]:
     series all states.
     """
     out: dict[str, Any] = {**stated(run.last.recovered_dict())}
-    out["verdict"], _ = _verdict(run)
     out["warnings"] = list(_warnings(run))
     out["channels"] = {
         result.channel.name: {name.replace(" ", "_"): _spot_numbers(spot) for name, spot in result.states()}

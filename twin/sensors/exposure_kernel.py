@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
@@ -129,10 +129,7 @@ class Reading:
                     numbers = rooms[(first // size * len(range(0, frames, together)) + start // together) % len(rooms)]
                     numbers.expect(expected, some)
                     if group is None:
-                        own = [streams[k] for k in some]
-                        group = _Group(
-                            self, numbers, own, [same.get(_key(one)) for one in own], together, frames, pixels
-                        )
+                        group = _Group(self, numbers, [streams[k] for k in some], same, together, frames, pixels)
                     following = group.draw(numbers, out[some.start : some.stop, start : start + together], pool)
                     if drawn is not None:
                         drawn.read_out()
@@ -215,12 +212,15 @@ class _SameNumbers:
             numbers.normals[:count, own] = self.normals
 
 
-def _key(stream: np.random.SeedSequence) -> tuple[object, ...]:
+_Key = tuple[str, tuple[int, ...], int]
+
+
+def _key(stream: np.random.SeedSequence) -> _Key:
     """What two streams of the same numbers have in common."""
-    return str(stream.entropy), stream.spawn_key, stream.pool_size
+    return str(stream.entropy), tuple(stream.spawn_key), stream.pool_size
 
 
-def _same_numbers(streams: Sequence[np.random.SeedSequence], most: int) -> dict[tuple[object, ...], _SameNumbers]:
+def _same_numbers(streams: Sequence[np.random.SeedSequence], most: int) -> dict[_Key, _SameNumbers]:
     """Room for the numbers of each stream of several images, of so many streams at most."""
     several = [key for key, times in Counter(map(_key, streams)).items() if times > 1]
     return {key: _SameNumbers() for key in several[:most]}
@@ -234,12 +234,13 @@ class _Group:
         how: Reading,
         numbers: _Numbers,
         streams: Sequence[np.random.SeedSequence],
-        same: Sequence[_SameNumbers | None],
+        same: Mapping[_Key, _SameNumbers],
         together: int,
         frames: int,
         pixels: int,
     ) -> None:
-        self.how, self.pixels, self.same = how, pixels, same
+        self.how, self.pixels = how, pixels
+        self.same = [same.get(_key(own)) for own in streams]
         self.huge: list[np.ndarray] = []
         self.sources = []
         self.last: list[Future[np.ndarray | None] | None] = [None] * len(streams)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from scenes.yaml.yaml_file import YamlFile
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import QUALITY, quality_dicts
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.monitor_memory import pieces
 from twin.monitor.observation import Observing, observe
 from twin.monitor.truth import Truth
 from twin.study.runs.base_job import PHYSICS, Failure, Outcome, Run, Tree, one_line, with_values
@@ -129,7 +130,7 @@ def _run_together(
             frames, seed = own[0].frames, own[0].seed
             return before(frames, seed), experiment.frames_after(photons, frames, seed, np.zeros(len(own), int))
         first, after = [], []
-        for part in _pieces(len(own), max(1, _PIXELS_TOGETHER // photons[0].size)):
+        for part in pieces(len(own), photons[0].size * (own[0].frames + _PATTERN_FRAMES)):
             seeds = [run.seed for run in own[part]]
             first.append(experiment.frames_before(own[0].frames, seeds))
             after.append(experiment.frames_after(photons[part], own[0].frames, seeds, np.zeros(len(seeds), int)))
@@ -144,12 +145,8 @@ def _run_together(
     return out
 
 
-_PIXELS_TOGETHER = 1 << 19
-"""Pixels whose fixed patterns are held at once, 8 MiB: of as many states of noise of their own as have them."""
-
-
-def _pieces(count: int, size: int) -> Iterator[slice]:
-    return (slice(start, min(start + size, count)) for start in range(0, count, size))
+_PATTERN_FRAMES = 8
+"""Frames that take as much memory as the fixed pattern of their CCDs."""
 
 
 def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) -> list[Outcome]:
