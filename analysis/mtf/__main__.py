@@ -6,9 +6,11 @@ if __name__ == "__main__":
     import sys
 
     def _interrupted(kind: Any, error: Any, trace: Any) -> None:
-        """Ctrl-C during the imports is no fault that needs a traceback."""
+        """Say in one line what needs no traceback: Ctrl-C during the imports, help that a full disk does not take."""
         if issubclass(kind, KeyboardInterrupt):
             sys.stderr.write("interrupted\n")
+        elif isinstance(error, OSError) and error.strerror and error.filename is None:
+            sys.stderr.write(f"error: cannot write to the standard output: {error.strerror}\n")
         else:
             sys.__excepthook__(kind, error, trace)
 

@@ -180,18 +180,40 @@ def _surfaces(file: Any) -> Iterator[Any]:
     import h5py
 
     for name in ("Data/Surface", "Measurement/Surface"):
-        place = file.get(name)
+        place = _held(file, name)
         if isinstance(place, h5py.Dataset):
             yield place
         elif isinstance(place, h5py.Group):
-            yield from (place[key] for key in sorted(place) if isinstance(place[key], h5py.Dataset))
+            held = (_held(place, key) for key in sorted(place))
+            yield from (one for one in held if isinstance(one, h5py.Dataset))
+
+
+def _held(place: Any, name: str) -> Any:
+    """Return the group or data set of a name, None for none; links lead to other places, and are refused unfollowed.
+
+    Raises
+    ------
+    MapError
+        The name, or a part of it, is a link.
+    """
+    import h5py
+
+    for part in name.split("/"):
+        if not isinstance(place, h5py.Group):
+            return None
+        if isinstance(place.get(part, getlink=True), h5py.ExternalLink | h5py.SoftLink):
+            raise MapError(
+                f"{place.file.filename}: {part} is a link to another place; save it as one file, without links"
+            )
+        place = place.get(part)
+    return place
 
 
 def _attributes(file: Any, surface: Any) -> dict[str, Any]:
     """Scalars and texts among the attributes of the surface and, where these lack one, of the measurement."""
     import h5py
 
-    general = file.get("Measurement/Attributes")
+    general = _held(file, "Measurement/Attributes")
     out: dict[str, Any] = {}
     for holder in (general, surface):
         if isinstance(holder, h5py.Group | h5py.Dataset):

@@ -17,7 +17,7 @@ import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import LONGEST_SHOWN, InputError, Issue, Problem, names_text, nearest, shown
-from scenes.yaml.input_file import read_text
+from scenes.yaml.input_file import read_bytes, read_text
 from scenes.yaml.old_keys import tell
 from scenes.yaml.units import TEMPERATURE, Kind, parse_quantity, unit_ratio
 
@@ -182,16 +182,63 @@ def lines_of(text: str) -> Iterator[str]:
     return (match[0] for match in _LINE.finditer(text))
 
 
+def rows_apart(path: str | Path, most: int) -> list[tuple[int, list[str] | str]]:
+    """Return line and cells of every row of a small table whose rows are taken or refused one by one.
+
+    Each line is a row: a quotation mark that is never closed spoils its own row alone.
+
+    Parameters
+    ----------
+    path : str or Path
+        File, as for `read_table`.
+    most : int
+        Bytes that it may have.
+
+    Returns
+    -------
+    list of (int, list of str or str)
+        Line, counted from 1, and its cells, or what is wrong with it.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
+    """
+    text = read_bytes(path, "a CSV file", most, (Path(path).suffix,)).decode("utf-8-sig", "replace")
+    rows: list[tuple[int, list[str] | str]] = []
+    delimiter = _delimiter(text)
+    for number, line in enumerate(lines_of(text), 1):
+        if "\0" in line or "\ufffd" in line:
+            rows.append((number, "a byte that is no text" if "\0" in line else "not UTF-8 text"))
+            continue
+        try:
+            cells = next(csv.reader([line], delimiter=delimiter, strict=True), [])
+        except csv.Error as error:
+            rows.append((number, f"not a row of a CSV file: {error}"))
+            continue
+        if _holds(cells):
+            rows.append((number, cells))
+    return rows
+
+
+def _delimiter(text: str) -> str:
+    first = next((row for row in lines_of(text) if row.strip() and not row.lstrip().startswith("#")), "")
+    return next((sign for sign in _DELIMITERS if sign in first), ",")
+
+
+def _holds(row: Sequence[str]) -> bool:
+    """Return whether a row holds something and is no remark."""
+    return bool(row) and not row[0].lstrip().startswith("#") and any(map(str.strip, row))
+
+
 def _rows(file: str, text: str) -> Iterator[tuple[list[int], list[list[str]]]]:
     """Lines and cells of the rows that hold something, ``_TOGETHER`` at a time."""
-    first = next((row for row in lines_of(text) if row.strip() and not row.lstrip().startswith("#")), "")
-    delimiter = next((sign for sign in _DELIMITERS if sign in first), ",")
-    reader = csv.reader(lines_of(text), delimiter=delimiter, strict=True)
+    reader = csv.reader(lines_of(text), delimiter=_delimiter(text), strict=True)
     lines: list[int] = []
     rows: list[list[str]] = []
     try:
         for row in reader:
-            if row and any(row) and not row[0].lstrip().startswith("#") and any(map(str.strip, row)):
+            if _holds(row):
                 lines.append(reader.line_num)
                 rows.append(row)
                 if len(rows) == _TOGETHER:

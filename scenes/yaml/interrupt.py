@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import os
 import sys
@@ -28,5 +29,8 @@ def end_quietly() -> None:
 def _told(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     if issubclass(kind, KeyboardInterrupt):
         sys.stderr.write("interrupted\n")
+    elif isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+        # help is written by a library, which has no word for it
+        sys.stderr.write(f"error: cannot write to the standard output: {error.strerror}\n")
     else:
         sys.__excepthook__(kind, error, trace)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -15,7 +16,10 @@ from rich.console import Console
 
 from scenes.yaml.errors import printable
 
-FAILURE = 1
+BAD_INPUT, FAILURE = 2, 1
+_OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""What an operating system answers where the machine, and not what a user named, is at fault: a full disk for instance.
+"""
 PIPE_CLOSED = 128 + signal.SIGPIPE
 """Exit code with which a shell tells of a program that the signal has ended."""
 
@@ -24,6 +28,11 @@ def print_error(errors: Console, text: str) -> None:
     """One error message, as it is: no markup, no wrapping; control characters as escapes."""
     text = "\n".join(printable(line) for line in text.split("\n"))
     errors.print(f"error: {text}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+
+
+def code_of(error: BaseException | None) -> int:
+    """Return the exit code of a failure to write: FAILURE where the machine is its cause, else BAD_INPUT."""
+    return FAILURE if isinstance(error, OSError) and error.errno in _OF_THE_MACHINE else BAD_INPUT
 
 
 @contextmanager

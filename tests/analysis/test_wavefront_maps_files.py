@@ -344,3 +344,18 @@ def test_500_spoilt_files(kind, tmp_path):
     read, refused = read_spoilt(kind, range(100, 600), tmp_path)
     assert read > 10
     assert refused > 50
+
+
+@pytest.mark.parametrize("where", ["Data", "Data/Surface", "Data/Surface/{A1}", "Measurement/Attributes"])
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_link_is_not_followed(where: str, soft: bool, tmp_path: Path) -> None:
+    """A surface, or what is said of it, that lies in another file or elsewhere in this one."""
+    write.datx(tmp_path / "other.h5", write.wave())
+    whole = tmp_path / "whole.datx"
+    write.datx(whole, write.wave())
+    with h5py.File(whole, "a") as file:
+        if where.startswith("Data"):
+            file.move(where, "kept")
+        file[where] = h5py.SoftLink("/kept") if soft else h5py.ExternalLink("other.h5", where)
+    with pytest.raises(MapError, match="is a link to another place"):
+        read_map(whole)

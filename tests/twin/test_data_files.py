@@ -1,5 +1,6 @@
 """What a TIFF file of frames says of itself to any reader."""
 
+import csv
 import io
 import json
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from twin.run.data_files import WRITER, FrameFacts, frame_files, tiff
+from twin.run.data_files import WRITER, FrameFacts, csv_table, frame_files, tiff
 
 FRAMES = np.arange(3 * 5 * 4, dtype=np.uint16).reshape(3, 5, 4)
 FACTS = FrameFacts("forward, left area CCD", 5.5e-6, 0.01, (0.0, 720.0, 1800.0), "perturbed")
@@ -49,3 +50,11 @@ def test_what_nobody_knows_is_not_said() -> None:
         tags = {tag.name: tag.value for tag in file.pages[0].tags.values()}
     assert json.loads(tags["ImageDescription"]) == {"frame": 1}
     assert not {"Model", "ExposureTime"} & set(tags)
+
+
+def test_no_cell_of_a_table_is_a_formula() -> None:
+    """Names of users come into tables, and a spreadsheet would work them out; numbers stay numbers."""
+    evil = ["=HYPERLINK(1)", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "=1"]
+    same = ["-5", "+1e-3", "-.5", "-inf", "M1 = M2", "-", "", "a@b"]
+    rows = list(csv.reader(io.StringIO(csv_table([evil + same, [-5.0, None]]).decode())))
+    assert rows == [[f"'{cell}" for cell in evil] + same, ["-5.0", ""]]

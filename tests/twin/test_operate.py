@@ -336,6 +336,117 @@ def test_a_row_that_cannot_be_is_refused_and_the_others_are_taken(case: str, rec
     assert [(r["line"], r["reason"]) for r in status(record)["refused"]] == [(2, one["reason"])]
 
 
+def test_a_refused_row_of_a_growing_table_counts_once(record: Path, tmp_path: Path) -> None:
+    """One row before its time and one without a number; the table grows, and a copy of it lies elsewhere."""
+    rows = ["2026-01-02T00:00:00Z,20.0", "2026-01-01T00:00:00Z,20.1", "2026-01-03T00:00:00Z,warm"]
+    rows += [f"2026-01-{day:02}T00:00:00Z,20.0" for day in range(4, 9)]
+    (tmp_path / "copy").mkdir()
+    for count in range(3, len(rows) + 1):
+        text = "UTC,T\n" + "\n".join(rows[:count]) + "\n"
+        result = run("ingest", record, written(tmp_path, TELEMETRY, {"t_1.csv": text}), "--json")
+        told = json.loads(result.stdout)
+        assert (result.exit_code, told["refused"], told["refused_before"]) == (2, *((2, 0) if count == 3 else (0, 2)))
+        assert len(told["files"][0]["refused"]) == 2  # told again: the file is not all taken
+    run("ingest", record, written(tmp_path / "copy", TELEMETRY, {"t_1.csv": text}))
+    held = status(record)
+    assert (held["open"], held["entries"], sorted(one["line"] for one in held["refused"])) == (2, 6, [3, 4])
+
+
+SPOILT = {
+    "NUL": b'2026-01-02T00:00:00Z,"2\x000.1"',
+    "bytes": b"2026-01-02T00:00:00Z,\xff\xfe20.1",
+    "letters": b"2026-01-02T00:00:00Z," + b"x" * 5000,
+    "time": b"2" * 5000 + b",20.1",
+    "quote": b'2026-01-02T00:00:00Z,"20.1',
+    "cell": b"2026-01-02T00:00:00Z," + b"2" * 200_000,
+    "infinite": b"2026-01-02T00:00:00Z,1e999",
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_one_spoilt_row_is_refused_whatever_is_in_it(case: str, record: Path, tmp_path: Path) -> None:
+    file = written(tmp_path, TELEMETRY, {"t_1.csv": ""})
+    good = [b"2026-01-01T00:00:00Z,20.0", b"2026-01-03T00:00:00Z,20.2"]
+    (tmp_path / "t_1.csv").write_bytes(b"\n".join([b"UTC,T", good[0], SPOILT[case], good[1], b""]))
+    result = run("ingest", record, file, "--json")
+    told = json.loads(result.stdout)
+    assert (result.exit_code, told["new"], told["refused"]) == (2, 2, 1), result.stderr
+    (one,) = told["files"][0]["refused"]
+    assert one["line"] == 3
+    assert len(one["reason"]) < 500
+
+
+RUNS_TABLE = """
+instrument: gf7_pair
+readings:
+  - {kind: monitor, files: "p_*.csv", time: UTC, name: run}
+"""
+
+
+@pytest.mark.parametrize("name", [b'"a\x00b"', b"x" * 5000, b"\xff", b"/", b"..", b'"'])
+def test_a_folder_of_a_run_that_can_be_none_is_refused(name: bytes, record: Path, tmp_path: Path) -> None:
+    file = written(tmp_path, RUNS_TABLE, {"p_1.csv": ""})
+    (tmp_path / "p_1.csv").write_bytes(b"UTC,run\n2026-01-02T00:00:00Z," + name + b"\n")
+    result = run("ingest", record, file, "--json")
+    assert (result.exit_code, json.loads(result.stdout)["refused"]) == (2, 1), result.stderr
+
+
+ATTACKS = {
+    "replace by id": "INSERT OR REPLACE INTO {to}entry SELECT id, 'x', kind, subject, time_us, time_utc, '{{}}', "
+    "source_id, line, origin FROM {to}entry WHERE id = 1",
+    "replace by digest": "REPLACE INTO {to}entry SELECT 99, sha256, kind, subject, time_us, time_utc, '{{}}', "
+    "source_id, line, origin FROM {to}entry WHERE id = 1",
+    "replace": "REPLACE INTO {to}instrument SELECT id, 'x', sha256, temperature_k, simulated, bodies, plain "
+    "FROM {to}instrument",
+    "update": "UPDATE {to}entry SET content = '{{}}'",
+    "upsert": "INSERT INTO {to}source SELECT * FROM {to}source WHERE true ON CONFLICT (id) DO UPDATE SET file = 'x'",
+}
+
+
+@pytest.mark.parametrize("attached", [False, True])
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_the_database_refuses_to_replace_rows(attack: str, attached: bool, record: Path) -> None:
+    with History(str(record)) as history:
+        history.take(given("a", temperatures(0, 3)))
+    base = sqlite3.connect(":memory:" if attached else record / FILE)
+    if attached:
+        base.execute("ATTACH ? AS record", (str(record / FILE),))
+    with pytest.raises(sqlite3.IntegrityError, match="a record is never altered"):
+        base.execute(ATTACKS[attack].format(to="record." if attached else ""))
+    base.close()
+    held = status(record)
+    assert (held["guarded"], held["altered"], held["entries_checked"]) == (True, [], 3)
+
+
+def test_the_status_finds_what_was_altered_behind_the_guard(record: Path) -> None:
+    """Triggers taken out of the schema, rows altered and removed, and the triggers put back: digests do not agree."""
+    with History(str(record)) as history:
+        history.take(given("a", temperatures(0, 700)))
+    base = sqlite3.connect(record / FILE)
+    guards = base.execute("SELECT * FROM sqlite_master WHERE type = 'trigger'").fetchall()
+    base.execute("PRAGMA writable_schema = ON")
+    base.execute("DELETE FROM sqlite_master WHERE type = 'trigger'")
+    base.commit()
+    base.close()
+    base = sqlite3.connect(record / FILE)
+    base.execute("UPDATE entry SET content = replace(content, '293.', '300.') WHERE id IN (1, 690)")
+    base.execute("UPDATE entry SET time_utc = '2026-01-01T00:00:00Z' WHERE id = 695")
+    base.execute("DELETE FROM entry WHERE id = 300")
+    base.commit()
+    result = run("status", record)
+    assert "what guards the record against alterations was removed or changed" in " ".join(result.stdout.split())
+    for row in guards:
+        base.execute(row[4])
+    base.commit()
+    base.close()
+    held = status(record)
+    assert (held["guarded"], held["entries_checked"]) == (True, 500)
+    assert [text.split(",")[0] for text in held["altered"]] == ["1 entries have been removed", "entry 690", "entry 695"]
+    held = json.loads(run("status", record, "--check-all", "--json").stdout)
+    assert held["entries_checked"] == 699
+    assert [text.split(",")[0] for text in held["warnings"]][1:] == ["entry 1", "entry 690", "entry 695"]
+
+
 def test_a_clock_that_runs_backwards(record: Path) -> None:
     first, second, third = temperatures(0, 3)
     with History(str(record)) as history:
@@ -604,7 +715,7 @@ def shape(place: Path) -> dict:
     }
 
 
-@pytest.mark.parametrize(("frozen", "passed"), [(frozen_one, [2, 3]), (frozen_two, [3])], ids=["one", "two"])
+@pytest.mark.parametrize(("frozen", "passed"), [(frozen_one, [2, 3, 4]), (frozen_two, [3, 4])], ids=["one", "two"])
 def test_a_record_of_an_earlier_version_is_brought_up(
     frozen: Callable[[Path], None], passed: list[int], tmp_path: Path, record: Path
 ) -> None:
@@ -612,7 +723,7 @@ def test_a_record_of_an_earlier_version_is_brought_up(
     frozen(old)
     found = passed[0] - 1
     with pytest.raises(
-        NotARecord, match=rf"is of version {found}, this program writes 3; python -m twin\.operate init"
+        NotARecord, match=rf"is of version {found}, this program writes 4; python -m twin\.operate init"
     ):
         History(str(old))
     result = run("init", old, "gf7_pair", "--json")

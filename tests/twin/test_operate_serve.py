@@ -260,6 +260,17 @@ def test_what_is_no_acknowledgement_is_refused(port, record, told, status):
     assert record.alarms()[0]["acknowledged"] is None
 
 
+def test_who_posts_and_does_not_go_on_is_sent_away(port, monkeypatch):
+    """A body of which a part comes and then nothing: an answer, and not a task that waits for ever."""
+    monkeypatch.setattr("twin.operate.serve.SLOWEST_POST", 0.3)
+    head = f"POST /acknowledge HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nOrigin: http://127.0.0.1:{port}\r\n"
+    head += f"Cookie: space_camera_twin_{port}={READ}; space_camera_twin_{port}_write={WRITE}\r\n"
+    head += "Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{"
+    with socket.create_connection(("127.0.0.1", port), timeout=20.0) as line:
+        line.sendall(head.encode())
+        assert line.recv(4096).startswith(b"HTTP/1.1 400")
+
+
 # --- what is answered -------------------------------------------------------------------------------------------------
 def test_the_state_is_that_of_the_estimate(port):
     told = data(port, "/state")

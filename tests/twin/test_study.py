@@ -195,7 +195,7 @@ def test_a_corrupt_chunk_is_computed_again(done) -> None:
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
     chunk.write_bytes(content)
-    (folder / "chunks" / "00099.npz.partial").write_bytes(b"half")
+    (folder / "chunks" / ".00099.npz.0123abcd.partial").write_bytes(b"half")
     with (folder / "chunks" / "index.txt").open("ab") as index:
         index.write(b'0123456789abcdef {"file": "00')
     result = run(path, "--out", folder, "--resume", "--workers", 1)

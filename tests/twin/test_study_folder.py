@@ -143,7 +143,7 @@ def test_a_worker_with_other_code_computes_nothing(setup) -> None:
 def test_force_replaces_an_unfinished_study(setup, tmp_path) -> None:
     path = work(tmp_path / "run", setup)
     (path / "chunks" / "00001.npz.corrupt").touch()
-    (path / "chunks" / ".00002.npz.partial").touch()
+    (path / "chunks" / ".00002.npz.0123abcd.partial").touch()
     finish(path, setup, force=True)
     assert files(path) == OWN - {".written", "chunks/00000.npz"} | {"manifest.json", "report.html", "artefacts/a.csv"}
     assert [place.name for place in tmp_path.iterdir()] == ["run"]

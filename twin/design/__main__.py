@@ -8,7 +8,6 @@ if __name__ == "__main__":
     end_quietly()
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -93,18 +92,18 @@ def monitor(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    journal = Path(f"{out if out is not None else Path('runs') / file.stem}.search")
+    from twin.run.kept_work import KeptWork
+
     count = cores() if workers is None else workers
     procedure = PROCEDURES["design monitor"]
 
     def run(*given: Any) -> Any:
-        if not resume:
-            journal.unlink(missing_ok=True)
-        return procedure.run(*given, workers=count, journal=journal)
+        return procedure.run(*given, workers=count, journal=kept.begin() / "trials.txt")
 
     options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "monitor", replace(procedure, run=run), file, options)
-    journal.unlink(missing_ok=True)  # what came of it stands in the run folder
+    with KeptWork(out, file.stem, "search", resume) as kept:
+        run_test(PROGRAM, "monitor", replace(procedure, run=run), file, options)
+        kept.finish()
 
 
 if __name__ == "__main__":

@@ -142,7 +142,7 @@ def ingest(
 
     A file is taken in one step. What is in the record already is told and not doubled. What cannot be true is refused
     with its reason, which `status` shows: another instrument, a clock that runs backwards, a unit that does not fit, an
-    unknown event.
+    unknown event. A refusal counts once, also where the file is read again after it has grown.
 
     For example:
 
@@ -158,14 +158,15 @@ def ingest(
     with told() as errors, durable.exit_on_terminate(), History(record) as history:
         start = None if moment is None else moment_said("--time", moment)
         sources = Sources(files, start, _is_stated(instrument, history), watch)
-        totals, files_told, first = Counter({"new": 0, "known": 0, "refused": 0}), [], ""
+        totals, files_told, first = Counter({"new": 0, "known": 0, "refused": 0, "refused_before": 0}), [], ""
         raised: list[str] = []
         try:
             while True:
                 before = totals["new"]
                 for given in sources.look(history):
                     taken = history.take(given, late)
-                    totals.update(new=taken.new, known=taken.known, refused=len(taken.refused))
+                    totals.update(new=taken.new, known=taken.known, refused=len(taken.refused) - taken.refused_before)
+                    totals.update(refused_before=taken.refused_before)
                     first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
                     if watch or not as_json:
                         tell(errors, as_json, quiet, _taken(taken), partial(line, text=_line(taken)))
@@ -183,7 +184,7 @@ def ingest(
             if not watch:  # a watching command has no other end
                 print_error(errors, "interrupted: the files that were told are in the record, the others are not")
                 raise typer.Exit(INTERRUPTED) from None
-        text = f"{totals['new']} taken, {totals['known']} known already, {totals['refused']} refused"
+        text = _counted(totals["new"], totals["known"], totals["refused"], totals["refused_before"])
         tell(
             errors,
             as_json,
@@ -191,9 +192,9 @@ def ingest(
             {**totals, "files": files_told, "alarms": raised},
             partial(print_verdict, verdict=text),
         )
-        if totals["refused"]:
+        if refused := totals["refused"] + totals["refused_before"]:
             if quiet or as_json:
-                print_error(errors, f"{totals['refused']} refused, the first in {first}")
+                print_error(errors, f"{refused} refused, the first in {first}")
             raise typer.Exit(BAD_INPUT)
 
 
@@ -223,8 +224,13 @@ def _is_stated(instrument: str | None, history: History) -> bool:
     return True
 
 
+def _counted(new: int, known: int, refused: int, before: int) -> str:
+    return f"{new} taken, {known} known already, {refused} refused" + (f", {before} refused before" if before else "")
+
+
 def _line(taken: Taken) -> str:
-    lines = [f"{taken.file}: {taken.new} taken, {taken.known} known already, {len(taken.refused)} refused"]
+    new = len(taken.refused) - taken.refused_before
+    lines = [f"{taken.file}: {_counted(taken.new, taken.known, new, taken.refused_before)}"]
     shown = [f"  refused{'' if line is None else f', line {line}'}: {reason}" for line, reason in taken.refused[:10]]
     more = len(taken.refused) - len(shown)
     return "\n".join([*lines, *shown, *([f"  and {more} more; status shows all"] if more else [])])
@@ -232,15 +238,25 @@ def _line(taken: Taken) -> str:
 
 def _taken(one: Taken) -> dict[str, Any]:
     refused = [{"line": line, "reason": reason} for line, reason in one.refused]
-    return {"file": one.file, "new": one.new, "known": one.known, "refused": refused, "before": one.before}
+    counts = {"new": one.new, "known": one.known, "refused": refused, "refused_before": one.refused_before}
+    return {"file": one.file, **counts, "before": one.before}
 
 
 @app.command("status")
-def status(record: Place, plan: PlanFile = None, as_json: AsJson = False, quiet: Quiet = False) -> None:
+def status(
+    record: Place,
+    plan: PlanFile = None,
+    check_all: Annotated[
+        bool, typer.Option("--check-all", help="Compare every entry with its digest, not the newest 500 alone.")
+    ] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
     """Tell what a record holds, what was refused and why; and, under its plan of operation or another one, how the
     instrument stands: every quantity with its sigma, requirements, jumps, sensors, whether predictions came true.
 
-    What is new and has to be known is raised as an alarm (python -m twin.operate alarms).
+    What is new and has to be known is raised as an alarm (python -m twin.operate alarms). A warning says where entries
+    are not as they were taken, or what guards them was changed.
 
     Example: `python -m twin.operate status record scenes/examples/operation.yaml`
 
@@ -254,7 +270,8 @@ def status(record: Place, plan: PlanFile = None, as_json: AsJson = False, quiet:
         rows = history.alarms()
         opened = sum(one["acknowledged"] is None for one in rows)
         estimate = None if found is None else found[0].to_dict()
-        data = {**history.status(), "estimate": estimate, "open_alarms": opened}
+        held = history.status(check_all)
+        data = {**held, "warnings": _record_warnings(held), "estimate": estimate, "open_alarms": opened}
 
         def show(console: Console) -> None:
             _show(data, console)
@@ -264,13 +281,23 @@ def status(record: Place, plan: PlanFile = None, as_json: AsJson = False, quiet:
         tell(errors, as_json, quiet, data, show)
 
 
+def _record_warnings(held: dict[str, Any]) -> list[str]:
+    """Return what a reader of a record's status has to know of the record itself."""
+    out = [*held["altered"]]
+    if not held["guarded"] and held["record"].startswith("sqlite"):
+        out.append("what guards the record against alterations was removed or changed; status --check-all compares all")
+    elif not held["guarded"]:
+        out.append("this kind of database does not itself refuse to alter rows; only the program does")
+    return out
+
+
 def _show(data: dict[str, Any], console: Console) -> None:
     name, entries, opened = data["instrument"], data["entries"], data["open"]
     print_verdict(
         console, f"{name}: {entries} readings and events of {data['files']} files; {opened} refused and not taken"
     )
-    if not data["guarded"]:
-        line(console, "warning: this kind of database does not itself refuse to alter rows; only the program does")
+    for text in data["warnings"]:
+        line(console, f"warning: {text}")
     table = result_table()
     for head in ("kind", "of", "entries", "first [UTC]", "last [UTC]"):
         table.add_column(head, justify="right" if head == "entries" else "left")

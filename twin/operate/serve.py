@@ -31,6 +31,8 @@ LOOK = 3.0
 """Seconds from one look at the record to the next."""
 LONGEST_POST = 4096
 """Bytes of what a page posts."""
+SLOWEST_POST = 10.0
+"""Seconds within which the whole of it has to come."""
 LONGEST_NAME, LONGEST_NOTE = 80, 500
 """Letters of who acknowledges, and of the note."""
 _PAGE = files(__package__) / "page"
@@ -185,10 +187,14 @@ def _whole(request: Request, name: str) -> int:
 async def _posted(request: Request) -> dict[str, Any]:
     """The plain data that a page posts. Raises BadQuestion."""
     body = b""
-    async for piece in request.stream():
-        body += piece
-        if len(body) > LONGEST_POST:
-            raise BadQuestion(f"at most {LONGEST_POST} bytes")
+    try:
+        async with asyncio.timeout(SLOWEST_POST):
+            async for piece in request.stream():
+                body += piece
+                if len(body) > LONGEST_POST:
+                    raise BadQuestion(f"at most {LONGEST_POST} bytes")
+    except TimeoutError:
+        raise BadQuestion(f"the whole of it within {SLOWEST_POST:g} s") from None
     try:
         told = json.loads(body)
     except (ValueError, RecursionError):

@@ -7,6 +7,7 @@ if __name__ == "__main__":
 
     end_quietly()
 
+import os
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -251,7 +252,7 @@ def export(
         facts = {"config": read.config, "seed": drawn, "again": again, "given": inputs}
         return finished(session, "export", shown, numbers, program=PROGRAM, **facts)
 
-    stem = source.resolve().name if source.is_dir() else source.stem
+    stem = source.resolve().name if os.path.isdir(source) else source.stem
     run_command(f"{stem}-export", Options(out, seed, backend, force, as_json, quiet), resolve, work, None)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import threading
 import time
@@ -18,9 +19,11 @@ from rich.table import Table
 
 from optics.numerics.backend import NAMES
 from scenes.yaml.errors import InputError
-from scenes.yaml.standard_output import FAILURE, print_error
+from scenes.yaml.standard_output import BAD_INPUT, FAILURE, code_of, print_error
 
-BAD_INPUT, INTERRUPTED = 2, 128 + signal.SIGINT
+INTERRUPTED = 128 + signal.SIGINT
+NO_NAME = (errno.ENAMETOOLONG, errno.ELOOP)
+"""What an operating system answers to a name that no file can have."""
 LARGEST_SEED = 2**63 - 1
 BACKEND_HELP = f"Where to trace: {' or '.join(NAMES)}."
 OUT_HELP = "Run folder to make. Default: runs/NAME-001, -002, ... (the first that is free), NAME that of the file."
@@ -86,6 +89,11 @@ def explained(errors: Console) -> Iterator[None]:
     except KeyboardInterrupt:
         errors.print("interrupted: nothing was kept", style="bold red")
         raise typer.Exit(INTERRUPTED) from None
+    except OSError as error:
+        if error.errno not in NO_NAME or not error.filename:
+            raise
+        print_error(errors, f"{str(error.filename)[:80]}: {error.strerror}")
+        raise typer.Exit(BAD_INPUT) from None
     except Exception as error:
         # the work that failed has imported these; help and a bad file do not wait for them
         from optics.numerics.backend import BackendUnavailable
@@ -95,7 +103,7 @@ def explained(errors: Console) -> Iterator[None]:
         if not isinstance(error, RunFolderError | BackendUnavailable | LibraryMissing):
             raise
         print_error(errors, str(error))
-        raise typer.Exit(BAD_INPUT if isinstance(error, RunFolderError) else FAILURE) from None
+        raise typer.Exit(code_of(error.__cause__) if isinstance(error, RunFolderError) else FAILURE) from None
 
 
 TICK_SECONDS = 8.0

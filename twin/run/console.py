@@ -118,4 +118,7 @@ def main() -> None:
         module, _ = PROGRAMS[sys.argv.pop(1)]
         runpy.run_module(_BEFORE + module, run_name="__main__", alter_sys=True)
     else:
+        from scenes.yaml.interrupt import end_quietly
+
+        end_quietly()
         _application()(prog_name="camtwin")

@@ -15,6 +15,7 @@ import csv
 import importlib.metadata
 import io
 import json
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -161,6 +162,10 @@ def _cf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
     return {**attributes, **said}
 
 
+_FORMULA = re.compile(r"[=+\-@\t\r].")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|[+-]?(inf|nan)", re.IGNORECASE)
+
+
 def _units(attributes: Mapping[Any, Any], numbers: bool) -> dict[str, Any]:
     """Attributes of a variable with units that UDUNITS knows; texts have none."""
     rest = {str(key): value for key, value in attributes.items() if key != "units"}
@@ -174,10 +179,18 @@ def _units(attributes: Mapping[Any, Any], numbers: bool) -> dict[str, Any]:
 
 
 def csv_table(rows: Iterable[Sequence[Any]]) -> bytes:
-    """Rows, the heads first, as the contents of a CSV file in UTF-8: numbers with all digits, None as an empty cell."""
+    """Return rows, the heads first, as the contents of a CSV file in UTF-8.
+
+    Numbers have all digits, None is an empty cell, and a text that a spreadsheet would take for a formula begins with a
+    single quotation mark.
+    """
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    csv.writer(text, lineterminator="\n").writerows(map(_harmless, row) for row in rows)
     return text.getvalue().encode()
+
+
+def _harmless(cell: Any) -> Any:
+    return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) and not _NUMBER.fullmatch(cell) else cell
 
 
 SPOT_STRETCH = 30.0

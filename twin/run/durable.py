@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import secrets
 import signal
 import threading
 from collections.abc import Iterable, Iterator
@@ -19,6 +20,8 @@ from pathlib import Path
 
 PARTIAL = ".partial"
 """Ending of a file that is being written."""
+PARTIAL_NAME = r"\.[^/]+\.[0-9a-f]{8}\.partial"
+"""Pattern of the name of such a file: two processes that write the same file do not share it."""
 AT_ONCE = 8
 """Files written through at once: the disk's journal takes many in one go."""
 _EXCHANGE, _HERE = 2, -100
@@ -84,7 +87,7 @@ def make_folders(place: Path) -> list[Path]:
 def write_safely(place: Path, content: bytes) -> None:
     """Write a file so that under its name it is whole or not there, whenever the power fails.
 
-    Until then it is a hidden file beside its place that ends in ``PARTIAL``.
+    Until then it is a hidden file beside its place with a name as ``PARTIAL_NAME``.
 
     Args:
         place: of the file; its folder is there.
@@ -112,7 +115,7 @@ def write_all_safely(files: Iterable[tuple[Path, bytes]]) -> None:
 
 def _write_one(file: tuple[Path, bytes]) -> None:
     place, content = file
-    partial = place.with_name(f".{place.name}{PARTIAL}")
+    partial = place.with_name(f".{place.name}.{secrets.token_hex(4)}{PARTIAL}")
     try:
         with partial.open("wb") as out:
             out.write(content)

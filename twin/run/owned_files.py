@@ -23,6 +23,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
+from twin.run import durable
+
 MANIFEST = "manifest.json"
 STUDY_STATE = "study_state.json"
 """Says which study a folder belongs to, from the beginning; the manifest is written at the end."""
@@ -41,7 +43,8 @@ NAMED = 5
 """Files that a message names at most."""
 _AT_WORK = re.compile(
     "|".join(map(re.escape, (STUDY_LOCK, WRITTEN, SUCCEEDS)))
-    + r"|chunks/(index\.txt|[0-9]+\.npz(\.corrupt)?)|(.*/)?\.[^/]+\.partial"
+    + r"|chunks/(index\.txt|[0-9]+\.npz(\.corrupt)?)|(.*/)?"
+    + durable.PARTIAL_NAME
 )
 """What a study keeps for itself; chunks have their checksums in their index."""
 _BY_NAME = re.compile(rf"{re.escape(STUDY_STATE)}|config\.yaml|report\.html|study\.(nc|csv|parquet|json)")
@@ -191,7 +194,11 @@ class Unfinished:
             place = self._beside(token, LOCK)
             lock = place.open("x", encoding="utf-8")
             # whoever sweeps the folder between these lines takes the file for one that a killed process left
-            if _take(lock) is not False and place.exists() and os.path.samestat(os.fstat(lock.fileno()), place.stat()):
+            if (
+                take_lock(lock) is not False
+                and place.exists()
+                and os.path.samestat(os.fstat(lock.fileno()), place.stat())
+            ):
                 return token, lock
             lock.close()
 
@@ -225,7 +232,7 @@ def scratch(stem: str) -> Iterator[Path]:
         place = _lock_of(folder)
         lock = os.open(place, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         # whoever clears up between these lines takes the file for one that a killed process left
-        if _take(lock) is not False and place.exists():
+        if take_lock(lock) is not False and place.exists():
             break
         os.close(lock)
     try:
@@ -246,7 +253,7 @@ def _clear_scratch(place: Path) -> None:
     lock = os.open(place, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         about, folder = os.fstat(lock), place.with_suffix("")
-        if about.st_uid != os.getuid() or not stat.S_ISREG(about.st_mode) or not _take(lock):
+        if about.st_uid != os.getuid() or not stat.S_ISREG(about.st_mode) or not take_lock(lock):
             return
         if folder.is_dir() and not folder.is_symlink() and folder.lstat().st_uid == os.getuid():
             shutil.rmtree(folder)
@@ -278,7 +285,7 @@ def sweep(folder: Path, replaced: Callable[[Path, Path], bool]) -> None:
         except OSError:  # somebody else's, or no file at all
             continue
         try:
-            if lock is None or _take(lock):
+            if lock is None or take_lock(lock):
                 _clear(folder / name, places, replaced)
         except OSError:  # not ours to remove; it stays for who may
             pass
@@ -302,8 +309,8 @@ def _clear(target: Path, places: dict[str, Path], replaced: Callable[[Path, Path
     places[LOCK].unlink(missing_ok=True)
 
 
-def _take(lock: TextIO | int) -> bool | None:
-    """Lock a file: True, False when another process has it, None where the file system has no locks."""
+def take_lock(lock: TextIO | int) -> bool | None:
+    """Lock a file and return whether that was done: False when another process has it, None where none can be had."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Protocol
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from twin.run import owned_files
 from twin.run.durable import ending_later, make_folders, put_in_place, sync_folder, sync_tree
@@ -372,7 +372,7 @@ def read_manifest(folder: Path) -> Manifest | None:
     """The manifest of a run, None when the folder has none."""
     try:
         return Manifest.model_validate_json((folder / MANIFEST).read_bytes())
-    except (OSError, ValidationError):
+    except (OSError, ValueError):  # of pydantic too; a name with a NUL is none of a folder
         return None
 
 

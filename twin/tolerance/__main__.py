@@ -7,7 +7,6 @@ if __name__ == "__main__":
 
     end_quietly()
 
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -73,7 +72,7 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    journal = Path(f"{out if out is not None else Path('runs') / file.stem}.samples")
+    from twin.run.kept_work import KeptWork
 
     def resolve() -> ToleranceSetup:
         setup: ToleranceSetup = read_for(PROGRAM, file, Named("scenes.specs.tolerance:resolve_tolerance"))
@@ -84,17 +83,16 @@ def main(
         from twin.tolerance.samples import Workforce
         from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance
 
-        if not resume:
-            shutil.rmtree(journal, ignore_errors=True)
-        force = Workforce(cores() if workers is None else workers, scheduler, journal)
+        force = Workforce(cores() if workers is None else workers, scheduler, kept.begin())
         run = run_tolerance(setup, session.backend, setup.test.seed, session.advance, force)
         from twin.tolerance.tolerance_report import tolerance_report
 
         facts = {"config": setup.to_yaml(), "named": setup.plain(), "seed": setup.test.seed}
         return finished(session, "tolerance", tolerance_report(run), TOLERANCE(run), program=PROGRAM, **facts)
 
-    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work, MODELS["tolerance"])
-    shutil.rmtree(journal, ignore_errors=True)  # what came of it stands in the run folder
+    with KeptWork(out, file.stem, "samples", resume) as kept:
+        run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work, MODELS["tolerance"])
+        kept.finish()
 
 
 if __name__ == "__main__":

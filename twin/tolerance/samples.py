@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -298,18 +297,14 @@ def _workers(plan: Plan, force: Workforce) -> int:
 
 @contextmanager
 def _journal(folder: Path, fingerprint: str) -> Iterator[None]:
-    """Keep a folder for one run of one budget.
+    """Keep a folder for runs of one budget.
 
     Raises:
-        RunFolderError: it is another's, or in use.
+        RunFolderError: it is of another budget, or cannot be written.
     """
     try:
         durable.make_folders(folder)
         with (folder / "of.txt").open("a+", encoding="utf-8") as head:
-            try:
-                fcntl.flock(head, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise run_folder.RunFolderError(f"{folder} is in use by another command") from None
             head.seek(0)
             said = head.read()
             if said and said != f"{fingerprint}\n":

@@ -44,6 +44,9 @@ from twin.operate.record.taking import Taken, Taking
 from twin.run.data_files import WRITER
 from twin.run.durable import make_folders, sync_folder
 
+LAST_CHECKED = 500
+"""Entries whose digests are worked out again whenever the status is asked for; all of them take too long."""
+
 
 class History:
     """The record of one instrument in a database.
@@ -161,12 +164,19 @@ class History:
         with self.reading() as connection:
             return [dict(row) for row in connection.execute(query.order_by(REFUSED.c.id)).mappings()]
 
-    def status(self) -> dict[str, Any]:
-        """What the record holds, as plain data."""
+    def status(self, every: bool = False) -> dict[str, Any]:
+        """Return what the record holds, as plain data.
+
+        Parameters
+        ----------
+        every : bool
+            Whether the digests of all entries are worked out again, and not those of the newest alone.
+        """
         with self.reading() as connection:
             streams = [(kind, subject, *_extent(connection, kind, subject)) for kind, subject in _streams(connection)]
             sources = int(connection.execute(select(func.count()).select_from(SOURCE)).scalar_one())
             guarded = schema.guarded(connection)
+            checked, altered = _altered(connection, None if every else LAST_CHECKED)
         refused = [
             {
                 "file": row["file"],
@@ -184,6 +194,8 @@ class History:
             "instrument_sha256": self.sha256,
             "simulated": self.simulated,
             "guarded": guarded,
+            "entries_checked": checked,
+            "altered": altered,
             "files": sources,
             "entries": sum(row[2] for row in streams),
             "streams": [
@@ -469,6 +481,30 @@ def _extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, 
     own = [select(one).select_from(ENTRY).where(c.kind == kind, c.subject == subject) for one in asked]
     count, first, last = (int(connection.execute(query).scalar_one()) for query in own)
     return count, first, last
+
+
+def _altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]:
+    """Return how many of the newest entries, or of all, were compared with their digests, and what is wrong."""
+    c = ENTRY.c
+    rows = connection.execute(select(*c).order_by(c.id.desc()).limit(newest)).mappings().all()
+    wrong = [
+        f"entry {row['id']}, {row['kind']} of {row['subject']} at {row['time_utc']}, is not as it was taken"
+        for row in rows
+        if _digest(row) != row["sha256"] or row["time_utc"] != utc_text(row["time_us"])
+    ]
+    if connection.dialect.name == "sqlite":  # it counts without gaps
+        held, last = connection.execute(select(func.count(), func.max(c.id)).select_from(ENTRY)).one()
+        if held != (last or 0):
+            wrong.append(f"{(last or 0) - held} entries have been removed")
+    return len(rows), wrong[::-1]
+
+
+def _digest(row: Mapping[str, Any]) -> str:
+    try:
+        content = json.loads(row["content"])
+    except ValueError:
+        return ""
+    return digest_of_data([row["kind"], row["subject"], row["time_us"], content])
 
 
 def content_of(row: Mapping[str, Any]) -> Any:

@@ -29,7 +29,7 @@ from sqlalchemy.schema import CreateIndex, CreateTable
 from optics.numerics.frozen_map import FrozenMap
 from twin.operate.record.place import NotARecord
 
-VERSION = 3
+VERSION = 4
 _METADATA = MetaData()
 _NUMBER = BigInteger().with_variant(Integer(), "sqlite")
 """SQLite counts rows by itself only where their type is INTEGER."""
@@ -102,7 +102,7 @@ REFUSED = _table(
     Column("refused_utc", String(32), nullable=False),
     Index("refused_entry", "entry"),
 )
-"""A row for what was not taken, once for each reason; ``entry`` is the digest of the reading, if it is one."""
+"""A row for what was not taken, once for each reading or row; ``entry`` is the digest of the reading, if it is one."""
 PLAN = _table(
     "plan",
     _digest("sha256", nullable=False),
@@ -145,24 +145,42 @@ CHECKPOINT = _table(
 _DERIVED = (CHECKPOINT.name,)
 
 
-def _guard(connection: Connection, table: str) -> None:
-    """Let the database refuse to alter or remove rows of a table; on others than these two only the program does."""
+def _triggers(table: Table) -> dict[str, str]:
+    """Return name and SQL of what lets SQLite refuse to alter, remove and replace rows of a table.
+
+    INSERT OR REPLACE removes rows without a word to a trigger on DELETE, so the rows that it would remove are looked
+    for before it inserts.
+    """
+    out, name = {}, table.name
     for what in ("UPDATE", "DELETE"):
-        name, says = f"{table}_no_{what.lower()}", f"a record is never altered: {what} of {table}"
-        if connection.dialect.name == "sqlite":
-            body = f"BEGIN SELECT RAISE(ABORT, '{says}'); END"
-            connection.execute(text(f"CREATE TRIGGER {name} BEFORE {what} ON {table} {body}"))
-        elif connection.dialect.name == "postgresql":
+        body = f"BEGIN SELECT RAISE(ABORT, 'a record is never altered: {what} of {name}'); END"
+        out[f"{name}_no_{what.lower()}"] = f"CREATE TRIGGER {name}_no_{what.lower()} BEFORE {what} ON {name} {body}"
+    same = " OR ".join(f"{c.name} = NEW.{c.name}" for c in table.columns if c.primary_key or c.unique)
+    body = f"BEGIN SELECT RAISE(ABORT, 'a record is never altered: REPLACE of {name}'); END"
+    there = f"WHEN EXISTS (SELECT 1 FROM {name} WHERE {same})"
+    out[f"{name}_no_replace"] = f"CREATE TRIGGER {name}_no_replace BEFORE INSERT ON {name} {there} {body}"
+    return out
+
+
+def _guard(connection: Connection, table: Table) -> None:
+    """Let the database refuse to alter or remove rows of a table; on others than these two only the program does."""
+    if connection.dialect.name == "sqlite":
+        there = set(connection.execute(text("SELECT name FROM sqlite_master WHERE type = 'trigger'")).scalars())
+        for name, sql in _triggers(table).items():
+            if name not in there:
+                connection.execute(text(sql))
+    elif connection.dialect.name == "postgresql":
+        for what in ("UPDATE", "DELETE"):
             connection.execute(
                 text(
-                    f"CREATE TRIGGER {name} BEFORE {what} ON {table} "
+                    f"CREATE TRIGGER {table.name}_no_{what.lower()} BEFORE {what} ON {table.name} "
                     "FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
                 )
             )
     if connection.dialect.name == "postgresql":
         connection.execute(
             text(
-                f"CREATE TRIGGER {table}_no_truncate BEFORE TRUNCATE ON {table} "
+                f"CREATE TRIGGER {table.name}_no_truncate BEFORE TRUNCATE ON {table.name} "
                 "FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
             )
         )
@@ -180,14 +198,17 @@ def _guard_function(connection: Connection) -> None:
 
 def guarded(connection: Connection) -> bool:
     """Whether the database itself refuses to alter the record, and not the program alone."""
-    names = {
-        "sqlite": "SELECT count(*) FROM sqlite_master WHERE type = 'trigger' AND name LIKE '%_no_%'",
-        "postgresql": "SELECT count(*) FROM pg_trigger WHERE tgname LIKE '%\\_no\\_%' "
-        "AND tgrelid IN (SELECT oid FROM pg_class WHERE pg_table_is_visible(oid))",
-    }
-    query = names.get(connection.dialect.name)
-    if query is None:
+    if connection.dialect.name == "sqlite":
+        rows = connection.execute(text("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"))
+        there = {name: " ".join(sql.split()) for name, sql in rows}
+        own = [_triggers(table) for table in _METADATA.sorted_tables if table.name not in _DERIVED]
+        return there == {name: sql for triggers in own for name, sql in triggers.items()}
+    if connection.dialect.name != "postgresql":
         return False
+    query = (
+        "SELECT count(*) FROM pg_trigger WHERE tgname LIKE '%\\_no\\_%' "
+        "AND tgrelid IN (SELECT oid FROM pg_class WHERE pg_table_is_visible(oid))"
+    )
     return int(connection.execute(text(query)).scalar_one()) >= 2 * (len(_METADATA.tables) - len(_DERIVED))
 
 
@@ -197,7 +218,7 @@ def create(connection: Connection) -> None:
     _guard_function(connection)
     for table in _METADATA.sorted_tables:
         if table.name not in _DERIVED:
-            _guard(connection, table.name)
+            _guard(connection, table)
 
 
 def version(connection: Connection) -> int:
@@ -226,7 +247,15 @@ def _make_table(connection: Connection, table: Table) -> None:
     for index in table.indexes:
         connection.execute(CreateIndex(index))
     if table.name not in _DERIVED:
-        _guard(connection, table.name)
+        _guard(connection, table)
+
+
+def _to_four(connection: Connection) -> None:
+    """Let the database refuse to replace rows, too."""
+    if connection.dialect.name == "sqlite":
+        for table in _METADATA.sorted_tables:
+            if table.name not in _DERIVED:
+                _guard(connection, table)
 
 
 def _make_index(connection: Connection, table: Table, name: str) -> None:
@@ -234,7 +263,7 @@ def _make_index(connection: Connection, table: Table, name: str) -> None:
     connection.execute(CreateIndex(index))
 
 
-MIGRATIONS: Mapping[int, Callable[[Connection], None]] = FrozenMap({1: _to_two, 2: _to_three})
+MIGRATIONS: Mapping[int, Callable[[Connection], None]] = FrozenMap({1: _to_two, 2: _to_three, 3: _to_four})
 """Version -> what makes the next one of it. Rows are added, none is altered."""
 
 

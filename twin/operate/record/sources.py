@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from scenes.specs.measured.telemetry import RUNS, ReadingTableSpec
-from scenes.yaml.csv_table import rows_of
+from scenes.yaml.csv_table import rows_apart
 from scenes.yaml.errors import InputError, Problem
+from scenes.yaml.input_file import is_file
 from twin.operate.record.entries import Given, Refused, digest_of_data, micros, one_line
 from twin.operate.record.history import History
 from twin.operate.record.run_readings import run_entries
@@ -141,9 +142,9 @@ class Sources:
 def _runs_named(table: ReadingTableSpec, path: Path) -> list[Path]:
     """Manifests of the run folders that a table names and that are finished."""
     try:
-        (_, heads), *rows = rows_of(path, LARGEST)
+        heads, *rows = [cells for _, cells in rows_apart(path, LARGEST) if not isinstance(cells, str)]
         column = [head.strip() for head in heads].index(str(table.name))
     except (InputError, OSError, ValueError):
         return []
-    named = (path.parent / cells[column].strip() / MANIFEST for _, cells in rows if len(cells) > column)
-    return [one for one in named if one.is_file()]
+    named = (path.parent / cells[column].strip() / MANIFEST for cells in rows if len(cells) > column)
+    return [one for one in named if is_file(one)]

@@ -38,6 +38,7 @@ class Taken:
         known: that were in it already.
         refused: what was not taken: line, reason.
         before: whether the same file had been taken before.
+        refused_before: how many of these had been refused before, and are not counted again.
     """
 
     file: str
@@ -45,6 +46,7 @@ class Taken:
     known: int
     refused: tuple[tuple[int | None, str], ...]
     before: bool = False
+    refused_before: int = 0
 
 
 class Taking:
@@ -88,10 +90,26 @@ class Taking:
                     self.first = (utc_text(one.time), _before(one.content))
             self.seen[stream] = max(one.time, self.seen.get(stream, one.time))
         before = source is not None
-        if kept or refused or not before:
-            self._write(given, taking, None if source is None else int(source[0]), kept, refused)
+        fresh = self._fresh(given, refused, before)
+        if kept or fresh or not before:
+            self._write(given, taking, None if source is None else int(source[0]), kept, fresh)
         told = tuple((one.line, one.reason) for one, _ in refused)
-        return Taken(given.file, len(kept), again, told, before)
+        return Taken(given.file, len(kept), again, told, before, len(refused) - len(fresh))
+
+    def _fresh(
+        self, given: Given, refused: list[tuple[Refused, str | None]], before: bool
+    ) -> dict[str, tuple[Refused, str | None]]:
+        """Return what is refused for the first time, by digest: a reading counts once whatever file it comes in, and a
+        row that could not be read once in each file, however the file grows.
+        """
+        out = {
+            digest_of_data([entry] if entry else [given.file, given.meaning, one.line, one.reason]): (one, entry)
+            for one, entry in refused
+            if entry or not before  # the same file, wherever it lies
+        }
+        known = self._known(REFUSED.c.sha256, list(out))
+        readings = self._known(REFUSED.c.entry, [entry for _, entry in out.values() if entry])
+        return {key: own for key, own in out.items() if key not in known and own[1] not in readings}
 
     def _known(self, column: Any, digests: list[str]) -> set[str]:
         found: set[str] = set()
@@ -165,7 +183,7 @@ class Taking:
         taking: str,
         source: int | None,
         kept: list[tuple[Entry, str]],
-        refused: list[tuple[Refused, str | None]],
+        refused: Mapping[str, tuple[Refused, str | None]],
     ) -> None:
         moment = utc_text(now())
         if source is None:
@@ -192,18 +210,18 @@ class Taking:
         if rows:  # estimates that went past the earliest of them do not hold it
             earliest = min(one.time for one, _ in kept)
             self.connection.execute(delete(CHECKPOINT).where(CHECKPOINT.c.time_us >= earliest))
-        told = {
-            digest_of_data([taking, one.line, one.reason, entry]): {
+        told = [
+            {
+                "sha256": key,
                 "source_id": source,
                 "line": one.line,
                 "reason": one.reason,
                 "entry": entry,
                 "refused_utc": moment,
             }
-            for one, entry in refused
-        }
-        there = self._known(REFUSED.c.sha256, list(told))
-        self._insert(REFUSED, [{"sha256": key, **row} for key, row in told.items() if key not in there])
+            for key, (one, entry) in refused.items()
+        ]
+        self._insert(REFUSED, told)
 
     def _insert(self, table: Any, rows: list[dict[str, Any]]) -> None:
         for k in range(0, len(rows), _TOGETHER):

@@ -20,7 +20,7 @@ from scenes.specs.measured.telemetry import (
     TelemetrySpec,
 )
 from scenes.specs.resolved import resolve_with
-from scenes.yaml.csv_table import rows_of
+from scenes.yaml.csv_table import rows_apart
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import digest_of
 from scenes.yaml.spec import validate
@@ -96,14 +96,16 @@ def read_table_file(table: ReadingTableSpec, path: Path, history: History) -> Gi
 
 
 def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[Entry | Refused], dict[str, str]]:
-    rows = rows_of(path, LARGEST)
+    rows = rows_apart(path, LARGEST)
     if not rows:
         raise InputError(Issue("an empty table", str(path), 1, allowed="a row of heads, and rows below it"))
     if table.form == "keywords":
         return _keyword_items(table, rows, history), {}
     frames: dict[str, str] = {}
-    line, heads = rows[0]
-    heads = [head.strip() for head in heads]
+    line, cells = rows[0]
+    if isinstance(cells, str):
+        raise InputError(Issue(cells, str(path), line, allowed="a row of heads, and rows below it"))
+    heads = [head.strip() for head in cells]
     wanted = [table.time, *(head for one in table.columns.values() for head in one.column)]
     wanted += [head for head in (table.name, table.detail) if head is not None]
     for head in wanted:
@@ -113,6 +115,9 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
     place = {head: heads.index(head) for head in wanted}
     items: list[Entry | Refused] = []
     for number, cells in rows[1:]:
+        if isinstance(cells, str):
+            items.append(Refused(cells, number))
+            continue
         if len(cells) != len(heads):
             items.append(Refused(f"{len(cells)} cells under {len(heads)} heads", number))
             continue
@@ -134,12 +139,15 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
 
 
 def _keyword_items(
-    table: ReadingTableSpec, rows: Sequence[tuple[int, list[str]]], history: History
+    table: ReadingTableSpec, rows: Sequence[tuple[int, list[str] | str]], history: History
 ) -> list[Entry | Refused]:
     """Lines of ``KEYWORD = TIME NUMBER``; other keywords, and lines without a number after a time, are not readings."""
     by_keyword = {one.column[0]: (subject, one) for subject, one in table.columns.items()}
     items: list[Entry | Refused] = []
     for number, cells in rows:
+        if isinstance(cells, str):
+            items.append(Refused(cells, number))
+            continue
         keyword, _, rest = ",".join(cells).partition("=")
         words = rest.split()
         if keyword.strip() not in by_keyword:

@@ -399,7 +399,7 @@ def _image(folder: Path, name: str) -> np.ndarray:
     """(rows, columns) of a run's image."""
     path = _file(folder, name)
     try:
-        return np.asarray(tifffile.imread(path)).squeeze()
+        return np.asarray(tifffile.imread(path, key=0)).squeeze()
     # readers of spoilt files fail in ways that cannot be foreseen
     except Exception as error:
         raise InputError(Issue(f"cannot be read: {error}", str(path), allowed="as the run wrote it")) from None

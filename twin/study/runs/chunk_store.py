@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import stat
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from twin.run.durable import PARTIAL, make_folders, sync_folder, write_safely
+from twin.run.durable import PARTIAL_NAME, make_folders, sync_folder, write_safely
 from twin.study.runs.base_job import BlockResult
 from twin.study.runs.plan import Plan
 
@@ -84,8 +85,9 @@ class ChunkStore:
     def open(self) -> None:
         """Read the index and check every chunk in it; corrupt ones are moved aside and told in ``corrupt``."""
         make_folders(self.folder)
-        for left in self.folder.glob(f"*{PARTIAL}"):
-            left.unlink(missing_ok=True)
+        for left in list(self.folder.iterdir()):
+            if re.fullmatch(PARTIAL_NAME, left.name):
+                left.unlink(missing_ok=True)
         listed = self._listed()
         for entry in listed:
             try:
@@ -94,9 +96,10 @@ class ChunkStore:
                 self._set_aside(entry)
                 continue
             self.entries[entry.first] = entry
-        for left in self.folder.glob("*.npz"):
+        known = {entry.file for entry in self.entries.values()}
+        for left in list(self.folder.iterdir()):
             # written, but not listed before the end: nobody vouches for it
-            if left.name not in {entry.file for entry in self.entries.values()}:
+            if re.fullmatch(r"[0-9]{5,}\.npz", left.name) and left.name not in known:
                 left.unlink(missing_ok=True)
         if self.corrupt or self._index() != b"".join(map(_line, listed)):
             write_safely(self.folder / INDEX, b"".join(map(_line, self.entries.values())))

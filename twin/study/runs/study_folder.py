@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -109,8 +110,9 @@ class StudyFolder:
                 self._make()
                 self._fresh = True
             self._take_lock(self.path)
-            for left in (place for place in owned_files.every_file(self.path) if place.endswith(durable.PARTIAL)):
-                (self.path / left).unlink(missing_ok=True)
+            for left in owned_files.every_file(self.path):
+                if re.fullmatch(f"(.*/)?{durable.PARTIAL_NAME}", left):
+                    (self.path / left).unlink(missing_ok=True)
             if (self.path / owned_files.STUDY_STATE).exists():
                 self._check_identity()
             else:

@@ -1,0 +1,42 @@
+"""Names that no file can have, and standard output that a full disk does not take: one line, and an exit code."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.tiers import quick
+
+ROOT = Path(__file__).resolve().parents[2]
+LONG = "x" * 5000
+COMMANDS = [
+    ("twin.operate", "status", LONG),
+    ("twin.verify", LONG),
+    ("twin.export", LONG),
+    ("twin.orbit", "export", LONG),
+    ("twin.compare", LONG, LONG),
+]
+
+
+def run(*words: str, **how: object) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, stderr=subprocess.PIPE, text=True, **how)
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@pytest.mark.parametrize("words", quick(1, [(words,) for words in COMMANDS]))
+def test_a_name_too_long_is_bad_input(words: tuple[str, ...]) -> None:
+    done = run(*words, stdout=subprocess.PIPE)
+    assert done.returncode == 2
+    assert "File name too long" in done.stderr
+
+
+@pytest.mark.parametrize("module", quick(2, ["twin.render", "analysis.mtf", "twin.operate", "scenes.lens"]))
+def test_help_that_a_full_disk_does_not_take(module: str) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = run(module, "--help", stdout=full)
+    assert done.returncode == 1
+    assert done.stderr == "error: cannot write to the standard output: No space left on device\n"
