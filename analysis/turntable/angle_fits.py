@@ -50,6 +50,8 @@ PERIODS = (1.05, 1.1, 1.25, 1.5, 2.0)
 """Fundamental periods of the Fourier series that are tried, in lengths of the range."""
 SMOOTHINGS = (0.0, *np.logspace(-8.0, 1.0, 46))
 """Smoothing parameters that are tried, for angles in units of the mean step and weights of mean one."""
+SLACK = 1e-9
+"""Radians within which an angle is that of a point."""
 GAP_ORDER = {"piecewise_linear": 2, "polynomial": 0, "cubic_spline": 4, "fourier": 0, "network": 0}
 """With which power of the step the error between points falls for a smooth curve: h^2 and h^4 for the local fits. The
 others miss what they have no terms for, wherever the points are.
@@ -104,6 +106,14 @@ class AngleFit:
         """Trace of the weights at the points: how many unknowns the fit in effect has."""
         return float(np.trace(self.weights(self.angle)))
 
+    def step_at(self, angle: ArrayLike) -> Array:
+        """Return the distance of the two points between which each angle lies, in the shape of the angles, radians."""
+        at = np.asarray(angle, np.float64)
+        steps = np.diff(self.angle)
+        # a point belongs to the smaller of its two steps
+        below, above = (np.searchsorted(self.angle, at + side, side="right") for side in (-SLACK, SLACK))
+        return np.asarray(np.minimum(*(steps[np.clip(k, 1, len(steps)) - 1] for k in (below, above))))
+
     def _inside(self, angle: Array) -> Array:
         low, high = self.range
         slack = 1e-9 * (high - low)
@@ -140,6 +150,25 @@ class CrossValidation:
     def excess(self) -> float:
         """Mean square of the residuals beyond the noise, not below zero."""
         return max(0.0, float(np.mean(self.residual**2 - self.variance)))
+
+
+def widest_step(angle: ArrayLike) -> float:
+    """Return the widest distance of neighbouring points, radians, over which a fit has been tried on its own points.
+
+    Cross-validation bridges the two steps beside a point that it leaves out. Nothing was tried over a wider gap, and
+    no sigma holds in it. A quarter of the points may lie beside such gaps.
+
+    Parameters
+    ----------
+    angle : (N,) array_like
+        Points of the fit, increasing, radians.
+    """
+    x = np.asarray(angle, np.float64)
+    bridged = x[2:] - x[:-2]
+    if not len(bridged):
+        return float(np.ptp(x)) + SLACK
+    tried = np.percentile(bridged, 75.0, method="lower")
+    return float(max(tried, 2.0 * np.median(np.diff(x))) * (1.0 + 1e-6))
 
 
 def fit(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike, seed: int = 0) -> AngleFit:

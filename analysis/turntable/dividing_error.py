@@ -346,7 +346,8 @@ class DividingCompensation:
     - the noise of the calibration points, propagated: A diag(sigma^2) A^T with A = `fit.weights`;
     - `common`^2 everywhere: a constant, as from calibration points that all lie at one phase of the grating's signal;
       it has no influence on differences of angles;
-    - `smooth`^2 times `step_kernel`: what the fit misses between its points, correlated over one step;
+    - `smooth`^2 times `step_kernel`: what the fit misses between its points, correlated over one step. It grows with
+      the step of the calibration around the reading as the fit's error does (`angle_fits.GAP_ORDER`);
     - `white`^2 on the diagonal: what changes from reading to reading, such as the subdivision error, whose period
       (arcseconds) is far below the distances of readings in use.
 
@@ -358,6 +359,8 @@ class DividingCompensation:
         common, smooth, white: standard deviations of the three misfits, radians.
         repeatability: of one comparison, radians; an upper limit of that of one reading, as it holds the reference's
             noise too.
+        bridged: step over which `smooth` holds, radians: one step of the calibration, two where no held-out angles were
+            there to judge single steps by.
     """
 
     fit: angle_fits.AngleFit
@@ -366,6 +369,7 @@ class DividingCompensation:
     smooth: float
     white: float
     repeatability: float
+    bridged: float
 
     @property
     def region(self) -> tuple[float, float]:
@@ -373,12 +377,25 @@ class DividingCompensation:
         return self.fit.range
 
     def error(self, reading: ArrayLike) -> Array:
-        """Estimated dividing error at the readings, in their shape, radians. ValueError outside of the region."""
-        return self.fit(reading)
+        """Estimated dividing error at the readings, in their shape, radians.
+
+        Raises
+        ------
+        UndeterminedError
+            A reading outside of the region, or in a gap of the calibration.
+        """
+        value = self.fit(reading)
+        if not np.all(inside := covered(self.fit.angle, reading)):
+            at = np.degrees(np.asarray(reading)[~inside].flat[0])
+            steps = ", ".join(f"{a:.4f} to {b:.4f}" for a, b in np.degrees(gaps(self.fit.angle)))
+            raise UndeterminedError(
+                f"{at:.4f} deg lies in a gap of the calibration ({steps} deg); calibrate there, too"
+            )
+        return value
 
     def correct(self, reading: ArrayLike) -> Array:
-        """True angles of the readings, in their shape, radians. ValueError outside of the region."""
-        return np.asarray(reading, np.float64) - self.fit(reading)
+        """True angles of the readings, in their shape, radians. UndeterminedError where `error` raises it."""
+        return np.asarray(reading, np.float64) - self.error(reading)
 
     def covariance(self, reading: ArrayLike, other: ArrayLike | None = None) -> Array:
         """Covariance (M, L) of the corrected angles at readings (M,) and (L,), or (M, M), rad^2; see the class.
@@ -387,13 +404,36 @@ class DividingCompensation:
         """
         first = np.atleast_1d(np.asarray(reading, np.float64))
         second = first if other is None else np.atleast_1d(np.asarray(other, np.float64))
-        misfit = self.smooth**2 * step_kernel(first, second, self.step)
+        amplitude, other_amplitude = (self._missed(at) for at in (first, second))
+        misfit = np.outer(amplitude, other_amplitude) * step_kernel(first, second, self.step)
         same = self.white**2 * (first[:, None] == second)
         return self.fit.covariance(first, second) + self.common**2 + misfit + same
+
+    def _missed(self, reading: Array) -> Array:
+        wide = np.maximum(1.0, self.fit.step_at(reading) / self.bridged)
+        return np.asarray(self.smooth * wide ** angle_fits.GAP_ORDER[self.fit.name])
 
     def sigma(self, reading: ArrayLike) -> Array:
         """Standard deviation of each corrected angle, (M,), radians."""
         return np.sqrt(np.diag(self.covariance(reading)))
+
+
+def gaps(angle: Array) -> Array:
+    """Return first and last angle of the gaps of a calibration at angles (N,), (K, 2): wider than was ever bridged."""
+    k = np.flatnonzero(np.diff(angle) > angle_fits.widest_step(angle))
+    return np.stack([angle[k], angle[k + 1]], axis=-1)
+
+
+def covered(angle: Array, reading: ArrayLike) -> NDArray[np.bool_]:
+    """Return which readings a calibration at angles (N,) covers, in the shape of the readings.
+
+    They lie between its first and last angle, and in no gap.
+    """
+    at, slack = np.asarray(reading, np.float64), angle_fits.SLACK
+    inside = (at >= angle[0] - slack) & (at <= angle[-1] + slack)
+    for first, last in gaps(angle):
+        inside &= (at <= first + slack) | (at >= last - slack)
+    return np.asarray(inside)
 
 
 def step_kernel(first: Array, second: Array, step: float) -> Array:
@@ -441,5 +481,6 @@ def compensate(
         noise = np.diag(held_out.sigma**2) + trial.fit.covariance(held_out.angle)
         common = max(0.0, float(np.mean(residual) ** 2 - np.mean(noise)))
         white = max(0.0, float(np.mean(residual**2) - np.mean(np.diag(noise))) - common - excess)
-    misfit = np.sqrt([common, excess, white]).tolist()
-    return DividingCompensation(trial.fit, series.step, misfit[0], misfit[1], misfit[2], series.repeatability)
+    common, smooth, white = np.sqrt([common, excess, white]).tolist()
+    bridged = series.step if held_out is not None else 2.0 * series.step
+    return DividingCompensation(trial.fit, series.step, common, smooth, white, series.repeatability, bridged)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from analysis.measurement_error import UndeterminedError
 from analysis.turntable.dividing_error import (
     CalibrationSeries,
     DividingCompensation,
     chauvenet,
     choose,
     compensate,
+    covered,
     normal_reduction,
     rejection_rate,
     step_kernel,
@@ -165,7 +167,7 @@ def test_covariance_matches_the_scatter() -> None:
 def test_covariance_of_two_sets_of_readings() -> None:
     calibration = series(6)
     choice = choose(calibration, names=("fourier",))
-    made = DividingCompensation(choice["fourier"].fit, calibration.step, 3e-8, 2e-8, 1e-8, 1e-7)  # type: ignore[arg-type]
+    made = DividingCompensation(choice["fourier"].fit, calibration.step, 3e-8, 2e-8, 1e-8, 1e-7, calibration.step)  # type: ignore[arg-type]
     both = np.radians([95.0, 95.1, 103.0])
     whole = made.covariance(both)
     np.testing.assert_allclose(made.covariance(both[:1], both[1:]), whole[:1, 1:], rtol=1e-12)
@@ -194,3 +196,33 @@ def test_a_series_without_noise() -> None:
 def test_bad_series(angle: list[float], comparisons: np.ndarray, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         CalibrationSeries(np.array(angle), comparisons)
+
+
+def slow_error(rng: np.random.Generator, reading: np.ndarray) -> np.ndarray:
+    """An error of a table of 1 arcsec with waves of 6 deg and longer, random for each table."""
+    waves = 2.0 * np.pi / np.radians(np.array([6.0, 11.0, 23.0, 60.0]))
+    size, phase = rng.normal(size=4) * ARCSEC, rng.uniform(0.0, 2.0 * np.pi, 4)
+    return np.asarray(size @ np.sin(waves[:, None] * reading + phase[:, None]))
+
+
+@pytest.mark.parametrize("name", ["cubic_spline", "piecewise_linear", pytest.param("fourier", marks=pytest.mark.slow)])
+def test_a_gap_is_outside_and_a_missing_angle_has_a_sigma_that_holds(name: str) -> None:
+    """One angle of 41 was not compared, and eight elsewhere in a row. The readings in the first gap are met by sigma,
+    whose mean square is one within four sigma of its own scatter over 25 tables; those in the second are refused.
+    """
+    angle = np.radians(np.delete(np.arange(-20.0, 20.5, 1.0), [10, *range(24, 32)]))
+    missing, ratios = np.radians(-10.0), []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        at = np.append(angle, missing)
+        truth = slow_error(rng, at)
+        series = CalibrationSeries(angle, truth[:-1, None] + rng.normal(0.0, 0.03 * ARCSEC, (len(angle), 8)), 1e-9)
+        made = compensate(series, choose(series, names=(name,)))
+        ratios.append((made.error(missing) - truth[-1]) / made.sigma(missing)[0])
+        for inside in (4.5, 8.0, 11.9):
+            with pytest.raises(UndeterminedError, match="lies in a gap of the calibration"):
+                made.correct(np.radians([0.0, inside]))
+    # the misfit is stated from all angles, so that sigma may be on the safe side
+    assert np.mean(np.square(ratios)) < 1.0 + 4.0 * np.sqrt(2.0 / len(ratios))
+    assert not np.any(covered(angle, np.radians([3.5, 8.0, 20.1])))
+    assert np.all(covered(angle, np.radians([-20.0, -10.0, 3.0, 12.0, 20.0])))

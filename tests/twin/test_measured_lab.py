@@ -307,6 +307,57 @@ def test_reference_angles_and_positions_in_place_of_differences(folder: Path) ->
     np.testing.assert_allclose(after.angle, before.angle, atol=1.0 * ARCSEC)
 
 
+def shifted(path: Path, head: str, off: float, circle: bool = False) -> None:
+    """Move the readings of a table by so many degrees, and count them over a full circle."""
+    rows = rows_of(path)
+    k = rows[0].index(head)
+    for row in rows[1:]:
+        at = float(row[k]) + off
+        row[k] = repr(at % 360.0 if circle else at)
+    write(path, rows)
+
+
+@pytest.mark.parametrize("around", [0.0, 355.0])
+def test_readings_across_the_zero_of_the_circle(folder: Path, around: float) -> None:
+    """A table that counts from 0 to 360 deg and is used on both sides of its zero: as if it had counted on."""
+    middle = 0.5 * sum(float(rows_of(folder / "comparisons.csv")[k][0]) for k in (1, -1))
+    text = (folder / "distortion.yaml").read_text()
+    zero = float(re.search(r"zero: (-?[\d.]+) deg", text)[1])  # type: ignore[index]
+    states = []
+    for circle in (False, True):
+        for name in ("comparisons.csv", "held_out.csv", "spots.csv"):
+            shutil.copy(EXAMPLES / name, folder / name)
+            shifted(folder / name, "reading [deg]", around - middle, circle)
+        at = around - middle + zero
+        at = at % 360.0 if circle else at
+        (folder / "distortion.yaml").write_text(text.replace(f"zero: {zero:g} deg", f"zero: {at!r} deg"))
+        assert f"zero: {at!r}" in (folder / "distortion.yaml").read_text()
+        states.append((turntable_of(folder).series, distortion_of(folder)))
+    (straight, one), (wrapped, other) = states
+    turns = (wrapped.angle - straight.angle) / (2.0 * math.pi)
+    np.testing.assert_allclose(turns, np.rint(turns[0]), atol=1e-12)
+    np.testing.assert_array_equal(wrapped.mean, straight.mean)
+    f = "principal_distance"
+    # rounding of degrees of 360 in radians: 1e-13 of the angles
+    assert other.compensated.fit.value(f) == pytest.approx(one.compensated.fit.value(f), rel=1e-11)
+    assert other.compensated.fit.sigma(f) == pytest.approx(one.compensated.fit.sigma(f), rel=1e-6)
+
+
+def test_a_reading_in_a_gap_of_the_calibration_is_outside(folder: Path) -> None:
+    """From 98.5 to 102 deg nothing was compared: readings there are refused with their line, also held-out ones."""
+    rows = rows_of(folder / "comparisons.csv")
+    write(folder / "comparisons.csv", [rows[0], *(row for row in rows[1:] if not 98.9 < float(row[0]) < 101.9)])
+    text = (folder / "distortion.yaml").read_text()
+    (folder / "distortion.yaml").write_text(text.replace("    held_out: held_out.csv\n", ""))
+    refused = r"spots.csv:\d+: reading.*outside of the calibrated readings.*without the gap"
+    with pytest.raises(InputError, match=refused):
+        distortion_of(folder)
+    code, told = run("turntable", folder / "turntable.yaml", "--out", folder / "out", "--quiet")
+    assert code == 2
+    assert "held_out.csv" in told
+    assert "a held-out reading beyond the calibrated ones" in told
+
+
 def test_missing_repeats_cost_only_their_own_angle(folder: Path) -> None:
     whole = turntable_of(folder).series
     head, *body = rows_of(folder / "comparisons.csv")

@@ -21,13 +21,20 @@ from analysis.orientation.distortion_model import OrientationError, distortion, 
 from analysis.orientation.distortion_model import principal_distance_and_point as distance_and_point
 from analysis.spots.spot_positions import SpotError
 from analysis.turntable.angle_fits import FITS
-from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
+from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate, covered
 from optics.numerics.backend import Backend
 from scenes.specs.camera_tests import DistortionFiles, DistortionTestSpec, MeasuredDistortionSpec
 from scenes.specs.resolved import DistortionSetup, ExperimentSetup, MeasuredDistortionSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth
-from twin.laboratory.measured_readings import Comparisons, SpotReadings, read_spots, read_turntable
+from twin.laboratory.measured_readings import (
+    Comparisons,
+    SpotReadings,
+    calibrated_text,
+    read_spots,
+    read_turntable,
+    unwrapped,
+)
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import usable_fits
 from twin.run.procedure import Advance, BenchError, silent
@@ -288,20 +295,23 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
     """
     files = spec.measured
     found = read_spots(files)
-    compensation, series = None, None
+    compensation, series, zero = None, None, files.zero
     tables: tuple[Comparisons, ...] = ()
     if files.turntable is not None:
         tables = read_turntable(files.turntable)
         cal, *held = tables
         series = cal.series
-        _check_region(files, found, series)
+        # whole turns between the calibration's readings and those of the test
+        turns = unwrapped(np.array([files.zero]), 0.5 * float(series.angle[0] + series.angle[-1]))[0] - files.zero
+        zero, found = files.zero + turns, replace(found, reading=found.reading + turns)
+        _check_region(files, found, series, zero)
         names, _ = usable_fits(files.turntable, cal, CLOSED_FORMS)
         choice = choose(series, seed, names, files.turntable.folds)
         compensation = compensate(series, choice, held[0].series if held else None)
-    _check_angles(files, found)
+    _check_angles(files, found, zero)
     scatter = files.angle_sigma or 0.0, files.reversed, found.present
     try:
-        reduced = reduce(found.reading, found.spots, files.zero, spec.principal_distance, compensation, *scatter)
+        reduced = reduce(found.reading, found.spots, zero, spec.principal_distance, compensation, *scatter)
     except OrientationError as error:
         text = str(error).removeprefix("interior orientation: ")
         allowed = "reversed: true, where readings rise as places fall" if "opposite senses" in text else None
@@ -317,14 +327,13 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
     )
 
 
-def _check_region(files: DistortionFiles, found: SpotReadings, series: CalibrationSeries) -> None:
+def _check_region(files: DistortionFiles, found: SpotReadings, series: CalibrationSeries, zero: float) -> None:
     """InputError unless the turntable is calibrated wherever it was read."""
-    first, last = series.angle[[0, -1]]
-    allowed = f"{np.degrees(first):.9g} to {np.degrees(last):.9g} deg, where the turntable is calibrated"
-    if not first <= files.zero <= last:
+    allowed = f"{calibrated_text(series.angle)}, where the turntable is calibrated"
+    if not covered(series.angle, zero):
         shown = f"{np.degrees(files.zero):.9g} deg"
         raise files.error("outside of the calibrated readings", ("zero",), found=shown, allowed=allowed)
-    beyond = ((found.reading < first) | (found.reading > last)) & (found.lines > 0)
+    beyond = ~covered(series.angle, found.reading) & (found.lines > 0)
     if np.any(beyond):
         place = np.argwhere(beyond)[0]
         shown = f"{np.degrees(found.reading[tuple(place)]):.9g} deg"
@@ -333,9 +342,9 @@ def _check_region(files: DistortionFiles, found: SpotReadings, series: Calibrati
         raise InputError(Issue(text, found.file.file, line, (found.head,), shown, allowed))
 
 
-def _check_angles(files: DistortionFiles, found: SpotReadings) -> None:
+def _check_angles(files: DistortionFiles, found: SpotReadings, zero: float) -> None:
     """InputError for readings that are far from the zero, which is a mistaken zero or unit."""
-    off = np.abs(found.reading - files.zero) * (found.lines > 0)
+    off = np.abs(found.reading - zero) * (found.lines > 0)
     if np.max(off) > WIDEST:
         place = np.unravel_index(int(np.argmax(off)), off.shape)
         shown = f"{np.degrees(found.reading[place]):.9g} deg, {np.degrees(off[place]):.4g} deg from the zero"

@@ -5,14 +5,15 @@ Rows are sorted before anything is computed, so that their order in a file chang
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.orientation.measurement import CALIBRATED, Spots
-from analysis.turntable.dividing_error import CalibrationSeries
+from analysis.turntable.dividing_error import CalibrationSeries, covered, gaps
+from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera_tests import DistortionFiles
 from scenes.specs.turntable import TurntableFiles
 from scenes.yaml.csv_table import Column, Table, read_table
@@ -116,26 +117,54 @@ def read_turntable(files: TurntableFiles) -> tuple[Comparisons, ...]:
     series = read_comparisons(files.comparisons, files.reference)
     if files.held_out is None:
         return (series,)
-    held_out = read_comparisons(files.held_out, files.reference, fewest=1)
-    first, last = series.series.angle[[0, -1]]
-    beyond = (held_out.series.angle < first) | (held_out.series.angle > last)
+    own = series.series.angle
+    held_out = read_comparisons(files.held_out, files.reference, fewest=1, around=0.5 * float(own[0] + own[-1]))
+    beyond = ~covered(own, held_out.series.angle)
     if np.any(beyond):
         k = int(np.argmax(beyond))
         found = f"{np.degrees(held_out.series.angle[k]):.9g} deg"
-        allowed = f"{np.degrees(first):.9g} to {np.degrees(last):.9g} deg, as {files.comparisons} has it"
+        allowed = f"{calibrated_text(own)}, as {files.comparisons} has it"
         line = int(held_out.lines[k].max())
         text = "a held-out reading beyond the calibrated ones"
         raise InputError(Issue(text, held_out.file.file, line, (held_out.head,), found, allowed))
     return series, held_out
 
 
-def read_comparisons(path: str, reference_sigma: float, fewest: int = 4) -> Comparisons:
+def calibrated_text(angle: Array) -> str:
+    """Return where a turntable is calibrated at angles (N,), in words: the region, and the gaps in it."""
+    holes = [f"{a:.9g} to {b:.9g}" for a, b in np.degrees(gaps(angle))]
+    first, last = np.degrees(angle[[0, -1]])
+    return f"{first:.9g} to {last:.9g} deg" + (f" without the gaps {', '.join(holes)} deg" if holes else "")
+
+
+def unwrapped(reading: Array, around: float | None = None) -> Array:
+    """Return readings of a circle without a jump of a whole turn among them.
+
+    Parameters
+    ----------
+    reading : (N,) ndarray
+        Readings, radians.
+    around : float, optional
+        Reading from which none shall be farther than half a turn. By default the circle is cut in its widest arc
+        without a reading: 350, 355, 0, 5 deg become -10, -5, 0, 5 deg.
+    """
+    if around is not None:
+        return reading - CIRCLE * np.rint((reading - around) / CIRCLE)
+    rank = np.sort(reading)
+    steps = np.diff(rank)
+    if not len(steps) or np.max(steps) <= CIRCLE - (rank[-1] - rank[0]):
+        return reading
+    return np.where(reading > rank[int(np.argmax(steps))], reading - CIRCLE, reading)
+
+
+def read_comparisons(path: str, reference_sigma: float, fewest: int = 4, around: float | None = None) -> Comparisons:
     """A table of comparisons of a turntable with a reference.
 
     Args:
         path: of the CSV file.
         reference_sigma: of the reference's certificate, radians.
         fewest: different angles.
+        around: as of `unwrapped`.
 
     Raises:
         InputError: with file, line and column.
@@ -145,7 +174,8 @@ def read_comparisons(path: str, reference_sigma: float, fewest: int = 4) -> Comp
         found = "neither" if "difference" not in table else "both"
         allowed = "'difference [arcsec]', reading minus reference, or 'reference [deg]'"
         raise InputError(Issue("one column has to say what the reference read", path, 1, (), found, allowed))
-    reading = table["reading"]
+    reading = unwrapped(table["reading"], around)
+    table = replace(table, columns=FrozenMap({**table.columns, "reading": reading}))
     if "difference" in table:
         value = table["difference"]
     else:
@@ -198,7 +228,7 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
         raise InputError(
             Issue("sets of points that have no number", files.spots, 1, allowed="a column 'point' as well")
         )
-    reading = table["reading"]
+    reading = unwrapped(table["reading"], files.zero)
     group = (
         np.unique(table["point"], return_inverse=True)[1]
         if numbered

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import chi2
 
+from analysis.turntable.dividing_error import covered, gaps
 from analysis.units import ARCSEC
 from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
@@ -80,7 +81,7 @@ def curve_figure(run: TurntableRun) -> Figure:
     axes = figure.subplots()
     if run.model is not None:
         axes.plot(np.degrees(at), _slow_truth(run.model, at) / ARCSEC, color=INK, lw=2.4, alpha=0.35, label="truth")
-    fitted = run.fits[chosen](at) / ARCSEC
+    fitted = np.where(covered(series.angle, at), run.fits[chosen](at) / ARCSEC, np.nan)
     axes.plot(np.degrees(at), fitted, color=COLOURS[chosen], lw=1.1, label=f"chosen fit: {FIT_NAMES[chosen]}")
     for points, mark, colour, label in ((series, "o", INK, "calibrated"), (held, "s", VERMILION, "held out")):
         if points is None:
@@ -393,6 +394,9 @@ def _warnings(run: TurntableRun, data: Mapping[str, Any]) -> tuple[str, ...]:
             f"held-out readings scatter more than the compensation states: chi-square {data['heldout_chi_square']:.0f} "
             f"for {data['heldout_degrees_of_freedom']} degrees of freedom, by chance once in {1.0 / tail:.0f}"
         )
+    if len(holes := np.degrees(gaps(run.series.angle))):
+        arcs = ", ".join(f"{first:.9g} to {last:.9g} deg" for first, last in holes)
+        warnings.append(f"the calibration has gaps in which no reading is compensated: {arcs}")
     if data["suspect_angles"]:
         warnings.append(f"angles whose kept repeats scatter more than their number allows: {data['suspect_angles']}")
     return tuple(warnings)

@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from scenes.yaml.errors import InputError, nearest
-from scenes.yaml.standard_output import FAILURE, print_error
+from scenes.yaml.standard_output import BAD_INPUT, FAILURE, print_error
 from twin.operate.estimate_commands import alarms, estimate_of, forecast, show_estimate
 from twin.operate.followed import PlanFile
 from twin.operate.life_commands import judge, simulate
@@ -26,7 +26,6 @@ from twin.operate.shown_commands import report, serve
 from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run import durable
 from twin.run.cli import (
-    BAD_INPUT,
     INTERRUPTED,
     AsJson,
     InputErrorText,

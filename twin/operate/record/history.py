@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sqlalchemy import Connection, delete, func, insert, or_, select
+from sqlalchemy import Connection, RowMapping, delete, func, insert, or_, select
 from sqlalchemy.exc import IntegrityError
 
 from optics.numerics.backend import load_backend
@@ -499,7 +499,7 @@ def _altered(connection: Connection, newest: int | None) -> tuple[int, list[str]
     return len(rows), wrong[::-1]
 
 
-def _digest(row: Mapping[str, Any]) -> str:
+def _digest(row: RowMapping) -> str:
     try:
         content = json.loads(row["content"])
     except ValueError:
