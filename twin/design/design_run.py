@@ -102,8 +102,6 @@ def run_design(
     if worst > BLURRED:
         told = f"{worst:.3g} waves rms in its worst field, more than {BLURRED:g}"
         warnings.append(f"camera {spec.name} is blurred: {told}")
-    if not found.converged:
-        warnings.append(f"the search for {spec.name} was still getting better when it ended, after {ITERATIONS} steps")
     return DesignRun(setup, searched, spec.file_text(remark), tuple(warnings))
 
 
@@ -161,7 +159,14 @@ DESIGN: Record[DesignRun] = Record(
     Quantity("improved", lambda run: run.found.improved, "whether the new camera is better"),
     Quantity("held_by", lambda run: run.found.held, "what keeps it from more, the dearest first", record=HELD_BY),
     Quantity("jacobians", lambda run: run.found.evaluations, "Jacobians that were traced for the best"),
-    Quantity("converged", lambda run: run.found.converged, "whether the best search settled"),
+    Quantity(
+        "converged",
+        lambda run: run.found.converged,
+        "whether the best search settled",
+        warning=lambda run: (
+            f"the search for {run.setup.test.name} was still getting better when it ended, after {ITERATIONS} steps"
+        ),
+    ),
     Quantity("starts", lambda run: run.searched.attempts, "what came of every start", record=START),
     Quantity("starts_at_best", lambda run: run.searched.agreeing, "starts that end within a share of the best"),
     Quantity("local_optimum", lambda run: run.searched.local, "whether starts end at different cameras"),

@@ -14,7 +14,7 @@ from twin.laboratory.focus_bench import BudgetLine
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState
 from twin.laboratory.focus_scan import VERTEX_ERROR
 from twin.laboratory.measured_focus import NoEdge
-from twin.laboratory.turntable_numbers import DATA_FILE
+from twin.laboratory.turntable_numbers import DATA_FILE, likely
 from twin.run.quantity import Quantity, Record
 from twin.targets.target_images import ALONG, TRACK
 
@@ -190,6 +190,7 @@ MEASURED: Record[FocusRun] = Record(
     Quantity("expected_confocal_um_sigma", lambda r: r.shimmings[0].expected[1], "standard deviation"),
     Quantity("curves_chi_square", lambda r: r.chi_square[0], "of all curves through focus together"),
     Quantity("curves_degrees_of_freedom", lambda r: r.chi_square[1], "of all curves through focus together"),
+    Quantity("curves_agree", lambda r: likely(*r.chi_square), "whether that is likely"),
     Quantity("sites", lambda r: PLACES.rows(_standing(r)), "all places"),
     Quantity("images_without_edge", lambda r: r.readings and r.readings.no_edge, "not measured", record=NO_EDGE),
     Quantity("files", lambda r: r.readings and [r.readings.file], "that were read", record=DATA_FILE),

@@ -8,10 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.monitor.unseen_motions import UnseenMode
+from scenes.specs.course import moment
+from scenes.yaml.errors import names_text
 from twin.orbit.loop.line_images import ImagedPair
-from twin.orbit.loop.loop_run import LoopFacts, LoopPass, LoopRun, height_rms
+from twin.orbit.loop.loop_run import GAIN_MARGIN, PHASE_MARGIN_DEG, LoopFacts, LoopPass, LoopRun, height_rms
 from twin.orbit.monitoring.monitoring_numbers import SUMMARY
 from twin.orbit.monitoring.monitoring_run import rms
+from twin.run.artefact import significant
 from twin.run.quantity import Quantity, Record
 
 Array = NDArray[np.float64]
@@ -105,8 +108,24 @@ PASS: Record[tuple[LoopRun, LoopPass]] = Record(
     Quantity("chi_square", lambda of: float(of[1].course.chi_square.sum()), "of all readings"),
     Quantity("degrees_of_freedom", lambda of: of[1].course.degrees, "of chi-square"),
     Quantity("chi_square_limit", lambda of: of[1].course.limit, "of chi-square"),
-    Quantity("agrees", lambda of: of[1].course.agrees, "whether the readings are as stated, together and one by one"),
+    Quantity(
+        "agrees",
+        lambda of: of[1].course.agrees,
+        "whether the readings are as stated, together and one by one",
+        warning=lambda of: _contradicted(*of),
+    ),
 )
+
+
+def _contradicted(run: LoopRun, one: LoopPass) -> str:
+    course, label = one.course, "closed" if one is run.closed else "open"
+    at = course.contradiction
+    where = "" if at is None else f", first at {moment(float(course.times[at]))}"
+    return (
+        f"with the loop {label} the readings contradict what is stated to move{where}: chi-square "
+        f"{course.chi_square.sum():.4g} of {course.degrees} degrees of freedom, limit {course.limit:.4g}; the "
+        "posterior's sigmas are not reliable"
+    )
 
 
 def positions(run: LoopRun, name: str) -> Array:
@@ -127,7 +146,15 @@ CORRECTION: Record[tuple[LoopRun, str, LoopFacts]] = Record(
     Quantity("gain_limit", lambda of: of[2].margins.limit, "below which this loop is stable"),
     Quantity("gain_margin", lambda of: _known(of[2].margins.gain), "the limit over the loop gain; null for gain 0"),
     Quantity("phase_margin_deg", lambda of: _known(of[2].margins.phase_deg), converted=False),
-    Quantity("stable", lambda of: of[2].margins.stable, "by itself"),
+    Quantity(
+        "stable",
+        lambda of: of[2].margins.stable,
+        "by itself",
+        warning=lambda of: (
+            f"{of[1]} is unstable by itself: its loop gain of {of[2].loop_gain:.3g} is not below "
+            f"{of[2].margins.limit:.3g}, the limit of a delay of {of[2].corrector.spec.delay}"
+        ),
+    ),
     Quantity(
         "cycle_steps", lambda of: None if of[2].cycle is None else of[2].cycle.steps, "of the limit cycle, peak to peak"
     ),
@@ -171,6 +198,19 @@ def angle_of(run: LoopRun, mode: UnseenMode) -> float:
     return float(run.open.angle @ run.model.stated.parameters @ mode.motions)
 
 
+def _barely_stable(run: LoopRun) -> str:
+    near = [
+        name
+        for name, one in run.loops.items()
+        if one.margins.gain < GAIN_MARGIN or one.margins.phase_deg < PHASE_MARGIN_DEG
+    ]
+    return (
+        f"the loop is barely stable: gains {significant(run.margin, 3)} times as large make it unstable, phase margin "
+        f"{run.phase_deg:.0f} deg; it amplifies what it should take away. At least {GAIN_MARGIN:g} times and "
+        f"{PHASE_MARGIN_DEG:g} deg are usual: lower the gain of {names_text(near or list(run.loops))}"
+    )
+
+
 LOOP: Record[LoopRun] = Record(
     "loop.json.",
     Quantity("seed", lambda run: run.seed, "of all random numbers"),
@@ -185,7 +225,22 @@ LOOP: Record[LoopRun] = Record(
     Quantity("gain_margin", lambda run: _known(run.margin), "of all loops together"),
     Quantity("phase_margin_deg", lambda run: _known(run.phase_deg), "the smallest", converted=False),
     Quantity("spectral_radius", lambda run: run.radius, "of all loops together; below 1 errors decay"),
-    Quantity("stable", lambda run: run.stable, "whether it is"),
+    Quantity(
+        "stable",
+        lambda run: run.stable,
+        "whether it is",
+        warning=lambda run: (
+            f"the loops together are unstable: their largest eigenvalue is {run.radius:.3g}; gains below "
+            f"{significant(run.margin, 3)} times the stated ones are stable"
+        ),
+    ),
+    Quantity(
+        "margins_hold",
+        lambda run: run.margins_hold if run.stable else None,
+        f"whether gain and phase margins are {GAIN_MARGIN:g} and {PHASE_MARGIN_DEG:g} deg at least; null if unstable",
+        warning=_barely_stable,
+    ),
+    Quantity("made_worse", lambda run: list(run.worse), "errors that are larger with the loop closed"),
     Quantity("largest_ratios", lambda run: run.ratios, "quantity -> largest error of the posterior over its sigma"),
     Quantity("ratio_limit", lambda run: run.ratio_limit, "of these"),
     Quantity("times_s", lambda run: run.closed.course.times, "of the readings"),

@@ -116,7 +116,16 @@ PROPAGATION: Record[MonitorRun] = Record(
     Quantity("ratio", lambda run: run.scatter.spread / run.scatter.sigma, "spread over sigma"),
     Quantity("lower_limit", lambda run: run.scatter.limits[0], "of the ratio"),
     Quantity("upper_limit", lambda run: run.scatter.limits[1], "of the ratio"),
-    Quantity("agrees", lambda run: run.scatter.agrees, "whether the ratio lies within the limits"),
+    Quantity(
+        "agrees",
+        lambda run: run.scatter.agrees,
+        "whether the ratio lies within the limits",
+        warning=lambda run: (
+            "scatter and propagated sigma of the heights differ: ratio "
+            f"{run.scatter.spread / run.scatter.sigma:.3g}, limits {run.scatter.limits[0]:.2f} to "
+            f"{run.scatter.limits[1]:.2f}"
+        ),
+    ),
 )
 SMOOTHED: Record[tuple[MonitorRun, float, Smoothing]] = Record(
     "Heights by values smoothed from the measurements at one interval.",
@@ -147,6 +156,24 @@ SMOOTHING: Record[MonitorRun] = Record(
     Quantity("cameras", _readings, "changes at the file's interval, with sigmas"),
     Quantity("height_error_m", lambda run: _unsigned(run.smoothed.error), "mean height error over the times"),
     Quantity("height_m_sigma", lambda run: _unsigned(run.smoothed.sigma), "its standard deviation by the smoother"),
+    Quantity(
+        "shifts_agree",
+        lambda run: run.smoothed.consistency.agrees,
+        "whether the measurements at the file's interval agree with the prior",
+        warning=lambda run: (
+            f"the measured shifts contradict the prior: chi-square {run.smoothed.consistency.chi_square:.4g}, limit "
+            f"{run.smoothed.consistency.limit:.4g}; the sigmas are not reliable"
+        ),
+    ),
+    Quantity(
+        "agrees",
+        lambda run: run.smoothed.agrees,
+        "whether heights smoothed from them are as wrong as their sigma says",
+        warning=lambda run: (
+            f"smoothed heights are wrong by up to {run.smoothed.furthest:.3g} of their sigma, limit "
+            f"{run.smoothed.limit:.2f}"
+        ),
+    ),
     Quantity("intervals", lambda run: [(run, *item) for item in run.smoothing.items()], record=SMOOTHED),
 )
 PART: Record[Array] = Record(
