@@ -367,12 +367,9 @@ def _series_contradicted(run: RenderRun) -> str:
     series = run.series
     if series is None or series.smoothed is None or series.smoothed.consistency.agrees:
         return ""
-    errors = [
-        np.abs(row.value - series.readings.row(row.group, row.parameter.key, run.judged).true) / row.sigma
-        for row in series.smoothed.changes
-        if row.group != GROUND_GROUP
-    ]
-    worst = float(np.max(errors))
+    true = {(row.group, row.parameter.key): row.true for row in series.readings}
+    found = [row for row in series.smoothed.changes if row.group != GROUND_GROUP]
+    worst = max(float(np.max(np.abs(r.value - true[r.group, r.parameter.key]) / r.sigma)) for r in found)
     off = f": they are off by up to {significant(worst, 3)} σ" if worst > FAR else ""
     return (
         f"the course contradicts the prior {series.smoothed.name} or its time laws, and σ of filtered and smoothed "

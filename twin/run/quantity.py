@@ -116,15 +116,12 @@ class Quantity(Generic[S]):
         return self.record(found)
 
 
-def _sources(found: Any) -> Iterator[Any]:
-    """Yield the sources of a record that `Quantity.of` may give: one, several, by name, or by name and name."""
-    if not isinstance(found, Mapping | list | tuple):
-        yield found
-    elif isinstance(found, Mapping):
-        for below in found.values():
-            yield from _sources(below) if isinstance(below, Mapping) else (below,)
-    else:
-        yield from found
+def _sources(found: Any) -> list[Any]:
+    """Return the sources of a record: none for None, one, those of a list, or of a mapping and the mappings in it."""
+    several = list(found.values()) if isinstance(found, Mapping) else found
+    if isinstance(several, list):
+        return [source for below in several for source in _sources(below)]
+    return [] if found is None else [found]
 
 
 def _by_name(record: Record[Any], sources: Mapping[str, Any]) -> dict[str, Any]:
@@ -173,7 +170,7 @@ class Record(Generic[S]):
                 yield one.warning(source)
             if one.record is not None:
                 found = one.of(source)
-                for below in [] if found is None else _sources(found):
+                for below in _sources(list(found) if isinstance(found, tuple) else found):
                     yield from one.record.warnings(below)
 
     def of_part(self, part: Callable[[T], S]) -> list[Quantity[T]]:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from analysis.monitor.unseen_motions import UnseenMode
 from scenes.specs.course import moment
-from scenes.yaml.errors import names_text
 from twin.orbit.loop.line_images import ImagedPair
 from twin.orbit.loop.loop_run import GAIN_MARGIN, PHASE_MARGIN_DEG, LoopFacts, LoopPass, LoopRun, height_rms
 from twin.orbit.monitoring.monitoring_numbers import SUMMARY
@@ -199,15 +198,11 @@ def angle_of(run: LoopRun, mode: UnseenMode) -> float:
 
 
 def _barely_stable(run: LoopRun) -> str:
-    near = [
-        name
-        for name, one in run.loops.items()
-        if one.margins.gain < GAIN_MARGIN or one.margins.phase_deg < PHASE_MARGIN_DEG
-    ]
+    nearest = min(run.loops, key=lambda name: run.loops[name].margins.gain)
     return (
         f"the loop is barely stable: gains {significant(run.margin, 3)} times as large make it unstable, phase margin "
         f"{run.phase_deg:.0f} deg; it amplifies what it should take away. At least {GAIN_MARGIN:g} times and "
-        f"{PHASE_MARGIN_DEG:g} deg are usual: lower the gain of {names_text(near or list(run.loops))}"
+        f"{PHASE_MARGIN_DEG:g} deg are usual: lower gains, that of {nearest} first"
     )
 
 
@@ -237,7 +232,7 @@ LOOP: Record[LoopRun] = Record(
     Quantity(
         "margins_hold",
         lambda run: run.margins_hold if run.stable else None,
-        f"whether gain and phase margins are {GAIN_MARGIN:g} and {PHASE_MARGIN_DEG:g} deg at least; null if unstable",
+        f"whether they are {GAIN_MARGIN:g} and {PHASE_MARGIN_DEG:g} deg at least; null if unstable",
         warning=_barely_stable,
     ),
     Quantity("made_worse", lambda run: list(run.worse), "errors that are larger with the loop closed"),
