@@ -547,20 +547,18 @@ _UNIT_WORDS = frozenset(UNITS) | {"m2", "mm2", "um2"}
 def unit_of(key: KeyPath) -> str:
     """Return the unit that a result's key says, empty if it says none: "um" for d_f_um, d_f_um_sigma_noise and other
     keys whose last words, after the unit, say which number it is (d_f_um_true), "m/arcsec" for height_m_per_arcsec,
-    "1/mm" for nyquist_per_mm.
+    "1/mm" for nyquist_per_mm. A name below such a key has its unit: "um" for defocus_um, centre.
     """
-    last = next((str(part) for part in reversed(key) if isinstance(part, str)), "")
-    last = last.removesuffix(NOISE).removesuffix(TOTAL)
-    words = last.split("_")
+    *above, last = [str(part) for part in key if isinstance(part, str)] or [""]
+    words = last.removesuffix(NOISE).removesuffix(TOTAL).split("_")
     while "per" not in words and len(words) > 1 and words[-1] not in _UNIT_WORDS:
         words.pop()
     last = "_".join(words)
     endings = [ending for ending in UNITS if last.endswith(f"_{ending}")]
     if not endings:
-        return ""
+        return unit_of(above[-1:]) if above else ""
     ending = max(endings, key=len)
-    above = last.removesuffix(f"_{ending}")
-    if not above.endswith("_per"):
+    first = last.removesuffix(f"_{ending}")
+    if not first.endswith("_per"):
         return UNITS[ending]
-    above = above.removesuffix("_per")
-    return f"{unit_of((f'_{above}',)) or 1}/{UNITS[ending]}"
+    return f"{unit_of(('_' + first.removesuffix('_per'),)) or 1}/{UNITS[ending]}"

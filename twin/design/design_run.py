@@ -126,10 +126,15 @@ def _chief_rays(run: DesignRun) -> dict[str, np.ndarray]:
     return {"before": angles(found.begun), "after": angles(found.prescription)}
 
 
+def _anamorphism(held: Held) -> bool:
+    return held.name.startswith("anamorphism")
+
+
 HELD_BY: Record[Held] = Record(
     "A constraint that keeps the camera from becoming better.",
     Quantity("constraint", lambda held: held.name, "its name"),
-    Quantity("limit_m", lambda held: held.limit, "its limit; of the anamorphism a pure number"),
+    Quantity("limit_m", lambda held: None if _anamorphism(held) else held.limit, "its limit"),
+    Quantity("limit_percent", lambda held: held.limit if _anamorphism(held) else None, "likewise of the anamorphism"),
     Quantity("broken_at_start_m", lambda held: max(held.start, 0.0), "by how much the start breaks it"),
     Quantity(
         "worth_waves_per_mm", lambda held: 1e-3 * held.worth, "fall of the error when it is eased", converted=False
@@ -197,22 +202,30 @@ def verdict(run: DesignRun) -> str:
     held = tuple(one for one in found.held if 1e-3 * one.worth > WORTH * rms_error(found.after))
     if found.improved:
         text = f"Improved: {name} has a wavefront error of {errors}"
-        return f"{text}; more is held by {_held_text(held, start)}." if held else f"{text}."
+        return (
+            f"{text}; more is held by {_held_text(held, start, found.before.distance_across)}." if held else f"{text}."
+        )
     if held:
-        return f"Not improved, held by {_held_text(held, start)}: a wavefront error of {errors}."
+        return f"Not improved, held by {_held_text(held, start, found.before.distance_across)}: a wavefront error of {errors}."
     return f"Not improved: nothing that varies makes {start} better; {name} has a wavefront error of {errors}."
 
 
-def _held_text(held: tuple[Held, ...], start: str) -> str:
-    """The dearest constraints, at most three, each with by how much."""
+def _held_text(held: tuple[Held, ...], start: str, across: float) -> str:
+    """Return the dearest constraints, at most three, each with by how much.
+
+    Args:
+        held: the constraints.
+        start: name of the camera that the design starts from.
+        across: its principal distance across the line, metres, of which the anamorphism is a share.
+    """
     parts = []
     for one in held[:3]:
-        if one.name.startswith("anamorphism"):
-            limit = f"{100 * one.limit:.4g} %"
-        else:
-            limit = f"{one.limit:.6g} m" if one.limit > 1.0 else f"{1e3 * one.limit:.4g} mm"
+        limit = f"{one.limit:.6g} m" if one.limit > 1.0 else f"{1e3 * one.limit:.4g} mm"
+        step, unit = 1e-3, "mm"
+        if _anamorphism(one):
+            limit, step, unit = f"{100 * one.limit:.4g} %", 1e-2 * across, "%"
         text = f"the {one.name} ({limit}"
         if one.start > HELD:
-            text += f", which {start} breaks by {1e3 * one.start:.3g} mm"
-        parts.append(f"{text}; easing it by 1 mm is worth {1e-3 * one.worth:.2g} waves)")
+            text += f", which {start} breaks by {one.start / step:.3g} {unit}"
+        parts.append(f"{text}; easing it by 1 {unit} is worth {step * one.worth:.2g} waves)")
     return " and ".join(parts)
