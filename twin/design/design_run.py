@@ -150,6 +150,12 @@ START: Record[Attempt] = Record(
     Quantity("jacobians", _known(lambda found: found.evaluations), "Jacobians that were traced"),
     Quantity("problem", lambda attempt: attempt.problem, "why the constraints cannot be held, empty where they can"),
 )
+
+
+def _unsettled(run: DesignRun) -> str:
+    return f"the search for {run.setup.test.name} was still getting better when it ended, after {ITERATIONS} steps"
+
+
 DESIGN: Record[DesignRun] = Record(
     "design.json: an optimised camera, before and after.",
     Quantity("camera", lambda run: run.setup.test.name, "name of the new camera"),
@@ -164,14 +170,7 @@ DESIGN: Record[DesignRun] = Record(
     Quantity("improved", lambda run: run.found.improved, "whether the new camera is better"),
     Quantity("held_by", lambda run: run.found.held, "what keeps it from more, the dearest first", record=HELD_BY),
     Quantity("jacobians", lambda run: run.found.evaluations, "Jacobians that were traced for the best"),
-    Quantity(
-        "converged",
-        lambda run: run.found.converged,
-        "whether the best search settled",
-        warning=lambda run: (
-            f"the search for {run.setup.test.name} was still getting better when it ended, after {ITERATIONS} steps"
-        ),
-    ),
+    Quantity("converged", lambda run: run.found.converged, "whether the best search settled", warning=_unsettled),
     Quantity("starts", lambda run: run.searched.attempts, "what came of every start", record=START),
     Quantity("starts_at_best", lambda run: run.searched.agreeing, "starts that end within a share of the best"),
     Quantity("local_optimum", lambda run: run.searched.local, "whether starts end at different cameras"),
@@ -198,15 +197,14 @@ def agreement(run: DesignRun) -> str:
 def verdict(run: DesignRun) -> str:
     """Whether the camera has become better, and which constraints keep it from more; one sentence or two."""
     found, start, name = run.found, run.setup.camera.name, run.setup.test.name
+    across = found.before.distance_across
     errors = f"{rms_error(found.after):.4f} waves rms over the field ({rms_error(found.before):.4f} in {start})"
     held = tuple(one for one in found.held if 1e-3 * one.worth > WORTH * rms_error(found.after))
     if found.improved:
         text = f"Improved: {name} has a wavefront error of {errors}"
-        return (
-            f"{text}; more is held by {_held_text(held, start, found.before.distance_across)}." if held else f"{text}."
-        )
+        return f"{text}; more is held by {_held_text(held, start, across)}." if held else f"{text}."
     if held:
-        return f"Not improved, held by {_held_text(held, start, found.before.distance_across)}: a wavefront error of {errors}."
+        return f"Not improved, held by {_held_text(held, start, across)}: a wavefront error of {errors}."
     return f"Not improved: nothing that varies makes {start} better; {name} has a wavefront error of {errors}."
 
 

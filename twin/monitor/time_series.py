@@ -11,7 +11,7 @@ import numpy as np
 from analysis.chi_square import limit_of
 from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.curvature import Curvature
-from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, consistency
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.recovery import Recovery, estimates_of
@@ -263,6 +263,9 @@ def run_series(
         raise too_large(job, done + k, reason) from error
     shift = np.concatenate([r.shift for r in recoveries])
     spread = np.concatenate([r.shift_covariance for r in recoveries])
+    stated, agrees = experiment.disturbances, np.ones(len(shift), bool)
+    if stated is not None and np.any(spread):
+        agrees = chi_squares(shift, spread, stated) <= limit_of(FALSE_ALARM / len(shift), shift.shape[1])
     moves = [motions_of(job, k) for k in range(len(states))]
     smoothed = together.smoothed()
     jumped = () if smoothed is None else smoothed.jump_texts()
@@ -282,23 +285,8 @@ def run_series(
         warnings=(*_warnings(experiment, course, saturated, share), *(f"course: {text}" for text in jumped)),
         evidence=SpotEvidence.joined([r.evidence for r in recoveries if r.evidence is not None]),
         curvature={e: Curvature.joined([r.curvature[e] for r in recoveries]) for e in recoveries[0].curvature},
-        agrees=_agrees(experiment.disturbances, shift, spread),
+        agrees=agrees,
     )
-
-
-def _agrees(stated: Disturbances | None, shift: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Return (T,) whether the shifts of each time agree with the prior, as `MonitorReading.worst_of` judges the worst.
-
-    Args:
-        stated: the prior, None for none.
-        shift: (T, 2 C) px.
-        spread: (T, 2 C, 2 C) their covariance, px^2.
-    """
-    if stated is None or not np.any(spread):
-        return np.ones(len(shift), bool)
-    # suspects are not looked for
-    found = [consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(shift, spread, strict=True)]
-    return np.array(found) <= limit_of(FALSE_ALARM / len(shift), shift.shape[1])
 
 
 def too_large(job: JobSpec, k: int, reason: str) -> InputError:

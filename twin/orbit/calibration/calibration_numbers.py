@@ -315,8 +315,16 @@ UNLIKELY = 1e-3
 """Chance of a chi-square as large below which the adjustment does not fit."""
 
 
-def _drifting(run: CalibrationRun) -> bool:
-    return run.truth is not None and bool(run.campaign.simulated.drift)
+def _fits(run: CalibrationRun) -> bool | None:
+    return run.together.p_value >= UNLIKELY if run.campaign.spec.errors.switched_on else None
+
+
+def _misfit(run: CalibrationRun) -> str:
+    drifts = run.truth is not None and bool(run.campaign.simulated.drift)
+    return (
+        f"the adjustment does not fit: a chi-square as large has a chance of {run.together.p_value:.1g}; biases may "
+        f"drift during a pass{', and the cameras drift from field to field' * drifts}"
+    )
 
 
 FIT: Record[CalibrationRun] = Record(
@@ -324,15 +332,7 @@ FIT: Record[CalibrationRun] = Record(
     Quantity("chi_square", lambda run: run.together.chi_square, "of the residuals"),
     Quantity("degrees_of_freedom", lambda run: run.together.degrees_of_freedom, "of chi-square"),
     Quantity("p_value", lambda run: run.together.p_value, "chance of a chi-square as large"),
-    Quantity(
-        "agrees",
-        lambda run: run.together.p_value >= UNLIKELY if run.campaign.spec.errors.switched_on else None,
-        "whether residuals are as their sigmas say; null of exact points",
-        warning=lambda run: (
-            f"the adjustment does not fit: a chi-square as large has a chance of {run.together.p_value:.1g}; biases "
-            f"may drift during a pass{', and the cameras drift from field to field' * _drifting(run)}"
-        ),
-    ),
+    Quantity("agrees", _fits, "whether residuals are as their sigmas say; null of exact points", warning=_misfit),
     Quantity("iterations", lambda run: run.together.iterations, "steps of the adjustment"),
     Quantity("attitude_drift", lambda run: run.drift, record=ATTITUDE_DRIFT),
 )
@@ -355,9 +355,7 @@ STEPWISE: Record[CalibrationRun] = Record(
         "converged",
         lambda run: run.stepwise.converged,
         "whether the steps become small",
-        warning=lambda run: (
-            f"the stepwise solution has not settled after {run.stepwise.rounds} rounds: it is not the adjustment's"
-        ),
+        warning=lambda run: f"the stepwise solution has not settled after {run.stepwise.rounds} rounds",
     ),
 )
 BIAS_OF_FIELD: Record[tuple[float, float, float | None]] = Record(

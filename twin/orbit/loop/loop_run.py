@@ -167,22 +167,22 @@ class LoopRun:
 
     @property
     def margins_hold(self) -> bool:
-        """Return whether the loops are further from instability than GAIN_MARGIN and PHASE_MARGIN_DEG."""
-        return self.margin >= GAIN_MARGIN and not self.phase_deg < PHASE_MARGIN_DEG
+        """Return whether the loops are stable, and as far from the limit as GAIN_MARGIN and PHASE_MARGIN_DEG."""
+        return self.stable and self.margin >= GAIN_MARGIN and not self.phase_deg < PHASE_MARGIN_DEG
 
     @property
     def worse(self) -> dict[str, tuple[float, float]]:
         """Return the errors that the loop makes larger, RMS over the moments with the loop open and closed: angle and
         quantities in rad and m, height in m, and of the MTF at Nyquist what it lacks to 1.
         """
-        named = {f"{key} of {name}": (name, key) for name in self.model.cameras for key in (*PARAMETERS, "defocus")}
-        errors = {"angle": [rms(one.true(one.angle)) for one in (self.open, self.closed)]}
-        errors["height"] = [height_rms(one) for one in (self.open, self.closed)]
-        for label, place in named.items():
-            errors[label] = [rms(one.truth[:, self.model.row(*place)]) for one in (self.open, self.closed)]
-        for name in self.model.cameras:
-            errors[f"MTF of {name}"] = [1.0 - float(one.mtf[name].min()) for one in (self.open, self.closed)]
-        return {n: (free, left) for n, (free, left) in errors.items() if left > max((1.0 + WORSE) * free, _NOTHING)}
+        free, left = self._errors(self.open), self._errors(self.closed)
+        return {n: (free[n], v) for n, v in left.items() if v > max((1.0 + WORSE) * free[n], _NOTHING)}
+
+    def _errors(self, one: LoopPass) -> dict[str, float]:
+        places = [(name, key) for name in self.model.cameras for key in (*PARAMETERS, "defocus")]
+        own = {f"{key} of {name}": rms(one.truth[:, self.model.row(name, key)]) for name, key in places}
+        soft = {f"MTF of {name}": 1.0 - float(mtf.min()) for name, mtf in one.mtf.items()}
+        return {"angle": rms(one.true(one.angle)), "height": height_rms(one), **own, **soft}
 
     @property
     def pair(self) -> tuple[str, str]:
