@@ -109,9 +109,7 @@ def _artefacts(
             if not is_sigma(one.key)
         ]
         heads = ("file", "key", *names, "difference", "sigma", "of", "in sigma")
-        about = (
-            "Units are the keys' endings; sigma is that of the difference of independent measurements: of noise where "
-        )
+        about = "Units are the keys' endings; sigma is that of the difference of independent measurements, of noise if "
         about += "runs state it, else of the total error. Runs of one seed share their noise, and differ by less."
         left = len(found.numbers) - len(rows)
         about += f" {left} sigmas that changed are in compare.json." if left else ""

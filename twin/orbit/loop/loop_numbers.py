@@ -197,7 +197,7 @@ def _near_limit(run: LoopRun) -> str:
         return f"the loops together are unstable: largest eigenvalue {run.radius:.3g}; gains below {gains} are stable"
     nearest = min(run.loops, key=lambda name: run.loops[name].margins.gain)
     return (
-        f"the loop is barely stable: gains of {gains} make it unstable, the phase margin is {run.phase_deg:.0f} deg; it "
+        f"the loop is barely stable: gains of {gains} make it unstable, phase margin {run.phase_deg:.0f} deg; it "
         f"amplifies what it should take away. Usual are {GAIN_MARGIN:g} times and {PHASE_MARGIN_DEG:g} deg at least: "
         f"lower gains, that of {nearest} first"
     )
