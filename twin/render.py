@@ -56,6 +56,7 @@ def main(
     force: cli.Force = False,
     as_json: cli.AsJson = False,
     quiet: cli.Quiet = False,
+    strict: cli.Strict = False,
 ) -> None:
     """Perturb an instrument, render the spot images of its autocollimation monitor and recover the perturbation from
     them.
@@ -117,7 +118,7 @@ def main(
 
     run_command(
         job.stem,
-        cli.Options(out, seed, backend, force, as_json, quiet),
+        cli.Options(out, seed, backend, force, as_json, quiet, strict=strict),
         lambda: read_for("twin.render", job, RESOLVE),
         work,
         cost,

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.chi_square import chance_beyond, density, limit_of
 from analysis.short_repr import shows
 
-__all__ = ["FALSE_ALARM", "Consistency", "Disturbances", "Suspect", "TimeLaw", "consistency"]
+__all__ = ["FALSE_ALARM", "Consistency", "Disturbances", "Suspect", "TimeLaw", "chi_squares", "consistency"]
 
 Array = NDArray[np.float64]
 FALSE_ALARM = 1e-3
@@ -322,6 +322,17 @@ class Consistency:
             degrees: number of spot coordinates.
         """
         return float(chance_beyond(limit_of(FALSE_ALARM, degrees) / times**2, degrees))
+
+
+def chi_squares(shifts: Array, noise: Array, stated: Disturbances) -> Array:
+    """Return (T,) the predictive chi-square of each of T measurements by itself; no suspects are looked for.
+
+    Args:
+        shifts: (T, D) measured, px.
+        noise: (T, D, D) their covariance, px^2.
+        stated: what was to be expected.
+    """
+    return np.array([consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(shifts, noise, strict=True)])
 
 
 def consistency(

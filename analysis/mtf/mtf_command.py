@@ -122,9 +122,9 @@ def run_mtf(
         errors.print(f"warning: {text}", style="yellow", markup=False, highlight=False, soft_wrap=True)
     try:
         if isinstance(found, BarMtf):
-            _print_bars(found, size, offset, as_json)
+            _print_bars(found, size, offset, warnings if as_json else None)
         elif as_json:
-            _print_json(_edge_json(found, size, offset))
+            _print_json({**_edge_json(found, size, offset), "warnings": warnings})
         else:
             _print_edge(found, size, offset, [path for path in (plot, csv_file) if path is not None])
         sys.stdout.flush()
@@ -388,8 +388,9 @@ def _pages_text(edge: EdgeMtf) -> str:
     return f"edge in the pages, against {edge.position:.3f} px: {each}{more}, each ± {sigma:.3f} px; {how}"
 
 
-def _print_bars(bars: BarMtf, pitch: float, offset: float, as_json: bool) -> None:
-    if as_json:
+def _print_bars(bars: BarMtf, pitch: float, offset: float, warnings: list[str] | None) -> None:
+    """Print the result of bars, with its warnings as JSON, or without them as lines."""
+    if warnings is not None:
         _print_json(
             {
                 "frequency_cycles_per_mm": bars.cycles_per_pixel / pitch,
@@ -404,6 +405,7 @@ def _print_bars(bars: BarMtf, pitch: float, offset: float, as_json: bool) -> Non
                 "contrast": _or_none(bars.contrast),
                 "contrast_transfer": _or_none(bars.contrast_transfer),
                 "coltman_mtf": _or_none(bars.coltman),
+                "warnings": warnings,
             }
         )
         return

@@ -346,7 +346,11 @@ def _require_held(merit: MeritFunction, after: Evaluation) -> None:
     limits = np.abs([limit for _, limit in asked])
     limits = np.where(np.array(names) == "anamorphism", limits * after.distance_across, limits)
     kinds = tuple(sorted(kinds, key=lambda kind: -violated[worst[kind]] / max(limits[worst[kind]], HELD)))
-    parts = [f"{kind} (off by {1e3 * g[worst[kind]]:.3g} mm)" for kind in kinds]
+    off = {
+        kind: f"{100.0 * g[k] / after.distance_across:.3g} %" if kind == "anamorphism" else f"{1e3 * g[k]:.3g} mm"
+        for kind, k in worst.items()
+    }
+    parts = [f"{kind} (off by {off[kind]})" for kind in kinds]
     raise DesignError(
         f"no prescription near the start holds all constraints: {', '.join(parts)}; allow a longer envelope, less "
         "clearance, a larger field bias, or more variables",

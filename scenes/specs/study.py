@@ -540,18 +540,25 @@ class StudySpec(TitledSpec):
         return next((name for name in names if names.count(name) > 1), None)
 
 
+_UNIT_WORDS = frozenset(UNITS) | {"m2", "mm2", "um2"}
+"""Words that end what a key says of its unit."""
+
+
 def unit_of(key: KeyPath) -> str:
-    """The unit that the ending of a result's key says, empty if it says none: "um" for d_f_um, d_f_um_sigma and
-    d_f_um_sigma_noise, "m/arcsec" for height_m_per_arcsec, "1/mm" for nyquist_per_mm.
+    """Return the unit that a result's key says, empty if it says none: "um" for d_f_um, d_f_um_sigma_noise and other
+    keys whose last words, after the unit, say which number it is (d_f_um_true), "m/arcsec" for height_m_per_arcsec,
+    "1/mm" for nyquist_per_mm. A name below such a key has its unit: "um" for defocus_um, centre.
     """
-    last = next((str(part) for part in reversed(key) if isinstance(part, str)), "")
-    last = last.removesuffix(NOISE).removesuffix(TOTAL)
+    *above, last = [str(part) for part in key if isinstance(part, str)] or [""]
+    words = last.removesuffix(NOISE).removesuffix(TOTAL).split("_")
+    while "per" not in words and len(words) > 1 and words[-1] not in _UNIT_WORDS:
+        words.pop()
+    last = "_".join(words)
     endings = [ending for ending in UNITS if last.endswith(f"_{ending}")]
     if not endings:
-        return ""
+        return unit_of(above[-1:]) if above else ""
     ending = max(endings, key=len)
-    above = last.removesuffix(f"_{ending}")
-    if not above.endswith("_per"):
+    first = last.removesuffix(f"_{ending}")
+    if not first.endswith("_per"):
         return UNITS[ending]
-    above = above.removesuffix("_per")
-    return f"{unit_of((f'_{above}',)) or 1}/{UNITS[ending]}"
+    return f"{unit_of(('_' + first.removesuffix('_per'),)) or 1}/{UNITS[ending]}"

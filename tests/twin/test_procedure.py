@@ -107,7 +107,8 @@ def test_a_verdict_is_two_sentences_at_most(verdict: str) -> None:
 
 def test_numbers_have_no_verdict_but_the_reports() -> None:
     told = Report("Level", "It holds.", (), (), Table("readings", "Readings", "", ("number",), []), ())
-    assert told.told({"a": 1, "verdict": "It holds."}) == told.told({"a": 1}) == {"a": 1, "verdict": "It holds."}
+    expected = {"a": 1, "verdict": "It holds.", "warnings": []}
+    assert told.told({"a": 1, "verdict": "It holds."}) == told.told({"a": 1}) == expected
     with pytest.raises(ValueError, match="verdict"):
         told.told({"verdict": {"before": False}})
 
@@ -173,7 +174,7 @@ def test_command(run: Callable, tmp_path: Path) -> None:
     assert json.loads(done.stdout) == data
     assert list(data) == [
         *("schema", "reference_frames"),
-        *("seed", "mean_arcsec", "mean_arcsec_sigma", "readings_arcsec", "verdict"),
+        *("seed", "mean_arcsec", "mean_arcsec_sigma", "readings_arcsec", "verdict", "warnings"),
     ]
     assert data["seed"] == 7
     assert data["readings_arcsec"] == np.random.default_rng(7).normal(0.0, 0.5, 5).tolist()

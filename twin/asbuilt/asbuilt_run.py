@@ -341,7 +341,11 @@ ASBUILT: Record[AsBuiltRun] = Record(
     "asbuilt.json: the state of one instrument.",
     Quantity("instrument", lambda run: run.setup.test.instrument),
     Quantity("camera", lambda run: run.bench.camera, "the camera that is judged"),
-    Quantity("whole", lambda run: _agreement_plain(run.found.whole), "chi-square of all together"),
+    Quantity(
+        "whole",
+        lambda run: {**_agreement_plain(run.found.whole), "agrees": run.found.whole.holds()},
+        "chi-square of all together",
+    ),
     Quantity("false_alarm", lambda run: FALSE_ALARM, "chance that what is as stated is called a contradiction"),
     Quantity("measurements", _measured_plain, "each as all others predict it"),
     Quantity("motions", motions, "each motion of the prior: its estimate and standard deviations"),

@@ -11,6 +11,7 @@ import numpy as np
 
 from scenes.yaml.errors import InputError, Issue
 from twin.compare.run_differences import (
+    NOISE,
     ArrayDifference,
     Differences,
     Leaf,
@@ -100,16 +101,19 @@ def _artefacts(
         out.append(figure)
     if found.numbers:
         rows = [
-            [one.file, one.key, _value(one.reference), _value(one.other), one.difference, one.sigma, one.in_sigma]
+            [
+                *(one.file, one.key, _value(one.reference), _value(one.other)),
+                *(one.difference, one.sigma, one.sigma_of, one.in_sigma),
+            ]
             for one in sorted(found.numbers, key=lambda one: one.file != "truth.json")
             if not is_sigma(one.key)
         ]
-        heads = ("file", "key", *names, "difference", "sigma", "in sigma")
-        about = "Units are the keys' endings; sigma is that of the difference of independent measurements. Runs of one "
-        about += "seed share their noise, and differ by less."
+        heads = ("file", "key", *names, "difference", "sigma", "of", "in sigma")
+        about = "Units are the keys' endings; sigma is that of the difference of independent measurements, of noise if "
+        about += "runs state it, else of the total error. Runs of one seed share their noise, and differ by less."
         left = len(found.numbers) - len(rows)
         about += f" {left} sigmas that changed are in compare.json." if left else ""
-        out.append(Table(f"numbers-{k}", "Results", about, heads, rows, (None,) * 6 + (1,)))
+        out.append(Table(f"numbers-{k}", "Results", about, heads, rows, (None,) * 7 + (1,)))
     if found.arrays:
         heads = ("file", "variable", "shape", "largest", "rms", "peak", "share that differs")
         rows = [[a.file, a.name, _shape(a), a.largest, a.rms, a.peak, a.share] for a in found.arrays]
@@ -150,7 +154,8 @@ def _changes(found: Differences, names: tuple[str, str], k: int) -> SvgFigure | 
         axes.margins(y=0.02)
         plain_axes(axes)
         drawn = to_svg(figure)
-    caption = f"{names[1]} minus {names[0]}, over the sigma of the difference of independent measurements."
+    caption = f"{names[1]} minus {names[0]}, over the sigma of the difference of independent measurements, of noise "
+    caption += "where runs state it."
     if len(known) > len(chosen):
         caption += f" The {len(chosen)} largest of {len(known)}."
     return SvgFigure(f"changes-{k}", "Results that have a sigma", caption, drawn)
@@ -302,5 +307,6 @@ def verdict(comparison: Comparison) -> list[str]:
         )
         far = max(found.numbers, key=lambda one: abs(one.in_sigma or 0.0), default=None)
         if far is not None and far.in_sigma is not None:
-            parts.append(f"the largest change for its sigma is {far.key}, {far.in_sigma:+.3g} sigma")
+            kind = "of the noise alone" if far.sigma_of == NOISE else "of the total error"
+            parts.append(f"the largest change for its sigma is {far.key}, {far.in_sigma:+.3g} sigma {kind}")
     return parts

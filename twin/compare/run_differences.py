@@ -32,6 +32,8 @@ LEFT_OUT = frozenset(
     )
 )
 """Keys of results that say how the run was done, not what it gave."""
+NOISE = "noise"
+"""What a sigma is of that more frames lower; another is total."""
 TOLD = frozenset(("verdict", "warnings"))
 """Sentences at the top of a result that follow from its numbers, which are compared themselves."""
 NAMES = ("name", "motion", "label", "field", "path", "time_s")
@@ -66,6 +68,7 @@ class NumberDifference:
         reference, other: what stands there; None where there is nothing.
         sigma: standard deviation of the difference of two independent measurements, from both runs' sigmas; None where
             the file states none.
+        sigma_of: what that is of: ``noise`` of the images alone, or the ``total`` error; empty without a sigma.
     """
 
     file: str
@@ -73,6 +76,7 @@ class NumberDifference:
     reference: Leaf
     other: Leaf
     sigma: float | None = None
+    sigma_of: str = ""
 
     @property
     def difference(self) -> float | None:
@@ -256,9 +260,9 @@ def differences(reference: RunResults, other: RunResults, rtol: float, sigmas: f
         if sigmas is not None and is_sigma(place[1]):
             continue
         here, there = (run.numbers.get(place, _MISSING) for run in (reference, other))
-        sigma = sigma_of(reference.numbers, other.numbers, place)
+        sigma, kind = sigma_of(reference.numbers, other.numbers, place)
         if not _same_number(here, there, rtol, sigma, sigmas):
-            numbers.append(NumberDifference(*place, _shown(here), _shown(there), sigma))
+            numbers.append(NumberDifference(*place, _shown(here), _shown(there), sigma, kind))
     pairs: list[tuple[str, str, np.ndarray | None, np.ndarray | None]] = [
         (*place, reference.series.get(place), other.series.get(place))
         for place in dict.fromkeys((*reference.series, *other.series))
@@ -321,10 +325,12 @@ def is_sigma(key: str) -> bool:
     return last == "sigma" or last.endswith(("_sigma", "_sigma_noise")) or last.startswith(("sigma_", "left_"))
 
 
-def sigma_of(reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tuple[str, str]) -> float | None:
-    """Sigma of the difference of two numbers by the noise of both runs, from ``x_sigma_noise`` beside them in both
-    runs, else ``x_sigma`` or ``sigma``. What an estimator makes wrong of the motions is the same in runs
-    of the same motions, and does not scatter between them.
+def sigma_of(
+    reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tuple[str, str]
+) -> tuple[float | None, str]:
+    """Return the sigma of the difference of two numbers and what it is of: of the noise of both runs, from
+    ``x_sigma_noise`` beside them in both runs, else of the total error, from ``x_sigma`` or ``sigma``. What an
+    estimator makes wrong of the motions is the same in runs of the same motions, and does not scatter between them.
 
     Args:
         reference: (file, key) -> value of one run.
@@ -337,8 +343,9 @@ def sigma_of(reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tu
     for name in names:
         both = [run.get((file, f"{head}{dot}{name}")) for run in (reference, other)]
         if all(_is_number(value) for value in both):
-            return math.hypot(*(float(value) for value in both if value is not None))
-    return None
+            kind = NOISE if name.endswith(NOISE) else "total"
+            return math.hypot(*(float(value) for value in both if value is not None)), kind
+    return None, ""
 
 
 def _array_difference(

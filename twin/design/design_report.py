@@ -14,7 +14,7 @@ from optics.design.merit_function import Evaluation
 from optics.design.optimiser import Design, rms_error
 from optics.design.starts import Attempt
 from scenes.models.camera_design import prescription_of
-from twin.design.design_run import DesignRun, agreement, verdict
+from twin.design.design_run import DESIGN, DesignRun, agreement, verdict
 from twin.run.artefact import CameraFile, SvgFigure, Table
 from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
@@ -102,7 +102,8 @@ def design_report(run: DesignRun) -> Report:
         ("variables", str(len(found.variables))),
         ("starts", str(len(run.searched.attempts))),
     )
-    return Report(f"Design of {setup.test.name}", told, more, facts, summary, sections, warnings=run.warnings)
+    warnings = (*run.warnings, *DESIGN.warnings(run))
+    return Report(f"Design of {setup.test.name}", told, more, facts, summary, sections, warnings=warnings)
 
 
 def _start_row(number: int, attempt: Attempt) -> list[str | float]:

@@ -102,8 +102,6 @@ def run_design(
     if worst > BLURRED:
         told = f"{worst:.3g} waves rms in its worst field, more than {BLURRED:g}"
         warnings.append(f"camera {spec.name} is blurred: {told}")
-    if not found.converged:
-        warnings.append(f"the search for {spec.name} was still getting better when it ended, after {ITERATIONS} steps")
     return DesignRun(setup, searched, spec.file_text(remark), tuple(warnings))
 
 
@@ -128,10 +126,15 @@ def _chief_rays(run: DesignRun) -> dict[str, np.ndarray]:
     return {"before": angles(found.begun), "after": angles(found.prescription)}
 
 
+def _anamorphism(held: Held) -> bool:
+    return held.name.startswith("anamorphism")
+
+
 HELD_BY: Record[Held] = Record(
     "A constraint that keeps the camera from becoming better.",
     Quantity("constraint", lambda held: held.name, "its name"),
-    Quantity("limit_m", lambda held: held.limit, "its limit; of the anamorphism a pure number"),
+    Quantity("limit_m", lambda held: None if _anamorphism(held) else held.limit, "its limit"),
+    Quantity("limit_percent", lambda held: held.limit if _anamorphism(held) else None, "likewise of the anamorphism"),
     Quantity("broken_at_start_m", lambda held: max(held.start, 0.0), "by how much the start breaks it"),
     Quantity(
         "worth_waves_per_mm", lambda held: 1e-3 * held.worth, "fall of the error when it is eased", converted=False
@@ -147,6 +150,12 @@ START: Record[Attempt] = Record(
     Quantity("jacobians", _known(lambda found: found.evaluations), "Jacobians that were traced"),
     Quantity("problem", lambda attempt: attempt.problem, "why the constraints cannot be held, empty where they can"),
 )
+
+
+def _unsettled(run: DesignRun) -> str:
+    return f"the search for {run.setup.test.name} was still getting better when it ended, after {ITERATIONS} steps"
+
+
 DESIGN: Record[DesignRun] = Record(
     "design.json: an optimised camera, before and after.",
     Quantity("camera", lambda run: run.setup.test.name, "name of the new camera"),
@@ -161,7 +170,7 @@ DESIGN: Record[DesignRun] = Record(
     Quantity("improved", lambda run: run.found.improved, "whether the new camera is better"),
     Quantity("held_by", lambda run: run.found.held, "what keeps it from more, the dearest first", record=HELD_BY),
     Quantity("jacobians", lambda run: run.found.evaluations, "Jacobians that were traced for the best"),
-    Quantity("converged", lambda run: run.found.converged, "whether the best search settled"),
+    Quantity("converged", lambda run: run.found.converged, "whether the best search settled", warning=_unsettled),
     Quantity("starts", lambda run: run.searched.attempts, "what came of every start", record=START),
     Quantity("starts_at_best", lambda run: run.searched.agreeing, "starts that end within a share of the best"),
     Quantity("local_optimum", lambda run: run.searched.local, "whether starts end at different cameras"),
@@ -188,26 +197,33 @@ def agreement(run: DesignRun) -> str:
 def verdict(run: DesignRun) -> str:
     """Whether the camera has become better, and which constraints keep it from more; one sentence or two."""
     found, start, name = run.found, run.setup.camera.name, run.setup.test.name
+    across = found.before.distance_across
     errors = f"{rms_error(found.after):.4f} waves rms over the field ({rms_error(found.before):.4f} in {start})"
     held = tuple(one for one in found.held if 1e-3 * one.worth > WORTH * rms_error(found.after))
     if found.improved:
         text = f"Improved: {name} has a wavefront error of {errors}"
-        return f"{text}; more is held by {_held_text(held, start)}." if held else f"{text}."
+        return f"{text}; more is held by {_held_text(held, start, across)}." if held else f"{text}."
     if held:
-        return f"Not improved, held by {_held_text(held, start)}: a wavefront error of {errors}."
+        return f"Not improved, held by {_held_text(held, start, across)}: a wavefront error of {errors}."
     return f"Not improved: nothing that varies makes {start} better; {name} has a wavefront error of {errors}."
 
 
-def _held_text(held: tuple[Held, ...], start: str) -> str:
-    """The dearest constraints, at most three, each with by how much."""
+def _held_text(held: tuple[Held, ...], start: str, across: float) -> str:
+    """Return the dearest constraints, at most three, each with by how much.
+
+    Args:
+        held: the constraints.
+        start: name of the camera that the design starts from.
+        across: its principal distance across the line, metres, of which the anamorphism is a share.
+    """
     parts = []
     for one in held[:3]:
-        if one.name.startswith("anamorphism"):
-            limit = f"{100 * one.limit:.4g} %"
-        else:
-            limit = f"{one.limit:.6g} m" if one.limit > 1.0 else f"{1e3 * one.limit:.4g} mm"
+        limit = f"{one.limit:.6g} m" if one.limit > 1.0 else f"{1e3 * one.limit:.4g} mm"
+        step, unit = 1e-3, "mm"
+        if _anamorphism(one):
+            limit, step, unit = f"{100 * one.limit:.4g} %", 1e-2 * across, "%"
         text = f"the {one.name} ({limit}"
         if one.start > HELD:
-            text += f", which {start} breaks by {1e3 * one.start:.3g} mm"
-        parts.append(f"{text}; easing it by 1 mm is worth {1e-3 * one.worth:.2g} waves)")
+            text += f", which {start} breaks by {one.start / step:.3g} {unit}"
+        parts.append(f"{text}; easing it by 1 {unit} is worth {step * one.worth:.2g} waves)")
     return " and ".join(parts)

@@ -167,7 +167,7 @@ def _numbers(data: Mapping[str, Any]) -> DataTable | None:
             number = float(value) if isinstance(value, bool | int | float) else None
             text = None if isinstance(value, int | float) and not isinstance(value, bool) else json.dumps(value)
             text = value if isinstance(value, str) else text
-            rows.append((file, key, number, sigma, unit_of(last[-1:]) if number is not None else "", text))
+            rows.append((file, key, number, sigma, unit_of(last[-2:]) if number is not None else "", text))
     if not rows:
         return None
     names = ("file", "key", "value", "sigma", "unit", "text")

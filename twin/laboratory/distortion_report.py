@@ -19,7 +19,8 @@ from scenes.specs.camera_tests import MeasuredDistortionSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory.distortion_numbers import DISTORTION, ESTIMATE, POINTS
 from twin.laboratory.distortion_run import DistortionRun, SimulatedDistortion
-from twin.laboratory.turntable_report import DOUBTFUL, FIT_NAMES
+from twin.laboratory.turntable_numbers import DOUBTFUL
+from twin.laboratory.turntable_report import FIT_NAMES
 from twin.laboratory.turntable_run import rms
 from twin.run.artefact import FAR, Artefact, Cell, OwnDecimals, SvgFigure, Table, decimals_for
 from twin.run.data_files import FrameFacts

@@ -14,7 +14,7 @@ from twin.laboratory.focus_bench import BudgetLine
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState
 from twin.laboratory.focus_scan import VERTEX_ERROR
 from twin.laboratory.measured_focus import NoEdge
-from twin.laboratory.turntable_numbers import DATA_FILE
+from twin.laboratory.turntable_numbers import DATA_FILE, likely
 from twin.run.quantity import Quantity, Record
 from twin.targets.target_images import ALONG, TRACK
 
@@ -55,7 +55,7 @@ CORRECTION: Record[Shimming] = Record(
 )
 STATE: Record[SimulatedState] = Record(
     "The assembly as it was measured.",
-    Quantity("confocal_um_max", lambda s: UM * s.confocal[0], "largest distance of a CCD from best focus"),
+    Quantity("confocal_um_max", lambda s: s.confocal[0], "largest distance of a CCD from best focus"),
     Quantity("confocal_um_sigma", lambda s: np.hypot(s.confocal[1], VERTEX_ERROR), "noise and error of the vertices"),
     Quantity("line_level_arcmin", lambda s: s.level.angle, "turn of the line about Z', by the theodolite"),
     Quantity("line_level_arcmin_sigma", lambda s: s.level.sigma, "standard deviation of the theodolite"),
@@ -76,7 +76,7 @@ ROUND: Record[SimulatedState] = Record(
     Quantity("turn_by_hand_arcmin", lambda s: _shims(s).plan.turn, "rotation about the normal of the mounting surface"),
     Quantity("line_level_without_turn_arcmin", lambda s: _shims(s).plan.level_coupling, "error of level without it"),
     Quantity("correction", _shims, "motion that was asked for", record=CORRECTION),
-    Quantity("chips_um_rms", lambda s: UM * _shims(s).plane.extra_sigma, "scatter of the CCDs about one plane"),
+    Quantity("chips_um_rms", lambda s: _shims(s).plane.extra_sigma, "scatter of the CCDs about one plane"),
 )
 BUDGET: Record[BudgetLine] = Record(
     "What makes one band's MTF at the Nyquist frequency in one direction.",
@@ -87,7 +87,7 @@ BUDGET: Record[BudgetLine] = Record(
 )
 TRUE_STATE: Record[SimulatedState] = Record(
     "The assembly as it stands, by the exact trace.",
-    Quantity("confocal_um_max", lambda s: UM * np.max(np.abs(s.true_defocus)), "largest distance from best focus"),
+    Quantity("confocal_um_max", lambda s: np.max(np.abs(s.true_defocus)), "largest distance from best focus"),
     Quantity("line_level_arcmin", lambda s: s.true_level, "turn of the line about Z'"),
     Quantity("mtf_nyquist", lambda s: s.true_mtf, "band -> MTF along the track, mean of the fields"),
     Quantity("rotation_arcmin", lambda s: rotation_vector(s.standing.pose.rotation), "of the assembly"),
@@ -145,7 +145,7 @@ PLANE: Record[Shimming] = Record(
     Quantity("chi_square", lambda s: s.plane.chi_square, "of the places about the plane with their own sigmas"),
     Quantity("degrees_of_freedom", lambda s: s.plane.degrees_of_freedom, "places minus three unknowns"),
     Quantity("probability", lambda s: s.plane.p_value, "of such a chi-square or a larger one"),
-    Quantity("chips_um_rms", lambda s: UM * s.plane.extra_sigma, "scatter of the CCDs about one plane"),
+    Quantity("chips_um_rms", lambda s: s.plane.extra_sigma, "scatter of the CCDs about one plane"),
 )
 SHIMS: Record[Shimming] = Record(
     "The shim of one mounting hole.",
@@ -173,7 +173,7 @@ MEASURED: Record[FocusRun] = Record(
     "focus.json of a measured series. Expected: on the new shims, after rounding, where places are best predicted.",
     Quantity("name", lambda r: r.test.name, "name of the test"),
     Quantity("seed", lambda r: r.seed, "of the command; nothing is drawn"),
-    Quantity("confocal_um_max", lambda r: UM * r.states[0].confocal[0], "largest distance of a CCD from best focus"),
+    Quantity("confocal_um_max", lambda r: r.states[0].confocal[0], "largest distance of a CCD from best focus"),
     Quantity(
         "confocal_um_sigma",
         lambda r: np.hypot(r.states[0].confocal[1], r.shimmings[0].vertex_error),
@@ -186,10 +186,11 @@ MEASURED: Record[FocusRun] = Record(
     Quantity("shims", lambda r: _holes(SHIMS.rows(r.shimmings[0])), "by hole"),
     Quantity("turn_by_hand_arcmin", lambda r: r.shimmings[0].plan.turn, "rotation in the mounting surface"),
     Quantity("line_level_without_turn_arcmin", lambda r: r.shimmings[0].plan.level_coupling, "error without it"),
-    Quantity("expected_confocal_um_max", lambda r: UM * r.shimmings[0].expected[0], "largest expected distance"),
+    Quantity("expected_confocal_um_max", lambda r: r.shimmings[0].expected[0], "largest expected distance"),
     Quantity("expected_confocal_um_sigma", lambda r: r.shimmings[0].expected[1], "standard deviation"),
     Quantity("curves_chi_square", lambda r: r.chi_square[0], "of all curves through focus together"),
     Quantity("curves_degrees_of_freedom", lambda r: r.chi_square[1], "of all curves through focus together"),
+    Quantity("curves_agree", lambda r: likely(*r.chi_square), "whether that is likely"),
     Quantity("sites", lambda r: PLACES.rows(_standing(r)), "all places"),
     Quantity("images_without_edge", lambda r: r.readings and r.readings.no_edge, "not measured", record=NO_EDGE),
     Quantity("files", lambda r: r.readings and [r.readings.file], "that were read", record=DATA_FILE),

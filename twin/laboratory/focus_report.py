@@ -17,7 +17,7 @@ from scenes.yaml.units import LENGTH, format_quantity
 from twin.laboratory import focus_plots
 from twin.laboratory.focus_numbers import NO_EDGE, PLACES, SHIMS, focus_numbers
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus
-from twin.laboratory.turntable_report import DOUBTFUL
+from twin.laboratory.turntable_numbers import DOUBTFUL
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed
 from twin.run.report import Report, Section, answer
 from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK

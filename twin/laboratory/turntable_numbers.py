@@ -6,10 +6,25 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from analysis.chi_square import chance_beyond
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, expected_rejections
 from twin.laboratory.measured_readings import Comparisons, DataFile
 from twin.laboratory.turntable_run import TurntableRun, rms
 from twin.run.quantity import Quantity, Record
+
+DOUBTFUL = 1e-3
+"""Chance below which a chi-square is told as a warning."""
+
+
+def likely(chi_square: float, degrees: int) -> bool | None:
+    """Return whether a chi-square as large has a chance of DOUBTFUL at least; None without degrees of freedom.
+
+    Args:
+        chi_square: of residuals against their sigmas.
+        degrees: of freedom.
+    """
+    return bool(chance_beyond(chi_square, degrees) >= DOUBTFUL) if degrees else None
+
 
 DATA_FILE: Record[DataFile] = Record(
     "A file of measurements.",
@@ -109,6 +124,7 @@ TURNTABLE: Record[TurntableRun] = Record(
     Quantity("fit_degrees_of_freedom", lambda r: r.chi_square[1], "means minus effective parameters"),
     Quantity("heldout_chi_square", lambda r: r.held_out_chi_square[0], "against all that the compensation states"),
     Quantity("heldout_degrees_of_freedom", lambda r: r.held_out_chi_square[1], "number of held-out readings"),
+    Quantity("heldout_agrees", lambda r: r.held_out and likely(*r.held_out_chi_square), "whether that is likely"),
     Quantity(
         "rejected_readings", lambda r: rejected_rows(r.tables) if r.tables else None, "in files", where_known=True
     ),

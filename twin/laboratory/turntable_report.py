@@ -16,7 +16,7 @@ from analysis.units import ARCSEC
 from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_numbers import REJECTED, TURNTABLE
+from twin.laboratory.turntable_numbers import DOUBTFUL, REJECTED, TURNTABLE
 from twin.laboratory.turntable_run import TurntableRun
 from twin.run.artefact import Artefact, SvgFigure, Table, fixed
 from twin.run.report import Report, Section, answer
@@ -41,8 +41,6 @@ COLOURS = {
     "fourier": GREEN,
     "network": VERMILION,
 }
-DOUBTFUL = 1e-3
-"""Chance below which a chi-square is told as a warning."""
 _CURVE_POINTS = 801
 
 

@@ -156,7 +156,7 @@ class Client:
             case messages.Factors():
                 self.factors = message
             case messages.Save():
-                self.saves.append(message)
+                self.saves.append(message.model_copy(update={"state": self._own(message.state)}))
             case messages.Blind():
                 if message.on:
                     self.blind = secrets.randbelow(messages.LARGEST_SEED)

@@ -12,7 +12,7 @@ from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.live.knobs import AXES, Knob, perturbation
 from twin.live.live_bench import LiveBench
-from twin.live.messages import AskedState
+from twin.live.messages import AskedState, BlindState
 from twin.run.provenance import Provenance, versions
 
 HEAD = "# Recorded with python -m twin.live; repeat it: python -m twin.render THIS_FILE\n"
@@ -26,6 +26,12 @@ def _head() -> str:
         f"{HEAD}# made by space-camera-twin {by['space-camera-twin']}, source {made.source}, Python {by['python']}, "
         f"numpy {by['numpy']}, Dr.Jit {by['drjit']}, on {made.processor}; {kernels}\n"
     )
+
+
+BLIND = (
+    "# Saved while motions were hidden: this job holds the guess of the knobs alone, so that twin.render gives the\n"
+    "# spots of the guess and not those that were shown.\n"
+)
 
 
 def job_text(bench: LiveBench, asked: AskedState) -> str:
@@ -42,7 +48,8 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
     plain = resolved.plain()
     if asked.time is not None and resolved.job.course is not None:
         plain["job"]["course"]["detail"] = moment(resolved.job.course.times[asked.time])
-    return _head() + dump_yaml(plain)
+    hidden = BLIND if isinstance(asked, BlindState) else ""
+    return _head() + hidden + dump_yaml(plain)
 
 
 def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> str:

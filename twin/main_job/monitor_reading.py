@@ -12,7 +12,7 @@ import numpy as np
 
 from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.curvature import BEYOND
-from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, consistency
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares, consistency
 from analysis.monitor.estimators import Estimator, applicable, judged
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.limits import Quantity, posterior_sigma, quantities
@@ -192,9 +192,7 @@ class MonitorReading:
         stated, false_alarm = self.disturbances, FALSE_ALARM / len(shifts)
         if stated is None:
             return None
-        # suspects are looked for at one time only
-        found = [consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(shifts, covariance, strict=True)]
-        worst = int(np.argmax(found))
+        worst = int(np.argmax(chi_squares(shifts, covariance, stated)))
         others = self.any_motions(stated)
         return worst, consistency(shifts[worst], covariance[worst], stated, others, false_alarm=false_alarm)
 

@@ -69,7 +69,9 @@ def _numbers(run: JobRun) -> dict[str, Any]:
         parts["quality"] = QUALITY(run.quality)
     if run.targets is not None:
         parts["mtf"] = run.targets.to_dict()
-    return {kind: described(kind, data) for kind, data in parts.items()}
+    told = judge(run)
+    said = {"verdict": told.verdict, "warnings": list(told.warnings)}
+    return {**{kind: described(kind, data) for kind, data in parts.items()}, **said}
 
 
 def _print_result(run: JobRun, console: Console) -> None:

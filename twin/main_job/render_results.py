@@ -143,6 +143,7 @@ class RenderRun(JobRun):
     def reading(self) -> MonitorReading:
         """What the images say, beside the truth."""
         experiment = self.experiment
+        together = None if self.series is None else self.series.smoothed
         return MonitorReading(
             channels=tuple((channel.camera, channel.name) for channel in experiment.path.channels),
             cameras=experiment.cameras,
@@ -152,6 +153,7 @@ class RenderRun(JobRun):
             crosstalk=self.crosstalk,
             frames=self.frames,
             centroid=self.resolved.job.analysis.centroid,
+            found_wrong=together.contradiction if together is not None else (),
             truth=self.truth,
         )
 

@@ -83,6 +83,8 @@ def judge(run: JobRun) -> Judgement:
     given = (*run.warnings, *doubted(run), *contradiction(run), *unseen)
     warnings = (*given, *_unstated(run, found, unseen), *_misreadings(run))
     doubt = "σ does not hold for this measurement: see the warnings" if not run.sigma_holds else ""
+    if contradicted := _series_contradicted(run):
+        first, doubt = contradicted, first
     verdict, more = answer(first, doubt, *others, limited(run), _dimmed(run), _blurred(run))
     return Judgement(verdict, more, warnings)
 
@@ -355,6 +357,23 @@ def _series_verdict(
         f"the worst is {worst.name}, with an error of {worst.shown(worst.error)} {unit} RMS for a true change of "
         f"{worst.shown(worst.true)} {unit} RMS; {size} {worst.shown(worst.sigma)} {unit}",
         f"{why}; more frames do not reduce the error: see Time course",
+    )
+
+
+def _series_contradicted(run: RenderRun) -> str:
+    """Return what leads the verdict of a course that contradicts its prior, with the largest error of its filtered and
+    smoothed changes; empty where it does not.
+    """
+    series = run.series
+    if series is None or series.smoothed is None or series.smoothed.consistency.agrees:
+        return ""
+    true = {(row.group, row.parameter.key): row.true for row in series.readings}
+    found = [row for row in series.smoothed.changes if row.group != GROUND_GROUP]
+    worst = max(float(np.max(np.abs(r.value - true[r.group, r.parameter.key]) / r.sigma)) for r in found)
+    off = f": they are off by up to {significant(worst, 3)} σ" if worst > FAR else ""
+    return (
+        f"the course contradicts the prior {series.smoothed.name} or its time laws, and σ of filtered and smoothed "
+        f"changes does not hold{off}"
     )
 
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from analysis.chi_square import limit_of
 from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.curvature import Curvature
-from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.recovery import Recovery, estimates_of
@@ -30,6 +31,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import largest_piece
 from twin.monitor.observation import LOST, Observing, observe, one_detector, why_lost
 from twin.monitor.reading_table import ReadingTable, reading_table
+from twin.run.artefact import significant
 from twin.run.quantity import Quantity, Record
 
 LARGEST_SERIES = 200_000_000
@@ -55,6 +57,7 @@ class TimeSeries:
         warnings: what the user should know.
         evidence: what the fits of all spots say.
         curvature: estimator -> whether its motions are small enough to be linear, at all times.
+        agrees: (T,) whether the shifts of each time agree with the prior; the false-alarm rate is that of all times.
     """
 
     times: np.ndarray
@@ -72,11 +75,15 @@ class TimeSeries:
     warnings: tuple[str, ...]
     evidence: SpotEvidence
     curvature: Mapping[str, Curvature]
+    agrees: np.ndarray
 
     @property
     def sigma_holds(self) -> np.ndarray:
-        """(T,) whether spots and readings of each time are as their sigmas take them to be."""
-        return np.all([self.evidence.holds, *(found.holds for found in self.curvature.values())], axis=0)
+        """Return (T,) whether spots and readings of each time are as their sigmas take them to be; at no time where all
+        of them together contradict the prior or its time laws.
+        """
+        agrees = self.agrees & (self.smoothed is None or self.smoothed.consistency.agrees)
+        return agrees & np.all([self.evidence.holds, *(found.holds for found in self.curvature.values())], axis=0)
 
     def doubts(self, spots: Sequence[str]) -> tuple[str, ...]:
         """Where sigma does not hold, and which readings were worked out anew since they are not linear; sentences
@@ -85,7 +92,7 @@ class TimeSeries:
         Args:
             spots: their names.
         """
-        out = []
+        out = [] if self.smoothed is None else list(self.smoothed.contradiction)
         told = self.evidence.course_doubt([moment(time) for time in self.times.tolist()], spots)
         if told is not None:
             out.append(f"course {told}")
@@ -147,7 +154,11 @@ COURSE: Record[TimeSeries] = Record(
     Quantity("motions", lambda course: course.motions or None, "motions by body", record=_MOTIONS, where_known=True),
     Quantity("intersection_angle", _angle, "the angle between two cameras", where_known=True),
     Quantity("ground", lambda course: course.group("ground"), "errors of points on the ground", where_known=True),
-    Quantity("sigma_holds", lambda course: course.sigma_holds, "whether the sigmas hold at each time"),
+    Quantity(
+        "sigma_holds",
+        lambda course: course.sigma_holds,
+        "whether sigmas hold at each time, filtered and smoothed ones too",
+    ),
     Quantity(
         "disturbances",
         lambda course: None if course.smoothed is None else course.smoothed.to_dict(),
@@ -250,6 +261,11 @@ def run_series(
         k, spot = divmod(error.indices[0], len(channels))
         reason = f"the spot {channels[spot].key} cannot be measured ({error.reasons[error.indices[0]]})"
         raise too_large(job, done + k, reason) from error
+    shift = np.concatenate([r.shift for r in recoveries])
+    spread = np.concatenate([r.shift_covariance for r in recoveries])
+    stated, agrees = experiment.disturbances, np.ones(len(shift), bool)
+    if stated is not None and np.any(spread):
+        agrees = chi_squares(shift, spread, stated) <= limit_of(FALSE_ALARM / len(shift), shift.shape[1])
     moves = [motions_of(job, k) for k in range(len(states))]
     smoothed = together.smoothed()
     jumped = () if smoothed is None else smoothed.jump_texts()
@@ -261,14 +277,15 @@ def run_series(
         angle=angle,
         readings=ReadingTable.joined(tables),
         smoothed=smoothed,
-        shift=np.concatenate([r.shift for r in recoveries]),
-        shift_covariance=np.concatenate([r.shift_covariance for r in recoveries]),
+        shift=shift,
+        shift_covariance=spread,
         photons=photons,
         shown_photons=shown_photons,
         frames=first,
         warnings=(*_warnings(experiment, course, saturated, share), *(f"course: {text}" for text in jumped)),
         evidence=SpotEvidence.joined([r.evidence for r in recoveries if r.evidence is not None]),
         curvature={e: Curvature.joined([r.curvature[e] for r in recoveries]) for e in recoveries[0].curvature},
+        agrees=agrees,
     )
 
 
@@ -349,6 +366,20 @@ class SmoothedCourse:
     def jump_texts(self) -> tuple[str, ...]:
         """What jumped, when and how far; sentences without their end."""
         return tuple(jump_text(one) for one in self.jumps or ())
+
+    @property
+    def contradiction(self) -> tuple[str, ...]:
+        """Return a warning if all measurements contradict the prior or its time laws: each may agree with what moves,
+        and all of them not with how it goes on in time.
+        """
+        found = self.consistency
+        if found.agrees:
+            return ()
+        return (
+            f"the series contradicts the prior {self.name} or its time laws: chi-square "
+            f"{significant(found.chi_square)} of {found.degrees} coordinates where {found.limit:.1f} is exceeded with "
+            f"a chance of {FALSE_ALARM:g}; σ of filtered and smoothed changes does not hold",
+        )
 
     def between_dict(self) -> dict[str, Any]:
         """Filtered and smoothed changes between the times of the course, as course.json has those at its times."""

@@ -30,6 +30,8 @@ from twin.run.cli import (
     AsJson,
     InputErrorText,
     Quiet,
+    Strict,
+    end_strictly,
     print_verdict,
     print_whole,
     result_table,
@@ -250,6 +252,7 @@ def status(
     ] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    strict: Strict = False,
 ) -> None:
     """Tell what a record holds, what was refused and why; and, under its plan of operation or another one, how the
     instrument stands: every quantity with its sigma, requirements, jumps, sensors, whether predictions came true.
@@ -259,7 +262,8 @@ def status(
 
     Example: `python -m twin.operate status record scenes/examples/operation.yaml`
 
-    Exit codes: 0 success, whether alarms are open or not, 2 bad input, 1 anything else.
+    Exit codes: 0 success, whether alarms are open or not, 2 bad input, 3 with --strict where the last readings
+    contradict what is stated, 1 anything else.
     """
     require_record(record)
     from twin.operate.record.history import History
@@ -278,6 +282,8 @@ def status(
                 show_estimate(found[0], rows, console)
 
         tell(errors, as_json, quiet, data, show)
+        if strict:
+            end_strictly(errors, data)
 
 
 def _record_warnings(held: dict[str, Any]) -> list[str]:

@@ -300,18 +300,6 @@ class Overview:
             f"({100.0 * one.expected:.1f} and {100.0 * two.expected:.1f} %)"
         )
 
-    def doubts(self) -> list[str]:
-        """What a reader should know before using the numbers."""
-        told, out = self.following, []
-        if told.widened > 1.0:
-            out.append(
-                "the last readings contradict what is stated; all sigmas are "
-                f"{told.widened:.3g} times as wide as it would make them"
-            )
-        if told.too_many_jumps:
-            out.append(f"{len(told.jumps)} jumps are more than is stated: something else moves, or more of it")
-        return out
-
     def open_alarms(self) -> list[Mapping[str, Any]]:
         """Alarms that nobody has acknowledged, the newest first."""
         found = [one for one in self.alarms if one["acknowledged"] is None]

@@ -21,7 +21,7 @@ from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import Problem
 from scenes.yaml.standard_output import FAILURE, print_error
 from scenes.yaml.units import ANGLE, DISTANCE, parse_quantity
-from twin.run.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed
+from twin.run.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed, Strict
 from twin.run.command import Result, add_tests, finished, print_warnings, run_command, run_test
 from twin.run.procedure import Advance, Session
 
@@ -88,6 +88,7 @@ def adjust(
     force: Force = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    strict: Strict = False,
 ) -> None:
     """Adjust a block of scenes; its help is that of the test."""
     procedure = PROCEDURES["orbit adjust"]
@@ -97,7 +98,7 @@ def adjust(
 
         return without_sensors(resolve_any_adjust(path), without or ())
 
-    options = Options(out, seed, backend, force, as_json, quiet)
+    options = Options(out, seed, backend, force, as_json, quiet, strict=strict)
     if workers is None and scheduler is None:
         run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve), file, options)
         return

@@ -14,7 +14,7 @@ import typer
 
 from scenes.kinds.file_kinds import read_for
 from scenes.yaml.named import Named
-from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet
+from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Strict
 from twin.run.command import Result, finished, run_command
 from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
@@ -37,6 +37,7 @@ def main(
     force: Force = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    strict: Strict = False,
 ) -> None:
     """Recover what moved from measured frames of a monitor's area CCDs, before and after: the centroids and estimators
     of `python -m twin.render`, with total sigmas and without a truth.
@@ -77,7 +78,7 @@ def main(
 
     run_command(
         measurement.stem,
-        Options(out, None, backend, force, as_json, quiet),
+        Options(out, None, backend, force, as_json, quiet, strict=strict),
         lambda: read_for(PROGRAM, measurement, Named("scenes.specs.measured.monitor_frames:resolve_measurement")),
         work,
         MODELS["recover"],

@@ -156,15 +156,7 @@ def _warnings(run: RecoverRun) -> tuple[str, ...]:
     found = (*run.warnings, *contradicted(run.last.disturbances, worst[1], when, rate))
     if run.smoothed is not None:
         found += run.smoothed.jump_texts()
-    if run.smoothed is not None and not run.smoothed.consistency.agrees:
-        # each time may agree with what moves, and all of them not with how it goes on in time
-        found += (
-            f"the series contradicts the prior {run.smoothed.name} or its time laws: chi-square "
-            f"{significant(run.smoothed.consistency.chi_square)} of {run.smoothed.consistency.degrees} coordinates "
-            f"where {run.smoothed.consistency.limit:.1f} is exceeded with a chance of {FALSE_ALARM:g}; σ of filtered "
-            "and smoothed changes does not hold",
-        )
-    return found
+    return (*found, *(() if run.smoothed is None else run.smoothed.contradiction))
 
 
 def _frames_text(run: RecoverRun) -> str:

@@ -152,6 +152,8 @@ def run_recover(
         frames = min(len(result.channel.after[k].frames) for result in results)
         own = tuple(replace(result, after=result.after[k : k + 1]) for result in results)
         wrong = (*_unlike(own, times, k), *_noisy(own, times, source, k))
+        if smoothed is not None and one is recoveries[-1]:
+            wrong += smoothed.contradiction  # recovered.json is about the last state, and its filtered changes
         told = bench.cameras, ground, bench.disturbances, one, tables, frames, centroid, wrong
         readings.append(MonitorReading(names, *told))
     of_frames = (*_unlike(results, times), *_noisy(results, times, source))

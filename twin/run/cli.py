@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich import box, progress
@@ -21,7 +21,7 @@ from optics.numerics.backend import NAMES
 from scenes.yaml.errors import InputError
 from scenes.yaml.standard_output import BAD_INPUT, FAILURE, code_of, print_error
 
-INTERRUPTED = 128 + signal.SIGINT
+DOUBTFUL, INTERRUPTED = 3, 128 + signal.SIGINT
 NO_NAME = (errno.ENAMETOOLONG, errno.ELOOP)
 """What an operating system answers to a name that no file can have."""
 LARGEST_SEED = 2**63 - 1
@@ -39,6 +39,8 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 EXPORT_HELP = "Also write what was measured as a folder of tables that the same command reads, with a test file."
 Export = Annotated[Path | None, typer.Option("--export", readable=False, metavar="DIR", help=EXPORT_HELP)]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+STRICT_HELP = "Exit with code 3 where a sigma does not hold or another verdict on the result is negative."
+Strict = Annotated[bool, typer.Option("--strict", help=STRICT_HELP)]
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Options:
         as_json: print the numbers as JSON.
         quiet: print nothing.
         export: folder for what was measured, None for none.
+        strict: end with the exit code DOUBTFUL where a verdict on the result is negative.
     """
 
     out: Path | None
@@ -62,6 +65,25 @@ class Options:
     as_json: bool
     quiet: bool
     export: Path | None = None
+    strict: bool = False
+
+
+def end_strictly(errors: Console, numbers: Any) -> None:
+    """End with the exit code of a result whose sigmas do not hold.
+
+    Args:
+        errors: where the negative verdicts are named.
+        numbers: of the result, plain data.
+
+    Raises:
+        typer.Exit: a verdict is negative, see `twin.run.provenance.negative_verdicts`.
+    """
+    from twin.run.owned_files import first_names
+    from twin.run.provenance import negative_verdicts
+
+    if negative := negative_verdicts(numbers):
+        print_error(errors, f"--strict: not to be relied on, false in the result: {first_names(negative)}")
+        raise typer.Exit(DOUBTFUL)
 
 
 class InputErrorText(Exception):

@@ -118,6 +118,8 @@ def run_command(
         raise typer.Exit(FAILURE)
     if result.code:
         raise typer.Exit(result.code)
+    if options.strict:
+        cli.end_strictly(errors, result.numbers)
 
 
 def tell_cost(cost: Cost, errors: Console, quiet: bool) -> None:
@@ -202,8 +204,10 @@ def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure)
         force: cli.Force = False,
         as_json: cli.AsJson = False,
         quiet: cli.Quiet = False,
+        strict: cli.Strict = False,
     ) -> None:
-        run_test(program, command, procedure, file, cli.Options(out, seed, backend, force, as_json, quiet, export_to))
+        options = cli.Options(out, seed, backend, force, as_json, quiet, export_to, strict)
+        run_test(program, command, procedure, file, options)
 
     if procedure.export is None:
         # Typer makes the options from the signature

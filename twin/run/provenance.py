@@ -242,7 +242,13 @@ class SelfCheck:
 
 
 CHI_SQUARE, WITHIN = re.compile(r"(^|_)chi_square$|^relative_error$|^worst_relative$"), ("chi_square_limit", "limit")
-TRUE = ("converged", "agrees", "holds", "sigma_holds")
+VERDICT = re.compile(r"(^|_)(agrees?|converged|holds?|settled|stable)$")
+"""Ending of the keys of truth values that judge a result: where one is False, its numbers or their sigmas are not to be
+relied on.
+"""
+CANDIDATES = re.compile(r"(^|\.)(intervals|starts)\[").search
+"""Finds lists in a path whose entries are judged each: the result beside them states its verdict by itself."""
+_OF_TRUTH = "0 for yes, 1 for no"
 MOST_CHECKS = 50
 """Checks of one run that are kept at most."""
 
@@ -262,8 +268,9 @@ def _checks(tree: Any, path: str) -> Iterator[SelfCheck]:
         limit = next((float(tree[name]) for name in WITHIN if isinstance(tree.get(name), int | float)), None)
         for key, value in tree.items():
             name = f"{path}.{key}" if path else str(key)
-            if key in TRUE and isinstance(value, bool):
-                yield SelfCheck(name, 0.0 if value else 1.0, 0.0, "", "0 for yes, 1 for no")
+            if VERDICT.search(str(key)) and isinstance(value, bool | list):
+                good = all(value) if isinstance(value, list) else value
+                yield SelfCheck(name, 0.0 if good else 1.0, 0.0, "", _OF_TRUTH)
             elif CHI_SQUARE.search(str(key)) and isinstance(value, int | float) and not isinstance(value, bool):
                 yield SelfCheck(name, float(value), limit if "chi_square" in str(key) else None)
             else:
@@ -271,6 +278,18 @@ def _checks(tree: Any, path: str) -> Iterator[SelfCheck]:
     elif isinstance(tree, list | tuple):
         for k, value in enumerate(tree):
             yield from _checks(value, f"{path}[{k}]")
+
+
+def negative_verdicts(numbers: Mapping[str, Any]) -> list[str]:
+    """Return the paths of all verdicts on a result that are False, such as ``disturbances.agrees``; those of CANDIDATES
+    are left out.
+
+    Args:
+        numbers: of the result, nested plain data.
+    """
+    return [
+        one.name for one in _checks(numbers, "") if one.says == _OF_TRUTH and one.value and not CANDIDATES(one.name)
+    ]
 
 
 def inputs_in(tree: Any, given: Iterable[Path] = ()) -> dict[str, str]:

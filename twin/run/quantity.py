@@ -68,6 +68,7 @@ class Quantity(Generic[S]):
         where_known: files have the key only where the value is not None.
         converted: whether the source is in SI units; False where it already is in the unit of the key.
         shown: unit in which reports have it, empty for that of the key: ``percent`` of a share.
+        warning: source -> the sentence that warns readers where the value is False; of a verdict on the result.
     """
 
     key: str
@@ -79,6 +80,7 @@ class Quantity(Generic[S]):
     where_known: bool = False
     converted: bool = True
     shown: str = ""
+    warning: Callable[[S], str] | None = None
 
     @property
     def below(self) -> Record[Any] | None:
@@ -112,6 +114,14 @@ class Quantity(Generic[S]):
         if isinstance(found, list | tuple):
             return [self.record(one) for one in found]
         return self.record(found)
+
+
+def _sources(found: Any) -> list[Any]:
+    """Return the sources of a record: none for None, one, those of a list, or of a mapping and the mappings in it."""
+    several = list(found.values()) if isinstance(found, Mapping) else found
+    if isinstance(several, list):
+        return [source for below in several for source in _sources(below)]
+    return [] if found is None else [found]
 
 
 def _by_name(record: Record[Any], sources: Mapping[str, Any]) -> dict[str, Any]:
@@ -152,6 +162,16 @@ class Record(Generic[S]):
         """The numbers of a source each of whose quantities is an array of one length, row by row."""
         columns = self(source)
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+    def warnings(self, source: S) -> Iterator[str]:
+        """Yield the warnings of all verdicts of a source that are False, those of the records below it included."""
+        for one in self.quantities:
+            if one.warning is not None and (verdict := one.of(source)) is not None and not verdict:
+                yield one.warning(source)
+            if one.record is not None:
+                found = one.of(source)
+                for below in _sources(list(found) if isinstance(found, tuple) else found):
+                    yield from one.record.warnings(below)
 
     def of_part(self, part: Callable[[T], S]) -> list[Quantity[T]]:
         """Quantities of this record for the record of an object of which this record's source is a part."""

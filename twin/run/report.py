@@ -93,17 +93,19 @@ class Report:
         return (self.summary, *(artefact for section in self.sections for artefact in section.artefacts))
 
     def told(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """Numbers of the run with the verdict beside them.
+        """Return the numbers of the run with the verdict and the warnings beside them.
 
         Args:
             numbers: by their keys.
 
         Raises:
-            ValueError: they have a verdict of their own, which would be lost.
+            ValueError: they have another verdict or other warnings, which would be lost.
         """
-        if numbers.get("verdict", self.verdict) != self.verdict:
-            raise ValueError("the key 'verdict' of a run's numbers is for the sentence of its report")
-        return {**numbers, "verdict": self.verdict}
+        added = {"verdict": self.verdict, "warnings": list(self.warnings)}
+        for key, value in added.items():
+            if numbers.get(key, value) != value:
+                raise ValueError(f"the key {key!r} of a run's numbers is for what its report says")
+        return {**numbers, **added}
 
     def __post_init__(self) -> None:
         """Refuse a verdict of more than two sentences, and two artefacts of one name: they would be one file."""

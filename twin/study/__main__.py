@@ -56,6 +56,7 @@ def main(
     backend: cli.BackendName = "llvm",
     as_json: cli.AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and warnings.")] = False,
+    strict: cli.Strict = False,
     progress_fd: Annotated[int | None, typer.Option("--progress-fd", hidden=True, min=3)] = None,
 ) -> None:
     """Run a job many times with varied values and keep the numbers that matter.
@@ -91,7 +92,7 @@ def main(
         # drawing libraries are not needed before
         from twin.study.gradient.gradient_report import run_gradient
 
-        run_gradient(file, cli.Options(out, None, backend, force, as_json, quiet))
+        run_gradient(file, cli.Options(out, None, backend, force, as_json, quiet, strict=strict))
         return
     with cli.explained(errors):
         told = (lambda done, total: None) if progress_fd is None else tell_through(progress_fd)
@@ -120,6 +121,8 @@ def main(
         # everything is written: only what the file says of a response is wrong
         with cli.explained(errors):
             raise run.fault
+    if strict:
+        cli.end_strictly(errors, run.numbers)
 
 
 def _refuse_with_gradient(errors: Console, options: StudyOptions) -> None:

@@ -63,7 +63,7 @@ class StudyRun:
     """A finished study.
 
     Attributes:
-        numbers: contents of study.json.
+        numbers: contents of study.json, with the verdict and the warnings.
         verdict: what was found, in two sentences at most.
         folder: where it is.
         fault: what the study's file says of its responses and the runs contradict; None where they do not.
@@ -147,19 +147,18 @@ def run_study(
 
             result = store.result()
             numbers = write_data(plan, result, engine.seconds, engine.computed, folder)
-            if numbers.summary.get("doubted"):
-                remember(f"σ does not hold in {numbers.summary['doubted']} of {plan.runs} runs: see the report")
             report = write_report(numbers.data, plan, folder, numbers.files, (*given, *numbers.unwritten))
             missing = (*numbers.unwritten, *report.undrawn)
-            remember(*missing)
+            remember(*(text for text in report.warnings if text not in warnings))
             fault = impossible(StudyRuns.of(numbers.data, setup.study))
             entries: dict[str, Any] = {"backend": options.backend, "seed": setup.study.design.seed, "workers": count}
             entries |= {"runs": plan.runs, "failed": int(result.failed.sum())}
-            entries["warnings"] = [*warnings, *(str(issue) for issue in (fault.issues if fault else ()))]
+            entries["warnings"] = warnings
             entries["inputs"] = provenance.inputs_in(setup.tree)
             entries["again"] = [PROGRAM, "config.yaml", "--backend", options.backend, "--yes"]
             run_folder.write_manifest(folder, PROGRAM, started, engine.seconds, **entries)
-    return StudyRun(numbers.summary, report.verdict, folder.target, fault, missing)
+    told = {**numbers.summary, "verdict": report.verdict, "warnings": warnings}
+    return StudyRun(told, report.verdict, folder.target, fault, missing)
 
 
 def _check_size(setup: StudySetup, confirmed: bool) -> None:

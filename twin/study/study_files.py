@@ -132,7 +132,8 @@ def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
         "name": study.name,
         "runs": plan.runs,
         "failed": int(failed.sum()),
-        **({"doubted": sum(map(bool, data[DOUBT].values.tolist()))} if DOUBT in data else {}),
+        **({"doubted": (doubted := sum(map(bool, data[DOUBT].values.tolist())))} if DOUBT in data else {}),
+        **({"sigma_holds": not doubted} if DOUBT in data else {}),
         "seed": study.design.seed,
         "design": study.design.kind,
         "factors": {

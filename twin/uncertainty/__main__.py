@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
+from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, Strict
 from twin.run.command import Result, finished, run_command
 from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
@@ -56,6 +56,7 @@ def main(
     force: Force = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    strict: Strict = False,
 ) -> None:
     """Say what limits the readings of an instrument's monitor under its stated disturbances: standard deviations of
     every parameter, the intersection angle and points on the ground before and after a measurement, by every estimator;
@@ -101,7 +102,7 @@ def main(
         facts |= {"seed": run.seed if states else None, "checks": (*run.images.told(), *checks_in(numbers))}
         return finished(session, KIND, uncertainty_report(run), numbers, program=PROGRAM, **facts)
 
-    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work, cost)
+    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet, strict=strict), resolve, work, cost)
 
 
 if __name__ == "__main__":

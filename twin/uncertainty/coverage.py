@@ -120,6 +120,11 @@ class Coverage:
         return int(binom.ppf(1.0 - FALSE, self.measured, FALSE_ALARM))
 
     @property
+    def sigma_holds(self) -> bool:
+        """Return whether no count is beyond its limits and sigma is doubted in no state."""
+        return not self.outliers and self.alarms <= self.alarm_limit and not self.doubted
+
+    @property
     def outliers(self) -> tuple[tuple[str, str, str, float, int], ...]:
         """Estimator, group and key of a quantity, level and count of all counts beyond their limits."""
         out = []

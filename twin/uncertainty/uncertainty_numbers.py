@@ -221,6 +221,7 @@ STATES: Record[Coverage] = Record(
     Quantity("alarms", lambda found: found.alarms, "states whose chi-square is beyond its limit"),
     Quantity("alarms_limit", lambda found: found.alarm_limit, "largest number of alarms by chance"),
     Quantity("doubted", lambda found: found.doubted, "states for which sigma does not hold by what is measured"),
+    Quantity("sigma_holds", lambda found: found.sigma_holds, "no count beyond its limits, no state doubted"),
 )
 
 
@@ -245,7 +246,7 @@ def uncertainty_numbers(run: UncertaintyRun) -> dict[str, Any]:
     Args:
         run: of the command.
     """
-    out = {**LIMITS(run.limits), "warnings": list(run.warnings)}
+    out = LIMITS(run.limits)
     if run.coverage is not None:
         out["states"] = {"seed": run.seed, **STATES(run.coverage)}
     return out

@@ -87,6 +87,11 @@ def uncertainty_report(run: UncertaintyRun) -> Report:
             f"in {coverage.doubted} of {coverage.measured} random states spots are not as calibrated or motions not "
             "small, so that σ does not hold there"
         )
+    if coverage is not None and coverage.alarms > coverage.alarm_limit:
+        warnings.append(
+            f"in {coverage.alarms} of {coverage.measured} random states the shifts contradict the prior, by chance in "
+            f"{coverage.alarm_limit} at most: chi-square is larger than sigmas and prior say"
+        )
     if coverage is not None and coverage.outliers:
         warnings.append(
             "sigmas do not hold in the random states: "

@@ -351,7 +351,7 @@ def _numbers(old: Mapping[str, Leaf], new: Mapping[str, Leaf], elsewhere: bool) 
         if not math.isfinite(off):
             out.append(QuantityDifference(key, here, there))
             continue
-        sigma = sigma_of(first, second, ("", key))
+        sigma, _ = sigma_of(first, second, ("", key))
         in_sigma = off / (sigma / math.sqrt(2.0)) if sigma else None  # sigma is that of a difference of two
         size = max(size, peers.get(_peer(key), 0.0))
         relative = off / size if size else 0.0

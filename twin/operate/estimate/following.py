@@ -212,11 +212,26 @@ class Following:
     too_many_jumps: bool
     breaks: tuple[Break, ...]
 
+    @property
+    def warnings(self) -> list[str]:
+        """Return what a reader should know before using the numbers."""
+        out = []
+        if self.widened > 1.0:
+            out.append(
+                "the last readings contradict what is stated; all sigmas are "
+                f"{self.widened:.3g} times as wide as it would make them"
+            )
+        if self.too_many_jumps:
+            out.append(f"{len(self.jumps)} jumps are more than is stated: something else moves, or more of it")
+        return out
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         return {
             "time_utc": utc_text(self.time),
             "readings": self.readings,
+            "agrees": not self.warnings,
+            "warnings": self.warnings,
             "now": self.now.to_dict(),
             "scores": vars(self.scores),
             "innovations": [

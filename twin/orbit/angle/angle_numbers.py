@@ -74,7 +74,10 @@ PASS: Record[PassAngles] = Record(
     ),
     Quantity("plane_p_value", _plane_chances, "line -> chance of a chi-square of its plane as large or larger"),
     Quantity("resection_p_value", lambda one: one.estimate.resection.p_value, "the same for the resection"),
+    Quantity("resection_agrees", lambda one: one.estimate.resection.p_value >= UNLIKELY, "whether that is likely"),
 )
+UNLIKELY = 1e-3
+"""Chance of a chi-square as large below which a resection does not fit."""
 TRUTH: Record[SimulatedAngleRun] = Record(
     "The angles of the true camera, by each definition.",
     Quantity("look", lambda run: _degrees(run.names, run.flight.look.values()), "between the lines of sight"),

@@ -12,6 +12,7 @@ from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.measured.orbit_data_setup import MeasuredAngleSetup
 from scenes.specs.perturbation import PlainPerturbationSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.orbit.angle.angle_numbers import UNLIKELY
 from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, values_of
 from twin.orbit.angle.angle_sections import listed, sections, signs
 from twin.orbit.flight.light_effects import LightEffects
@@ -283,7 +284,7 @@ def _warnings(run: AngleRun) -> tuple[str, ...]:
                 f"{one.name}: {len(far)} points lie farther from their planes than chance allows, the farthest {name} "
                 f"of {worst[0]}, {worst[2]:.0f} σ; `angle` leaves none out: look at them, or let `calibrate` find them"
             )
-        if one.estimate.resection.p_value < 1e-3:
+        if one.estimate.resection.p_value < UNLIKELY:
             found.append(
                 f"{one.name}: the resection does not fit (chance {one.estimate.resection.p_value:.1g}); principal "
                 "distances may have changed, or lines turned about the flight direction or the vertical"

@@ -20,6 +20,8 @@ ACCURACY: Record[Accuracy] = Record(
     Quantity("le90_m", lambda one: one.le90, "in height", "LE90", 3),
     Quantity("points", lambda one: one.count, "of how many check points"),
 )
+ALARM = 1e-3
+"""Chance below which a test of a run speaks; a run has some ten of them."""
 WORTH: Record[Worth] = Record(
     "Check points by some of the block's sensors.",
     Quantity("left_out", lambda one: list(one.left_out), "sensors that were not used"),
@@ -107,6 +109,7 @@ BLOCK: Record[BlockRun] = Record(
     ),
     Quantity("degrees_of_freedom", lambda run: run.adjustment.degrees_of_freedom, "of the chi-square"),
     Quantity("p_value", lambda run: run.adjustment.p_value, "chance of such a chi-square or a larger one"),
+    Quantity("agrees", lambda run: run.adjustment.p_value >= ALARM, "whether all agrees with what was stated of it"),
     Quantity("unknowns", lambda run: len(run.adjustment.x), "beside the points"),
     Quantity("points", lambda run: int(np.isfinite(run.adjustment.ground[:, 0]).sum()), "that were adjusted"),
     Quantity("groups", lambda run: run.adjustment.groups, "group of observations, or law -> its test", record=GROUP),

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.orbit.block.block_numbers import CHANGE, GROUP
+from twin.orbit.block.block_numbers import ALARM, CHANGE, GROUP
 from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report, Section, answer
 
-_ALARM = 1e-3
-"""Chance below which a test of a run speaks; a run has some ten of them."""
 _NAMED = 8
 _TOLD = 0.1
 """Sigmas beforehand: what is told less well is listed as left to the priors."""
@@ -165,15 +163,15 @@ def _warnings(run: BlockRun) -> tuple[str, ...]:
             f"the control points lie {d.east:+.2f} m east, {d.north:+.2f} m north and {d.up:+.2f} m up of where all"
             f" else puts them (chance {run.datum_chance:.1g}): are they given in another datum?"
         )
-    found += [str(one) for one in run.laws if one.p_value < _ALARM]
+    found += [str(one) for one in run.laws if one.p_value < ALARM]
     for name, group in run.adjustment.groups.items():
-        if group.p_value < _ALARM:
+        if group.p_value < ALARM:
             size = float(np.sqrt(group.ratio))
             found.append(
                 f"{name}: residuals are {size:.2g} times as large as stated (chance {group.p_value:.1g});"
                 f" `components: [{name}]` estimates their variance, and another law may be the right one"
             )
-    if run.adjustment.p_value < _ALARM:
+    if run.adjustment.p_value < ALARM:
         found.append("the block as a whole contradicts what was stated of it; its sigmas are too small")
     return tuple(found)
 

@@ -311,11 +311,28 @@ ATTITUDE_DRIFT: Record[AttitudeDrift] = Record(
     Quantity("assumed_rate_rad_s", lambda d: d.assumed and d.assumed.rate, "sigma of the rates that are assumed since"),
     Quantity("assumed_walk_rad", lambda d: d.assumed and d.assumed.walk, "likewise of a random walk, in one second"),
 )
+UNLIKELY = 1e-3
+"""Chance of a chi-square as large below which the adjustment does not fit."""
+
+
+def _fits(run: CalibrationRun) -> bool | None:
+    return run.together.p_value >= UNLIKELY if run.campaign.spec.errors.switched_on else None
+
+
+def _misfit(run: CalibrationRun) -> str:
+    drifts = run.truth is not None and bool(run.campaign.simulated.drift)
+    return (
+        f"the adjustment does not fit: a chi-square as large has a chance of {run.together.p_value:.1g}; biases may "
+        f"drift during a pass{', and the cameras drift from field to field' * drifts}"
+    )
+
+
 FIT: Record[CalibrationRun] = Record(
     "How the adjustment of all fields fits.",
     Quantity("chi_square", lambda run: run.together.chi_square, "of the residuals"),
     Quantity("degrees_of_freedom", lambda run: run.together.degrees_of_freedom, "of chi-square"),
     Quantity("p_value", lambda run: run.together.p_value, "chance of a chi-square as large"),
+    Quantity("agrees", _fits, "whether residuals are as their sigmas say; null of exact points", warning=_misfit),
     Quantity("iterations", lambda run: run.together.iterations, "steps of the adjustment"),
     Quantity("attitude_drift", lambda run: run.drift, record=ATTITUDE_DRIFT),
 )
@@ -334,7 +351,12 @@ STEPWISE: Record[CalibrationRun] = Record(
     Quantity("field", lambda run: run.setup.test.schemes[0][0], "its name"),
     Quantity("rounds", lambda run: run.stepwise.rounds, "until the steps are small"),
     Quantity("rate", lambda run: run.stepwise.rate, "what a round leaves of the slowest error"),
-    Quantity("converged", lambda run: run.stepwise.converged, "whether the steps become small"),
+    Quantity(
+        "converged",
+        lambda run: run.stepwise.converged,
+        "whether the steps become small",
+        warning=lambda run: f"the stepwise solution has not settled after {run.stepwise.rounds} rounds",
+    ),
 )
 BIAS_OF_FIELD: Record[tuple[float, float, float | None]] = Record(
     "A bias of a field by itself.",

@@ -8,6 +8,7 @@ from analysis.units import ARCSEC
 from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration import calibration_sections
+from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import CalibrationRun, unit
 from twin.orbit.calibration.influences import SURPRISE, drift_warnings, step_warnings
 from twin.orbit.calibration.observations import any_effect, light_effects
@@ -125,13 +126,7 @@ def _light(setup: CalibrationSetup) -> str:
 
 
 def _warnings(run: CalibrationRun) -> tuple[str, ...]:
-    found, spec, assumptions = run.together, run.campaign.spec, []
-    drifts = run.truth is not None and bool(run.campaign.simulated.drift)
-    if spec.errors.switched_on and found.p_value < 1e-3:
-        assumptions.append(
-            f"the adjustment does not fit: a chi-square as large has a chance of {found.p_value:.1g}; biases may "
-            f"drift during a pass{', and the cameras drift from field to field' * drifts}"
-        )
+    found, spec, assumptions = run.together, run.campaign.spec, list(CALIBRATION.warnings(run))
     if run.surprises:
         first = run.surprises[0]
         scale, shown = (ARCSEC, "arcsec") if unit(first.name) == "rad" else (1e-6, "µm")

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.monitor.unseen_motions import UnseenMode
+from scenes.specs.course import moment
 from twin.orbit.loop.line_images import ImagedPair
-from twin.orbit.loop.loop_run import LoopFacts, LoopPass, LoopRun, height_rms
+from twin.orbit.loop.loop_run import GAIN_MARGIN, PHASE_MARGIN_DEG, LoopFacts, LoopPass, LoopRun, height_rms
 from twin.orbit.monitoring.monitoring_numbers import SUMMARY
 from twin.orbit.monitoring.monitoring_run import rms
+from twin.run.artefact import significant
 from twin.run.quantity import Quantity, Record
 
 Array = NDArray[np.float64]
@@ -85,6 +87,16 @@ def _foci(of: tuple[LoopRun, LoopPass]) -> float:
     return rms(np.concatenate([focus_true(*of, name) for name in of[0].pair]))
 
 
+def _contradicted(of: tuple[LoopRun, LoopPass]) -> str:
+    course, label = of[1].course, "closed" if of[1] is of[0].closed else "open"
+    where = "" if (at := course.contradiction) is None else f", first at {moment(float(course.times[at]))}"
+    return (
+        f"with the loop {label} the readings contradict what is stated to move{where}: chi-square "
+        f"{course.chi_square.sum():.4g} of {course.degrees} degrees of freedom, limit {course.limit:.4g}; the "
+        "posterior's sigmas are not reliable"
+    )
+
+
 PASS: Record[tuple[LoopRun, LoopPass]] = Record(
     "One way through the moments.",
     Quantity("angle_rms_arcsec", lambda of: rms(of[1].true(of[1].angle)), "RMS error of the angle", "angle", 3),
@@ -105,7 +117,7 @@ PASS: Record[tuple[LoopRun, LoopPass]] = Record(
     Quantity("chi_square", lambda of: float(of[1].course.chi_square.sum()), "of all readings"),
     Quantity("degrees_of_freedom", lambda of: of[1].course.degrees, "of chi-square"),
     Quantity("chi_square_limit", lambda of: of[1].course.limit, "of chi-square"),
-    Quantity("agrees", lambda of: of[1].course.agrees, "whether the readings are as stated, together and one by one"),
+    Quantity("agrees", lambda of: of[1].course.agrees, "whether readings are as stated", warning=_contradicted),
 )
 
 
@@ -113,6 +125,14 @@ def positions(run: LoopRun, name: str) -> Array:
     """(T,) where a mechanism is told to stand when images are taken, in its unit."""
     k = [one.name for one in run.model.correctors].index(name)
     return np.asarray(run.closed.course.positions[:, k] / run.model.correctors[k].unit[1] + 0.0)
+
+
+def _unstable_alone(of: tuple[LoopRun, str, LoopFacts]) -> str:
+    limit, delay = of[2].margins.limit, of[2].corrector.spec.delay
+    return (
+        f"{of[1]} is unstable by itself: its loop gain of {of[2].loop_gain:.3g} is not below {limit:.3g}, the limit of "
+        f"a delay of {delay}"
+    )
 
 
 CORRECTION: Record[tuple[LoopRun, str, LoopFacts]] = Record(
@@ -127,7 +147,7 @@ CORRECTION: Record[tuple[LoopRun, str, LoopFacts]] = Record(
     Quantity("gain_limit", lambda of: of[2].margins.limit, "below which this loop is stable"),
     Quantity("gain_margin", lambda of: _known(of[2].margins.gain), "the limit over the loop gain; null for gain 0"),
     Quantity("phase_margin_deg", lambda of: _known(of[2].margins.phase_deg), converted=False),
-    Quantity("stable", lambda of: of[2].margins.stable, "by itself"),
+    Quantity("stable", lambda of: of[2].margins.stable, "by itself", warning=_unstable_alone),
     Quantity(
         "cycle_steps", lambda of: None if of[2].cycle is None else of[2].cycle.steps, "of the limit cycle, peak to peak"
     ),
@@ -171,6 +191,18 @@ def angle_of(run: LoopRun, mode: UnseenMode) -> float:
     return float(run.open.angle @ run.model.stated.parameters @ mode.motions)
 
 
+def _near_limit(run: LoopRun) -> str:
+    gains = f"{significant(run.margin, 3)} times the stated ones"
+    if not run.stable:
+        return f"the loops together are unstable: largest eigenvalue {run.radius:.3g}; gains below {gains} are stable"
+    nearest = min(run.loops, key=lambda name: run.loops[name].margins.gain)
+    return (
+        f"the loop is barely stable: gains of {gains} make it unstable, phase margin {run.phase_deg:.0f} deg; it "
+        f"amplifies what it should take away. Usual are {GAIN_MARGIN:g} times and {PHASE_MARGIN_DEG:g} deg at least: "
+        f"lower gains, that of {nearest} first"
+    )
+
+
 LOOP: Record[LoopRun] = Record(
     "loop.json.",
     Quantity("seed", lambda run: run.seed, "of all random numbers"),
@@ -185,7 +217,9 @@ LOOP: Record[LoopRun] = Record(
     Quantity("gain_margin", lambda run: _known(run.margin), "of all loops together"),
     Quantity("phase_margin_deg", lambda run: _known(run.phase_deg), "the smallest", converted=False),
     Quantity("spectral_radius", lambda run: run.radius, "of all loops together; below 1 errors decay"),
-    Quantity("stable", lambda run: run.stable, "whether it is"),
+    Quantity("stable", lambda run: run.stable, "whether it is; the warning is that of its margins"),
+    Quantity("margins_hold", lambda run: run.margins_hold, "whether they are large enough", warning=_near_limit),
+    Quantity("made_worse", lambda run: list(run.worse), "errors that are larger with the loop closed"),
     Quantity("largest_ratios", lambda run: run.ratios, "quantity -> largest error of the posterior over its sigma"),
     Quantity("ratio_limit", lambda run: run.ratio_limit, "of these"),
     Quantity("times_s", lambda run: run.closed.course.times, "of the readings"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -10,8 +11,9 @@ from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.unseen_motions import UnseenMode
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
+from scenes.yaml.errors import names_text
 from twin.monitor.time_series import jump_text
-from twin.orbit.loop.loop_numbers import IMAGES, PASS, angle_of, motions_of, positions
+from twin.orbit.loop.loop_numbers import IMAGES, LOOP, PASS, angle_of, motions_of, positions
 from twin.orbit.loop.loop_plots import figure_svg
 from twin.orbit.loop.loop_run import LoopFacts, LoopRun, height_rms
 from twin.orbit.monitoring.monitoring_run import rms
@@ -32,14 +34,16 @@ def loop_report(run: LoopRun) -> Report:
         _facts(run),
         _summary(run),
         (_orbit(run), *_images(run), _loops(run), _unseen(run)),
-        warnings=_warnings(run),
+        warnings=(*LOOP.warnings(run), *_worse(run), *_warnings(run)),
     )
 
 
 def _verdict(run: LoopRun) -> tuple[str, tuple[str, ...]]:
     left, free = height_rms(run.closed), height_rms(run.open)
     sigma, hidden = rms(run.closed.told(run.closed.slopes)[1]), rms(run.unseen[0])
-    stands = "" if run.stable else "the loop is unstable; "
+    stands = "" if run.margins_hold else f"the loop is {'barely stable' if run.stable else 'unstable'}; "
+    if run.worse:
+        stands += f"the loop makes {names_text(list(run.worse))} worse; "
     angle = rms(run.closed.true(run.closed.angle)) / ARCSEC, rms(run.open.true(run.open.angle)) / ARCSEC
     return answer(
         f"{stands}with the loop closed the cameras make height errors of {significant(left, 2)} m RMS over the orbit, "
@@ -55,7 +59,7 @@ def _margin(run: LoopRun) -> str:
     if not math.isfinite(run.margin):
         return "no correction acts"
     phase = f", the smallest phase margin {run.phase_deg:.0f} deg" if math.isfinite(run.phase_deg) else ""
-    return f"all gains together may be {significant(run.margin, 2)} times as large before the loop is unstable{phase}"
+    return f"all gains together may be {significant(run.margin, 3)} times as large before the loop is unstable{phase}"
 
 
 def _focus_words(run: LoopRun) -> str:
@@ -258,20 +262,16 @@ def _motions(run: LoopRun, mode: UnseenMode) -> str:
     return ", ".join(f"{one['motion']} {significant(one['amount'], 2, sign=True)} {one['unit']}" for one in every)
 
 
+def _worse(run: LoopRun) -> Iterator[str]:
+    """Yield a warning of every error that is larger with the loop closed."""
+    for label, (free, left) in run.worse.items():
+        times = f"{significant(left / free, 3)} times that of the loop open" if free else "0 with the loop open"
+        yield f"the loop makes {label} worse: its error, RMS over the moments, is {times}"
+
+
 def _warnings(run: LoopRun) -> tuple[str, ...]:
     out = [*coarse_warnings(run.setup)]
-    if not run.stable:
-        out.append(
-            f"the loops together are unstable: their largest eigenvalue is {run.radius:.3g}; gains below "
-            f"{significant(run.margin, 3)} times the stated ones are stable"
-        )
     for name, one in run.loops.items():
-        spec = one.corrector.spec
-        if not one.margins.stable:
-            out.append(
-                f"{name} is unstable by itself: its loop gain of {one.loop_gain:.3g} is not below "
-                f"{one.margins.limit:.3g}, the limit of a delay of {spec.delay}"
-            )
         if one.ends:
             first = moment(float(run.closed.course.times[one.ends[0]]))
             out.append(f"the range of {name} ends: held at {len(one.ends)} of the readings, first at {first}")
@@ -282,14 +282,7 @@ def _warnings(run: LoopRun) -> tuple[str, ...]:
             )
     for label, course in (("closed", run.closed.course), ("open", run.open.course)):
         out += [f"with the loop {label} {jump_text(one)}" for one in course.jumps]
-        if not course.agrees:
-            at = course.contradiction
-            where = "" if at is None else f", first at {moment(float(course.times[at]))}"
-            out.append(
-                f"with the loop {label} the readings contradict what is stated to move{where}: chi-square "
-                f"{course.chi_square.sum():.4g} of {course.degrees} degrees of freedom, limit {course.limit:.4g}; the "
-                "posterior's sigmas are not reliable"
-            )
+        out += PASS.warnings((run, run.closed if label == "closed" else run.open))
         if course.evidence is not None:
             spots = [channel.key for channel in run.model.experiment.path.channels]
             doubt = course.evidence.course_doubt([moment(float(time)) for time in course.times], spots)

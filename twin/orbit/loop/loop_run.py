@@ -30,6 +30,7 @@ from analysis.orbit.forward_intersection import CalibratedLine, IntersectionErro
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
+from scenes.specs.orbit.monitor import PARAMETERS
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.corrected_lines import calibrated_line
@@ -49,6 +50,16 @@ if TYPE_CHECKING:
 
 _IMAGES = 100_000
 """Random stream of line images; moments of the check points have those up to the number of readings."""
+GAIN_MARGIN, PHASE_MARGIN_DEG = 1.5, 30.0
+"""Margins below which a loop is barely stable: it amplifies what is near its crossover twice and more. Of an integrator
+with a delay the two are the same limit (Astrom, Hagglund, PID Controllers, 1995, sec. 4.4).
+"""
+WORSE = 0.01
+"""Relative rise of an error by the loop, the same draw with and without it, from which the loop makes it worse: half of
+the last of two digits that reports show.
+"""
+_NOTHING = 1e-9
+"""Rad, m and MTF that are no error: a fraction of a milliarcsecond, a nanometre."""
 FOCUS_SCALE = 10e-6
 """Metres of defocus that count as much as a metre of height where modes are sought: a tenth of what blurs an image."""
 
@@ -153,6 +164,25 @@ class LoopRun:
     def stable(self) -> bool:
         """Whether all loops together are."""
         return self.radius < DECAYING
+
+    @property
+    def margins_hold(self) -> bool:
+        """Return whether the loops are stable, and as far from the limit as GAIN_MARGIN and PHASE_MARGIN_DEG."""
+        return self.stable and self.margin >= GAIN_MARGIN and not self.phase_deg < PHASE_MARGIN_DEG
+
+    @property
+    def worse(self) -> dict[str, tuple[float, float]]:
+        """Return the errors that the loop makes larger, RMS over the moments with the loop open and closed: angle and
+        quantities in rad and m, height in m, and of the MTF at Nyquist what it lacks to 1.
+        """
+        free, left = self._errors(self.open), self._errors(self.closed)
+        return {n: (free[n], v) for n, v in left.items() if v > max((1.0 + WORSE) * free[n], _NOTHING)}
+
+    def _errors(self, one: LoopPass) -> dict[str, float]:
+        places = [(name, key) for name in self.model.cameras for key in (*PARAMETERS, "defocus")]
+        own = {f"{key} of {name}": rms(one.truth[:, self.model.row(name, key)]) for name, key in places}
+        soft = {f"MTF of {name}": 1.0 - float(mtf.min()) for name, mtf in one.mtf.items()}
+        return {"angle": rms(one.true(one.angle)), "height": height_rms(one), **own, **soft}
 
     @property
     def pair(self) -> tuple[str, str]:

@@ -101,6 +101,13 @@ SLOPES: Record[Array] = Record(
     Quantity("d_gamma_m_per_arcsec", lambda slope: slope[2], "with Δγ", converted=False),
     Quantity("d_f_m_per_um", lambda slope: slope[3], "with the principal distance", converted=False),
 )
+
+
+def _scatter_differs(run: MonitorRun) -> str:
+    ratio, (low, high) = run.scatter.spread / run.scatter.sigma, run.scatter.limits
+    return f"scatter and propagated sigma of the heights differ: ratio {ratio:.3g}, limits {low:.2f} to {high:.2f}"
+
+
 PROPAGATION: Record[MonitorRun] = Record(
     "Standard deviation of the mean height, and that of the noise against repeats at one time.",
     Quantity("height_m_sigma_noise", lambda run: _unsigned(run.sigma), "over the times, by the monitor's noise"),
@@ -116,7 +123,9 @@ PROPAGATION: Record[MonitorRun] = Record(
     Quantity("ratio", lambda run: run.scatter.spread / run.scatter.sigma, "spread over sigma"),
     Quantity("lower_limit", lambda run: run.scatter.limits[0], "of the ratio"),
     Quantity("upper_limit", lambda run: run.scatter.limits[1], "of the ratio"),
-    Quantity("agrees", lambda run: run.scatter.agrees, "whether the ratio lies within the limits"),
+    Quantity(
+        "agrees", lambda run: run.scatter.agrees, "whether the ratio lies within the limits", warning=_scatter_differs
+    ),
 )
 SMOOTHED: Record[tuple[MonitorRun, float, Smoothing]] = Record(
     "Heights by values smoothed from the measurements at one interval.",
@@ -141,12 +150,27 @@ def _readings(run: MonitorRun) -> dict[str, Any]:
     return {name: readings[name].to_dict() for name in run.flight.pair}
 
 
+def _wrong(run: MonitorRun) -> str:
+    far, limit = run.smoothed.furthest, run.smoothed.limit
+    return f"smoothed heights are wrong by up to {far:.3g} of their sigma, limit {limit:.2f}"
+
+
 SMOOTHING: Record[MonitorRun] = Record(
     "What all measurements say together under the prior on disturbances.",
     Quantity("disturbances", lambda run: run.setup.disturbances and run.setup.disturbances.name, "name of the prior"),
     Quantity("cameras", _readings, "changes at the file's interval, with sigmas"),
     Quantity("height_error_m", lambda run: _unsigned(run.smoothed.error), "mean height error over the times"),
     Quantity("height_m_sigma", lambda run: _unsigned(run.smoothed.sigma), "its standard deviation by the smoother"),
+    Quantity(
+        "shifts_agree",
+        lambda run: run.smoothed.consistency.agrees,
+        "whether the measurements at the file's interval agree with the prior",
+        warning=lambda run: (
+            f"the measured shifts contradict the prior: chi-square {run.smoothed.consistency.chi_square:.4g}, limit "
+            f"{run.smoothed.consistency.limit:.4g}; the sigmas are not reliable"
+        ),
+    ),
+    Quantity("agrees", lambda run: run.smoothed.agrees, "whether smoothed heights are as good as said", warning=_wrong),
     Quantity("intervals", lambda run: [(run, *item) for item in run.smoothing.items()], record=SMOOTHED),
 )
 PART: Record[Array] = Record(

@@ -11,7 +11,7 @@ from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
 from twin.monitor.time_series import jump_text
-from twin.orbit.monitoring.monitoring_numbers import SUMMARY
+from twin.orbit.monitoring.monitoring_numbers import MONITOR, SUMMARY
 from twin.orbit.monitoring.monitoring_plots import PART_NAMES, figure_svg
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
 from twin.run.artefact import SYMBOLS, Cell, SvgFigure, Table
@@ -354,24 +354,7 @@ def _warnings(run: MonitorRun) -> tuple[str, ...]:
     out = [*coarse_warnings(run.setup), *run.flight.doubts]
     together = run.flight.smoothed.get(run.flight.spec.interval)
     out += [jump_text(one) for one in (together.jumps if together is not None else None) or ()]
-    if not run.scatter.agrees:
-        low, high = run.scatter.limits
-        ratio = run.scatter.spread / run.scatter.sigma
-        out.append(
-            f"scatter and propagated sigma of the heights differ: ratio {ratio:.3g}, limits {low:.2f} to {high:.2f}"
-        )
+    out += MONITOR.warnings(run)
     if run.cases["monitored"].camera_height_rms > run.cases["none"].camera_height_rms:
         out.append("monitoring makes heights worse: the monitor's own errors are larger than the cameras' changes")
-    if run.smoothing:
-        chosen = run.smoothed
-        found = chosen.consistency
-        if not found.agrees:
-            out.append(
-                f"the measured shifts contradict the prior: chi-square {found.chi_square:.4g}, limit "
-                f"{found.limit:.4g}; the sigmas are not reliable"
-            )
-        if not chosen.agrees:
-            out.append(
-                f"smoothed heights are wrong by up to {chosen.furthest:.3g} of their sigma, limit {chosen.limit:.2f}"
-            )
     return tuple(out)

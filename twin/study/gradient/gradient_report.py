@@ -41,7 +41,7 @@ def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warning
         setup: the study.
         found: its Jacobian.
         folder: where.
-        warnings: what is wrong with what the study is given.
+        warnings: what the user should know.
     """
     with svg.look("gradient"):
         figures = (
@@ -76,7 +76,7 @@ def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warning
         (),
         _response_table(found),
         (Section("Sensitivity", (), figures), Section("Factors", (), (_factor_rows(found),))),
-        warnings=(*warnings, *([f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if (bad := _doubtful(found)) else ())),
+        warnings=tuple(warnings),
     )
     page.write_artefacts(report.artefacts, folder)
     numbers = page.links(("gradient.csv", "gradient.json", "config.yaml"))
@@ -325,12 +325,15 @@ def _work(setup: StudySetup, session: procedure.Session) -> command.Result:
     found = study_gradient(setup, session.backend, session.advance)
     session.advance(procedure.WRITE, 0, 1)
     folder = session.folder
-    numbers = reference_frames.described("gradient", {**GRADIENT(found), "verdict": verdict(found)[0]})
+    base = base_of(setup)
+    bad = _doubtful(found)
+    told = [f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if bad else []
+    warnings = (*blur_warnings(base, session.backend), *coarse_warnings(base), *told)
+    said = {"verdict": verdict(found)[0], "warnings": list(warnings)}
+    numbers = reference_frames.described("gradient", {**GRADIENT(found), **said})
     folder.write_text("config.yaml", setup.to_yaml())
     folder.write_json("gradient.json", numbers)
     folder.write_bytes("gradient.csv", _whole_table(found).content())
-    base = base_of(setup)
-    warnings = (*blur_warnings(base, session.backend), *coarse_warnings(base))
     _write_report(setup, found, folder, warnings)
     entries: dict[str, Any] = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
     entries["again"] = [PROGRAM, "config.yaml", "--gradient", "--backend", session.backend.name]

@@ -37,11 +37,13 @@ class StudyReport:
         verdict: that it begins with.
         contents: of its files, by their paths in the study's folder.
         undrawn: what could not be drawn, a sentence each.
+        warnings: what the user should know.
     """
 
     verdict: str
     contents: dict[str, bytes]
     undrawn: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def write_report(
@@ -92,10 +94,10 @@ def report_files(
     undrawn = tuple(artefact.note for artefact in report.artefacts if isinstance(artefact, Undrawn))
     report = replace(report, warnings=(*given, *undrawn, *words.warnings(found)))
     contents = {artefact.file: artefact.content() for artefact in report.artefacts if artefact.within is None}
-    contents[STATISTICS] = run_folder.json_text({**study_analysis.STATISTICS(found), "verdict": said}).encode()
+    contents[STATISTICS] = run_folder.json_text(report.told(study_analysis.STATISTICS(found))).encode()
     numbers = page.links((*files, "study.json", STATISTICS, "config.yaml"))
     contents["report.html"] = page.report_page(report, (PROGRAM, "config.yaml"), [("Numbers", numbers)]).encode()
-    return StudyReport(said, contents, undrawn)
+    return StudyReport(said, contents, undrawn, report.warnings)
 
 
 MOST_NAMED = 6
