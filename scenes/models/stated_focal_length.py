@@ -1,4 +1,6 @@
-"""Is the focal length that a camera's file states the one that its surfaces have, and if not, which number is wrong?"""
+"""Are the focal length and the entrance pupil that a camera's file states those of its surfaces, and if not, which
+number is wrong?
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ class TracedFocalLengths(NamedTuple):
     Attributes:
         image: change of the image's place per angle, along the line and across it, (2,): on the plane that the file
             states, in focus or not.
-        light: of parallel light, wherever its focus is, in the two principal directions, (2,); infinite without power.
+        light: of parallel light, wherever its focus is: in the two principal directions about that ray, infinite
+            without power, and the effective focal length about the axis, (3,).
     """
 
     image: np.ndarray
@@ -58,15 +61,29 @@ def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengt
         InputError: they differ by more than ``LARGEST_DIFFERENCE``; with the number whose other sign or unit brings
             the focal length to the stated one, where there is one.
     """
-    if _difference(traced.image, spec.focal_length) <= LARGEST_DIFFERENCE:
+    in_focus = _difference(traced.light, spec.focal_length) <= LARGEST_DIFFERENCE
+    if in_focus and _difference(traced.image, spec.focal_length) <= LARGEST_DIFFERENCE:
         return
     cause, suggestion = _cause(spec, float(traced.image[0]), focal_lengths)
-    if suggestion is None and _difference(traced.light, spec.focal_length) <= LARGEST_DIFFERENCE:
+    if suggestion is None and in_focus:
         return
     stated, found = (f"{length:.4g} m" for length in (spec.focal_length, float(traced.image[0])))
     problem = f"the focal length is stated as {stated}, but light through the surfaces has one of {found}"
     allowed = f"the traced focal length within {100 * LARGEST_DIFFERENCE:.0f} %, or surfaces that have the stated one"
     raise spec.error(problem + cause, ("focal_length",), allowed=allowed, suggestion=suggestion)
+
+
+def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
+    """Check the stated entrance pupil of a camera that states its stop against the traced diameter, metres.
+
+    Raises:
+        InputError: they differ by more than ``LARGEST_DIFFERENCE``.
+    """
+    if abs(traced / spec.entrance_pupil - 1.0) > LARGEST_DIFFERENCE:
+        stated, found = (format_quantity(float(f"{d:.4g}"), LENGTH) for d in (spec.entrance_pupil, traced))
+        problem = f"a stop of this size has an entrance pupil of {found} on the axis; the file states one of {stated}"
+        allowed = f"both within {100 * LARGEST_DIFFERENCE:.0f} %, or the entrance pupil alone"
+        raise spec.error(problem, ("stop_diameter",), allowed=allowed)
 
 
 def _difference(traced: np.ndarray, stated: float) -> float:

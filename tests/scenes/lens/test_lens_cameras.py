@@ -115,7 +115,7 @@ def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
     path.write_text(f_number.replace("DISZ 47.5", f"DISZ {1e3 * focus!r}"), "utf-8")
     made = camera_of(read_zemax(path, own_glasses()), "singlet", backend)
     model = derive_camera(made.camera, backend)
-    assert float(model.first_order.focal_length[0]) == pytest.approx(1.0 / power, rel=1e-9)
+    assert float(model.first_order.principal_distance[0]) == pytest.approx(1.0 / power, rel=1e-9)
     bare = model.bare_assembly(False)
     launch, direction = rays_of(model, backend)
     there = trace(backend, assemble(bare, ["imaging"]), make_rays(backend, launch, direction), world=True)
