@@ -329,11 +329,11 @@ def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> Ca
         raise spec.error(problem, ("mirrors",), allowed=allowed) from error
 
 
-def _focal_lengths(chief: RayMatrix, effective: float) -> TracedFocalLengths:
+def _focal_lengths(chief: RayMatrix, about_axis: Paraxial) -> TracedFocalLengths:
     """About a chief ray, and the effective focal length about the axis."""
     power = np.linalg.svd(chief.direction_by_position[0], compute_uv=False)
     with np.errstate(divide="ignore"):
-        light = np.array([*1.0 / power, effective])
+        light = np.copysign([*1.0 / power, about_axis.focal_length], about_axis.back_focal_length)
         return TracedFocalLengths(np.abs(np.diagonal(first_order(chief).scale[0])), light)
 
 
@@ -344,7 +344,7 @@ def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLeng
     names = tuple(spec.mirrors)
     to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
     axis, _ = find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
-    return _focal_lengths(matrix, axis_data(backend, imaging, spec, axis, LINE_AXIS).focal_length)
+    return _focal_lengths(matrix, axis_data(backend, imaging, spec, axis, LINE_AXIS))
 
 
 def _chief(spec: CameraSpec, backend: Backend, bare: Assembly) -> tuple[np.ndarray, SystemBatch, RayMatrix]:
@@ -373,8 +373,9 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     if spec.stop_diameter is not None:
         pupil = pupil_diameter(backend, to_stop, axis, stop_radius)
     if stated:
-        found = _focal_lengths(matrix, about_axis.focal_length)
-        check_focal_length(spec, found, lambda other: _traced_focal_lengths(other, backend))
+        check_focal_length(
+            spec, _focal_lengths(matrix, about_axis), lambda other: _traced_focal_lengths(other, backend)
+        )
         check_entrance_pupil(spec, pupil)
 
     traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)

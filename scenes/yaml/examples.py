@@ -51,7 +51,6 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "spacing": ("10 m",),
     "spectrum": ("650 nm",),
     "spread": ("60 mm",),
-    "stop_diameter": ("0.24 m",),
     "step": ("20 um", "1 deg"),
     "thickness": ("10 mm",),
     "track": ("20 km",),
