@@ -205,7 +205,7 @@ def draw_camera(ax: Any, model: CameraModel, backend: Backend) -> None:
     node = (float(model.rear_node[2]), float(model.rear_node[1]))
     high = image[1] + 0.5
     arrow(ax, (0.30, high), (0.72, high), PLANE, 1.4)
-    focal = model.line_focal_length
+    focal = model.line_principal_distance
     words = f"rear_node, {focal:.2f} m upstream of the line\n(z = {node[0]:+.2f} m)"
     text(ax, (0.26, high), words, PLANE, SIZE - 1, ha="right")
     ax.plot(0.3, -1.04, marker="o", ms=4, color=PLANE)

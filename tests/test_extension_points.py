@@ -873,7 +873,7 @@ def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     # coma, and that beams walk over the mirrors of the camera
     assert np.abs(places[0]).max() < 0.1
     assert np.abs(moved[: len(whole)]).max() < test_prism_images.STILL
-    focal = np.array([instrument.cameras[c.camera].line_focal_length for c in channels])
+    focal = np.array([instrument.cameras[c.camera].line_principal_distance for c in channels])
     for shift in moved[len(whole) :]:
         np.testing.assert_allclose(np.linalg.norm(shift, axis=-1), 4.0 * TURN * focal / 12e-6, rtol=0.07)
     # images of one of these states: rows are y, columns x; of the beams' mean and the centroid coma makes two things

@@ -1,4 +1,4 @@
-"""First-order (parabasal) quantities about a chief ray, by derivatives of the exact trace."""
+"""First-order quantities by derivatives of the exact trace: parabasal about a chief ray, paraxial about the axis."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from optics.numerics.array_math import determinant, inverse, product
 from optics.numerics.backend import Backend
+from optics.raytrace.aim import transverse_axes
 from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import SystemBatch
 
@@ -20,6 +21,7 @@ class RayMatrix:
         image_by_position, image_by_angle: d(x, y on the last element)/d(launch), (B, 2, 2), 1 and m/rad.
         direction_by_position, direction_by_angle: d(direction x, y on the last element)/d(launch), (B, 2, 2).
         stop_by_position, stop_by_angle: the same for the hit on the stop, (B, 2, 2).
+        direction: unit direction of the ray at the last element, in its frame, (B, 3).
     """
 
     image_by_position: np.ndarray
@@ -28,6 +30,7 @@ class RayMatrix:
     direction_by_angle: np.ndarray
     stop_by_position: np.ndarray
     stop_by_angle: np.ndarray
+    direction: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,15 +39,16 @@ class FirstOrder:
 
     Attributes:
         scale: d(image x, y)/d(object angle about the two launch axes) with the stop point held, (B, 2, 2), metres per
-            radian: the local focal length along each axis, off-diagonal terms are rotation and anamorphism.
-        focal_length: sqrt|det scale|, (B,), metres.
+            radian: the local principal distance along each axis, which is that of the plane where the image is taken;
+            off-diagonal terms are rotation and anamorphism.
+        principal_distance: sqrt|det scale|, (B,), metres.
         entrance_magnification: d(stop x, y)/d(launch x, y), (B, 2, 2).
         exit_pupil_distance: from the image upstream along the chief ray, mean over both axes, (B,), metres; negative
             when the pupil lies downstream, large when the image space is telecentric.
     """
 
     scale: np.ndarray
-    focal_length: np.ndarray
+    principal_distance: np.ndarray
     entrance_magnification: np.ndarray
     exit_pupil_distance: np.ndarray
 
@@ -74,7 +78,8 @@ def ray_matrix(
     )
     # columns are launch steps, rows x and y
     image, angle, hit = (np.swapaxes(step[..., :2], 1, 2) for step in (out.position, out.direction, out.hits[stop]))
-    return RayMatrix(image[..., :2], image[..., 2:], angle[..., :2], angle[..., 2:], hit[..., :2], hit[..., 2:])
+    parts = (image[..., :2], image[..., 2:], angle[..., :2], angle[..., 2:], hit[..., :2], hit[..., 2:])
+    return RayMatrix(*parts, out.traced.numpy()[1][:, 0])
 
 
 def first_order(matrix: RayMatrix) -> FirstOrder:
@@ -82,7 +87,78 @@ def first_order(matrix: RayMatrix) -> FirstOrder:
     follow = -product(inverse(matrix.stop_by_position), matrix.stop_by_angle)
     scale = matrix.image_by_angle + product(matrix.image_by_position, follow)
     turn = matrix.direction_by_angle + product(matrix.direction_by_position, follow)
-    focal_length = np.sqrt(np.abs(determinant(scale)))
+    principal_distance = np.sqrt(np.abs(determinant(scale)))
     # two chief rays cross where image step - s * direction step vanishes, s measured upstream
     distance = np.sum(scale * turn, axis=(-1, -2)) / np.maximum(np.sum(turn * turn, axis=(-1, -2)), 1e-30)
-    return FirstOrder(scale, focal_length, matrix.stop_by_position, distance)
+    return FirstOrder(scale, principal_distance, matrix.stop_by_position, distance)
+
+
+@dataclass(frozen=True, eq=False)
+class Paraxial:
+    """Paraxial data of one system about a ray along its axis; lengths in metres, angles in radians.
+
+    Attributes:
+        focal_length: effective focal length, the magnitude 1 / sqrt|det d(direction)/d(launch)|; it does not depend on
+            where the image plane stands, and is infinite without power.
+        back_focal_length: distance of the paraxial focus from the last surface, downstream; infinite without power.
+        entrance_pupil: distance of the entrance pupil from the first surface, positive toward the scene.
+        exit_pupil: distance of the exit pupil from the image plane, upstream; infinite where chief rays leave parallel.
+        exit_magnification: diameter of the exit pupil over that of the entrance pupil.
+        angular_magnification: angle between two collimated beams after the system over that before it; it is what a
+            system without power has in place of a focal length.
+    """
+
+    focal_length: float
+    back_focal_length: float
+    entrance_pupil: float
+    exit_pupil: float
+    exit_magnification: float
+    angular_magnification: float
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def paraxial(matrix: RayMatrix, before: float, behind: float) -> Paraxial:
+    """Return the paraxial data of the first system of a ray matrix.
+
+    Steps of the ray at the image are taken square to the ray, so that a turned image plane has no part in them.
+
+    Args:
+        matrix: derivatives about the ray along the axis, by ``ray_matrix``.
+        before: distance along the ray from its launch point to the first surface, metres.
+        behind: distance along the ray from the last surface to the image, metres.
+    """
+    ray = matrix.direction[0]
+    square = transverse_axes(ray, np.array([1.0, 0.0, 0.0]))
+    # a step in the plane, and one of the unit direction, along these axes
+    from_place = square[:, :2]
+    from_angle = square[:, :2] - np.outer(square[:, 2], ray[:2]) / ray[2]
+    place, shift = from_place @ matrix.image_by_position[0], from_place @ matrix.image_by_angle[0]
+    power, turn = from_angle @ matrix.direction_by_position[0], from_angle @ matrix.direction_by_angle[0]
+    follow = -inverse(matrix.stop_by_position)[0] @ matrix.stop_by_angle[0]
+    chief, chief_turn = shift + place @ follow, turn + power @ follow
+    away = float(np.sum(chief_turn**2))
+    exit_pupil = np.sum(chief * chief_turn) / away if away else np.inf
+    return Paraxial(
+        focal_length=float(1.0 / np.sqrt(np.abs(determinant(power)))),
+        back_focal_length=float(behind - np.sum(place * power) / np.sum(power**2)),
+        entrance_pupil=float(before + 0.5 * np.trace(follow)),
+        exit_pupil=float(exit_pupil),
+        exit_magnification=float(np.sqrt(np.abs(determinant(place - exit_pupil * power)))) if away else np.inf,
+        angular_magnification=float(np.sqrt(np.abs(determinant(turn)))),
+    )
+
+
+def equal_area_radius(points: np.ndarray) -> float:
+    """Return the radius of the circle whose area a closed smooth curve through evenly spread points (N, 2) encloses."""
+    return float(np.sqrt(enclosed_area(points) / np.pi))
+
+
+def enclosed_area(points: np.ndarray) -> float:
+    """Return the area within a closed smooth curve through points (N, 2) that are spread evenly along it.
+
+    It is the area of the polygon times that of a circle over that of the regular polygon in it: exact for an ellipse.
+    """
+    u, v = points.T
+    polygon = 0.5 * abs(float(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))))
+    step = 2.0 * np.pi / len(u)
+    return polygon * step / np.sin(step)

@@ -16,9 +16,8 @@ from optics.geometry.surface import Surface, ZernikeFigure
 from optics.materials.dispersion import CatalogueGlass
 from optics.materials.glass import GLASSES
 from optics.numerics.backend import Backend
-from optics.raytrace.aim import AimError, transverse_axes
+from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import Interaction
-from optics.raytrace.first_order import ray_matrix
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, Rays, make_rays, trace
 from scenes.lens.prescription import (
@@ -31,7 +30,7 @@ from scenes.lens.prescription import (
     without_rim,
     written,
 )
-from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, derive_camera, field_direction
+from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError, Problem, printable
 from scenes.yaml.units import ANGLE, EXPANSION, LENGTH, format_quantity, power_of_length
@@ -91,7 +90,7 @@ class ReadCamera:
         parts = [f"{mirrors} mirrors"] + ([f"{faces} faces of lenses"] if faces else [])
         angles = [f"{math.degrees(a):.4g}" for a in (spec.field.x, spec.field.y, spec.field_bias)]
         return [
-            f"{lens.name}: {', '.join(parts)}, stop {spec.stop}, f {spec.focal_length:.6g} m, entrance pupil "
+            f"{lens.name}: {', '.join(parts)}, stop {spec.stop}, f {spec.focal_length:.7g} m, entrance pupil "
             f"{spec.entrance_pupil:.6g} m, field {angles[0]} x {angles[1]} deg about {angles[2]} deg",
             f"{self.rays} rays through both meet the image within {self.difference:.1e} m",
             *(f"note: {note}" for note in self.notes),
@@ -145,14 +144,13 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
         plain["medium"] = "air"  # which other programs take glasses against
     narrow = _derived(lens, plain, backend)
     pupil = _pupil(lens, narrow, plain, backend, width)
-    focal = float(abs(narrow.first_order.scale[0, 0, 0]))
-    pixels = 2.0 * focal * math.tan(half_x) / width.pitch
+    pixels = 2.0 * narrow.line_principal_distance * math.tan(half_x) / width.pitch
     if not 2.0 <= pixels <= 1e6:
         problem = "a line CCD over the whole field would have too few or too many pixels"
         raise lens.error(
             problem, None, f"{pixels:.4g} of {format_quantity(width.pitch, LENGTH)}", "2 to 1000000: --pitch"
         )
-    plain["focal_length"] = format_quantity(float(f"{focal:.6g}"), LENGTH)
+    plain["focal_length"] = format_quantity(float(f"{narrow.paraxial.focal_length:.7g}"), LENGTH)
     plain["entrance_pupil"] = written(pupil, LENGTH)
     plain["line"]["pixels"] = math.ceil(pixels)
     plain["edge_margin"] = format_quantity(float(f"{min(0.005, 0.05 * pupil):.3g}"), LENGTH)
@@ -364,7 +362,9 @@ def _derived(lens: Prescription, plain: dict[str, Any], backend: Backend) -> Cam
     try:
         return derive_camera(spec, backend, stated=False)
     except InputError as error:
-        raise lens.error(error.issues[0].problem, allowed="a system that light comes through") from error
+        raise lens.error(
+            error.issues[0].problem, allowed="a system that brings the light of its field to the image"
+        ) from error
     except (np.linalg.LinAlgError, FloatingPointError) as error:
         raise lens.error("no light of the field comes through the stop to the image") from error
 
@@ -379,26 +379,14 @@ def _pupil(lens: Prescription, narrow: CameraModel, plain: dict[str, Any], backe
     if lens.pupil.kind == "diameter":
         return lens.pupil.value
     if lens.pupil.kind == "stop":
-        edge = narrow.apertures[narrow.spec.stop]
-        return lens.pupil.value / float(edge.bounds[1]) * narrow.spec.entrance_pupil
+        plain["stop_diameter"] = written(2.0 * lens.pupil.value, LENGTH)
+        return float(f"{_derived(lens, plain, backend).entrance_pupil:.9g}")
     if lens.pupil.kind == "f_number":
         if any({"decentre", "rotate"} & set(surface) for surface in plain["mirrors"].values()):
             problem = "an F-number of a system with surfaces that are turned or off the axis"
             raise lens.error(problem, lens.pupil.line, allowed=allowed)
-        axial = _derived(lens, {**plain, "field_bias": "0 deg"}, backend)
-        return _axial_focal_length(axial, backend) / lens.pupil.value
+        return narrow.paraxial.focal_length / lens.pupil.value
     raise lens.error("a numerical aperture in object space", lens.pupil.line, allowed=allowed)
-
-
-def _axial_focal_length(model: CameraModel, backend: Backend) -> float:
-    """Focal length of rays beside the axis, wherever the image stands, metres."""
-    bare, names = model.bare_assembly(apertures=False), model.mirrors
-    stop = names.index(model.spec.stop)
-    centre = field_direction(model.spec, 0.0, 0.0)
-    launch = collimated(backend, assemble(bare, [names[: stop + 1]]), centre[None], np.zeros((1, 2)))[0]
-    axes = transverse_axes(centre[None], LINE_AXIS[None])
-    matrix = ray_matrix(backend, assemble(bare, ["imaging"]), stop, launch, centre[None], axes)
-    return float(1.0 / np.sqrt(np.abs(np.linalg.det(matrix.direction_by_position[0]))))
 
 
 def _beams(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> Rays:

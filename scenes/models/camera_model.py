@@ -21,16 +21,25 @@ from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Body, RigidTree, State
 from optics.materials.dispersion import ABBE_LINES
-from optics.numerics.array_math import determinant, norm, turned
+from optics.numerics.array_math import norm, turned
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from optics.raytrace.first_order import FirstOrder, RayMatrix, first_order, ray_matrix
+from optics.raytrace.first_order import FirstOrder, Paraxial, RayMatrix, first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
 from optics.waves.imaging import aim_collimated
-from scenes.models.stated_focal_length import TracedFocalLengths, check_focal_length
+from scenes.models.camera_axis import (
+    LAUNCH_DISTANCE,
+    LINE_AXIS,
+    AfocalError,
+    CameraAxis,
+    axis_data,
+    find_axis,
+    pupil_diameter,
+)
+from scenes.models.stated_focal_length import TracedFocalLengths, check_entrance_pupil, check_focal_length
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.perturbation import NodeInfo, perturbation_issues
@@ -168,10 +177,6 @@ def build_camera_under_test(test: CameraUnderTestSpec, camera: CameraSpec, backe
 
 IMAGE = "image"
 REFERENCE = "reference"
-LINE_AXIS = np.array([1.0, 0.0, 0.0])
-LAUNCH_DISTANCE = 3.0
-"""How far before the prescription's origin beams from the scene are launched, metres."""
-
 _RIM_POINTS = 24
 
 
@@ -187,7 +192,10 @@ class CameraModel:
         focal_plane: the focal-plane frame in the prescription frame.
         first_order: parabasal quantities about the centre's chief ray.
         image_direction: direction of the centre's chief ray at the image.
-        rear_node: point one focal length (along the line) upstream of the line's centre along that ray.
+        rear_node: point one principal distance (along the line) upstream of the line's centre along that ray.
+        axis: light along its axis.
+        paraxial: paraxial data about that axis.
+        entrance_pupil: diameter of the entrance pupil, metres: of the beam along the axis that fills the stop.
     """
 
     spec: CameraSpec
@@ -198,6 +206,9 @@ class CameraModel:
     first_order: FirstOrder
     image_direction: np.ndarray
     rear_node: np.ndarray
+    axis: CameraAxis
+    paraxial: Paraxial
+    entrance_pupil: float
 
     @property
     def mirrors(self) -> tuple[str, ...]:
@@ -224,8 +235,13 @@ class CameraModel:
         return through
 
     @property
-    def line_focal_length(self) -> float:
-        """Focal length along the line about the centre's chief ray, metres (the papers' f)."""
+    def f_number(self) -> float:
+        """Focal length over the diameter of the entrance pupil."""
+        return self.paraxial.focal_length / self.entrance_pupil
+
+    @property
+    def line_principal_distance(self) -> float:
+        """Local principal distance along the line about the centre's chief ray, metres (the papers' f)."""
         return float(abs(self.first_order.scale[0, 0, 0]))
 
     def vertex(self, mirror: str) -> np.ndarray:
@@ -304,6 +320,8 @@ def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> Ca
     """
     try:
         return _derived(spec, backend, stated)
+    except AfocalError as error:
+        raise spec.error(str(error), ("mirrors",), allowed="surfaces that focus light on the image") from error
     except (AimError, BeamMissedError) as error:
         reason = str(error).partition(";")[0]
         problem = f"no light of the whole field comes through the stop to the image: {reason}"
@@ -311,17 +329,22 @@ def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> Ca
         raise spec.error(problem, ("mirrors",), allowed=allowed) from error
 
 
-def _focal_lengths(chief: RayMatrix) -> TracedFocalLengths:
-    """About a chief ray."""
+def _focal_lengths(chief: RayMatrix, about_axis: Paraxial) -> TracedFocalLengths:
+    """About a chief ray, and the effective focal length about the axis."""
     power = np.linalg.svd(chief.direction_by_position[0], compute_uv=False)
     with np.errstate(divide="ignore"):
-        return TracedFocalLengths(np.abs(np.diagonal(first_order(chief).scale[0])), 1.0 / power)
+        light = np.copysign([*1.0 / power, about_axis.focal_length], about_axis.back_focal_length)
+        return TracedFocalLengths(np.abs(np.diagonal(first_order(chief).scale[0])), light)
 
 
 def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLengths:
-    """`_focal_lengths` of a prescription. Raises AimError, BeamMissedError."""
+    """`_focal_lengths` of a prescription. Raises AimError, BeamMissedError, AfocalError."""
     bare = _bare(spec, {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}, {})
-    return _focal_lengths(_chief(spec, backend, bare)[2])
+    _, imaging, matrix = _chief(spec, backend, bare)
+    names = tuple(spec.mirrors)
+    to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
+    axis, _ = find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
+    return _focal_lengths(matrix, axis_data(backend, imaging, spec, axis, LINE_AXIS))
 
 
 def _chief(spec: CameraSpec, backend: Backend, bare: Assembly) -> tuple[np.ndarray, SystemBatch, RayMatrix]:
@@ -336,17 +359,25 @@ def _chief(spec: CameraSpec, backend: Backend, bare: Assembly) -> tuple[np.ndarr
 
 
 def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
-    """What `derive_camera` says. Raises AimError, BeamMissedError."""
+    """What `derive_camera` says. Raises AimError, BeamMissedError, AfocalError."""
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     bare = _bare(spec, surfaces, {})
     to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
     launch, imaging, matrix = _chief(spec, backend, bare)
     chief = first_order(matrix)
-    if stated:
-        check_focal_length(spec, _focal_lengths(matrix), lambda other: _traced_focal_lengths(other, backend))
-
     centre = field_direction(spec, 0.0, 0.0)
+    axis, stop_radius = find_axis(spec, backend, to_stop, imaging, centre)
+    about_axis = axis_data(backend, imaging, spec, axis, LINE_AXIS)
+    pupil = spec.entrance_pupil
+    if spec.stop_diameter is not None:
+        pupil = pupil_diameter(backend, to_stop, axis, stop_radius)
+    if stated:
+        check_focal_length(
+            spec, _focal_lengths(matrix, about_axis), lambda other: _traced_focal_lengths(other, backend)
+        )
+        check_entrance_pupil(spec, pupil)
+
     traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)
     assert traced.world is not None
     position, direction, _, valid = traced.numpy(traced.world)
@@ -362,11 +393,11 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     normal = np.sign(sight[2]) * image_pose(spec).rotation[:, 2]
     focal_plane = Pose(np.stack([np.cross(LINE_AXIS, normal), LINE_AXIS, normal], axis=-1), image_centre)
 
-    stop_radius = 0.5 * spec.entrance_pupil * float(np.sqrt(abs(determinant(chief.entrance_magnification[0]))))
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
-    focal_length = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
-    rear_node = image_centre - focal_length * image_direction
-    return CameraModel(spec, surfaces, apertures, camera_frame, focal_plane, chief, image_direction, rear_node)
+    distance = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
+    rear_node = image_centre - distance * image_direction
+    frames = (camera_frame, focal_plane, chief, image_direction, rear_node)
+    return CameraModel(spec, surfaces, apertures, *frames, axis, about_axis, pupil)
 
 
 def surface_of(mirror: MirrorSpec) -> Surface:

@@ -265,7 +265,7 @@ def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Cha
     dx, dy = ccd.offset
     out = []
     for name, one in spec.channels_of(camera).items():
-        place = model.line_focal_length * float(np.tan(one.field))
+        place = model.line_principal_distance * float(np.tan(one.field))
         beam = one.pupil_offset, one.return_face.aperture, one.photons_per_frame
         out.append(Channel(camera, name, (-dx, place - dy), (0.0, place), *beam))
     half = 0.5 * ccd.pitch * np.array([ccd.columns, ccd.rows])

@@ -1,4 +1,6 @@
-"""Is the focal length that a camera's file states the one that its surfaces have, and if not, which number is wrong?"""
+"""Are the focal length and the entrance pupil that a camera's file states those of its surfaces, and if not, which
+number is wrong?
+"""
 
 from __future__ import annotations
 
@@ -20,6 +22,11 @@ LARGEST_DIFFERENCE = 0.1
 line and 8 % across it; a wrong sign or unit is seldom below a third.
 """
 
+LARGEST_PUPIL_DIFFERENCE = 0.3
+"""Share by which the traced entrance pupil may differ from the stated one where the stop's diameter is stated as well.
+Of off-axis cameras the pupil of the axis is up to some 10 % from that of the field's middle, and the smallest mistake,
+a radius in place of a diameter, is a factor of two."""
+
 
 class TracedFocalLengths(NamedTuple):
     """Focal lengths of a camera about the chief ray of its field's middle, metres.
@@ -27,7 +34,9 @@ class TracedFocalLengths(NamedTuple):
     Attributes:
         image: change of the image's place per angle, along the line and across it, (2,): on the plane that the file
             states, in focus or not.
-        light: of parallel light, wherever its focus is, in the two principal directions, (2,); infinite without power.
+        light: of parallel light, wherever its focus is: in the two principal directions about that ray, infinite
+            without power, and the effective focal length about the axis, (3,); negative where light diverges after the
+            last surface.
     """
 
     image: np.ndarray
@@ -58,15 +67,30 @@ def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengt
         InputError: they differ by more than ``LARGEST_DIFFERENCE``; with the number whose other sign or unit brings
             the focal length to the stated one, where there is one.
     """
-    if _difference(traced.image, spec.focal_length) <= LARGEST_DIFFERENCE:
+    stated, real = spec.focal_length, bool(np.all(traced.light > 0.0))
+    in_place, in_focus = (_difference(np.abs(one), stated) <= LARGEST_DIFFERENCE for one in traced)
+    if in_focus and in_place and real:
         return
-    cause, suggestion = _cause(spec, float(traced.image[0]), focal_lengths)
-    if suggestion is None and _difference(traced.light, spec.focal_length) <= LARGEST_DIFFERENCE:
+    cause, suggestion = _cause(spec, float(traced.image[0]), focal_lengths, in_focus and real)
+    if suggestion is None and in_focus:
         return
-    stated, found = (f"{length:.4g} m" for length in (spec.focal_length, float(traced.image[0])))
-    problem = f"the focal length is stated as {stated}, but light through the surfaces has one of {found}"
+    off = float(traced.light[-1] if in_place else traced.image[0])
+    problem = f"the focal length is stated as {stated:.4g} m, but light through the surfaces has one of {off:.4g} m"
     allowed = f"the traced focal length within {100 * LARGEST_DIFFERENCE:.0f} %, or surfaces that have the stated one"
     raise spec.error(problem + cause, ("focal_length",), allowed=allowed, suggestion=suggestion)
+
+
+def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
+    """Check the stated entrance pupil of a camera that states its stop against the traced diameter, metres.
+
+    Raises:
+        InputError: they differ by more than ``LARGEST_PUPIL_DIFFERENCE``.
+    """
+    if abs(traced / spec.entrance_pupil - 1.0) > LARGEST_PUPIL_DIFFERENCE:
+        stated, found = (format_quantity(float(f"{d:.4g}"), LENGTH) for d in (spec.entrance_pupil, traced))
+        problem = f"a stop of this size has an entrance pupil of {found} on the axis; the file states one of {stated}"
+        allowed = f"both within {100 * LARGEST_PUPIL_DIFFERENCE:.0f} %, or the entrance pupil alone"
+        raise spec.error(problem, ("stop_diameter",), allowed=allowed)
 
 
 def _difference(traced: np.ndarray, stated: float) -> float:
@@ -74,13 +98,14 @@ def _difference(traced: np.ndarray, stated: float) -> float:
     return float(np.min(np.abs(traced / stated - 1.0)))
 
 
-def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths) -> tuple[str, str | None]:
+def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, in_focus: bool) -> tuple[str, str | None]:
     """What is likely wrong, in words and as the line that would be right; nothing where no single number is."""
     for factor, what in _UNITS:
         if abs(factor * traced / spec.focal_length - 1.0) <= LARGEST_DIFFERENCE:
             right = format_quantity(spec.focal_length / factor, LENGTH)
             return f"; the stated one is likely {what}", f"focal_length: {right}"
-    for among in (_single(spec), _places(spec), _together(spec)):
+    # surfaces that have the stated focal length are right: only where the image is taken may be wrong
+    for among in (_places(spec),) if in_focus else (_single(spec), _places(spec), _together(spec)):
         fits = []
         for words, line, changed in among:
             try:

@@ -376,11 +376,13 @@ class CameraSpec(TitledSpec):
         name: as the file is called.
         description: for people.
         focal_length: nominal, metres; the trace tells the exact one.
-        entrance_pupil: diameter of the entrance pupil, metres.
+        entrance_pupil: diameter of the entrance pupil, metres: of the beam along the axis before the first surface.
+            Its rays make the stop as large as they spread there, unless ``stop_diameter`` states that.
         field_bias: angle of the line CCD's centre from the parent axis, in the plane of symmetry, radians.
         field: half angles about the field bias.
         wavelength: design wavelength, metres.
         stop: name of the mirror, or other surface, that is the aperture stop.
+        stop_diameter: diameter of the stop, metres, where it is known; ``entrance_pupil`` is then nominal.
         mirrors: by name, in the order in which the light meets them; faces of lenses and a stop among them.
         image: focal plane.
         line: line CCD.
@@ -397,6 +399,7 @@ class CameraSpec(TitledSpec):
     field: FieldSpec
     wavelength: Wavelength
     stop: Name
+    stop_diameter: PositiveLength | None = None
     mirrors: Annotated[Named[MirrorSpec], Field(min_length=1)]
     image: ImageSpec
     line: LineSpec

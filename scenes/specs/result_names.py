@@ -83,6 +83,8 @@ RENAMED: tuple[Renamed, ...] = (
     Renamed("pixel_um", "pitch_um"),
     Renamed("focal_length_m", "principal_distance_m", ("camera.json", "truth.json")),
     Renamed("focal_length", "principal_distance", ("crosstalk.json",)),
+    Renamed("focal_length_along_line_m", "principal_distance_along_line_m", ("optics.json",)),
+    Renamed("focal_length_along_track_m", "principal_distance_along_track_m", ("optics.json",)),
     Renamed("side", "channel", ("spots.csv",)),
 )
 """All of them, by version."""

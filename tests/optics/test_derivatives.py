@@ -165,4 +165,5 @@ def test_ray_matrix_against_neighbouring_rays(backend, gf7, bare) -> None:
         slope = ((value[0, 0::2] - value[0, 1::2]) / (2 * h))[:, :2].T
         np.testing.assert_allclose(by_position[0], slope[:, :2], atol=2e-8)
         np.testing.assert_allclose(by_angle[0], slope[:, 2:], atol=2e-8)
-    assert first_order(matrix).focal_length[0] == pytest.approx(float(gf7.first_order.focal_length[0]), rel=1e-9)
+    distance = float(gf7.first_order.principal_distance[0])
+    assert first_order(matrix).principal_distance[0] == pytest.approx(distance, rel=1e-9)

@@ -51,7 +51,7 @@ def test_tilt_of_the_wrong_sign_is_named(tmp_path: Path, backend) -> None:
     # turned by -8 deg about x the first mirror leaves 5.42 m, turned by +8 deg 6.9 m
     tilted = "radius: -6.74535927468851 m\n    rotate: [{} deg, 0 deg, 0 deg]"
     right = changed(tmp_path, "radius: -6.74535927468851 m", tilted.format(-8))
-    assert derive_camera(load_camera(str(right)), backend).line_focal_length == pytest.approx(5.45, abs=0.1)
+    assert derive_camera(load_camera(str(right)), backend).line_principal_distance == pytest.approx(5.45, abs=0.1)
     wrong = changed(tmp_path, "radius: -6.74535927468851 m", tilted.format(8))
     with pytest.raises(InputError, match="sign of the tilt about x of M1") as error:
         derive_camera(load_camera(str(wrong)), backend)
@@ -63,7 +63,7 @@ def test_a_nominal_focal_length_may_differ_by_some_percent(tmp_path: Path, backe
         model = derive_camera(
             load_camera(str(changed(tmp_path, "focal_length: 5.52 m", f"focal_length: {length}"))), backend
         )
-        assert model.line_focal_length == pytest.approx(5.5104, abs=1e-4)
+        assert model.line_principal_distance == pytest.approx(5.5104, abs=1e-4)
 
 
 CASSEGRAIN = """
@@ -87,7 +87,7 @@ def test_a_misplaced_image_plane_is_no_other_focal_length(tmp_path: Path, backen
     path = tmp_path / "mine.yaml"
     path.write_text(CASSEGRAIN.replace("image: {z: 0.5 m}", "image: {z: 0.85 m}"), "utf-8")
     model = derive_camera(load_camera(str(path)), backend)
-    assert model.line_focal_length > 4.0 * 1.15
+    assert model.line_principal_distance > 4.0 * 1.15
     # the sign of a mirror's radius is another thing
     path.write_text(CASSEGRAIN.replace("radius: -0.8 m", "radius: 0.8 m"), "utf-8")
     with pytest.raises(InputError, match="sign of the radius of M2"):

@@ -12,7 +12,8 @@ from optics.geometry.tree import Body, RigidTree
 from optics.materials.finish import ABSORBER, BARE, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
-from scenes.models.camera_model import LINE_AXIS, collimated, field_direction
+from scenes.models.camera_axis import LINE_AXIS
+from scenes.models.camera_model import collimated, field_direction
 from scenes.models.instrument_model import Instrument
 from scenes.models.scenery import BOARD, FACING_THE_LIGHT, Scenery, _reach
 from scenes.models.scenery_parts import (

@@ -130,7 +130,7 @@ def test_every_channel_gets_its_light(two) -> None:
     # the mean of 1 / r over all directions is 2 sqrt(2) / (pi h); the spot is not quite in the middle of its CCD
     spec = two.instrument.spec.monitor
     half = 0.5 * spec.area_ccd.rows * spec.area_ccd.pitch
-    f = np.array([two.instrument.cameras[c.camera].line_focal_length for c in two.instrument.channels])
+    f = np.array([two.instrument.cameras[c.camera].line_principal_distance for c in two.instrument.channels])
     v = np.pi * np.array([c.aperture for c in two.instrument.channels]) * half / (spec.wavelength * f)
     beyond = 2.0 / (np.pi * v) * 2.0 * np.sqrt(2.0) / np.pi
     np.testing.assert_allclose(1.0 - photons.sum(axis=(1, 2)) / asked, beyond, rtol=0.1)
@@ -190,7 +190,7 @@ def turned_by_heat(own: MonitorExperiment, prism: str) -> tuple[float, float]:
     fields = [Temperature(0.0, tuple(GRADIENT * e)) for e in np.eye(3)] + [Temperature(1.0)]
     states = [own.thermal.state(dict.fromkeys([c.prism_body(prism) for c in channels], field)) for field in fields]
     place = own.path.coarse_trace([{}, *states]).place
-    focal = np.array([own.instrument.cameras[c.camera].line_focal_length for c in channels])[:, None, None]
+    focal = np.array([own.instrument.cameras[c.camera].line_principal_distance for c in channels])[:, None, None]
     moved = (place[:, 1:] - place[:, :1]) * own.path.pitch / focal / ARCSEC
     return float(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=(1, 2))) / 2.0)), float(np.abs(moved[:, 3]).max())
 

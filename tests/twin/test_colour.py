@@ -50,7 +50,7 @@ def test_colour_of_a_thin_achromat(achromat, backend) -> None:
     spread = n[:, 0] - n[:, 2]
     abbe, partial = (n[:, 1] - 1.0) / spread, (n[:, 0] - n[:, 1]) / spread
     found = judge_colours(achromat, spec.spectrum, ((0.0, 0.0),), False)
-    focal = float(achromat.model.first_order.focal_length[0])
+    focal = float(achromat.model.first_order.principal_distance[0])
     assert found.axial is not None
     # what is not achromatic of it is a little of what one lens has, f / V; that is taken off the blue line's focus
     blue = found.axial[0, 0] - found.axial_reference[0]

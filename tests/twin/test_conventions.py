@@ -85,7 +85,7 @@ def test_focal_plane_frame_in_the_prescription(gf7_pair):
     # three mirrors: the light reaches the image running toward +Z, so its upstream side is -Z
     assert model.image_direction @ model.focal_plane.rotation[:, 2] > 0.99
     node = model.focal_plane.inverse().apply(model.rear_node)
-    assert node[2] == pytest.approx(-model.line_focal_length, rel=1e-3)
+    assert node[2] == pytest.approx(-model.line_principal_distance, rel=1e-3)
 
 
 def test_mirror_bodies_have_the_prescription_axes(gf7_pair):
@@ -207,7 +207,7 @@ def test_principal_distance_is_eq_3_of_paper_004(gf7_pair, backend):
     model = gf7_pair.cameras[CAMERA]
     half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
     bare = model.bare_assembly()
-    angle = np.linspace(-1, 1, 41) * np.arctan(half / model.line_focal_length)
+    angle = np.linspace(-1, 1, 41) * np.arctan(half / model.line_principal_distance)
     travel = np.array([field_direction(model.spec, w, 0.0) for w in angle])
     launch = collimated(backend, assemble(bare, [("M1", "M2")]), travel, np.zeros((1, 2)))[:, 0]
     hits = trace(backend, assemble(bare, ["imaging"]), make_rays(backend, launch, travel)).numpy()[0][0]

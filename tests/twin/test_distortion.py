@@ -106,7 +106,7 @@ def test_line_follows_the_turn_and_the_middle_is_zero():
     assert middle == pytest.approx([0.0, 0.0], abs=1e-12)
     along = b.places(truth.axis, np.array([-1e-3, 1e-3]))[:, 0]
     # L = +f tan W with the focal length along the line; mirror figures change it by parts in 1e5
-    assert along == pytest.approx(b.path.model.line_focal_length * np.tan([-1e-3, 1e-3]), rel=1e-4)
+    assert along == pytest.approx(b.path.model.line_principal_distance * np.tan([-1e-3, 1e-3]), rel=1e-4)
     # a tilted axis moves spots across the line to first order, along it to second order only
     straight = b.places(np.array([1.0, 0.0, 0.0]), b.turn)
     tilted = b.places(np.array([1.0, 1e-4, 0.0]) / np.hypot(1.0, 1e-4), b.turn)

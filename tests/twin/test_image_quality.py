@@ -18,7 +18,7 @@ from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import aim_collimated
 from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import fit_wavefront, path_difference
-from scenes.models.camera_model import LAUNCH_DISTANCE
+from scenes.models.camera_axis import LAUNCH_DISTANCE
 from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.resolved import resolve
 from tests.twin.commands import invoke

@@ -105,7 +105,7 @@ def test_facets_are_square_to_the_beams(path) -> None:
         pose = placed.pose(channel.face_body)
         normal = pose.rotation[:, 2]
         # 3 mm / (2 f); across the line the focal length is 3 % longer
-        half = 0.5 * abs(channel.pinhole[0]) / path.instrument.cameras[channel.camera].line_focal_length
+        half = 0.5 * abs(channel.pinhole[0]) / path.instrument.cameras[channel.camera].line_principal_distance
         assert np.arccos(after @ normal) == pytest.approx(half, rel=0.07)
         # all facets pass through the block's apex, and lean outward from it
         assert abs((pose.translation - apex) @ normal) < 1e-3
@@ -143,7 +143,7 @@ def test_an_angle_error_is_a_turn_of_the_facet(path, prism, face, axis) -> None:
     by_face, by_facet = moved[:, 1] - moved[:, 0], moved[:, 2] - moved[:, 0]
     assert np.abs(by_face - by_facet).max() < 2e-3
     size = np.linalg.norm(by_face, axis=-1)
-    focal = np.array([path.instrument.cameras[c.camera].line_focal_length for c in path.channels])
+    focal = np.array([path.instrument.cameras[c.camera].line_principal_distance for c in path.channels])
     # twice the turn of the facet times the focal length; across the line that is 3 % longer, distortion adds as much
     ups = [path.instrument.assembly.nominal_pose(c.face_body).rotation[:, 2] for c in path.channels]
     want = [

@@ -21,7 +21,7 @@ from optics.waves.diffraction import Grid, image
 from optics.waves.imaging import imaging_field
 from optics.waves.pupil_stack import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
-from scenes.models.camera_model import LAUNCH_DISTANCE
+from scenes.models.camera_axis import LAUNCH_DISTANCE
 from scenes.models.shadow import imaging_shadows
 from scenes.specs.camera import BandSpec
 from scenes.specs.load import load_detector

@@ -28,6 +28,7 @@ from optics.numerics.invariants import hold_within
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
+from optics.raytrace.first_order import equal_area_radius
 from optics.waves.line_transfer import line_transfers
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
@@ -70,7 +71,7 @@ INSIDE = 1.0 - 1e-9
 """Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
 
 
-@shows("model.spec.name", "model.mirrors", "model.line_focal_length [m]", "model.spec.entrance_pupil [mm]", "state")
+@shows("model.spec.name", "model.mirrors", "model.paraxial.focal_length [m]", "model.entrance_pupil [mm]", "state")
 @dataclass(frozen=True, eq=False)
 class CameraOptics:
     """One camera in one state, ready to be looked at.
@@ -277,7 +278,7 @@ class CameraOptics:
                     rms=float(np.sqrt(np.sum(spread))),
                     rms_along=np.sqrt(spread),
                     farthest=float(np.max(np.linalg.norm(hexapolar - centroid, axis=-1))),
-                    airy=0.61 * self.wavelength / round_aperture(leaving[k, -len(rings[-1]) :, :2]),
+                    airy=0.61 * self.wavelength / equal_area_radius(leaving[k, -len(rings[-1]) :, :2]),
                     place=self._place(rays, k),
                 )
             )
@@ -473,18 +474,3 @@ def rim(count: int) -> np.ndarray:
     """Places evenly along the edge of the stop, within it by a rounding, in units of its radius, (count, 2)."""
     turn = 2.0 * np.pi * np.arange(count) / count
     return np.asarray(INSIDE * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
-
-
-def solid_angle(cosines: np.ndarray) -> float:
-    """Area in direction cosines, (N, 2), of a beam whose edge goes through evenly spread rays: that of the smooth curve
-    through the polygon's corners, which is larger by what a circle is larger than its own.
-    """
-    u, v = cosines.T
-    polygon = 0.5 * abs(float(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))))
-    step = 2.0 * np.pi / len(u)
-    return polygon * step / np.sin(step)
-
-
-def round_aperture(cosines: np.ndarray) -> float:
-    """Numerical aperture of the round beam with the solid angle of one whose edge has direction cosines (N, 2)."""
-    return float(np.sqrt(solid_angle(cosines) / np.pi))

@@ -96,18 +96,20 @@ def first_order_table(run: CameraRun) -> Table:
     """First-order data, the report's first table."""
     n = FIRST_ORDER(run.first_order)
 
-    def far(value: float) -> str:
-        return f"{value:.4g} m" if abs(value) < 1e4 else "infinite"
+    def far(value: float | None) -> str:
+        return f"{value:.4g} m" if value is not None and abs(value) < 1e4 else "infinite"
 
     rows: list[tuple[str, str]] = [
         ("worst wavefront error", f"{run.worst[0]:.4g} waves rms at {field_text(run.camera, run.worst[1])}"),
-        ("focal length", f"{n['focal_length_m']:.5f} m (line {n['focal_length_along_line_m']:.5f}, "
-         f"track {n['focal_length_along_track_m']:.5f})"),
+        ("focal length", f"{n['focal_length_m']:.7g} m"),
+        ("back focal length", f"{n['back_focal_length_m']:.7g} m"),
+        ("principal distance in the middle", f"line {n['principal_distance_along_line_m']:.7g} m, "
+         f"track {n['principal_distance_along_track_m']:.7g} m"),
         ("principal distance of the line", f"{run.distortion.line_distance:.6f} m"),
         ("F-number", f"{n['f_number']:.3f}"),
         ("working F-number", f"{n['working_f_number']:.3f} (line {n['working_f_number_along_line']:.3f}, "
          f"track {n['working_f_number_along_track']:.3f})"),
-        ("entrance pupil", f"{1e3 * n['entrance_pupil_m']:.1f} mm, "
+        ("entrance pupil", f"{1e3 * n['entrance_pupil_m']:.5g} mm, "
          f"{_before(n['entrance_pupil_before_first_mirror_m'])} the first mirror"),
         ("exit pupil", f"{far(n['exit_pupil_m'])}, {_before(n['exit_pupil_before_image_m'])} the image"),
         ("chief rays at the image", "{:.3f} deg from its normal in the middle, {:.3f} at most".format(
@@ -120,18 +122,23 @@ def first_order_table(run: CameraRun) -> Table:
         ("sampling", f"λF / pixel {n['sampling_lambda_f_per_pixel']:.3f} (2 samples the cut-off); "
          f"Nyquist {n['nyquist_per_mm']:.2f}, cut-off {n['cutoff_per_mm']:.1f} cycles/mm"),
         ("length along the axis", f"{n['length_m']:.4f} m"),
-        ("obscuration by its own parts",
+        (f"obscuration by its own parts{', as designed' if run.perturbed else ''}",
          ", ".join(f"{b} {100 * s:.2f}%" for b, s in n["obscuration"].items()) or "none"),
     ]  # fmt: skip
     if n["hole_radius_mm"]:
         holes = ", ".join(f"{b} a hole of {r:.1f} mm radius or more" for b, r in n["hole_radius_mm"].items())
         rows.append(("light goes through", f"{holes} (the file states none: edges: [{{blocks: circle, radius: ...}}])"))
-    caption = f"In the middle of the field, at {1e9 * run.camera.wavelength:.0f} nm, unless it says otherwise."
+    about = "the axis" if run.optics.model.axis.on_axis else "the field's middle, as no light comes along the axis"
+    caption = (
+        f"The camera {'as perturbed' if run.perturbed else 'as designed'}, at {1e9 * run.camera.wavelength:.0f} nm. "
+        f"Focal lengths, F-number and pupils are paraxial, about {about}; all else is of the field's middle where "
+        "nothing else is stated, on the image plane where it stands."
+    )
     return Table("first-order", "First-order data", caption, ("quantity", "value"), rows)
 
 
-def _before(distance: float) -> str:
-    if abs(distance) > 1e4:
+def _before(distance: float | None) -> str:
+    if distance is None or abs(distance) > 1e4:
         return "infinitely far from"
     return f"{abs(distance):.4g} m {'before' if distance > 0.0 else 'behind'}"
 

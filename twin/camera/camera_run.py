@@ -323,7 +323,7 @@ def perturbed_text(run: CameraRun) -> str:
 
 _LONG = re.compile(r"-?\d+\.\d{3,}(e-?\d+)?")
 """Numbers with more digits than a sentence bears."""
-_OF_THE_DRAWING = "First-order data and layout are those of the camera as designed."
+_OF_THE_DRAWING = "First-order data are those of this state; layout and obscuration are of the camera as designed."
 
 
 def built_text(run: CameraRun) -> str:

@@ -8,9 +8,10 @@ import numpy as np
 
 from analysis.orientation.distortion_model import principal_distance, principal_distance_and_point
 from analysis.short_repr import shows
+from optics.raytrace.first_order import enclosed_area
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_sharpness import FocalPlane
-from twin.camera.camera_optics import CameraOptics, rim, solid_angle
+from twin.camera.camera_optics import CameraOptics, rim
 from twin.camera.camera_results import Field
 
 LINE_POINTS = 41
@@ -161,7 +162,7 @@ def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCur
     fields = np.stack([share, np.zeros(count)], axis=-1)
     waves = optics.wavefronts(fields, points=3, terms=28)
     leaving = optics.rays(fields, rim(48)).direction[..., 1::-1]
-    area = np.array([solid_angle(beam) for beam in leaving])
+    area = np.array([enclosed_area(beam) for beam in leaving])
     wavelength = optics.model.spec.wavelength
     terms = np.array([wave.coefficients for wave in waves]) * wavelength
     aperture = 0.5 * np.ptp(leaving, axis=1)

@@ -15,12 +15,16 @@ from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.first_order import Paraxial, equal_area_radius, first_order, ray_matrix
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction
+from optics.waves.imaging import aim_collimated
+from scenes.models.camera_axis import LINE_AXIS, axis_data, pupil_diameter
+from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction, focal_plane_body
 from scenes.specs.camera import CameraSpec
-from twin.camera.camera_optics import CameraOptics, rim, round_aperture
+from twin.camera.camera_optics import CameraOptics, rim
 from twin.run.quantity import Quantity, Record
 
 EARLIER = 6.0
@@ -236,41 +240,39 @@ _NEAR = 1e-6
 """A ray meets a surface where it starts or ends: so close to it does not count, metres."""
 
 
-_SMALL = 1e-5
-"""Field angle by which the entrance pupil is found, radians: chief rays cross to its square."""
-
 _RIM = 48
 """Rays on the edge of the stop."""
 
 
-@shows("focal_length [m]", "aperture", "image [mm]", "obscuration.shares", "obscuration.holes")
+@shows("paraxial.focal_length [m]", "entrance_pupil [m]", "aperture", "obscuration.shares", "obscuration.holes")
 @dataclass(frozen=True, eq=False)
 class FirstOrderData:
-    """What was traced in the middle of the field for `FIRST_ORDER`; lengths in metres, angles in radians.
+    """What was traced for `FIRST_ORDER` of a camera in one state; lengths in metres, angles in radians.
 
     Attributes:
         spec: the camera.
-        focal_length_line, focal_length_track: change of the image's place per angle, along the line and the track.
-        focal_length: their geometric mean.
-        entrance_pupil_distance: of the entrance pupil from the first mirror, positive toward the scene.
-        exit_pupil_distance: from the image upstream; negative where it lies behind the image.
+        paraxial: data about the axis.
+        entrance_pupil: diameter of the entrance pupil.
+        principal_distance_line, principal_distance_track: change of the image's place per angle in the middle of the
+            field, along the line and along the track, where the image plane stands.
         aperture: numerical apertures along the line and along the track.
         round_aperture: numerical aperture of the round beam with the same solid angle at the image.
         image: length and width of the image of the whole field.
         chief_ray_angle: of chief rays against the image's normal: in the middle, and the largest over the field.
-        obscuration: what of the camera stands in its own beam.
+        length: distance along the parent axis between the outermost of the mirrors and the image.
+        obscuration: what of the camera, as designed, stands in its own beam.
     """
 
     spec: CameraSpec
-    focal_length_line: float
-    focal_length_track: float
-    focal_length: float
-    entrance_pupil_distance: float
-    exit_pupil_distance: float
+    paraxial: Paraxial
+    entrance_pupil: float
+    principal_distance_line: float
+    principal_distance_track: float
     aperture: tuple[float, float]
     round_aperture: float
     image: tuple[float, float]
     chief_ray_angle: tuple[float, float]
+    length: float
     obscuration: InTheWay
 
     @property
@@ -278,23 +280,39 @@ class FirstOrderData:
         """F-number along the line by the beam at the image, 1 / (2 NA)."""
         return 0.5 / self.aperture[0]
 
-    @property
-    def length(self) -> float:
-        """Distance along the parent axis between the outermost of the mirrors and the image, metres."""
-        z = [mirror.z for mirror in self.spec.mirrors.values()] + [self.spec.image.z]
-        return float(max(z) - min(z))
 
+def _near(value: float) -> float | None:
+    """Return a length that is no rounding of an infinite one, metres."""
+    return value if abs(value) < _INFINITE else None
+
+
+_INFINITE = 1e9
+"""Distance of an exit pupil, or its diameter, from which on image space is telecentric, metres."""
 
 FIRST_ORDER: Record[FirstOrderData] = Record(
-    "First-order data of a camera, in the middle of its field and at its design wavelength where nothing else is said.",
-    Quantity("focal_length_m", lambda d: d.focal_length, "geometric mean of those along the line and along the track"),
-    Quantity("focal_length_along_line_m", lambda d: d.focal_length_line, "change of the image's place per angle"),
-    Quantity("focal_length_along_track_m", lambda d: d.focal_length_track, "change of the image's place per angle"),
-    Quantity("entrance_pupil_m", lambda d: d.spec.entrance_pupil, "diameter"),
-    Quantity("entrance_pupil_before_first_mirror_m", lambda d: d.entrance_pupil_distance, "positive toward the scene"),
-    Quantity("exit_pupil_m", lambda d: 2.0 * abs(d.exit_pupil_distance) * d.round_aperture, "diameter"),
-    Quantity("exit_pupil_before_image_m", lambda d: d.exit_pupil_distance, "negative where it lies behind the image"),
-    Quantity("f_number", lambda d: d.focal_length / d.spec.entrance_pupil, "focal length over entrance pupil"),
+    "First-order data of a camera in the state in which it is judged, at its design wavelength. Focal lengths, F-"
+    "number and pupils are paraxial, about the axis; all else is of the field's middle where nothing else is stated.",
+    Quantity("focal_length_m", lambda d: d.paraxial.focal_length, "effective focal length, wherever the image stands"),
+    Quantity(
+        "back_focal_length_m",
+        lambda d: d.paraxial.back_focal_length,
+        "from the last mirror or lens face downstream to the paraxial focus",
+    ),
+    Quantity("principal_distance_along_line_m", lambda d: d.principal_distance_line, "image's place per angle"),
+    Quantity("principal_distance_along_track_m", lambda d: d.principal_distance_track, "image's place per angle"),
+    Quantity("entrance_pupil_m", lambda d: d.entrance_pupil, "diameter of the beam along the axis that fills the stop"),
+    Quantity(
+        "entrance_pupil_before_first_mirror_m",
+        lambda d: d.paraxial.entrance_pupil,
+        "from the first mirror or lens face, positive toward the scene",
+    ),
+    Quantity("exit_pupil_m", lambda d: _near(d.entrance_pupil * d.paraxial.exit_magnification), "diameter"),
+    Quantity(
+        "exit_pupil_before_image_m",
+        lambda d: _near(d.paraxial.exit_pupil),
+        "negative where it lies behind the image; nothing where it is infinitely far",
+    ),
+    Quantity("f_number", lambda d: d.paraxial.focal_length / d.entrance_pupil, "focal length over entrance pupil"),
     Quantity("working_f_number", lambda d: 0.5 / d.round_aperture, "of the round beam with the same solid angle"),
     Quantity("working_f_number_along_line", lambda d: d.working_f_number_line, "1 / (2 NA) at the image"),
     Quantity("working_f_number_along_track", lambda d: 0.5 / d.aperture[1], "1 / (2 NA) at the image"),
@@ -302,12 +320,12 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
     Quantity("image_mm", lambda d: np.array(d.image), "length and width of the image of the field"),
     Quantity(
         "plate_scale_arcsec_per_mm",
-        lambda d: 3.6 * np.degrees(1.0 / d.focal_length_line),
+        lambda d: 3.6 * np.degrees(1.0 / d.principal_distance_line),
         "angle per length on the image, along the line",
         converted=False,
     ),
     Quantity("pitch_um", lambda d: d.spec.line.pitch, "pitch of the line's pixels"),
-    Quantity("pixel_arcsec", lambda d: d.spec.line.pitch / d.focal_length_line, "angle that a pixel sees"),
+    Quantity("pixel_arcsec", lambda d: d.spec.line.pitch / d.principal_distance_line, "angle that a pixel sees"),
     Quantity("nyquist_per_mm", lambda d: 0.5 / d.spec.line.pitch, "of the line's pixels"),
     Quantity(
         "cutoff_per_mm",
@@ -341,43 +359,43 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
 
 
 def first_order_data(optics: CameraOptics) -> FirstOrderData:
-    """Trace what the first-order data of a camera follow from, as designed. Raises AimError, BeamMissedError."""
-    model, backend = optics.model, optics.path.backend
-    first = model.first_order
-    scale = np.abs(first.scale[0])
+    """Trace what the first-order data of a camera follow from, in its state.
+
+    Raises:
+        AimError, BeamMissedError: light does not come through.
+        AfocalError: the state brings it to no focus.
+    """
+    path, model, backend = optics.path, optics.model, optics.path.backend
+    state = path.coloured(optics.state, optics.wavelength)
+    placed = path.assembly.place([state])
+    imaging, to_stop = (
+        assemble(path.assembly, [f"{path.name}/{way}"], [state], placed=placed) for way in ("imaging", "to_stop")
+    )
+    frame = placed.pose(path.root) @ model.camera_frame.inverse()
+    axis, first = model.axis.moved(frame), frame.rotation @ LINE_AXIS
+    middle = optics.directions([(0.0, 0.0)])
+    launch = aim_collimated(backend, to_stop, middle, axis.centre[None], np.zeros((1, 2)))[0][:, 0]
+    about = transverse_axes(middle, first[None])
+    scale = first_order(ray_matrix(backend, imaging, model.mirrors.index(model.spec.stop), launch, middle, about)).scale
+    (_, track), (line, _) = np.abs(scale[0])
     rays = optics.rays(_FIELDS, np.concatenate([np.zeros((1, 2)), rim(_RIM)]))
-    middle = _FIELDS.index((0.0, 0.0))
-    cosines = rays.direction[middle, 1:, 1::-1]  # along the line, along the track
+    at = _FIELDS.index((0.0, 0.0))
+    cosines = rays.direction[at, 1:, 1::-1]  # along the line, along the track
     slant = np.arccos(np.clip(np.abs(rays.direction[:, 0, 2]), 0.0, 1.0))
     na_line, na_track = 0.5 * np.ptp(cosines, axis=0)
     length, width = np.ptp(rays.position[:, 0, 1::-1], axis=0)
+    image = placed.pose(focal_plane_body(path.root)) @ model.focal_plane.inverse() @ model.image_body
+    ends = [placed.pose(f"{path.root}/{mirror}").translation for mirror in model.mirrors] + [image.translation]
     return FirstOrderData(
         spec=model.spec,
-        focal_length_line=float(scale[0, 0]),
-        focal_length_track=float(scale[1, 1]),
-        focal_length=float(first.focal_length[0]),
-        entrance_pupil_distance=_entrance_pupil(model, optics),
-        exit_pupil_distance=float(first.exit_pupil_distance[0]),
+        paraxial=axis_data(backend, imaging, model.spec, axis, first),
+        entrance_pupil=pupil_diameter(backend, to_stop, axis, path.stop.radius),
+        principal_distance_line=float(line),
+        principal_distance_track=float(track),
         aperture=(float(na_line), float(na_track)),
-        round_aperture=round_aperture(cosines),
+        round_aperture=equal_area_radius(cosines),
         image=(float(length), float(width)),
-        chief_ray_angle=(float(slant[middle]), float(np.max(slant))),
+        chief_ray_angle=(float(slant[at]), float(np.max(slant))),
+        length=float(np.ptp(frame.inverse().apply(np.array(ends))[:, 2])),
         obscuration=obscuration(model, backend),
     )
-
-
-def _entrance_pupil(model: CameraModel, optics: CameraOptics) -> float:
-    """Where chief rays of neighbouring fields cross before the camera: along its line of sight from the first mirror,
-    positive toward the scene.
-    """
-    spec, backend = model.spec, optics.path.backend
-    bare = model.bare_assembly(apertures=False)
-    to_stop = assemble(bare, [model.mirrors[: model.mirrors.index(spec.stop) + 1]])
-    steps = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
-    light = np.array([field_direction(spec, *(_SMALL * step)) for step in steps])
-    start = collimated(backend, to_stop, light, np.zeros((1, 2)))[:, 0]
-    # rays x(t) = start + t light: how far each has to go to meet the middle one's plane there, by least squares
-    apart, turned = start[1:] - start[0], light[1:] - light[0]
-    way = -float(np.sum(apart * turned) / np.sum(turned * turned))
-    crossing = model.camera_frame.inverse().apply(start[0] + way * light[0])
-    return float(crossing[2])

@@ -26,7 +26,8 @@ from optics.waves.lit_stop import LitStop
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, to_terms
 from optics.waves.wavefront import path_to_sphere
-from scenes.models.camera_model import LAUNCH_DISTANCE, glass_steps, in_glass
+from scenes.models.camera_axis import LAUNCH_DISTANCE
+from scenes.models.camera_model import glass_steps, in_glass
 from twin.camera.camera_optics import CameraOptics
 
 AT_ONCE = 200

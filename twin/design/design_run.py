@@ -96,6 +96,11 @@ def run_design(
             f"\nIts extent along z is {100 * found.after.envelope / found.before.envelope:.2f} % of {camera.name}'s."
         )
     spec = camera_design.camera_of(camera, found.prescription, test.name, test.description)
+    if camera.stop_diameter is not None:
+        # its beams are as wide as the entrance pupil in the middle of the field
+        free = derive_camera(spec.model_copy(update={"stop_diameter": None}), backend)
+        width = np.sqrt(np.abs(determinant(free.first_order.entrance_magnification[0])))
+        spec = spec.model_copy(update={"stop_diameter": float(spec.entrance_pupil * width)})
     derive_camera(spec, backend)  # it can be used as a camera
     warnings = []
     worst = float(found.after.errors.max())

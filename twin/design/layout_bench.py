@@ -161,7 +161,7 @@ class LayoutBench:
         """Whether the area CCDs of two beams have room beside each other at an end of every line."""
         ccd = monitor_layout.layout_spec(self.setup, (one,)).autocollimator.area_ccd
         return all(
-            abs(camera.line_focal_length * (np.tan(one.field) - np.tan(other.field))) >= ccd.rows * ccd.pitch
+            abs(camera.line_principal_distance * (np.tan(one.field) - np.tan(other.field))) >= ccd.rows * ccd.pitch
             for camera in self.start.cameras.values()
         )
 

@@ -278,9 +278,9 @@ class DistortionBench:
         design = TargetPath(camera.assembly, ROOT, ROOT, camera.model, backend)
         band = setup.camera.bands[test.band]
         ccd = LineCcd.from_specs(band, setup.detectors[band.detector])
-        _check_pinhole(setup, camera.model.line_focal_length)
+        _check_pinhole(setup, camera.model.line_principal_distance)
         half = 0.5 * band.pixels * band.pitch
-        turn = np.arctan(test.reach * half / camera.model.line_focal_length) * np.linspace(-1.0, 1.0, test.points)
+        turn = np.arctan(test.reach * half / camera.model.line_principal_distance) * np.linspace(-1.0, 1.0, test.points)
         _check_table(setup, turn)
         try:
             middle = _aim(path, camera.as_built, band.offset)

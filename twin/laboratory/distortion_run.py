@@ -210,7 +210,7 @@ def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> Sim
     spots = _locate(bench, record)
     # the line's middle was put on the pinhole at the camera's angle; the prescription's focal length serves to see
     # scatter only
-    args = record.reading, spots, setup.turntable.camera_angle, bench.path.model.line_focal_length
+    args = record.reading, spots, setup.turntable.camera_angle, bench.path.model.line_principal_distance
     try:
         return SimulatedDistortion(
             test=setup.test,

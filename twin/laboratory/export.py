@@ -69,7 +69,7 @@ def export_distortion(run: SimulatedDistortion) -> Files:
     test = camera_tests.MeasuredDistortionSpec.model_construct(
         name="distortion",
         description=setup.test.description,
-        principal_distance=run.bench.path.model.line_focal_length,
+        principal_distance=run.bench.path.model.line_principal_distance,
         measured=files,
         seed=run.seed,
     )

@@ -128,7 +128,7 @@ class FocusBench:
         self.ccds = {
             name: LineCcd.from_specs(band, setup.detectors[band.detector]) for name, band in setup.camera.bands.items()
         }
-        self.focal_length = float(self.camera.model.first_order.focal_length[0])
+        self.focal_length = float(self.camera.model.first_order.principal_distance[0])
         self.sites = self._build_sites(advance)
 
     def geometric_zero(self, band: str) -> float:

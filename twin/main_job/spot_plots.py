@@ -60,7 +60,7 @@ def airy_radius(run: RenderRun) -> float:
     """Radius of the first dark ring that the return face's aperture gives, pixels."""
     path = run.experiment.path
     camera = next(iter(run.experiment.instrument.cameras.values()))
-    focal = float(camera.first_order.focal_length[0])
+    focal = float(camera.first_order.principal_distance[0])
     return float(1.2197 * path.wavelength * focal / (2.0 * float(np.min(path.face_radius))) / path.pitch)
 
 

@@ -42,7 +42,8 @@ from optics.waves.pupil_shadow import FEW_SIDES, SMALLEST
 from optics.waves.pupil_stack import CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
 from optics.waves.wavefront import eikonal, path_to_sphere
 from scenes.models import shadow
-from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_body
+from scenes.models.camera_axis import LAUNCH_DISTANCE
+from scenes.models.camera_model import coloured, lenses, line_body
 from scenes.models.instrument_model import Instrument
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE

@@ -152,7 +152,7 @@ def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict
     if len(names) > 1:
         out["angle"] = (unit[0] - unit[_PARAMETERS])[None]
     if ground is not None:
-        first, second = (instrument.cameras[name].line_focal_length for name in names[:2])
+        first, second = (instrument.cameras[name].line_principal_distance for name in names[:2])
         rows = ground.rows((first, second))
         out["height"] = rows[len(rows) // 2, 2:3]
     return out
@@ -164,7 +164,8 @@ def ground_of(instrument: Instrument) -> GroundGeometry | None:
     Raises:
         InputError: its rays do not meet on the ground.
     """
-    return ground_geometry(instrument, {name: model.line_focal_length for name, model in instrument.cameras.items()})
+    distances = {name: model.line_principal_distance for name, model in instrument.cameras.items()}
+    return ground_geometry(instrument, distances)
 
 
 def spot_noise(

@@ -114,7 +114,7 @@ def pinhole(
     placed = instrument.assembly.place([state])
     model = instrument.cameras[channel.camera]
     if cone is None:
-        cone = CONE_ROOM * 0.5 * model.spec.entrance_pupil / model.line_focal_length
+        cone = CONE_ROOM * 0.5 * model.spec.entrance_pupil / model.line_principal_distance
     place = placed.pose(channel.reticle_body).translation
     axis = instrument.toward_optics(placed, channel.camera)[0]
     radius = 0.5 * instrument.spec.autocollimator.reticle.pinhole * float(placed.size(channel.reticle_body)[0])

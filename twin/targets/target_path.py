@@ -33,7 +33,8 @@ from optics.waves.line_transfer import LINE_SIDES, CutPupil, cut_pupils, lit_at
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import CUT_RESIDUAL, CUT_RINGS, DEGREE, PupilFunction, fit_pupils
 from optics.waves.transfer import with_nodes_enough
-from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
+from scenes.models.camera_axis import LAUNCH_DISTANCE
+from scenes.models.camera_model import CameraModel, coloured, line_body
 from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
 
 RINGS = 14
@@ -143,7 +144,7 @@ class TargetPath:
         """Divides target coordinates into angles: the collimator's focal length, or that of the camera along its line,
         so that a far target is measured on the image.
         """
-        return self.model.line_focal_length if self.collimator is None else self.collimator.focal_length
+        return self.model.line_principal_distance if self.collimator is None else self.collimator.focal_length
 
     def directions(self, places: np.ndarray, state: State | None = None) -> np.ndarray:
         """Directions of the light, world, (F, 3), that the camera images at places (F, 2), (along, across), metres, of

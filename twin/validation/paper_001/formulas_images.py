@@ -146,7 +146,7 @@ class MonitorImages:
         """Focal length along the line at its centre, where d_beta is taken, over the formulas' f; of both cameras."""
         cameras = self.experiment.instrument.cameras
         return float(
-            np.mean([cameras[c].line_focal_length / self.geometry(c).principal_distance_m for c in self.cameras])
+            np.mean([cameras[c].line_principal_distance / self.geometry(c).principal_distance_m for c in self.cameras])
         )
 
     def parameters(self) -> Mapping[str, Mapping[str, CameraParameters]]:
@@ -245,7 +245,8 @@ class SingleMotions(MonitorImages):
             geometry = self.geometry(camera)
             local, field = 1.0, geometry.field_alpha_rad
             if parameter == "d_beta":
-                local = self.experiment.instrument.cameras[camera].line_focal_length / geometry.principal_distance_m
+                model = self.experiment.instrument.cameras[camera]
+                local = model.line_principal_distance / geometry.principal_distance_m
                 field = geometry.field_beta_rad
             value, sigma = self.reading(camera, motion, "paper_single", parameter)
             bare = math.tan(value) / math.cos(field) ** 2 / local

@@ -73,7 +73,7 @@ def _singles(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[s
     show.singles_shown(context, ranges, data)
     geometry = bench.geometry(bench.cameras[0])
     own = ranges[INSTRUMENT]
-    local = bench.experiment.instrument.cameras[bench.cameras[0]].line_focal_length
+    local = bench.experiment.instrument.cameras[bench.cameras[0]].line_principal_distance
     show.causes_shown(context, own, geometry, local, data)
     for equation, name in _BY_EQUATION.items():
         yield _range(context, f"001.{equation}.range", own[name], geometry)

@@ -1,0 +1,266 @@
+"""First-order data of lenses and telescopes whose stop stands before, in and behind the power, against optiland,
+ray-optics and rays of batoid near the axis.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from scenes.models.camera_model import CameraModel, derive_camera
+from scenes.specs.camera import CameraSpec
+from scenes.yaml.spec import validate
+from scenes.yaml.yaml_file import parse_yaml
+from tests.oracles import prescription_peers  # noqa: F401  puts ray-optics on the path
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.first_order_data import FIRST_ORDER, first_order_data
+
+pytestmark = pytest.mark.oracle
+
+WAVE = 587.5618e-9
+KEYS = {
+    "efl": "focal_length_m",
+    "bfl": "back_focal_length_m",
+    "entrance": "entrance_pupil_before_first_mirror_m",
+    "diameter": "entrance_pupil_m",
+    "exit": "exit_pupil_before_image_m",
+    "exit_diameter": "exit_pupil_m",
+    "f_number": "f_number",
+}
+DISTANCES = ("bfl", "entrance", "exit")
+SAME = 1e-6
+"""Largest difference of lengths, relative; of distances, to the focal length."""
+
+
+class Face(NamedTuple):
+    """A surface: vertex and radius, metres, conic, and the index behind it, 0 for a mirror, -1 for a bare stop."""
+
+    z: float
+    radius: float
+    index: float
+    conic: float = 0.0
+
+
+class System(NamedTuple):
+    """Surfaces in the order of the light, which of them is the stop, entrance pupil and image, metres."""
+
+    faces: tuple[Face, ...]
+    stop: int
+    pupil: float
+    image: float
+
+
+INF = np.inf
+LENS = (Face(0.0, 0.052, 1.5168), Face(0.006, -0.31, 1.0))
+TRIPLET = (
+    Face(0.0, 0.0218, 1.6204), Face(0.0033, -0.41, 1.0), Face(0.0091, -0.0224, 1.6200),
+    Face(0.0101, 0.0201, 1.0), Face(0.0149, 0.0798, 1.6204), Face(0.0178, -0.0183, 1.0),
+)  # fmt: skip
+TELE = (Face(0.0, 0.11, 1.5168), Face(0.012, -0.28, 1.0), Face(0.11, -0.062, 1.62), Face(0.115, 0.21, 1.0))
+CASSEGRAIN = (Face(0.0, -2.6, 0.0, -1.0), Face(-0.93, -1.02, 0.0, -2.9))
+GREGORY = (Face(0.0, -2.0, 0.0, -1.0), Face(-1.25, 0.44, 0.0, -0.5))
+KORSCH = (Face(0.0, -2.5, 0.0, -0.93), Face(-0.94, -0.83, 0.0, -2.2), Face(1.45, -1.24, 0.0, -0.42))
+STOP = -1.0
+SYSTEMS = {
+    "lens, stop in front": System((Face(-0.02, INF, STOP), *LENS), 0, 0.012, 0.085),
+    "lens, stop behind": System((*LENS, Face(0.025, INF, STOP)), 2, 0.012, 0.09),
+    "triplet, stop inside": System(TRIPLET, 3, 0.009, 0.0602),
+    "triplet, plane stop": System((*TRIPLET[:4], Face(0.0125, INF, STOP), *TRIPLET[4:]), 4, 0.009, 0.0598),
+    "telephoto, stop inside": System((*TELE[:2], Face(0.07, INF, STOP), *TELE[2:]), 2, 0.04, 0.19),
+    "telephoto, stop behind": System((*TELE, Face(0.13, INF, STOP)), 4, 0.03, 0.2),
+    "Cassegrain, stop on M1": System(CASSEGRAIN, 0, 0.4, 0.4),
+    "Cassegrain, stop on M2": System(CASSEGRAIN, 1, 0.4, 0.41),
+    "Cassegrain, stop in front": System((Face(-1.4, INF, STOP), *CASSEGRAIN), 0, 0.4, 0.4),
+    "Gregory, stop on M2": System(GREGORY, 1, 0.3, 0.3),
+    "Korsch, stop behind M3": System((*KORSCH, Face(0.9, INF, STOP)), 3, 0.4, 0.1),
+    "Schmidt": System((Face(-1.0, INF, 1.5168), Face(-0.99, -40.0, 1.0), Face(0.0, -1.0, 0.0)), 0, 0.2, -0.5),
+    "lens and mirrors": System((Face(-0.9, 3.0, 1.5168), Face(-0.88, 3.4, 1.0), *CASSEGRAIN), 3, 0.3, 0.3),
+}
+
+
+def camera(system: System, backend: Any, image: float | None = None) -> CameraModel:
+    """The system as a camera of the twin; its stated focal length is not looked at."""
+    rows = []
+    for k, face in enumerate(system.faces):
+        light = {0.0: "", STOP: ", light: passes"}.get(face.index, f", light: refracts, index: {face.index}")
+        radius = "flat" if np.isinf(face.radius) else f"{face.radius!r} m"
+        rows.append(f"  S{k}: {{z: {face.z!r} m, radius: {radius}, conic: {face.conic}{light}}}")
+    text = f"""
+name: drawn
+focal_length: 1 m
+entrance_pupil: {system.pupil!r} m
+field_bias: 0 deg
+field: {{x: 0.05 deg, y: 0.05 deg}}
+wavelength: {WAVE * 1e9!r} nm
+stop: S{system.stop}
+mirrors:
+{chr(10).join(rows)}
+image: {{z: {system.image if image is None else image!r} m}}
+line: {{pixels: 100, pitch: 7 um}}
+edge_margin: 1 mm
+"""
+    return derive_camera(validate(CameraSpec, parse_yaml(text)), backend, stated=False)
+
+
+def travels(system: System) -> list[float]:
+    """Direction of the light along z behind each surface, 1 or -1."""
+    return [(-1.0) ** sum(f.index == 0.0 for f in system.faces[: k + 1]) for k in range(len(system.faces))]
+
+
+def ends(system: System) -> tuple[int, int]:
+    """The first and the last surface that reflect or refract."""
+    used = [k for k, face in enumerate(system.faces) if face.index != STOP]
+    return used[0], used[-1]
+
+
+def by_optiland(system: System) -> dict[str, float]:
+    """optiland's paraxial data."""
+    from optiland.materials import IdealMaterial
+    from optiland.optic import Optic
+
+    optic = Optic()
+    optic.surfaces.add(index=0, z=-np.inf)
+    for k, face in enumerate(system.faces, start=1):
+        material: Any = {0.0: "mirror", STOP: "air"}.get(face.index) or IdealMaterial(n=face.index)
+        optic.surfaces.add(index=k, z=face.z, radius=face.radius, conic=face.conic, material=material,
+                           is_stop=k - 1 == system.stop)  # fmt: skip
+    optic.surfaces.add(index=len(system.faces) + 1, z=system.image)
+    optic.wavelengths.add(1e6 * WAVE, is_primary=True)
+    optic.set_aperture("EPD", system.pupil)
+    optic.fields.set_type("angle")
+    optic.fields.add(y=0.0)
+    optic.fields.add(y=0.05)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        p = optic.paraxial
+        told = [float(np.ravel(v())[0]) for v in (p.f2, p.F2, p.EPL, p.EPD, p.XPL, p.XPD, p.FNO)]
+    f, focus, before, width, exit_pupil, exit_width, number = told
+    first, last = ends(system)
+    toward = travels(system)[-1]
+    return {
+        "efl": abs(f),
+        "bfl": toward * (system.image + focus - system.faces[last].z),
+        "entrance": system.faces[first].z - system.faces[0].z - before,
+        "diameter": width,
+        "exit": -toward * exit_pupil,
+        "exit_diameter": abs(exit_width),
+        "f_number": abs(number),
+    }
+
+
+def by_ray_optics(system: System) -> dict[str, float]:
+    """First-order data of ray-optics."""
+    from rayoptics.optical.opticalmodel import OpticalModel
+    from rayoptics.raytr.opticalspec import FieldSpec, PupilSpec, WvlSpec
+
+    optic = OpticalModel()
+    sequence, spec = optic["seq_model"], optic["optical_spec"]
+    optic.radius_mode = True
+    sequence.gaps[0].thi = 1e11  # farther, and its sums round; nearer, and the F-number is of a finite scene
+    spec["pupil"] = PupilSpec(spec, key=["object", "epd"], value=1e3 * system.pupil)
+    spec["fov"] = FieldSpec(spec, key=["object", "angle"], value=0.05, flds=[0.0, 1.0], is_relative=True)
+    spec["wvls"] = WvlSpec([(1e9 * WAVE, 1.0)], ref_wl=0)
+    places = [*(face.z for face in system.faces), system.image]
+    for k, face in enumerate(system.faces):
+        medium: list[Any] = ["REFL"] if face.index == 0.0 else [] if face.index in (STOP, 1.0) else [face.index, 1e6]
+        radius = 0.0 if np.isinf(face.radius) else 1e3 * face.radius
+        sequence.add_surface([radius, 1e3 * (places[k + 1] - places[k]), *medium])
+        if k == system.stop:
+            sequence.set_stop()
+    optic.update_model()
+    data = optic["analysis_results"]["parax_data"].fod
+    first, last = ends(system)
+    toward = travels(system)[-1]
+    # its exit pupil is at the focus less its distance from the image plane
+    return {
+        "efl": 1e-3 * abs(data.efl),
+        "bfl": toward * (1e-3 * data.bfl + system.faces[-1].z - system.faces[last].z),
+        "entrance": system.faces[first].z - system.faces[0].z - 1e-3 * data.enp_dist,
+        "diameter": 2e-3 * data.enp_radius,
+        "exit": toward * 1e-3 * (data.bfl - data.exp_dist),
+        "exit_diameter": 2e-3 * abs(data.exp_radius),
+        "f_number": abs(data.fno),
+    }
+
+
+def by_batoid(system: System) -> dict[str, float]:
+    """Rays of batoid near the axis: one beside it and one inclined to it, combined to chief and marginal rays; and the
+    marginal ray itself at the stop.
+    """
+    import batoid
+
+    height, angle = 1e-5 * system.pupil, 1e-6
+    air, inside = batoid.ConstMedium(1.0), batoid.ConstMedium(1.0)
+    start = min(face.z for face in system.faces) - 0.5
+    x = np.array([height, 0.0, 0.5 * system.pupil])
+    slope = np.array([0.0, angle, 0.0])
+    rays = batoid.RayVector(x, np.zeros(3), np.full(3, start), slope, np.zeros(3), np.sqrt(1.0 - slope**2),
+                            np.zeros(3), np.full(3, WAVE))  # fmt: skip
+    lateral = []
+    for face in system.faces:
+        # a quadric that is a paraboloid has no answer for rays along its axis
+        quadric = batoid.Paraboloid(face.radius) if face.conic == -1.0 else batoid.Quadric(face.radius, face.conic)
+        shape = batoid.Plane() if np.isinf(face.radius) else quadric
+        stand, item = {"coordSys": batoid.CoordSys(origin=[0.0, 0.0, face.z])}, None
+        if face.index == 0.0:
+            item = batoid.Mirror(shape, **stand)
+        elif face.index == STOP:
+            item = batoid.Detector(shape, **stand)
+        else:
+            behind = air if face.index == 1.0 else batoid.ConstMedium(face.index)
+            item = batoid.RefractiveInterface(shape, inMedium=inside, outMedium=behind, **stand)
+            inside = behind
+        item.trace(rays)
+        rays.toCoordSys(batoid.CoordSys())
+        lateral.append(np.array(rays.x))
+    batoid.Detector(batoid.Plane(), coordSys=batoid.CoordSys(origin=[0.0, 0.0, system.image])).trace(rays)
+    place, way = np.array(rays.x), np.array(rays.vx / np.abs(rays.vz))
+    at_stop = lateral[system.stop]
+    share = -at_stop[1] / at_stop[0]  # of the ray beside the axis, in the chief ray
+    chief, turned = place[1] + share * place[0], way[1] + share * way[0]
+    away = chief / turned
+    first, last = ends(system)
+    toward = travels(system)[-1]
+    return {
+        "efl": abs(height / way[0]),
+        "bfl": toward * (system.image - system.faces[last].z) - place[0] / way[0],
+        "entrance": share * height / angle + system.faces[first].z - start,
+        "exit": away,
+        "exit_diameter": system.pupil * abs(place[0] - away * way[0]) / height,
+        "stop": abs(at_stop[2]),
+        "f_number": abs(height / way[0]) / system.pupil,
+    }
+
+
+PEERS = {"optiland": by_optiland, "rayoptics": by_ray_optics, "batoid": by_batoid}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("peer", PEERS)
+def test_first_order_data(backend, peer: str, name: str) -> None:
+    pytest.importorskip(peer)
+    system = SYSTEMS[name]
+    model = camera(system, backend)
+    told = FIRST_ORDER(first_order_data(CameraOptics.alone(model, backend)))
+    ours = {key: told[name] for key, name in KEYS.items()} | {"stop": model.apertures[model.spec.stop].radius}
+    theirs = PEERS[peer](system)
+    assert len(theirs) >= 7
+    for key, value in theirs.items():
+        # distances are as right as the lengths of the system are
+        assert value == pytest.approx(ours[key], rel=SAME, abs=SAME * told["focal_length_m"] * (key in DISTANCES)), key
+
+
+@pytest.mark.parametrize("name", ["lens, stop behind", "Cassegrain, stop on M2"])
+def test_the_focal_length_does_not_move_with_the_image_plane(backend, name: str) -> None:
+    """The principal distance does, and so did what was called the focal length."""
+    system = SYSTEMS[name]
+    near, far = (
+        FIRST_ORDER(first_order_data(CameraOptics.alone(camera(system, backend, image), backend)))
+        for image in (system.image, 1.1 * system.image)
+    )
+    for key in ("focal_length_m", "back_focal_length_m", "entrance_pupil_m", "f_number", "exit_pupil_m"):
+        assert far[key] == pytest.approx(near[key], rel=1e-9), key
+    assert abs(far["principal_distance_along_line_m"] / near["principal_distance_along_line_m"] - 1.0) > 0.02
