@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from scenes.specs.tolerance import SPECTRUM
 from scenes.yaml.units import split_quantity
 from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, plain, shown_unit
 from twin.run.report import Report, Section, answer
@@ -67,6 +68,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
             name="inverse",
         ),
         *_allocation_sections(run),
+        *_figure_sections(run),
         *_monitor_sections(run),
         *_compensator_sections(run),
         Section(
@@ -330,6 +332,35 @@ def _tol_table(run: ToleranceRun) -> Table:
         rows.append([name, one.words, str(limits.get(name, one.limit)), law, " ".join(one.carrying)])
     heads = ("tolerance", "motion", "limit (plus, minus)", "law", "carrying")
     return Table("tol", "Limits for the workshop", "As CSV in artefacts/tol.csv.", heads, rows)
+
+
+def _figure_sections(run: ToleranceRun) -> tuple[Section, ...]:
+    """The circles and the clear apertures over which figure errors are."""
+    figures = [(name, one) for name, one in run.setup.test.tolerances.items() if one.parts[1] == SPECTRUM]
+    if not figures:
+        return ()
+    rows: list[list[Cell]] = []
+    for name, one in figures:
+        body = next(iter(next(n for n in run.bench.numbers if n.entry == name).moves))
+        element = run.bench.instrument.assembly.face(body)
+        disk, outer = element.figure_disk, element.outer_edge
+        assert outer is not None
+        x0, x1, y0, y1 = outer.bounds
+        blocked = " with blocked parts" if any(edge.blocks for edge in element.edges) else ""
+        shape = f"{type(outer).__name__.lower()}{blocked}"
+        rows.append(
+            [name, one.words, *(1e3 * v for v in (disk.radius, *disk.centre)), shape, 1e3 * (x1 - x0), 1e3 * (y1 - y0)]
+        )
+    circle = ("radius of the circle [mm]", "x of its middle [mm]", "y of its middle [mm]")
+    heads = ("tolerance", "motion", *circle, "clear aperture", "width [mm]", "height [mm]")
+    places = (None, None, 2, 2, 2, None, 2, 2)
+    table = Table("figures", "Circles and clear apertures", "In the surface's own x and y.", heads, rows, places)
+    text = (
+        "A Zernike term is stated by its rms over the smallest circle round the clear aperture, a whole figure error "
+        "by its rms over the clear aperture itself, about its mean. Where the camera's file states no clear edge, the "
+        "clear aperture is the stop, or the outline of the beams of the whole field with the camera's edge_margin.",
+    )
+    return (Section("Figure errors", text, (table,), name="figures"),)
 
 
 def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
