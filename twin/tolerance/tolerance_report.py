@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from scenes.specs.tolerance import SPECTRUM
 from scenes.yaml.units import split_quantity
 from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, plain, shown_unit
 from twin.run.report import Report, Section, answer
@@ -336,21 +335,17 @@ def _tol_table(run: ToleranceRun) -> Table:
 
 def _figure_sections(run: ToleranceRun) -> tuple[Section, ...]:
     """The circles and the clear apertures over which figure errors are."""
-    figures = [(name, one) for name, one in run.setup.test.tolerances.items() if one.parts[1] == SPECTRUM]
-    if not figures:
+    if not run.bench.figure_faces:
         return ()
     rows: list[list[Cell]] = []
-    for name, one in figures:
-        body = next(iter(next(n for n in run.bench.numbers if n.entry == name).moves))
-        element = run.bench.instrument.assembly.face(body)
+    for name, element in run.bench.figure_faces.items():
         disk, outer = element.figure_disk, element.outer_edge
         assert outer is not None
         x0, x1, y0, y1 = outer.bounds
         blocked = " with blocked parts" if any(edge.blocks for edge in element.edges) else ""
         shape = f"{type(outer).__name__.lower()}{blocked}"
-        rows.append(
-            [name, one.words, *(1e3 * v for v in (disk.radius, *disk.centre)), shape, 1e3 * (x1 - x0), 1e3 * (y1 - y0)]
-        )
+        lengths = [1e3 * v for v in (disk.radius, *disk.centre, x1 - x0, y1 - y0)]
+        rows.append([name, run.setup.test.tolerances[name].words, *lengths[:3], shape, *lengths[3:]])
     circle = ("radius of the circle [mm]", "x of its middle [mm]", "y of its middle [mm]")
     heads = ("tolerance", "motion", *circle, "clear aperture", "width [mm]", "height [mm]")
     places = (None, None, 2, 2, 2, None, 2, 2)
