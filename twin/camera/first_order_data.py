@@ -80,11 +80,10 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
             continue  # a stop's plate stands where its hole is not
         # the other mirrors' clear apertures have the margin already
         out[name] = _body(model, name, Circle(edge.radius + margin) if name == spec.stop else edge)
-    lines = [(spec.line.pixels * spec.line.pitch, 0.0)]
-    lines += [(band.pixels * band.pitch, band.offset) for band in spec.bands.values()]
-    half = 0.5 * max(length for length, _ in lines) + margin
-    offsets = [offset for _, offset in lines]
-    low, high = min(offsets) - margin, max(offsets) + margin
+    lines = [(spec.line, 0.0), *((band, band.offset) for band in spec.bands.values())]
+    half = 0.5 * max(line.pixels * line.pitch for line, _ in lines) + margin
+    low = min(offset - 0.5 * line.pitch for line, offset in lines) - margin
+    high = max(offset + 0.5 * line.pitch for line, offset in lines) + margin
     centre = model.image_body.inverse().apply(model.focal_plane.translation)
     out[IMAGE] = Rectangle(half, 0.5 * (high - low), (float(centre[0]), float(centre[1] + 0.5 * (high + low))))
     return out
@@ -221,7 +220,7 @@ def _met(
     length = np.linalg.norm(way, axis=-1)
     obstacle = Element(body, body, bare.elements[body].surface, Interaction.PASS, edge)
     system = assemble(bare.with_element(obstacle), [(body,)])
-    rays = make_rays(backend, start.reshape(-1, 3), (way / length[..., None]).reshape(-1, 3))
+    rays = make_rays(backend, start.reshape(-1, 3), (way / np.maximum(length, _NEAR)[..., None]).reshape(-1, 3))
     position, _, path, inside = trace(backend, system, rays).numpy()
     path, inside = path.reshape(length.shape), inside.reshape(length.shape)
     place = position.reshape(*length.shape, 3)[..., :2]
