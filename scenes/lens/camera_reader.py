@@ -123,6 +123,11 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
 def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) -> ReadCamera:
     """What `camera_of` says, with the field as the prescription has it."""
     notes = list(lens.notes)
+    notes += [
+        Note(0, name, f"the glass of {glass.source}; --glasses FILE.agf takes another")
+        for name, glass in lens.glasses.items()
+        if isinstance(glass, CatalogueGlass) and glass.source
+    ]
     surfaces, stop, origin, taken = _surfaces(lens, notes)
     bias, half_x, half_y = _field(lens, surfaces, notes)
     where = {"z": written(_image(lens)[0], LENGTH)}
