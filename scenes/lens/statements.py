@@ -212,9 +212,9 @@ MAKERS = ("SCHOTT", "OHARA", "HOYA", "CDGM")
 
 def of_makers(glasses: Glasses, makers: Sequence[str]) -> Glasses:
     """Return glasses without common ones of other makers than those that a file names, if it names any."""
-    named = {maker for maker in MAKERS if maker in makers}
-    sources = {key: getattr(found, "source", "").partition("'")[0].upper() for key, found in glasses.items()}
-    return FrozenMap({k: g for k, g in glasses.items() if not named or sources[k] not in MAKERS or sources[k] in named})
+    others = set(MAKERS).difference(makers) if set(MAKERS).intersection(makers) else set()
+    known = glasses.items()
+    return FrozenMap({k: g for k, g in known if getattr(g, "source", "").partition("'")[0].upper() not in others})
 
 
 def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, line: int) -> float:

@@ -296,22 +296,25 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
         system.name,
         wavelength=primary,
         wavelengths=tuple(dict.fromkeys(waves)),
-        fields=_fields(system),
+        fields=_fields(system) if system.field_type == 0 else (),
+        heights=tuple((x * scale, y * scale) for x, y in _pairs(system)) if 1 <= system.field_type <= 3 else (),
         field_kind=kinds[min(system.field_type, 4)],
         pupil=pupil,
         glasses=named_glasses(glasses, chain.surfaces),
     )
 
 
-def _fields(system: _System) -> tuple[tuple[float, float], ...]:
-    if system.field_type != 0:
-        return ()
+def _pairs(system: _System) -> tuple[tuple[float, float], ...]:
     count = system.field_count or max(len(system.x), len(system.y))
     x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
-    for value in (*x, *y):
+    return tuple(zip(x, y, strict=True))
+
+
+def _fields(system: _System) -> tuple[tuple[float, float], ...]:
+    for value in (value for pair in _pairs(system) for value in pair):
         if not abs(value) < 89.0:
             raise system.source.error("a field beyond 89 deg", system.field_line, value)
-    return tuple((math.radians(a), math.radians(b)) for a, b in zip(x, y, strict=True))
+    return tuple((math.radians(a), math.radians(b)) for a, b in _pairs(system))
 
 
 def _break(source: Source, chain: Chain, surface: _Surface, scale: float) -> None:

@@ -364,7 +364,7 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     focal_plane = Pose(np.stack([np.cross(LINE_AXIS, normal), LINE_AXIS, normal], axis=-1), image_centre)
 
     stop_radius = 0.5 * spec.entrance_pupil * float(np.sqrt(abs(determinant(chief.entrance_magnification[0]))))
-    apertures = _apertures(spec, surfaces, backend, to_stop, imaging, stop_radius)
+    apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     focal_length = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
     rear_node = image_centre - focal_length * image_direction
     return CameraModel(spec, surfaces, apertures, camera_frame, focal_plane, chief, image_direction, rear_node)
@@ -477,12 +477,7 @@ def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[
 
 
 def _apertures(
-    spec: CameraSpec,
-    surfaces: Mapping[str, Surface],
-    backend: Backend,
-    to_stop: SystemBatch,
-    imaging: SystemBatch,
-    stop_radius: float,
+    spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, stop_radius: float
 ) -> dict[str, Aperture]:
     """Return the clear apertures: the stop, and of the other surfaces the outline of the beams of the whole field with
     the margin about them. A mirror or a lens about its own axis is round, as it is made: a circle about its vertex,
@@ -509,7 +504,7 @@ def _apertures(
         half, middle = 0.5 * (high - low), 0.5 * (high + low)
         box = Rectangle(float(half[0]), float(half[1]), (float(middle[0]), float(middle[1])))
         hits = np.where(valid[0, :, None], traced.hit(i)[0, :, :2], np.nan).reshape(len(fields), _RIM_POINTS, 2)
-        out[name] = box if spec.mirrors[name].light == "passes" else _made(box, hits, surfaces[name], spec.edge_margin)
+        out[name] = box if spec.mirrors[name].light == "passes" else _made(box, hits, spec, name)
     return out
 
 
@@ -518,11 +513,12 @@ _ABOUT_AXIS = 0.5
 its own axis: below 0.13 for mirrors of telescopes on their axis, above 1 for off-axis ones."""
 
 
-def _made(box: Rectangle, hits: np.ndarray, surface: Surface, margin: float) -> Aperture:
+def _made(box: Rectangle, hits: np.ndarray, spec: CameraSpec, name: str) -> Aperture:
     """Return the outline of a surface as it is made for beams whose rims meet it at (F, N, 2), NaN for lost rays."""
+    margin = spec.edge_margin
     if np.hypot(*box.centre) > _ABOUT_AXIS * min(box.half_x, box.half_y):
         return box
-    if surface.is_plane:
+    if surface_of(spec.mirrors[name]).is_plane:
         half = np.array([box.half_x, box.half_y]) - margin
         wider = float(np.nanmax(np.hypot(*np.moveaxis((hits - box.centre) / half, -1, 0))))
         return Ellipse(*(float(wider * size + margin) for size in half), box.centre)

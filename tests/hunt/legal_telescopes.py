@@ -86,8 +86,8 @@ def legal_telescope(number: int) -> LegalTelescope:
         order.insert(at, f"D{k}")
         mirrors = {name: mirrors.get(name, {"z": f"{z} m", **plane}) for name in order}
         said.append(f"dummy at {z:.3g} m before {place or 'the image'}")
-    if chance.random() < 0.3:
-        z, aside = 0.2 * image, 0.3 * image
+    z, aside = 0.2 * image, 0.5 * image
+    if chance.random() < 0.4 and aside > 2.5 * beams["M2"]:  # else the second fold stands in the first one's light
         turn = {"radius": "flat", "rotate": ["45 deg", "0 deg", "0 deg"]}
         mirrors["F1"] = {"z": f"{z} m", **turn}
         mirrors["F2"] = {"z": f"{z} m", "decentre": ["0 m", f"{aside} m"], **turn}
@@ -98,7 +98,9 @@ def legal_telescope(number: int) -> LegalTelescope:
         mirrors["M2"]["edges"] = [{"clear": "circle", "radius": f"{beams['M2']} m"}]
         said.append("edge of M2 stated")
     open_share = 0.0  # of the beam, that goes through the hole and is not the camera's
-    hole = chance.random() < 0.3
+    # of the light through the primary: the axial beam, and chief rays that come from the secondary
+    needed = radius * abs(share) * (behind - before) / behind + first * abs(size) * wander * before / behind
+    hole = chance.random() < 0.4 and 1.1 * needed < 0.9 * beams["M2"]
     if hole:
         open_share = (0.9 * beams["M2"] / radius) ** 2
         mirrors["M1"]["edges"] = [{"blocks": "circle", "radius": f"{0.9 * beams['M2']} m"}]
