@@ -110,6 +110,11 @@ class Circle:
         """Radius of the largest disk about the centre that lies inside the outer edge, metres."""
         return self.radius
 
+    @property
+    def enclosing(self) -> Circle:
+        """Smallest circle that holds the shape: its outer edge."""
+        return Circle(self.radius, self.centre)
+
     def grown(self, size: float) -> Circle:
         """Return this shape on a body that has grown to another size, 1 being the nominal one."""
         return Circle(size * self.radius, (size * self.centre[0], size * self.centre[1]), size * self.inner)
@@ -158,6 +163,11 @@ class Rectangle(_TwoHalves):
                 f"a rectangular aperture needs positive half-widths, found {self.half_x} and {self.half_y}"
             )
 
+    @property
+    def enclosing(self) -> Circle:
+        """Smallest circle that holds the shape: through its corners."""
+        return Circle(float(np.hypot(self.half_x, self.half_y)), self.centre)
+
     def contains(self, x: Any, y: Any) -> Any:
         """Mask of points inside; NumPy or Dr.Jit arrays."""
         return self.numbers().contains(x, y)
@@ -184,6 +194,11 @@ class Ellipse(_TwoHalves):
         """Check the sizes."""
         if not (self.half_x > 0.0 and self.half_y > 0.0):
             raise ValueError(f"an elliptical aperture needs positive half axes, found {self.half_x} and {self.half_y}")
+
+    @property
+    def enclosing(self) -> Circle:
+        """Smallest circle that holds the shape: about its longer axis."""
+        return Circle(max(self.half_x, self.half_y), self.centre)
 
     def contains(self, x: Any, y: Any) -> Any:
         """Mask of points inside; NumPy or Dr.Jit arrays."""
@@ -241,6 +256,21 @@ class Polygon:
         """Check the corners."""
         if len(self.corners) < 3:
             raise ValueError(f"a polygon needs three corners or more, found {len(self.corners)}")
+
+    @property
+    def enclosing(self) -> Circle:
+        """Circle that holds the shape, about the middle of its box: the smallest one of a regular polygon with an even
+        number of corners.
+        """
+        x0, x1, y0, y1 = self.bounds
+        x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+        return Circle(max(float(np.hypot(a - x, b - y)) for a, b in self.corners), (x, y))
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x_min, x_max, y_min, y_max, metres."""
+        x, y = zip(*self.corners, strict=True)
+        return min(x), max(x), min(y), max(y)
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Mask of points inside, by how often a way along x crosses the sides."""

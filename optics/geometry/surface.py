@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, assert_never
+from typing import Any
 
 import numpy as np
 
 from optics.geometry import zernike
-from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
+from optics.geometry.aperture import Aperture, Polygon
 from optics.geometry.sag_terms import SagTerm, grown
 from optics.geometry.zernike import triangle_order, triangle_polynomial
 from optics.numerics.frozen_map import FrozenMap
@@ -370,23 +370,19 @@ class Surface:
         terms = tuple(grown(term, scale) for term in self.terms)
         return replace(self, curvature=self.curvature / scale, even=even, terms=terms)
 
-    def figure_disk(self, aperture: Aperture | None) -> ZernikeFigure:
-        """The Zernike figure that terms are added to: the surface's own, or one without terms over the aperture's disk.
+    def figure_disk(self, aperture: Aperture | Polygon | None) -> ZernikeFigure:
+        """Return the Zernike figure that terms are added to: the surface's own, or one without terms over the smallest
+        circle round the aperture.
 
         Raises:
             ValueError: neither a Zernike figure nor an aperture sets the disk.
         """
         if self.zernike_figure is not None:
             return self.zernike_figure
-        match aperture:
-            case Circle(radius, centre):
-                return ZernikeFigure(radius, centre)
-            case Rectangle(half_x, half_y, centre) | Ellipse(half_x, half_y, centre):
-                return ZernikeFigure(float(np.hypot(half_x, half_y)), centre)
-            case None:
-                raise ValueError("a surface without an aperture has no disk for a figure")
-            case _:
-                assert_never(aperture)
+        if aperture is None:
+            raise ValueError("a surface without an aperture has no disk for a figure")
+        disk = aperture.enclosing
+        return ZernikeFigure(disk.radius, disk.centre)
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
         """Height z at x, y (metres, any shape); NaN outside the conic's domain."""

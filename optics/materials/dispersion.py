@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import csv
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import sqrt
+from pathlib import Path
 
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.physical_error import UnphysicalError
@@ -65,6 +68,7 @@ class CatalogueGlass:
         shortest, longest: between which it holds, metres.
         expansion: linear thermal expansion, 1/K, mean of -30..70 C; None where the catalogue does not say it.
         thermal: Schott's constants of dn/dT, D0, D1, D2, E0, E1 and Lambda_TK, likewise.
+        source: where a common glass is from, its maker first; empty for one of a user's catalogue.
     """
 
     name: str
@@ -74,6 +78,7 @@ class CatalogueGlass:
     longest: float
     expansion: float | None = None
     thermal: tuple[float, ...] | None = None
+    source: str = ""
 
     def __call__(self, wavelength: float) -> float:
         """Index against air.
@@ -95,3 +100,24 @@ class CatalogueGlass:
                 f"{self.name}: no index comes out of its dispersion formula at {wavelength * 1e9:.6g} nm"
             )
         return index
+
+
+@cache
+def common_glasses() -> Mapping[str, CatalogueGlass]:
+    """Return glasses of Schott, Ohara, Hoya and CDGM that prescriptions name often, and calcium fluoride, by name.
+
+    The file beside this one names the maker's catalogue for each, as refractiveindex.info has it (CC0), and the
+    temperature at which its formula holds. Constants of dn/dT are there where they count from 20 C.
+    """
+    out = {}
+    with Path(__file__).with_name("common_glasses.csv").open(encoding="utf-8", newline="") as stream:
+        for name, source, formula, shortest, longest, expansion, coefficients, constants in list(csv.reader(stream))[
+            1:
+        ]:
+            numbers, thermal = (tuple(map(float, part.split())) for part in (coefficients, constants))
+            ends = (1e-6 * float(shortest), 1e-6 * float(longest))
+            expands = 1e-6 * float(expansion) if expansion else None
+            out[name] = CatalogueGlass(
+                name, int(formula), (*numbers, *[0.0] * 6), *ends, expands, thermal or None, source
+            )
+    return FrozenMap(out)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture
+from optics.geometry.aperture import Aperture, Edge, Polygon, Ray
 from optics.geometry.pose import Pose
 from optics.geometry.surface import GridFigure, SummedFigure, Surface, ZernikeFigure
 from optics.geometry.tree import AT_REST, Motion, PlacedBodies, RigidTree, State
@@ -39,7 +39,9 @@ class Element:
         body: path of the rigid body that carries it; the surface's frame is the body's frame.
         surface: its shape.
         interaction: reflect, refract or pass.
-        aperture: clear aperture in the surface's x, y; None is unlimited.
+        aperture: clear aperture in the surface's x, y, outside of which rays are lost; None is unlimited.
+        edges: what the surface's file states of its clear aperture. The trace lets rays pass them, and images cut them
+            out of the pupil; figures are over what they leave.
         index_after: refractive index on the side the light goes to (the index before is that of the element before
             it); for surfaces that are not faces of a solid.
         solid: path of the glass body whose face this is, behind it (on its -z side). A refracted ray enters it when it
@@ -53,17 +55,31 @@ class Element:
     aperture: Aperture | None = None
     index_after: float = 1.0
     solid: str | None = None
+    edges: tuple[Edge, ...] = ()
+
+    @property
+    def outer_edge(self) -> Aperture | Polygon | None:
+        """The outer edge of the clear aperture: the smallest that its file states, else that of ``aperture``."""
+        stated = [edge.shape for edge in self.edges if not edge.blocks and not isinstance(edge.shape, Ray)]
+        return min(stated, key=lambda shape: shape.enclosing.radius, default=self.aperture)
+
+    def clear(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return which points of the surface, in its own x and y, lie in its clear aperture."""
+        outer = self.outer_edge
+        inside = np.ones(np.shape(x), bool) if outer is None else np.asarray(outer.contains(x, y))
+        return inside & np.all([edge.passes(x, y) for edge in self.edges], axis=0)
 
     @property
     def figure_disk(self) -> ZernikeFigure:
-        """What the terms of a state's figure are added to: ``Surface.figure_disk`` over the clear aperture.
+        """Return what the terms of a state's figure are added to: ``Surface.figure_disk`` over the clear aperture.
 
         Raises:
             ValueError: neither a Zernike figure nor an aperture sets the disk.
         """
-        if self.aperture is None and self.surface.zernike_figure is None:
+        outer = self.outer_edge
+        if outer is None and self.surface.zernike_figure is None:
             raise ValueError(f"element {self.name!r} needs an aperture to carry a figure: it sets the disk")
-        return self.surface.figure_disk(self.aperture)
+        return self.surface.figure_disk(outer)
 
     def figured(self, motion: Motion) -> Surface:
         """The surface with what a motion does to its radius and conic constant and adds to its figure.
@@ -157,6 +173,16 @@ class Assembly:
             KeyError: unknown sequence.
         """
         return tuple(self.elements[n] for n in self.sequences[name])
+
+    def face(self, body: str) -> Element:
+        """Return the optical surface of a body, the widest where several elements use it.
+
+        Raises:
+            ValueError: the body has none with a clear aperture.
+        """
+        own = [e for e in self.elements.values() if e.body == body and e.interaction is not Interaction.PASS]
+        sizes = [(e.aperture.enclosing.radius, e) for e in own if e.aperture is not None]
+        return max(sizes, key=lambda one: one[0])[1]
 
     def with_element(self, element: Element) -> Assembly:
         """A copy in which the element of that name is replaced or added."""

@@ -141,6 +141,9 @@ def read(
     ] = None,
     wavelength: Annotated[str | None, typer.Option(help='"620 nm", for files of batoid, which name none.')] = None,
     pitch: Annotated[str, typer.Option(help="Of the line CCD's pixels, which no such file has.")] = "7 um",
+    flat_image: Annotated[
+        bool, typer.Option("--flat-image", help="Of a curved image, take the plane that touches it.")
+    ] = False,
     force: Force = False,
 ) -> None:
     """Make a camera's file of another program's prescription, and say what of it did not come along.
@@ -165,9 +168,12 @@ def read(
 
         from optics.numerics.backend import load_backend
         from scenes.lens.camera_reader import Width, camera_of, camera_text
+        from scenes.lens.unfolding import with_flat_image
 
         if half is not None:
-            lens = replace(lens, fields=((0.0, 0.0), (0.0, half)), field_kind="angles", round_field=True)
+            lens = replace(lens, fields=((0.0, 0.0), (0.0, half)), heights=(), field_kind="angles", round_field=True)
+        if flat_image and not lens.image.surface.is_plane:
+            lens = with_flat_image(lens)
         name = re.sub(r"[^A-Za-z0-9_-]", "_", out.stem)[:64]
         name = name if re.match(r"[A-Za-z]", name) else f"camera_{name}"[:64]
         assert step is not None

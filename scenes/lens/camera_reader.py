@@ -30,6 +30,7 @@ from scenes.lens.prescription import (
     without_rim,
     written,
 )
+from scenes.lens.unfolding import unfolded
 from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError, Problem, printable
@@ -37,7 +38,10 @@ from scenes.yaml.units import ANGLE, EXPANSION, LENGTH, format_quantity, power_o
 
 PITCH = 7e-6
 """Pitch of a line CCD's pixels where none is asked for, metres."""
-LARGEST_TILT = math.radians(45.0)
+LARGEST_TILT, TURNED = math.radians(45.0), 1e-12
+"""Largest turn of an image about x, radians, and sine of its turn about y that is rounding."""
+FAR = 1e6
+"""An object beyond this distance is at infinity, metres: programs write 1e9 millimetres and more for one."""
 SAME = 1e-9
 """Farthest that a ray of the camera may meet the image from where the prescription's does, metres. Both are traced by
 the same code: what is left is the rounding of poses and numbers."""
@@ -109,6 +113,10 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
     Raises:
         InputError: the prescription has what a camera's file cannot hold, or light does not come through.
     """
+    if abs(lens.image.pose.rotation[0, 2]) > TURNED or abs(_image(lens)[1]) > LARGEST_TILT:
+        lens = unfolded(lens)
+    if lens.heights:
+        lens = _by_angles(lens, name, backend, width)
     _check(lens)
     if _one_axis(lens) and not lens.round_field:
         try:
@@ -122,6 +130,11 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
 def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) -> ReadCamera:
     """What `camera_of` says, with the field as the prescription has it."""
     notes = list(lens.notes)
+    notes += [
+        Note(0, name, f"the glass of {glass.source}; --glasses FILE.agf takes another")
+        for name, glass in lens.glasses.items()
+        if isinstance(glass, CatalogueGlass) and glass.source
+    ]
     surfaces, stop, origin, taken = _surfaces(lens, notes)
     bias, half_x, half_y = _field(lens, surfaces, notes)
     where = {"z": written(_image(lens)[0], LENGTH)}
@@ -144,7 +157,12 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
         plain["medium"] = "air"  # which other programs take glasses against
     narrow = _derived(lens, plain, backend)
     pupil = _pupil(lens, narrow, plain, backend, width)
-    pixels = 2.0 * narrow.line_principal_distance * math.tan(half_x) / width.pitch
+    focal = narrow.line_principal_distance
+    if math.isfinite(lens.object_distance):
+        nearer = f"{1e6 * focal**2 / lens.object_distance:.3g} um"
+        text = f"{lens.object_distance:.6g} m away is taken for infinity, whose image is {nearer} nearer to the optics"
+        notes.append(Note(0, "object", text))
+    pixels = 2.0 * focal * math.tan(half_x) / width.pitch
     if not 2.0 <= pixels <= 1e6:
         problem = "a line CCD over the whole field would have too few or too many pixels"
         raise lens.error(
@@ -183,20 +201,65 @@ def _round_field(lens: Prescription) -> Prescription:
     return replace(lens, fields=fields, round_field=True).with_notes(note)
 
 
+def _by_angles(lens: Prescription, name: str, backend: Backend, width: Width) -> Prescription:
+    """Return the prescription with the directions from which light comes to its fields' heights."""
+    heights = np.array(lens.heights)
+    if lens.field_kind == "object heights":
+        tangents = -heights / lens.object_distance
+    else:
+        middle = replace(lens, fields=((0.0, 0.0),), heights=(), field_kind="angles")
+        _check(middle)
+        model = derive_camera(_camera_of(middle, name, backend, width).camera, backend)
+        tangents = _tangents_at(model, lens, heights, backend)
+    note = Note(0, "field", f"{lens.field_kind}: the directions are taken whose chief rays belong to them")
+    fields = tuple((float(x), float(y)) for x, y in np.arctan(tangents))
+    return replace(lens, fields=fields, heights=(), field_kind="angles").with_notes(note)
+
+
+def _tangents_at(model: CameraModel, lens: Prescription, heights: np.ndarray, backend: Backend) -> np.ndarray:
+    """Return the tangents (F, 2) of the directions whose chief rays meet the image at heights (F, 2), metres; by the
+    slope in the middle where the heights are paraxial.
+    """
+    bare, names = model.bare_assembly(apertures=False), model.mirrors
+    to_stop, imaging = assemble(bare, [names[: names.index(model.spec.stop) + 1]]), assemble(bare, ["imaging"])
+
+    def places(tangents: np.ndarray) -> np.ndarray:
+        light = np.concatenate([tangents, np.ones((len(tangents), 1))], axis=1)
+        light /= np.linalg.norm(light, axis=1, keepdims=True)
+        launch = collimated(backend, to_stop, light, np.zeros((1, 2)))[:, 0]
+        return np.asarray(trace(backend, imaging, make_rays(backend, launch, light)).numpy()[0][0, :, :2])
+
+    try:
+        middle, *steps = places(_SMALL_STEP * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
+        back = np.linalg.inv((np.array(steps) - middle).T / _SMALL_STEP).T
+        tangents = (heights - middle) @ back
+        # distortion alone is left of each step
+        for _ in range(_STEPS if lens.field_kind == "real image heights" else 0):
+            tangents = tangents + (heights - places(tangents)) @ back
+    except (AimError, BeamMissedError, np.linalg.LinAlgError) as error:
+        raise lens.error(f"no light at its {lens.field_kind}", allowed="a smaller field: --field") from error
+    return np.asarray(tangents)
+
+
+_SMALL_STEP, _STEPS = 1e-6, 40
+"""Tangent by which the scale in the middle of the image is found, and steps to a height: distortion of 50 % ends at
+1e-12 of it."""
+
+
 def _check(lens: Prescription) -> None:
     """Refuse what a camera's file cannot hold."""
-    if math.isfinite(lens.object_distance):
+    if abs(lens.object_distance) < FAR:
         found = f"{lens.object_distance:.6g} m"
         raise lens.error("the object is at a finite distance", lens.surfaces[0].line, found, "a scene at infinity")
     if not lens.fields:
         raise lens.error("no directions of the field in this file", None, lens.field_kind, "field angles")
     image = lens.image
     if not image.surface.is_plane or image.surface.figure is not None:
-        raise lens.error("a curved image", image.line, allowed="a plane")
+        raise lens.error("a curved image", image.line, allowed="a plane: --flat-image takes the one that touches it")
     if image.index != 1.0 or image.interaction is not Interaction.PASS:
         raise lens.error("an image in glass", image.line, allowed="an image in the object's medium")
     normal = image.pose.rotation[:, 2]
-    if abs(normal[0]) > 1e-12:
+    if abs(normal[0]) > TURNED:
         raise lens.error("an image that is turned out of the plane of symmetry", image.line, allowed="a turn about x")
     if abs(_image(lens)[1]) > LARGEST_TILT:
         found = f"{math.degrees(_image(lens)[1]):.4g} deg"

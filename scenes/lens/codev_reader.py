@@ -118,16 +118,15 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
         system.name,
         wavelength=wavelength,
         wavelengths=tuple(dict.fromkeys(system.waves)),
-        fields=_fields(system),
+        fields=_pairs(system) if system.field_kind == "angles" else (),
+        heights=() if system.field_kind == "angles" else tuple((x * scale, y * scale) for x, y in _pairs(system)),
         field_kind=system.field_kind,
         pupil=pupil,
         glasses=named_glasses(glasses, chain.surfaces),
     )
 
 
-def _fields(system: CodevSystem) -> tuple[tuple[float, float], ...]:
-    if system.field_kind != "angles":
-        return ()
+def _pairs(system: CodevSystem) -> tuple[tuple[float, float], ...]:
     count = max(len(system.x), len(system.y))
     x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
     return tuple(zip(x, y, strict=True))

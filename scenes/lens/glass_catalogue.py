@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from optics.materials.dispersion import FORMULAS, CatalogueGlass
+from optics.materials.dispersion import FORMULAS, CatalogueGlass, common_glasses
 from optics.materials.glass import GLASSES
 from optics.numerics.frozen_map import FrozenMap
 from scenes.lens.statements import Glasses, Source, glass_key, is_number, read_lines, statement_of
@@ -18,9 +18,11 @@ _CONSTANTS = 6
 
 
 def own_glasses() -> Glasses:
-    """The twin's glasses; fused silica also by the names that catalogues have for it."""
-    own: dict[str, Callable[[float], float]] = {glass_key(name): glass.index for name, glass in GLASSES.items()}
+    """Return the twin's glasses and the common ones; fused silica also by the names that catalogues have for it."""
+    own: dict[str, Callable[[float], float]] = {glass_key(name): glass for name, glass in common_glasses().items()}
+    own |= {glass_key(name): glass.index for name, glass in GLASSES.items()}
     own |= dict.fromkeys(("SILICA", "FSILICA"), own[glass_key("fused silica")])
+    own["BK7"] = own[glass_key("N-BK7")]  # before arsenic was left out of it; the catalogue has one formula for both
     return FrozenMap(own)
 
 

@@ -369,6 +369,7 @@ class Prescription:
         fields: directions (x, y) from which light comes as their tangents' angles, radians; empty where the file has
             other fields than angles.
         field_kind: what the file's fields are, for messages.
+        heights: fields that the file has as heights (x, y) on object or image, metres; empty for others.
         pupil: how wide the beam is; None where the file does not say.
         object_distance: from the object to the frame's origin, metres; infinite for a scene.
         notes: what did not come along.
@@ -385,6 +386,7 @@ class Prescription:
     wavelengths: tuple[float, ...] = ()
     fields: tuple[tuple[float, float], ...] = ()
     field_kind: str = "angles"
+    heights: tuple[tuple[float, float], ...] = ()
     pupil: Pupil | None = None
     object_distance: float = float("inf")
     notes: tuple[Note, ...] = ()

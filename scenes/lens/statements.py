@@ -206,6 +206,17 @@ def glass_key(name: str) -> str:
     return "".join(c for c in head.upper() if c.isalnum())
 
 
+MAKERS = ("SCHOTT", "OHARA", "HOYA", "CDGM")
+"""Makers of common glasses; several have glasses of one name, as F2."""
+
+
+def of_makers(glasses: Glasses, makers: Sequence[str]) -> Glasses:
+    """Return glasses without common ones of other makers than those that a file names, if it names any."""
+    others = set(MAKERS).difference(makers) if set(MAKERS).intersection(makers) else set()
+    known = glasses.items()
+    return FrozenMap({k: g for k, g in known if getattr(g, "source", "").partition("'")[0].upper() not in others})
+
+
 def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, line: int) -> float:
     """Refractive index of a catalogue's glass that a file names.
 
@@ -219,9 +230,9 @@ def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, lin
     Raises:
         InputError: no such glass, or none whose index is known there.
     """
-    found = glasses.get(glass_key(name))
+    found = of_makers(glasses, [name.strip("'\"").upper().partition("_")[2]]).get(glass_key(name))
     if found is None:
-        allowed = "glasses of the twin, and of a catalogue given with --glasses FILE.agf"
+        allowed = "common glasses of the named makers, and those of a catalogue given with --glasses FILE.agf"
         raise source.error("unknown glass", line, name, allowed)
     try:
         return found(wavelength)

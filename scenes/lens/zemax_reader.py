@@ -25,6 +25,7 @@ from scenes.lens.statements import (
     index_of,
     joined,
     named_glasses,
+    of_makers,
     read_lines,
     require_d_line,
     statement_of,
@@ -38,13 +39,15 @@ SHAPES = ("STANDARD", "EVENASPH", "ODDASPHE", "XPOLYNOM", "SZERNSAG", "COORDBRK"
 OF_NO_EFFECT = frozenset(
     # the program's version and windows, drawings, solves whose values stand in the file, optimisation, tolerances,
     # coatings and polarisation, weights of fields and wavelengths, physical optics, hammer settings
-    "VERS AUTH IWDP STUD PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN VANN POLS GLRS GSTD NSCD "
+    "VERS AUTH IWDP STUD PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN VANN POLS GLRS GSTD NSCD "
     "COFN LUID EERA SSID FIMP HIDE MIRR SLAB POPS MEMA PPAR VPAR PZUP MAZH OPDX EFFL EFLY WFNO BLNK TOL TOLE MOFF "
     "TRAC DMFS ACOS GLCB REAX REAY REAZ COAT PKUP VCON VDSZ EDGE ZVDX ZVDY ZVCX ZVCY ZVAN WWGN WWGT NOTE TCMM "
     "TCED CONF GLCZ GLCA GLCC MNCA MXCA MNEA MNCG MXCG MNEG RGLA PMAG TOTR OPTH PRIM COMM ENVD".split()
 )
 
-_SYSTEM = frozenset("MODE NAME UNIT ENPD FNUM OBNA FLOA FTYP XFLN YFLN WAVM WAVL WAVN PWAV VDXN VDYN VCXN VCYN".split())
+_SYSTEM = frozenset(
+    "MODE NAME UNIT GCAT ENPD FNUM OBNA FLOA FTYP XFLN YFLN WAVM WAVL WAVN PWAV VDXN VDYN VCXN VCYN".split()
+)
 _ON_SURFACES = frozenset(
     "TYPE STOP CURV CONI PARM XDAT DISZ GLAS DIAM FLAP CLAP SQAP ELAP OBSC SQOB ELOB OBDC USAP SCBD".split()
 )
@@ -90,6 +93,7 @@ class _System:
     source: Source
     scale: float = 1e-3
     name: str = ""
+    catalogues: tuple[str, ...] = ()
     pupil: Pupil | None = None
     field_type: int = 0
     field_count: int = 0
@@ -156,6 +160,8 @@ def _take_system(system: _System, s: Statement) -> None:
         case "MODE":
             if s.words[:1] != ("SEQ",):
                 raise source.error("not a sequential system", s.line, s.text, "MODE SEQ")
+        case "GCAT":
+            system.catalogues = tuple(word.upper() for word in s.words)
         case "NAME":
             system.name = joined(s.words)
         case "UNIT":
@@ -255,7 +261,7 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
     if not waves:
         raise source.error("no wavelength in this file", 1, allowed="WAVM or WAVL")
     primary = system.waves.get(system.primary, waves[0])
-    chain, read = Chain(source), system.surfaces
+    chain, read, glasses = Chain(source), system.surfaces, of_makers(glasses, system.catalogues)
     if read[0].kind == "COORDBRK" or read[0].glass:
         raise source.error("the object is a coordinate break or stands in glass", read[0].line)
     for k, surface in enumerate(read[1:], start=1):
@@ -290,22 +296,25 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
         system.name,
         wavelength=primary,
         wavelengths=tuple(dict.fromkeys(waves)),
-        fields=_fields(system),
+        fields=_fields(system) if system.field_type == 0 else (),
+        heights=tuple((x * scale, y * scale) for x, y in _pairs(system)) if 1 <= system.field_type <= 3 else (),
         field_kind=kinds[min(system.field_type, 4)],
         pupil=pupil,
         glasses=named_glasses(glasses, chain.surfaces),
     )
 
 
-def _fields(system: _System) -> tuple[tuple[float, float], ...]:
-    if system.field_type != 0:
-        return ()
+def _pairs(system: _System) -> tuple[tuple[float, float], ...]:
     count = system.field_count or max(len(system.x), len(system.y))
     x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
-    for value in (*x, *y):
+    return tuple(zip(x, y, strict=True))
+
+
+def _fields(system: _System) -> tuple[tuple[float, float], ...]:
+    for value in (value for pair in _pairs(system) for value in pair):
         if not abs(value) < 89.0:
             raise system.source.error("a field beyond 89 deg", system.field_line, value)
-    return tuple((math.radians(a), math.radians(b)) for a, b in zip(x, y, strict=True))
+    return tuple((math.radians(a), math.radians(b)) for a, b in _pairs(system))
 
 
 def _break(source: Source, chain: Chain, surface: _Surface, scale: float) -> None:

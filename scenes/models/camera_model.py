@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture, Circle, Edge, Rectangle
+from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Rectangle
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Body, RigidTree, State
@@ -82,7 +82,8 @@ def camera_elements(name: str, root: str, model: CameraModel) -> dict[str, Eleme
         surface, aperture = model.surfaces[mirror], model.apertures[mirror]
         how = LIGHT[model.spec.mirrors[mirror].light]
         solid = f"{root}/{glass[mirror]}" if mirror in glass else None
-        out[key] = Element(key, f"{root}/{mirror}", surface, how, aperture, solid=solid)
+        edges = model.edges.get(mirror, ())
+        out[key] = Element(key, f"{root}/{mirror}", surface, how, aperture, solid=solid, edges=edges)
     key = f"{name}/line"
     out[key] = Element(key, line_body(root), plane(), Interaction.PASS)
     return out
@@ -509,8 +510,9 @@ def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[
 def _apertures(
     spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, stop_radius: float
 ) -> dict[str, Aperture]:
-    """Clear apertures: the stop, and for the other mirrors the box around the beams of the whole field plus the
-    margin.
+    """Return the clear apertures: the stop, and of the other surfaces the outline of the beams of the whole field with
+    the margin about them. A mirror or a lens about its own axis is round, as it is made: a circle about its vertex,
+    and an ellipse where it is flat, as a slanted flat is that light meets round. Others have a box.
     """
     angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
     rim = stop_radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -531,5 +533,27 @@ def _apertures(
         points = traced.hit(i)[0, valid[0], :2]
         low, high = points.min(axis=0) - spec.edge_margin, points.max(axis=0) + spec.edge_margin
         half, middle = 0.5 * (high - low), 0.5 * (high + low)
-        out[name] = Rectangle(float(half[0]), float(half[1]), (float(middle[0]), float(middle[1])))
+        box = Rectangle(float(half[0]), float(half[1]), (float(middle[0]), float(middle[1])))
+        hits = np.where(valid[0, :, None], traced.hit(i)[0, :, :2], np.nan).reshape(len(fields), _RIM_POINTS, 2)
+        out[name] = box if spec.mirrors[name].light == "passes" else _made(box, hits, spec, name)
     return out
+
+
+_ABOUT_AXIS = 0.5
+"""Distance of the middle of all beams from a surface's vertex, of their half-width, up to which the surface is about
+its own axis: below 0.13 for mirrors of telescopes on their axis, above 1 for off-axis ones."""
+
+
+def _made(box: Rectangle, hits: np.ndarray, spec: CameraSpec, name: str) -> Aperture:
+    """Return the outline of a surface as it is made for beams whose rims meet it at (F, N, 2), NaN for lost rays."""
+    margin = spec.edge_margin
+    if np.hypot(*box.centre) > _ABOUT_AXIS * min(box.half_x, box.half_y):
+        return box
+    if surface_of(spec.mirrors[name]).is_plane:
+        half = np.array([box.half_x, box.half_y]) - margin
+        wider = float(np.nanmax(np.hypot(*np.moveaxis((hits - box.centre) / half, -1, 0))))
+        return Ellipse(*(float(wider * size + margin) for size in half), box.centre)
+    # a rim between the traced points is no farther off than the beam's middle and radius together
+    middle = np.nanmean(hits, axis=1)
+    radius = np.nanmax(np.hypot(*np.moveaxis(hits - middle[:, None], -1, 0)), axis=1) + np.hypot(*middle.T)
+    return Circle(float(np.nanmax(radius)) + margin)

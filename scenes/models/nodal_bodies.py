@@ -19,7 +19,6 @@ from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
 from optics.geometry.tree import Motion, State
 from optics.numerics.frozen_map import FrozenMap
-from optics.raytrace.assembly import Interaction
 from optics.thermal.deformation import Displacement, FaceChange
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import PRINTED, SEEN, TERMS, NodalDeformation, NodesError, nodal_deformation
@@ -334,18 +333,6 @@ def pose_of_frame(instrument: Instrument, job: JobSpec, key: KeyPath, path: str,
 
 def _face(instrument: Instrument, path: str) -> tuple[Surface, Aperture]:
     """Shape and clear aperture of a body's optical surface, the widest where several elements use it."""
-    own = [
-        e
-        for e in instrument.assembly.elements.values()
-        if e.body == path and e.aperture is not None and e.interaction is not Interaction.PASS
-    ]
-    widest = max(own, key=lambda e: _area(e.aperture))
+    widest = instrument.assembly.face(path)
     assert widest.aperture is not None
     return widest.surface, widest.aperture
-
-
-def _area(aperture: Aperture | None) -> float:
-    if aperture is None:
-        return 0.0
-    x0, x1, y0, y1 = aperture.bounds
-    return (x1 - x0) * (y1 - y0)

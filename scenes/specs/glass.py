@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from optics.materials.dispersion import FORMULAS, CatalogueGlass
+from optics.materials.dispersion import FORMULAS, CatalogueGlass, common_glasses
 from optics.materials.glass import GLASSES, SCHOTT_RANGE, ThermalDispersion, WarmGlass, air_index, glass
 from optics.materials.material import MATERIALS, TemperatureRange
 from optics.numerics.physical_error import UnphysicalError
@@ -25,12 +25,12 @@ class LensGlassSpec(Spec):
     """A glass whose index is known by wavelength, at 20 C.
 
     Attributes:
-        name: of the catalogue, or any name beside a formula.
+        name: of the catalogue (`N-BK7`, `N-SF11`, `S-FPL53`, `FCD1`, `H-K9L`, ...), or any name beside a formula.
         formula: number of the dispersion formula as AGF catalogues have it (1 Schott, 2 Sellmeier 1, ...).
         coefficients: of it, for micrometres, in the catalogue's order; for Sellmeier's B1, C1, B2, C2, B3, C3.
         range: wavelengths between which it holds, metres.
-        expansion: linear, 1/K, mean of -30..70 C as the ED line of AGF catalogues has it; that of the twin's material
-            of the same name when left out, else unknown, and the lens is not warmed.
+        expansion: linear, 1/K, mean of -30..70 C as the ED line of AGF catalogues has it; that of the catalogue or of
+            the twin's material of the same name when left out, else unknown, and the lens is not warmed.
         thermal: Schott's constants D0, D1, D2, E0, E1 and Lambda_TK of dn/dT, in the units of data sheets, as the TD
             line of AGF catalogues has them; those of the catalogue when left out, else unknown.
     """
@@ -47,12 +47,20 @@ class LensGlassSpec(Spec):
         given = [key for key in ("formula", "coefficients", "range") if getattr(self, key) is not None]
         if given and len(given) < 3:
             raise Problem("a glass of one's own has all of these", ", ".join(given), "formula, coefficients, range")
-        if not given:
+        if self._formula is None:
             try:
                 glass(self.name)
             except KeyError:
-                raise unknown("no such glass", self.name, GLASSES, within=("name",)) from None
+                known = (*GLASSES, *common_glasses())
+                raise unknown("no such glass", self.name, known, within=("name",)) from None
         return self
+
+    @property
+    def _formula(self) -> CatalogueGlass | None:
+        """The dispersion formula of its keys, or of the common glass of that name; None for a glass of the twin."""
+        if self.formula is None or self.coefficients is None or self.range is None:
+            return common_glasses().get(self.name)
+        return CatalogueGlass(self.name, self.formula, self._filled(self.coefficients), *self.range)
 
     @model_serializer(mode="wrap")
     def _short(self, handler: SerializerFunctionWrapHandler) -> Any:
@@ -71,10 +79,11 @@ class LensGlassSpec(Spec):
         Raises:
             ValueError: the formula does not hold at that wavelength.
         """
-        if self.formula is None or self.coefficients is None or self.range is None:
+        formula = self._formula
+        if formula is None:
             own = glass(self.name)
             return own.index(wavelength) if medium == "air" else own.vacuum_index(wavelength)
-        n = CatalogueGlass(self.name, self.formula, self._filled(self.coefficients), *self.range)(wavelength)
+        n = formula(wavelength)
         return n if medium == "air" else n * air_index(wavelength)
 
     def warm(self, wavelength: float, medium: Medium) -> WarmGlass:
@@ -87,24 +96,27 @@ class LensGlassSpec(Spec):
         Raises:
             ValueError: neither the catalogue nor the file says how it expands, or how its index changes.
         """
-        own = None if self.formula is not None else glass(self.name)
+        formula = self._formula
+        own = None if formula is not None else glass(self.name)
         stuff = None if own is None else MATERIALS.get(own.name)
-        if self.expansion is None and stuff is None:
+        expands = self.expansion if formula is None or self.expansion is not None else formula.expansion
+        if expands is None and stuff is None:
             raise UnphysicalError(
                 f"nothing says how {self.name} expands; its glass has to say `expansion: 8.2 ppm/K`, the first number "
                 "of ED in its AGF catalogue"
             )
         thermal = own.thermal if own is not None else None
-        if self.thermal is not None:
-            d0, d1, d2, e0, e1, lambda_tk = self.thermal
+        constants = self.thermal if formula is None or self.thermal is not None else formula.thermal
+        if constants is not None:
+            d0, d1, d2, e0, e1, lambda_tk = constants
             thermal = ThermalDispersion(d0, d1, d2, e0, e1, lambda_tk)
         if thermal is None:
             raise UnphysicalError(
                 f"nothing says how the index of {self.name} changes with temperature; its glass has to say `thermal: "
                 "[D0, D1, D2, E0, E1, Lambda_TK]`, the first six numbers of TD in its AGF catalogue"
             )
-        if self.expansion is not None:
-            expansion, stated = self.expansion, CATALOGUE_RANGE
+        if expands is not None:
+            expansion, stated = expands, CATALOGUE_RANGE
         else:
             assert stuff is not None
             expansion, stated = stuff.expansion, stuff.known

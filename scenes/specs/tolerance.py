@@ -117,7 +117,7 @@ class ToleranceSpec(Varied):
         motion: what varies: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`,
             `L1 abbe` (relative), `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
         carrying: further bodies that move rigidly with the first.
-        limit: largest amount either way; of a figure error its rms.
+        limit: largest amount either way; of a figure error its rms over the clear aperture, about its mean.
         law: how it is distributed: `normal` within the limit, which is `sigmas` standard deviations; `uniform` within
             it; `ends`, one of both ends.
         sigmas: standard deviations that the limit of a normal law is.

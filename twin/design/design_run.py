@@ -13,6 +13,7 @@ from optics.design.design_variables import Prescription
 from optics.design.merit_function import Evaluation, MeritFunction, Operands
 from optics.design.optimiser import HELD, ITERATIONS, Design, DesignError, Held, rms_error
 from optics.design.starts import SAME, Attempt, Search, search
+from optics.numerics.array_math import determinant
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
@@ -88,6 +89,10 @@ def run_design(
     except DesignError as error:
         key = next((_KEYS[kind] for kind in error.violated if kind in _KEYS), ("vary",))
         remedies = [_REMEDIES[kind] for kind in _REMEDIES if kind in error.violated]
+        least = float(MeritFunction.of(backend, start, beams, operands).evaluate(start).clearances.min(initial=np.inf))
+        if "clearance" in error.violated and least < 0.0:
+            # a telescope about its axis, whose secondary stands in the beam
+            remedies.insert(0, f"clearance: {np.floor(1e3 * least):g} mm, as {camera.name} obscures its own beams")
         raise BenchError(str(error), key, ", ".join([*remedies, "more to vary, or more starts"])) from error
     found = searched.best
     remark = REMARK.format(start=camera.name)

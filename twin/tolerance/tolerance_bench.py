@@ -18,9 +18,10 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError, UnphysicalError
 from optics.numerics.threads import one_blas_thread
+from optics.raytrace.assembly import Element
 from optics.raytrace.line_of_sight import line_change, line_tangents
 from scenes.models.camera_model import lenses
-from scenes.specs.tolerance import OF_MONITOR, ToleranceSetup
+from scenes.specs.tolerance import OF_MONITOR, SPECTRUM, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import AT_ONCE, BeamLight, CutError, RoughError, VariedBeams
@@ -128,6 +129,12 @@ class ToleranceBench:
         self.monitor = MonitorMerit.of(
             setup, self.experiment, self.camera, (*self.numbers, *self.compensators), self.ranges
         )
+
+    @property
+    def figure_faces(self) -> dict[str, Element]:
+        """Name of each tolerance of a figure -> the surface that has it."""
+        bodies = {number.entry: next(iter(number.moves)) for number in self.numbers if number.kind == SPECTRUM}
+        return {name: self.instrument.assembly.face(body) for name, body in bodies.items()}
 
     def _camera_name(self) -> str:
         test, names = self.setup.test, tuple(self.instrument.cameras)

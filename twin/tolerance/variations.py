@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from optics.geometry.aperture import Circle
 from optics.geometry.pose import Pose, rotation_matrix, triple
 from optics.geometry.tree import Body, Motion, State
-from optics.geometry.zernike import noll_to_nm
+from optics.geometry.zernike import noll_to_nm, zernike
 from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.assembly import Element
 from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
@@ -113,7 +115,7 @@ class _Maker:
         if not one.spectrum:
             return [VariedNumber(name, name, kind, one.limit_si, self._moves(one, key, one.limit_si))]
         body = self._node(one, one.parts[0], key)
-        sizes = one.limit_si * spectrum_shares(one.spectrum, one.power)
+        sizes = one.limit_si * spectrum_over(self.instrument.assembly.face(body), one.spectrum, one.power)
         return [
             VariedNumber(
                 f"{name} Z{j}", name, kind, float(size), FrozenMap({body: BodyMove(figure=FrozenMap({j: 1.0}))})
@@ -249,6 +251,33 @@ def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
     order = np.array([noll_to_nm(j)[0] for j in terms])
     variance = (order + 1.0) ** -power
     return np.asarray(np.sqrt(variance / np.sum(variance)))
+
+
+def spectrum_over(element: Element, terms: Sequence[int], power: float) -> np.ndarray:
+    """Return the standard deviation of each term of a figure error whose rms over a clear aperture is 1, (T,).
+
+    The mean square is that of many surfaces, about each surface's mean over its clear aperture. Terms have unit rms
+    over the smallest circle round that aperture, and another one over a rectangle or a ring in it.
+
+    Args:
+        element: the surface.
+        terms: Noll's numbers.
+        power: as of ``spectrum_shares``.
+    """
+    shares, disk, outer = spectrum_shares(terms, power), element.figure_disk, element.outer_edge
+    assert outer is not None
+    if outer == Circle(disk.radius, disk.centre) and not any(edge.blocks for edge in element.edges):
+        return shares
+    x0, x1, y0, y1 = outer.bounds
+    cells = (np.arange(_CELLS) + 0.5) / _CELLS
+    x, y = (part.ravel() for part in np.meshgrid(x0 + (x1 - x0) * cells, y0 + (y1 - y0) * cells))
+    clear = element.clear(x, y)
+    u, v = (x[clear] - disk.centre[0]) / disk.radius, (y[clear] - disk.centre[1]) / disk.radius
+    return np.asarray(shares / np.sqrt(np.sum(shares**2 * [np.var(zernike(j, u, v)) for j in terms])))
+
+
+_CELLS = 200
+"""Cells along each side of the box round a clear aperture, over which the rms of terms is taken: right to 1e-3."""
 
 
 def states_of(numbers: Sequence[VariedNumber], amounts: np.ndarray) -> list[State]:

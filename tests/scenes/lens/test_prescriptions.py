@@ -272,7 +272,7 @@ WRONG_CODEV = {
     "bend about two axes": (CODEV.replace("  ADE 3.0", "  ADE 3.0; BDE 2.0"), "BEN with turns about several axes"),
     "edited": (CODEV.replace("GO", "THI S3 5.0"), "a change of surfaces that have been given before"),
     "no image": (CODEV[: CODEV.index("SI 0.0")], "it is cut off"),
-    "glass": (CODEV.replace("REFL", "NSK16_SCHOTT", 1), "unknown glass"),
+    "glass": (CODEV.replace("REFL", "NSK99_SCHOTT", 1), "unknown glass"),
     "Fresnel base": (CODEV.replace("  CON", "  CUF 0.1"), "a curvature of a Fresnel base"),
 }
 
