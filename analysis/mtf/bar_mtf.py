@@ -496,6 +496,8 @@ def page_warnings(found: EdgeMtf | BarMtf, step: float) -> list[str]:
             f"the noise of {noise:.2g} in a pixel is below {_ROUGH:g} of the step of {step:g} between grey values,"
             " so that rounding does not average out over pixels and pages; sigma holds it. A higher gain helps"
         )
+    if isinstance(found, EdgeMtf) and found.doubt:
+        out.append(found.doubt)
     if isinstance(found, EdgeMtf) and found.pages is not None and found.pages.aligned:
         pages = found.pages
         apart = np.abs(pages.position - np.mean(pages.position))

@@ -13,6 +13,7 @@ otherwise takes 0.7 % off the MTF at low frequencies.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass, replace
 
@@ -176,6 +177,9 @@ def fit_rows(rows: EdgeRows, grey: Array, core: float, even: bool, line_steps: i
     for step in range(line_steps):
         fitted = _fitted(fitted.rows, fitted, grey, core, COARSE, even) if step else fitted
         fitted = _moved(fitted, grey, 1)
+    # of a region that holds something else the residuals say more
+    with contextlib.suppress(EdgeError):
+        core = core if even else core_width(fitted.rows.distance(), grey - fitted.light, fitted.rows.plateau)
     straight = _fitted(fitted.rows, fitted, grey, core, OVERSAMPLING, even)
     order = _chosen_order(straight, grey)
     if order == 1:
@@ -297,4 +301,3 @@ def core_width(distance: Array, grey: Array, plateau: float) -> float:
             f"{plateau:.0f} px lie beside the edge; take a wider region, or one with a single edge between even areas"
         )
     return min(max(CORE_WIDTHS * width, _LEAST_CORE), largest)
-
