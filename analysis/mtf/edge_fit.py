@@ -30,7 +30,8 @@ Array = NDArray[np.float64]
 CORE_WIDTHS, _LEAST_CORE, _LARGEST_CORE_SHARE = 4.0, 6.0, 0.7
 # Widest hole between neighbouring sampling phases, px.
 _LARGEST_GAP = 0.3
-_LINE_STEPS = 2
+# Gauss-Newton steps of a straight line in uneven light, which moves with it, and in even light.
+_LINE_STEPS = (4, 2)
 OVERSAMPLING, COARSE = 4, 2
 """Knots of the edge-spread function per pixel; and while the line is sought, whose slope must not follow the noise."""
 HIGHEST_ORDER = 5
@@ -160,7 +161,7 @@ def fit_edge(rising: Array, offset: float, slope: float, even: bool = False) -> 
     rows = EdgeRows.of(np.array([[offset, slope]]), *rising.shape)
     distance = rows.distance()
     check_phases(distance, len(rising), slope)
-    return fit_rows(rows, grey, core_width(distance, grey, rows.plateau), even, _LINE_STEPS)
+    return fit_rows(rows, grey, core_width(distance, grey, rows.plateau), even, _LINE_STEPS[even])
 
 
 def fit_rows(rows: EdgeRows, grey: Array, core: float, even: bool, line_steps: int = 0) -> FittedEdge:
