@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.chi_square import chance_beyond
-from analysis.mtf import slanted_edge
+from analysis.mtf import edge_fit, slanted_edge
 from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, locate_edge
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.mtf.slanted_edge import EdgeMtf
@@ -81,6 +81,7 @@ def measure_pages(
     noise: NoiseModel | None = None,
     saturation: float | None = None,
     step: float = 0.0,
+    even: bool = False,
 ) -> EdgeMtf:
     """MTF of the one edge that all pages show.
 
@@ -89,6 +90,7 @@ def measure_pages(
         noise: the detector's model, as in `slanted_edge.measure_edge`.
         saturation: as there; one page that reaches it is enough.
         step: between the grey values of a page, which are rounded to it; 0 for real numbers.
+        even: the light is known to be even, as in `slanted_edge.measure_edge`.
 
     Raises:
         EdgeError: the region does not show one measurable edge, or pages cannot be laid over each other.
@@ -103,11 +105,12 @@ def measure_pages(
         saturation = noise.saturation_dn
     grey = checked_region(mean_page(given, saturation), saturation)
     every = np.asarray(given, np.float64)
-    run = _Run(noise, step, same)
+    run = _Run(noise, step, same, even)
     try:
         line = locate_edge(grey)
         up = slanted_edge.rising(grey, line)
-        fitted = slanted_edge.fit_edge(up, *slanted_edge.rising_line(line, up.shape[1]))
+        fitted = edge_fit.fit_edge(up, *slanted_edge.rising_line(line, up.shape[1]), even)
+        up = up - fitted.light.reshape(up.shape)
         stack = _Stack.of(slanted_edge.rising(every, line), fitted)
         shift = stack.differences(step, up)
         if len(every) == 1 or shift.p_value >= FALSE_ALARM:
@@ -129,13 +132,14 @@ class _Run:
     noise: NoiseModel | None
     step: float
     same: int
+    even: bool
 
     def result(
         self,
         pages: Array,
         frames: int,
         line: EdgeLine,
-        fitted: slanted_edge.FittedEdge,
+        fitted: edge_fit.FittedEdge,
         stack: _Stack,
         shift: _Shift,
         aligned: bool,
@@ -199,20 +203,25 @@ class _Shift:
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """Pages (P, H, W), the edge rising in their rows, with a line for each, (P, 2) offset and slope, and one
-    edge-spread function. Of its levels (2,) each page has its own, (P, 2).
+    """Pages (P, H, W) without uneven light, the edge rising in their rows, with a line for each, (P, 2) offset and
+    slope, one edge-spread function and one bend, (B,) as `edge_fit.EdgeRows` has it. Of the levels (2,) each page has
+    its own, (P, 2). light: (H, W), what was taken off.
     """
 
     pages: Array
     line: Array
     spread: EdgeSpread
     levels: Array
+    bend: Array
+    light: Array
 
     @classmethod
-    def of(cls, pages: Array, fitted: slanted_edge.FittedEdge) -> _Stack:
-        """All pages at the place and the levels of their mean."""
-        line = np.tile([fitted.offset, fitted.slope], (len(pages), 1))
-        return cls(pages, line, fitted.spread, np.tile([fitted.spread.dark, fitted.spread.contrast], (len(pages), 1)))
+    def of(cls, pages: Array, fitted: edge_fit.FittedEdge) -> _Stack:
+        """Return all pages at the place and the levels of their mean, the light of that taken off."""
+        line = np.tile([fitted.rows.offset.mean(), fitted.rows.slope.mean()], (len(pages), 1))
+        levels = np.tile([fitted.spread.dark, fitted.spread.contrast], (len(pages), 1))
+        light = fitted.light.reshape(pages.shape[1:])
+        return cls(pages - light, line, fitted.spread, levels, fitted.rows.bend, light)
 
     def moved(self, line: Array) -> _Stack:
         """Stack of the same pages with its lines changed by the given amounts."""
@@ -226,9 +235,7 @@ class _Stack:
 
     def distance(self) -> Array:
         """Distance of all pixels from the edge in their page, along its normal, (P, H, W), px."""
-        offset, slope = self.line[:, :1, None], self.line[:, 1:, None]
-        column = np.arange(self.pages.shape[2])
-        return np.asarray((column - offset - slope * self.along[:, None]) * np.cos(np.arctan(slope)))
+        return edge_fit.EdgeRows.of(self.line, *self.pages.shape[1:], self.bend).distance().reshape(self.pages.shape)
 
     @property
     def levelled(self) -> Array:
@@ -256,7 +263,7 @@ class _Stack:
             design = self.spread.design(x[p].ravel())
             value = self.spread.value(design)
             fall = np.zeros(page.size)
-            close = np.abs(design.x[design.inside]) <= self.spread.core / slanted_edge.CORE_WIDTHS
+            close = np.abs(design.x[design.inside]) <= self.spread.core / edge_fit.CORE_WIDTHS
             fall[design.inside[close]] = -self.spread.core_slope(design)[close]
             fall *= math.cos(math.atan(self.line[p, 1]))
             along = np.repeat(self.along, page.shape[1])
@@ -350,12 +357,16 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
     if lines is None:
         assert stack is not None
         lines = stack.line
+    if stack is None:
+        stack = _Stack.of(up, edge_fit.fit_edge(up[0], *lines[0], run.even))
+    # what the mean shows of light and bend is near enough to lay the pages over each other
+    flat, bend = up - stack.light, stack.bend
     # one slope for all unless they turn
     start = np.column_stack([lines[:, 0], np.full(len(up), lines[:, 1].mean())])
-    left, right = (np.median(part, axis=(1, 2)) for part in (up[..., :8], up[..., -8:]))
+    left, right = (np.median(part, axis=(1, 2)) for part in (flat[..., :8], flat[..., -8:]))
     levels = np.column_stack([left, right - left])
     turning = False
-    current = _fitted(up, start, levels, slanted_edge.COARSE)
+    current = _fitted(flat, start, levels, bend)
     for number in range(_STEPS):
         shift = current.differences(run.step)
         change = shift.line.copy()
@@ -365,7 +376,7 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         gain = current.levels[:, 1] / current.spread.contrast
         new = current.levels + shift.levels * gain[:, None]
         own = np.abs(change) / np.sqrt(np.diagonal(shift.covariance, axis1=1, axis2=2))
-        current = _fitted(up, current.line + change, new, slanted_edge.COARSE)
+        current = _fitted(flat, current.line + change, new, bend)
         if not turning and number >= _SETTLED and shift.turned:
             turning = True
         elif number >= _SETTLED and np.max(own) < _DONE:
@@ -374,15 +385,15 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         raise EdgeError(
             "the pages cannot be laid over each other: the edge does not look alike in them; measure single pages"
         )
-    final = _fitted(up, current.line, current.levels, slanted_edge.OVERSAMPLING)
+    fitted = edge_fit.fit_rows(*_levelled(up, current.line, current.levels, bend), run.even)
+    lines = np.column_stack([fitted.rows.offset, fitted.rows.slope])[:: up.shape[1]]
+    even = _levelled(up, lines, current.levels, bend)[1] - fitted.light
+    levels = np.tile([fitted.spread.dark, fitted.spread.contrast], (len(up), 1))
+    final = _Stack(even.reshape(up.shape), lines, fitted.spread, levels, fitted.rows.bend, stack.light)
     sigma = np.stack([np.diag(one) for one in shift.covariance])
     normal = np.cos(np.arctan(final.line[:, 1])) ** 2
     jitter = float(np.mean(normal * (sigma[:, 0] + turning * sigma[:, 1] * np.mean(final.along**2))))
-    offset, slope = final.line.mean(axis=0)
-    design = EdgeDesign.of(final.distance().ravel(), final.spread.core, slanted_edge.OVERSAMPLING)
-    fitted = slanted_edge.FittedEdge(
-        float(offset), float(slope), np.tile(final.along, len(up)), design, final.spread, jitter
-    )
+    fitted = replace(fitted, jitter=jitter)
     chi = final.differences(run.step)
     # of pages that differ: how far the lines stand apart
     apart = final.line - final.line.mean(axis=0)
@@ -390,31 +401,30 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
     return run.result(final.levelled, len(up), line, fitted, final, replace(chi, chi_square=square), aligned=True)
 
 
-def _fitted(up: Array, lines: Array, levels: Array, oversampling: int) -> _Stack:
-    """Edge-spread function of all pages, each at its own line and with its own levels."""
+def _levelled(up: Array, lines: Array, levels: Array, bend: Array) -> tuple[edge_fit.EdgeRows, Array, float]:
+    """Return the rows of all pages, their grey values with the mean levels (N,), and the half width of the spline."""
     dark, contrast = levels.mean(axis=0)
     if np.any(levels[:, 1] < 0.1 * contrast) or contrast <= 0.0:
         page = int(np.argmin(levels[:, 1]))
         raise EdgeError(f"page {page} of those that are not repeated shows no edge; leave it out")
-    even = dark + (up - levels[:, :1, None]) * (contrast / levels[:, 1:, None])
-    rows, columns = up.shape[1:]
-    offset, slope = lines[:, 0], lines[:, 1]
-    reach = np.abs(slope) * (rows - 1) / 2.0
-    plateau = float(np.min(np.minimum(offset, columns - 1 - offset) - reach))
-    if plateau < 10.0:
+    grey = (dark + (up - levels[:, :1, None]) * (contrast / levels[:, 1:, None])).ravel()
+    rows = edge_fit.EdgeRows.of(lines, *up.shape[1:], bend)
+    if rows.plateau < 10.0:
         raise EdgeError(
             "the edge moves so far between the pages that it comes within 10 px of the region's side: take a wider"
             " region, or fewer pages"
         )
-    along = np.arange(rows) - (rows - 1) / 2.0
-    place = (np.arange(columns) - offset[:, None, None] - slope[:, None, None] * along[:, None]) * np.cos(
-        np.arctan(slope)
-    )[:, None, None]
-    distance, grey = place.ravel(), even.ravel()
-    slanted_edge.check_phases(distance, rows * len(up), float(slope.mean()))
-    design = EdgeDesign.of(distance, slanted_edge.core_width(distance, grey, plateau), oversampling)
-    spread = fit_edge_spread(design, grey)
+    distance = rows.distance()
+    edge_fit.check_phases(distance, len(rows.along), float(lines[:, 1].mean()))
+    return rows, grey, edge_fit.core_width(distance, grey, rows.plateau)
+
+
+def _fitted(up: Array, lines: Array, levels: Array, bend: Array) -> _Stack:
+    """Return the edge-spread function of all pages, each at its own line and with its own levels."""
+    rows, grey, core = _levelled(up, lines, levels, bend)
+    spread = fit_edge_spread(EdgeDesign.of(rows.distance(), core, edge_fit.COARSE), grey)
     # levels of the pages against those of the fit
-    factor = spread.contrast / contrast
-    own = np.column_stack([levels[:, 0] + (spread.dark - dark) * levels[:, 1] / contrast, levels[:, 1] * factor])
-    return _Stack(up, lines, spread, own)
+    dark, contrast = levels.mean(axis=0)
+    gain = levels[:, 1] / contrast
+    own = np.column_stack([levels[:, 0] + (spread.dark - dark) * gain, spread.contrast * gain])
+    return _Stack(up, lines, spread, own, bend, np.zeros(up.shape[1:]))

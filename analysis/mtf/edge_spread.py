@@ -40,7 +40,7 @@ class EdgeDesign:
     """Pixels at x (N,), px along the normal, as rows of the least-squares design; P unknowns.
 
     inside: (M,) numbers of the pixels in the core. cell, u: their knot interval and place in it, 0 to 1.
-    basis: (4, M) the splines that live there. levels: (3, N) columns of dark level, step and tail.
+    basis: (4, M) the splines that live there. levels: (K + 3, N) columns of uneven light, dark level, step and tail.
     """
 
     x: Array
@@ -53,13 +53,14 @@ class EdgeDesign:
     levels: Array
 
     @staticmethod
-    def of(x: Array, core: float, oversampling: int) -> EdgeDesign:
-        """The design for pixels at given distances.
+    def of(x: Array, core: float, oversampling: int, light: Array | None = None) -> EdgeDesign:
+        """Return the design for pixels at the distances x.
 
         Args:
             x: distances from the edge, (N,), px.
             core: half width of the spline, px, rounded up to whole knots.
             oversampling: knots per pixel.
+            light: columns of uneven light, (K, N); none by default. They are no part of the edge-spread function.
         """
         half = math.ceil(core * oversampling)
         place = x * oversampling + half
@@ -69,12 +70,15 @@ class EdgeDesign:
         u = place - cell
         v = 1.0 - u
         basis = np.stack([v**3 / 6, u * u * (u / 2 - 1) + 2 / 3, v * v * (v / 2 - 1) + 2 / 3, u**3 / 6])
-        levels = np.empty((3, x.size))
-        levels[0] = 1.0
-        levels[1] = x > 0.0
+        extra = 0 if light is None else len(light)
+        levels = np.empty((extra + 3, x.size))
+        if light is not None:
+            levels[:extra] = light
+        levels[-3] = 1.0
+        levels[-2] = x > 0.0
         # the core is at least 6 px wide on each side, twelve widths of the step
-        levels[1, inside] = ndtr(x[inside] / _STEP_WIDTH)
-        levels[2] = -x / (x * x + _TAIL_WIDTH**2)
+        levels[-2, inside] = ndtr(x[inside] / _STEP_WIDTH)
+        levels[-1] = -x / (x * x + _TAIL_WIDTH**2)
         return EdgeDesign(x, half / oversampling, oversampling, inside, cell, u, basis, levels)
 
     @property
@@ -99,13 +103,11 @@ class EdgeDesign:
         pair = ((self.cell * (size + 1)) + (_FIRST * size + _SECOND)).ravel()
         upper = np.bincount(pair, (basis[_FIRST[:, 0]] * self.basis[_SECOND[:, 0]]).ravel(), minlength=size * size)
         upper = upper.reshape(size, size)[3:-3, 3:-3]
-        matrix = np.empty((count + 3, count + 3))
+        matrix = np.empty((count + len(self.levels),) * 2)
         matrix[:count, :count] = upper + np.triu(upper, 1).T
         index = (self.cell + _FOUR).ravel()
-        # the dark level's column is the sum of the splines' rows
         for k, level in enumerate(self.levels[:, self.inside]):
-            part = basis if k == 0 else basis * level
-            matrix[:count, count + k] = np.bincount(index, part.ravel(), minlength=size)[3:-3]
+            matrix[:count, count + k] = np.bincount(index, (basis * level).ravel(), minlength=size)[3:-3]
         matrix[count:, :count] = matrix[:count, count:].T
         matrix[count:, count:] = (self.levels if weight is None else self.levels * weight) @ self.levels.T
         return matrix
@@ -116,7 +118,8 @@ class EdgeSpread:
     """A fitted edge-spread function; x in pixels along the normal, grey values rise with x.
 
     core: half width of the spline's range, px. oversampling: knots per pixel.
-    coefficients: (P,) spline, then dark level, contrast, tail (grey values; the tail's in grey values * px).
+    coefficients: (P,) spline, uneven light, then dark level, contrast, tail (grey values; the tail's in grey values *
+        px).
     factor: Cholesky factor of the normal matrix.
     """
 
@@ -124,6 +127,11 @@ class EdgeSpread:
     oversampling: int
     coefficients: Array
     factor: tuple[Array, bool]
+
+    @property
+    def spline_count(self) -> int:
+        """Number of splines, the first coefficients."""
+        return round(2.0 * self.core * self.oversampling) - 3
 
     @property
     def dark(self) -> float:
@@ -141,7 +149,7 @@ class EdgeSpread:
 
     def value(self, design: EdgeDesign) -> Array:
         """Grey values (N,) at the places of a design with the same knots."""
-        value = self.coefficients[-3:] @ design.levels
+        value = self.coefficients[-len(design.levels) :] @ design.levels
         value[design.inside] += (design.basis * self._local(design)).sum(axis=0)
         return np.asarray(value)
 
@@ -166,15 +174,14 @@ class EdgeSpread:
         """
         omega = 2.0 * np.pi * frequency
         step = 1.0 / self.oversampling
-        count = self.coefficients.size - 3
+        count = self.spline_count
         centre = -self.core + (np.arange(count) + 2.0) * step
-        rows = np.empty((count + 3, frequency.size), dtype=np.complex128)
+        rows = np.zeros((self.coefficients.size, frequency.size), dtype=np.complex128)
         rows[:count] = (1j * omega * step * np.sinc(frequency * step) ** 4) * np.exp(-1j * np.outer(centre, omega))
-        rows[count] = 0.0
-        rows[count + 1] = np.exp(-0.5 * (_STEP_WIDTH * omega) ** 2)
-        rows[count + 2] = -np.pi * omega * np.exp(-_TAIL_WIDTH * omega)
+        rows[-2] = np.exp(-0.5 * (_STEP_WIDTH * omega) ** 2)
+        rows[-1] = -np.pi * omega * np.exp(-_TAIL_WIDTH * omega)
         transfer = (self.coefficients[:, None] * rows).sum(axis=0) / self.contrast
-        rows[count + 1] -= transfer
+        rows[-2] -= transfer
         rows /= self.contrast
         return transfer, rows
 
@@ -194,8 +201,8 @@ class EdgeSpread:
 
     def _local(self, design: EdgeDesign) -> Array:
         """(4, M) coefficients of the splines at each pixel of the core."""
-        padded = np.zeros(self.coefficients.size + 3)
-        padded[3:-3] = self.coefficients[:-3]
+        padded = np.zeros(self.spline_count + 6)
+        padded[3:-3] = self.coefficients[: self.spline_count]
         return np.asarray(padded[design.cell + _FOUR])
 
     def _level_slope(self, x: Array) -> Array:

@@ -34,6 +34,7 @@ _LENGTHS = {"nm": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "mm": 1.0}
 _HIGHEST = 2.0
 # Larger numbers are in no image.
 _NUMBERS = re.compile(r"\s*" + r"\s*,\s*".join([r"([0-9]{1,10})"] * 4) + r"\s*")
+_LIGHT = tuple(f"{level}_change_{way}" for level in ("bright", "dark") for way in ("along", "across"))
 # Table rows, cycles/pixel.
 _ROWS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 
@@ -122,7 +123,7 @@ def run_mtf(
         errors.print(f"warning: {text}", style="yellow", markup=False, highlight=False, soft_wrap=True)
     try:
         if isinstance(found, BarMtf):
-            _print_bars(found, size, offset, warnings if as_json else None)
+            _print_bars(found, size, offset, warnings, as_json)
         elif as_json:
             _print_json({**_edge_json(found, size, offset), "warnings": warnings})
         else:
@@ -307,6 +308,9 @@ def _edge_json(edge: EdgeMtf, pitch: float, offset: float) -> dict[str, Any]:
         "position_px_sigma": edge.position_sigma,
         "curvature_per_px": edge.curvature,
         "curvature_per_px_sigma": edge.curvature_sigma,
+        "order": edge.order,
+        **{f"{name}_dn": value for name, value in zip(_LIGHT, edge.light.tolist(), strict=True)},
+        **{f"{name}_dn_sigma": value for name, value in zip(_LIGHT, edge.light_sigma.tolist(), strict=True)},
         "dark_dn": edge.dark - offset,
         "bright_dn": edge.bright - offset,
         "noise_dark_dn": edge.noise_dark,
@@ -368,9 +372,13 @@ def _print_edge(edge: EdgeMtf, pitch: float, offset: float, written: list[Path])
         "MTF50: not reached"
         if math.isnan(half)
         else f"MTF50: {half / pitch:.2f} ± {half_sigma / pitch:.2f} cycles/mm ({half:.4f} cycles/pixel)",
-        f"edge: {math.degrees(edge.angle):+.3f} ± {math.degrees(edge.angle_sigma):.3f} deg, {kind}",
+        f"edge: {math.degrees(edge.angle):+.3f} ± {math.degrees(edge.angle_sigma):.3f} deg, {kind}; "
+        + ("straight" if edge.order == 1 else f"bowed, followed by a polynomial of order {edge.order}"),
         f"levels: {edge.dark - offset:.1f} and {edge.bright - offset:.1f}, noise {edge.noise_dark:.2f} and "
         f"{edge.noise_bright:.2f} per pixel",
+        "light: bright level changes by {} along the edge and {} across it, dark level by {} and {}".format(
+            *(f"{value:+.1f} ± {sigma:.1f}" for value, sigma in zip(edge.light, edge.light_sigma, strict=True))
+        ),
         *([_pages_text(edge)] if edge.pages is not None and len(edge.pages.position) > 1 else []),
         *(f"written: {path}" for path in written),
     ]
@@ -388,9 +396,8 @@ def _pages_text(edge: EdgeMtf) -> str:
     return f"edge in the pages, against {edge.position:.3f} px: {each}{more}, each ± {sigma:.3f} px; {how}"
 
 
-def _print_bars(bars: BarMtf, pitch: float, offset: float, warnings: list[str] | None) -> None:
-    """Print the result of bars, with its warnings as JSON, or without them as lines."""
-    if warnings is not None:
+def _print_bars(bars: BarMtf, pitch: float, offset: float, warnings: list[str], as_json: bool) -> None:
+    if as_json:
         _print_json(
             {
                 "frequency_cycles_per_mm": bars.cycles_per_pixel / pitch,

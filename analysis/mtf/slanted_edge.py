@@ -25,21 +25,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
+from analysis.chi_square import chance_beyond
+from analysis.mtf.edge_fit import OVERSAMPLING, FittedEdge, fit_edge, path_parts
 from analysis.mtf.edge_location import Axis, EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
-from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
+from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread
 from analysis.mtf.rice import measured_bias, rice_sigma, signal_modulus
 from analysis.spots.noise import NoiseModel
 
 Array = NDArray[np.float64]
-# Half width of the spline: so many 10-90% widths of the edge, at least so many px, at most this part of the plateau.
-CORE_WIDTHS, _LEAST_CORE, _LARGEST_CORE_SHARE = 4.0, 6.0, 0.7
-# Widest hole between neighbouring sampling phases, px.
-_LARGEST_GAP = 0.3
 # Block means of 4 x 4 px that stick out of the fitted edge by more than this share of the contrast.
 _OTHER_STRUCTURE = 0.1
-_LINE_STEPS = 2
-OVERSAMPLING, COARSE = 4, 2
-"""Knots of the edge-spread function per pixel; and while the line is sought, whose slope must not follow the noise."""
+# Blocks and strips of pixels whose means are tested for structure, px.
+_BLOCK, _STRIP = 8, 4
+FALSE_ALARM = 1e-4
+"""Rate at which independent noise of the pixels is reported as structure."""
+_LEAST_STRUCTURE = 5e-5
 FREQUENCY = np.linspace(0.0, 1.0, 65)
 FREQUENCY.setflags(write=False)
 """Frequencies at which an MTF is given by default, cycles/pixel."""
@@ -55,6 +55,7 @@ def measure_edge(
     saturation: float | None = None,
     frequency: ArrayLike | None = None,
     rounding: tuple[float, float] = (0.0, 0.0),
+    even: bool = False,
 ) -> EdgeMtf:
     """MTF of the one edge in a region.
 
@@ -68,6 +69,7 @@ def measure_edge(
         saturation: grey value of saturation; default the model's, else plateaus of equal values are looked for.
         frequency: (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
         rounding: rms of what rounding leaves in the dark and in the bright level, grey values (`edge_pages.left_over`).
+        even: the light is known to be even, as in a simulated image; else both levels are planes.
 
     Raises:
         EdgeError: the region does not show one measurable edge.
@@ -79,8 +81,8 @@ def measure_edge(
     grey = checked_region(region, saturation)
     line = locate_edge(grey)
     up = rising(grey, line)
-    fitted = fit_edge(up, *rising_line(line, up.shape[1]))
-    return edge_result(up[None], line, fitted, noise, frames, wanted, rounding)
+    fitted = fit_edge(up, *rising_line(line, up.shape[1]), even)
+    return edge_result(up[None] - fitted.light.reshape(up.shape), line, fitted, noise, frames, wanted, rounding)
 
 
 def _checked_frequency(frequency: ArrayLike) -> Array:
@@ -102,118 +104,6 @@ def rising(grey: Array, line: EdgeLine) -> Array:
 def rising_line(line: EdgeLine, columns: int) -> tuple[float, float]:
     """Column in the middle row and slope of the line in a region so turned."""
     return line.position if line.sign > 0 else columns - 1 - line.position, math.tan(line.sign * line.angle)
-
-
-@dataclass(frozen=True, eq=False)
-class FittedEdge:
-    """Line column = offset + slope * v with v from the middle row (rows,); all pixels by their distance from it.
-
-    Of P pages with lines of their own these are the means, rows those of all pages, one after the other; jitter is the
-    mean variance of what noise does to a page's line, (P,), px^2.
-    """
-
-    offset: float
-    slope: float
-    along: Array
-    design: EdgeDesign
-    spread: EdgeSpread
-    jitter: float = 0.0
-
-
-def fit_edge(rising: Array, offset: float, slope: float) -> FittedEdge:
-    """Line and edge-spread function of a region (H, W) from `rising`.
-
-    Args:
-        rising: grey values.
-        offset: column of the line in the middle row, about.
-        slope: of the line, about.
-
-    Raises:
-        EdgeError: too few sampling phases, or no sharp edge.
-    """
-    rows, columns = rising.shape
-    along = np.arange(rows) - (rows - 1) / 2.0
-    column = np.arange(columns)
-    grey = rising.ravel()
-    core = 0.0
-    for step in range(_LINE_STEPS + 1):
-        distance = ((column - offset - slope * along[:, None]) * math.cos(math.atan(slope))).ravel()
-        if step == 0:
-            check_phases(distance, rows, slope)
-            core = core_width(distance, grey, min(offset, columns - 1 - offset) - abs(slope) * (rows - 1) / 2.0)
-        last = step == _LINE_STEPS
-        design = EdgeDesign.of(distance, core, OVERSAMPLING if last else COARSE)
-        spread = fit_edge_spread(design, grey)
-        if not last:
-            parts, normal, near = _line_parts(design, spread, along, columns)
-            change = normal @ (parts @ (grey - spread.value(design))[near])
-            offset, slope = offset + float(change[0]), slope + float(change[1])
-    return FittedEdge(offset, slope, along, design, spread)
-
-
-def _line_parts(
-    design: EdgeDesign, spread: EdgeSpread, along: Array, columns: int
-) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Derivatives (3, M) of grey values by the line's offset, slope and curvature; inverse normal matrix; pixels.
-
-    Only pixels in the inner quarter of the core: farther out the fitted slope is mostly noise and would pull the line.
-    """
-    close = np.abs(design.x[design.inside]) <= spread.core / CORE_WIDTHS
-    near = design.inside[close]
-    v = along[near // columns]
-    fall = -spread.core_slope(design)[close]
-    parts = np.stack([fall, fall * v, fall * (0.5 * v * v)])
-    return parts, np.asarray(np.linalg.inv(parts @ parts.T)), near
-
-
-def check_phases(distance: Array, rows: int, slope: float) -> None:
-    """EdgeError where the sampling phases leave a wide gap.
-
-    Args:
-        distance: of pixels from the edge, (N,), px.
-        rows: lines that they lie in, for the message.
-        slope: of the edge, likewise.
-    """
-    near = np.sort(distance[np.abs(distance) <= 1.5])
-    gap = float(np.diff(near).max()) if near.size > 1 else math.inf
-    if gap > _LARGEST_GAP:
-        degrees = math.degrees(abs(math.atan(slope)))
-        raise EdgeError(
-            f"the edge at {degrees:.2f} deg to the pixel grid leaves gaps of {gap:.2f} px between its sampling phases "
-            f"in {rows} lines, at most {_LARGEST_GAP} px will do: tilt the target by 2 to 10 deg"
-            + (" or take a region that is longer along the edge" if 0.2 < degrees < 5 else "")
-        )
-
-
-def core_width(distance: Array, grey: Array, plateau: float) -> float:
-    """Half width of the spline, from the 10-90% width of the edge, px.
-
-    Args:
-        distance: of pixels from the edge, (N,), px.
-        grey: their values, (N,).
-        plateau: that lies beside the edge on both sides, px.
-
-    Raises:
-        EdgeError: the edge is too wide for it.
-    """
-    cell = np.round(2.0 * distance).astype(np.intp)
-    low = int(cell.min())
-    count = np.bincount(cell - low)
-    profile = np.bincount(cell - low, grey) / np.maximum(count, 1)
-    middle = -low
-    outer = round(2.0 * 0.7 * plateau)
-    dark, bright = profile[: middle - outer].mean(), profile[middle + outer :].mean()
-    relative = (profile - dark) / (bright - dark)
-    right = int(np.argmax(relative[middle:] > 0.9))
-    left = int(np.argmax(relative[middle::-1] < 0.1))
-    width = (left + right) / 2.0
-    largest = _LARGEST_CORE_SHARE * plateau
-    if not 0 < 2.0 * width <= largest:
-        raise EdgeError(
-            f"no sharp edge in the region: grey values rise from 10% to 90% over {width:.0f} px, and only "
-            f"{plateau:.0f} px lie beside the edge; take a wider region, or one with a single edge between even areas"
-        )
-    return min(max(CORE_WIDTHS * width, _LEAST_CORE), largest)
 
 
 def edge_result(
@@ -252,16 +142,11 @@ def edge_result(
     along, across = (np.sqrt(np.sum(part * (covariance @ part), axis=0)) for part in (turned.real, turned.imag))
     signal = signal_modulus(modulus, along, across)
 
-    parts, normal, near = _line_parts(design, spread, fitted.along, columns)
-    scatter = (parts * variance[near]) @ parts.T
-    bend = normal @ (parts @ (grey - model)[near])
-    bend_sigma = math.sqrt(float((normal @ scatter @ normal)[2, 2]))
-    # offset and slope without the curvature are what was fitted
-    straight = np.linalg.inv((parts @ parts.T)[:2, :2])
-    slope_sigma = math.sqrt(float((straight @ scatter[:2, :2] @ straight)[1, 1]))
-    cosine = math.cos(math.atan(fitted.slope))
-    # A turned line blurs: 1 - mean cos(2 pi f v dslope cosine) = k chi^2 of one degree of freedom, mean square 3 k^2.
-    blur = 0.5 * (2.0 * np.pi * frequency * cosine * slope_sigma) ** 2 * float(np.mean(fitted.along**2))
+    path = _path_errors(fitted, grey - model, variance)
+    cosine = math.cos(math.atan(float(fitted.rows.slope.mean())))
+    # A path that is off by e(v) blurs: 1 - mean cos(2 pi f e cosine) is a sum of k chi^2, its mean square as below.
+    blurs = 0.5 * path.blur * (2.0 * np.pi * frequency[:, None] * cosine) ** 2
+    blur = np.sqrt(blurs.sum(axis=1) ** 2 + 2.0 * np.sum(blurs**2, axis=1))
     # pages that are laid over each other by their noise: an error of one sign, as much up as down by its size
     jitter = 0.5 * (2.0 * np.pi * frequency) ** 2 * fitted.jitter
     # one error of the contrast, which the value 1 at frequency 0 does not have
@@ -270,9 +155,9 @@ def edge_result(
     steep = float(spread.slope(centre)[0])
     shift = (spread.dark + 0.5 * spread.contrast - float(spread.value(centre)[0])) / steep
     # how each coefficient lifts the middle of the edge above half height
-    lift = centre.project(np.ones(1))
+    lift = np.insert(centre.project(np.ones(1)), spread.spline_count, np.zeros(fitted.change.size))
     lift[-3:] -= (1.0, 0.5, 0.0)
-    offset = fitted.offset + shift / cosine
+    offset = fitted.rows.middle + shift / cosine
     if line.sign < 0:
         offset = columns - 1 - offset
     samples = math.floor(min(-design.x.min(), design.x.max()) * _SHOWN_PER_PIXEL)
@@ -286,17 +171,19 @@ def edge_result(
         sigma_along=along,
         sigma_across=across,
         sigma=np.sqrt(
-            rice_sigma(signal, along, across) ** 2
-            + 3.0 * (blur * modulus) ** 2
-            + (np.hypot(jitter, level) * modulus) ** 2
+            rice_sigma(signal, along, across) ** 2 + (blur * modulus) ** 2 + (np.hypot(jitter, level) * modulus) ** 2
         ),
         noise_bias=measured_bias(modulus, across),
-        angle=line.sign * math.atan(fitted.slope),
-        angle_sigma=slope_sigma * cosine**2,
+        angle=line.sign * math.atan(float(fitted.rows.slope.mean())),
+        angle_sigma=path.slope_sigma * cosine**2,
         position=offset,
         position_sigma=math.sqrt(float(lift @ covariance @ lift)) / steep / cosine,
-        curvature=line.sign * float(bend[2]),
-        curvature_sigma=bend_sigma,
+        curvature=line.sign * path.curvature,
+        curvature_sigma=path.curvature_sigma,
+        order=fitted.order,
+        light=fitted.change,
+        light_sigma=np.sqrt(np.diag(covariance)[spread.spline_count : -3]),
+        structure=_structure(fitted, grey - model, variance),
         place=place,
         esf=spread.value(shown),
         lsf=spread.slope(shown) / spread.contrast,
@@ -325,6 +212,71 @@ def _check_one_edge(residual: Array, contrast: float, line: EdgeLine) -> None:
             f"from such an edge by {blocks.max() / contrast:.0%} of its contrast (second edge, corner, bend, speck, "
             "uneven light); choose a region with one edge between two even areas"
         )
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What the means of blocks of pixels differ by from the fit.
+
+    rms: beyond the noise, grey values. chance: probability of such differences by independent noise of the pixels.
+    """
+
+    rms: float
+    chance: float
+
+
+def _structure(fitted: FittedEdge, residual: Array, variance: Array) -> Structure:
+    """Return the structure in the residuals of independent pixels (N,) with their variances (N,).
+
+    Means are taken of blocks of 8 x 8 px, of strips of 4 px along the edge, and of strips across it on either side.
+    """
+    along = np.repeat(fitted.rows.along + fitted.rows.half, fitted.rows.columns).astype(np.intp)
+    across = np.tile(np.arange(fitted.rows.columns), len(fitted.rows.along))
+    x = fitted.design.x
+    strip = np.floor(x / _STRIP).astype(np.intp)
+    out = []
+    for label in (along // _BLOCK * 10_000 + across // _BLOCK, strip - strip.min(), 2 * (along // _STRIP) + (x > 0.0)):
+        label = np.unique(label, return_inverse=True)[1].ravel()
+        count, total, noise = (np.bincount(label, weight) for weight in (None, residual, variance))
+        chance = float(chance_beyond(float(np.sum(total**2 / noise)), len(count)))
+        excess = float(np.mean((total**2 - noise) / count**2, where=count >= _STRIP**2))
+        out.append(Structure(math.sqrt(max(excess, 0.0)), min(3.0 * chance, 1.0)))
+    return min(out, key=lambda found: found.chance)
+
+
+@dataclass(frozen=True, eq=False)
+class _PathErrors:
+    """Standard deviations of a fitted path.
+
+    slope_sigma: of its slope. curvature, curvature_sigma: mean second derivative and its sigma, 1/px.
+    blur: (order,) mean square of its error along the rows by the coefficients of order 1 and up, px^2.
+    """
+
+    slope_sigma: float
+    curvature: float
+    curvature_sigma: float
+    blur: Array
+
+
+def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> _PathErrors:
+    """Return the errors of the path from the residuals of all pixels (N,) and their variances (N,)."""
+    rows, order = fitted.rows, fitted.order
+    parts, near = path_parts(rows, fitted.design, fitted.spread, max(order, 2))
+    scatter = (parts * variance[near]) @ parts.T
+    inverse = np.linalg.inv(parts @ parts.T)
+    bend = float((inverse @ (parts @ residual[near]))[2]) + (float(rows.bend[0]) if order > 1 else 0.0)
+    # the second derivative of the second Legendre polynomial is 3
+    scale = 3.0 / rows.half**2
+    # the coefficients without those that were not fitted
+    own = np.linalg.inv((parts @ parts.T)[: order + 1, : order + 1])
+    covariance = own @ scatter[: order + 1, : order + 1] @ own
+    blur = np.diag(covariance)[1:] * np.mean(rows.polynomials(order)[1:] ** 2, axis=1)
+    return _PathErrors(
+        slope_sigma=math.sqrt(float(covariance[1, 1])) / rows.half,
+        curvature=scale * bend,
+        curvature_sigma=scale * math.sqrt(float((inverse @ scatter @ inverse)[2, 2])),
+        blur=blur,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -414,8 +366,11 @@ class EdgeMtf:
         and too small where there is hardly a signal, by up to half of one.
     angle, angle_sigma: rad, against the grid: column (row) = position + tan(angle) (row (column) - middle).
     position, position_sigma: column (axis "x") or row (axis "y") of the edge's half height in the region's middle, px.
-    curvature, curvature_sigma: second derivative of the edge's column (row) by its row (column), 1/px; a straight edge
-        was used all the same.
+    curvature, curvature_sigma: mean second derivative of the edge's column (row) by its row (column), 1/px.
+    order: of the polynomial that the edge was followed by, 1 where it is straight within the noise.
+    light, light_sigma: (4,) change of the bright level over the region's length along the edge and over its width from
+        the dark side to the bright, and the same of the dark level, grey values; (0,) where light was taken as even.
+    structure: that the fit leaves in the region.
     place, esf, lsf: (S,) px along the normal from the dark side to the bright, 16 to a pixel, as far as there are
         pixels on both sides; grey values; line-spread function, 1/px, integral 1.
     pixel_place, pixel_grey: (N,) all pixels, projected, as used.
@@ -449,7 +404,27 @@ class EdgeMtf:
     noise_dark: float
     noise_bright: float
     core: float
+    order: int
+    light: Array
+    light_sigma: Array
+    structure: Structure
     pages: PagePlaces | None = None
+
+    @property
+    def doubt(self) -> str:
+        """Return why sigma does not hold what is wrong with the MTF; empty if nothing in the region speaks against it.
+
+        Noise-free images of diffraction at an F/9 pupil leave a structure of 2.5e-5 of the contrast.
+        """
+        share = self.structure.rms / (self.bright - self.dark)
+        if self.structure.chance >= FALSE_ALARM or share < _LEAST_STRUCTURE:
+            return ""
+        return (
+            f"the region holds structure of {share:.2g} of the contrast (rms of means over blocks and strips, p ="
+            f" {self.structure.chance:.1g}) that an edge of order {self.order} between two planes does not explain:"
+            " light that is not a plane, a rough edge, specks, or noise that neighbouring pixels share. sigma does not"
+            " hold what it does to the MTF: take even light or a smaller region"
+        )
 
     @property
     def frequency_along_axis(self) -> Array:

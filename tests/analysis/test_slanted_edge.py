@@ -131,9 +131,9 @@ def chi_square_limits(count):
 def test_perfect_pupil(degrees, size, pitch):
     image = edge_image(degrees, size, pitch=pitch)
     # 28 um: the image is aliased, with 13% of contrast left at 1.5 cycles/pixel
-    across_columns = measure_edge(image)
+    across_columns = measure_edge(image, even=True)
     across_rows = measure_edge(np.ascontiguousarray(image.T))
-    for edge, axis in ((across_columns, "x"), (across_rows, "y")):
+    for edge, axis, levels in ((across_columns, "x", 0.1), (across_rows, "y", 0.2)):
         assert edge.axis == axis
         near, far = error_of(edge, degrees, pitch=pitch)
         assert near < ACCURACY
@@ -142,8 +142,9 @@ def test_perfect_pupil(degrees, size, pitch):
         assert edge.angle == pytest.approx(math.radians(degrees), abs=1e-4)
         column = (size - 1) / 2 + MIDDLE[1] - MIDDLE[0] * math.tan(math.radians(degrees))
         assert edge.position == pytest.approx(column, abs=2e-3)
-        # the plateaus are extrapolated: at 32 px the diffraction tail still holds 1.7 DN of 1000
-        assert (edge.dark, edge.bright) == pytest.approx((DARK, BRIGHT), abs=0.1)
+        # the plateaus are extrapolated: at 32 px the diffraction tail still holds 1.7 DN of 1000, and levels that may
+        # be planes tell less of it
+        assert (edge.dark, edge.bright) == pytest.approx((DARK, BRIGHT), abs=levels)
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(64, 40), (24, 64), (160, 48), (100, 200)])

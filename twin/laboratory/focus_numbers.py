@@ -13,7 +13,7 @@ from optics.geometry.pose import rotation_vector
 from twin.laboratory.focus_bench import BudgetLine
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState
 from twin.laboratory.focus_scan import VERTEX_ERROR
-from twin.laboratory.measured_focus import NoEdge
+from twin.laboratory.measured_focus import ImageFault
 from twin.laboratory.turntable_numbers import DATA_FILE, likely
 from twin.run.quantity import Quantity, Record
 from twin.targets.target_images import ALONG, TRACK
@@ -157,11 +157,11 @@ SHIMS: Record[Shimming] = Record(
     Quantity("shim_um", lambda s: _ground(s.plan.thickness), "new thickness", "new shim", 1, converted=False),
     Quantity("slide_mm", lambda s: s.plan.slide, "displacement in the mounting surface, by hand"),
 )
-NO_EDGE: Record[NoEdge] = Record(
-    "An image without a measurable edge.",
+IMAGE_FAULT: Record[ImageFault] = Record(
+    "An image without a measurable edge, or whose sigma does not hold.",
     Quantity("file", lambda one: one.file, "the table that names it"),
     Quantity("line", lambda one: one.line, "line of the table"),
-    Quantity("reason", lambda one: one.reason, "why it has no edge"),
+    Quantity("reason", lambda one: one.reason, "why"),
 )
 
 
@@ -192,7 +192,8 @@ MEASURED: Record[FocusRun] = Record(
     Quantity("curves_degrees_of_freedom", lambda r: r.chi_square[1], "of all curves through focus together"),
     Quantity("curves_agree", lambda r: likely(*r.chi_square), "whether that is likely"),
     Quantity("sites", lambda r: PLACES.rows(_standing(r)), "all places"),
-    Quantity("images_without_edge", lambda r: r.readings and r.readings.no_edge, "not measured", record=NO_EDGE),
+    Quantity("images_without_edge", lambda r: r.readings and r.readings.no_edge, "not measured", record=IMAGE_FAULT),
+    Quantity("images_with_structure", lambda r: r.readings and r.readings.uneven, "doubtful", record=IMAGE_FAULT),
     Quantity("files", lambda r: r.readings and [r.readings.file], "that were read", record=DATA_FILE),
 )
 

@@ -127,7 +127,7 @@ def mtf_svg(run: SimulatedFocus) -> str:
             defocus = state.true_place(number)
             for edge in DIRECTIONS:
                 frames = state.focus[number].frames[edge]
-                measured = measure_edge(frames.mean(axis=0), noise=ccd.noise, frames=len(frames))
+                measured = measure_edge(frames.mean(axis=0), noise=ccd.noise, frames=len(frames), even=True)
                 frequency = measured.frequency / ccd.band.pitch
                 true = np.abs(site.imagers[edge].transfer(defocus, frequency))
                 colour = EDGE_COLOURS[edge]

@@ -184,6 +184,12 @@ def _warnings(run: FocusRun, data: Mapping[str, Any]) -> tuple[str, ...]:
             f"places are too small by about {np.sqrt(square / freedom):.1f}; those of plane and shims hold what places "
             "scatter"
         )
+    uneven = run.readings.uneven if run.readings else ()
+    if uneven:
+        out.append(
+            f"in {len(uneven)} of {len(run.readings.table)} images, first in that of line {uneven[0].line} of"
+            f" {uneven[0].file}, {uneven[0].reason}"
+        )
     if len(run.edges) == 1:
         out.append(
             f"one direction only, {DIRECTION_NAMES[run.edges[0]]}: with astigmatism best focus is midway between two"

@@ -11,7 +11,6 @@ import numpy as np
 from analysis.focal_plane.through_focus import FocusError, FocusVertex, focus_vertex
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
-from analysis.spots.noise import NoiseModel
 from optics.geometry.pose import Pose
 from optics.numerics.threads import cores, one_blas_thread
 from twin.laboratory.focus_bench import FocusBench, Site
@@ -140,7 +139,8 @@ class Recorder:
         """
         frames = self.frames(number, edge, shift, take)
         ccd = self.bench.ccds[self.bench.sites[number].band]
-        return *edge_mtf(frames, ccd.noise), frames
+        # the bench's light is even
+        return *measure_pages(frames, noise=ccd.noise, step=grey_step(frames), even=True).at(NYQUIST), frames
 
     def attempt(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray, str]:
         """Measure like ``measure``, but give MTF 0 with infinite sigma, and the reason, for an image that is too
@@ -150,20 +150,6 @@ class Recorder:
             return *self.measure(number, edge, shift, take), ""
         except EdgeError as error:
             return 0.0, np.inf, np.zeros((1, 1, 1), np.uint16), str(error)
-
-
-def edge_mtf(frames: np.ndarray, noise: NoiseModel | None, frequency: float = NYQUIST) -> tuple[float, float]:
-    """MTF of the knife edge in frames (frames, H, W) and its sigma, whichever bench they come from.
-
-    Args:
-        frames: as recorded.
-        noise: of the detector; None to estimate it from the image.
-        frequency: cycles per pixel.
-
-    Raises:
-        EdgeError: no edge can be measured in them.
-    """
-    return measure_pages(frames, noise=noise, step=grey_step(frames)).at(frequency)
 
 
 def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> tuple[SiteScan, ...]:

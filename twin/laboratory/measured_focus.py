@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex
 from analysis.images.image_file import ImageError, ImageFile, Region
 from analysis.mtf.edge_location import EdgeError
+from analysis.mtf.edge_pages import grey_step, measure_pages
 from analysis.spots.noise import NoiseModel
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import cores, one_blas_thread
@@ -22,7 +23,7 @@ from scenes.specs.camera_tests import FocusFiles, NoiseSpec
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.units import LENGTH
-from twin.laboratory.focus_scan import SiteScan, edge_mtf
+from twin.laboratory.focus_scan import SiteScan
 from twin.laboratory.measured_readings import DataFile
 from twin.run.procedure import Advance, silent
 from twin.targets.target_images import ALONG, DIRECTIONS
@@ -69,8 +70,8 @@ class _Place:
 
 
 @dataclass(frozen=True, eq=False)
-class NoEdge:
-    """An image in which no edge could be measured, and why."""
+class ImageFault:
+    """An image in which no edge could be measured, or whose MTF has a sigma that does not hold, and why."""
 
     file: str
     line: int
@@ -87,6 +88,7 @@ class FocusReadings:
         places: (X', Y') of the sites, (N, 2), metres.
         scans: curves through focus of the sites.
         no_edge: images that could not be measured.
+        uneven: images with structure that their edge does not explain.
         file: the table's.
     """
 
@@ -94,7 +96,8 @@ class FocusReadings:
     bands: tuple[str, ...]
     places: Array
     scans: tuple[SiteScan, ...]
-    no_edge: tuple[NoEdge, ...]
+    no_edge: tuple[ImageFault, ...]
+    uneven: tuple[ImageFault, ...]
     file: DataFile
 
 
@@ -112,16 +115,24 @@ def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
     images = files.images is not None
     table = read_table(str(files.images or files.mtf), IMAGE_COLUMNS if images else MTF_COLUMNS, 5)
     sites = _sites(table)
-    mtf, sigma, reasons = _from_images(table, files, advance) if images else (table["mtf"], table["sigma"], {})
+    mtf, sigma, reasons, doubts = (
+        _from_images(table, files, advance) if images else (table["mtf"], table["sigma"], {}, {})
+    )
     shift = table["shift"] * _per_shift(table, files)
     return FocusReadings(
         table,
         tuple(site.band for site in sites),
         np.array([site.place for site in sites]),
         tuple(_scan(table, site, shift, mtf, sigma, reasons) for site in sites),
-        tuple(NoEdge(table.file, int(table.lines[row]), reasons[row]) for row in sorted(reasons)),
+        _images(table, reasons),
+        _images(table, doubts),
         DataFile.of(table),
     )
+
+
+def _images(table: Table, reasons: Mapping[int, str]) -> tuple[ImageFault, ...]:
+    """Return the images of the rows of a table with their reasons."""
+    return tuple(ImageFault(table.file, int(table.lines[row]), reasons[row]) for row in sorted(reasons))
 
 
 def _per_shift(table: Table, files: FocusFiles) -> Array | float:
@@ -203,8 +214,10 @@ def _scan(table: Table, site: _Place, shift: Array, mtf: Array, sigma: Array, re
     )
 
 
-def _from_images(table: Table, files: FocusFiles, advance: Advance) -> tuple[Array, Array, dict[int, str]]:
-    """MTF and sigma of every row's image, and of those without a measurable edge the reason."""
+def _from_images(
+    table: Table, files: FocusFiles, advance: Advance
+) -> tuple[Array, Array, dict[int, str], dict[int, str]]:
+    """Return MTF and sigma of every row's image, why some have no edge, and why the sigma of some does not hold."""
     given = [name for name in _REGION if name in table]
     if given and len(given) < len(_REGION):
         allowed = "all of row, column, height and width, or none for whole images"
@@ -218,7 +231,7 @@ def _from_images(table: Table, files: FocusFiles, advance: Advance) -> tuple[Arr
     models = {name: _noise_model(files, name, spec) for name, spec in files.noise.items()}
     folder = Path(table.file).parent
 
-    def one(row: int) -> tuple[float, float, str]:
+    def one(row: int) -> tuple[float, float, str, str]:
         page = int(table["page"][row]) if "page" in table else None
         region = Region(*(int(table[name][row]) for name in _REGION)) if given else None
         try:
@@ -226,17 +239,18 @@ def _from_images(table: Table, files: FocusFiles, advance: Advance) -> tuple[Arr
         except ImageError as error:
             raise table.error(row, "file", str(error)) from error
         try:
-            return *edge_mtf(frames, models.get(str(band[row])), files.frequency), ""
+            edge = measure_pages(frames, noise=models.get(str(band[row])), step=grey_step(frames))
+            return *edge.at(files.frequency), "", edge.doubt
         except (EdgeError, ValueError) as error:
-            return 0.0, np.inf, str(error)
+            return 0.0, np.inf, str(error), ""
 
-    results: list[tuple[float, float, str]] = []
+    results: list[tuple[float, float, str, str]] = []
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
         for result in pool.map(one, range(len(table))):
             results.append(result)
             advance("measure the edges", len(results), len(table))
     mtf, sigma = (np.array([result[k] for result in results], np.float64) for k in (0, 1))
-    return mtf, sigma, {row: result[2] for row, result in enumerate(results) if result[2]}
+    return mtf, sigma, *({row: result[k] for row, result in enumerate(results) if result[k]} for k in (2, 3))
 
 
 def _noise_model(files: FocusFiles, name: str, spec: NoiseSpec) -> NoiseModel:
