@@ -227,7 +227,8 @@ def test_scaled_values(tmp_path) -> None:
         ("scales: [{key: [job, render, frames]}], values: [1, 1e9]", "factors.m2z.values", "outside the limits"),
         ("key: [job, perturb, base/forward/M2, shift, 2], values: [1 um, 2 um], scales: [{key: [job, render, frames]}]",
          "factors.m2z", "zero in the base"),
-        ("key: [job, perturb, base/forward/M3, figure, Z7], values: [5 nm, 9 nm], scales: [{key: [job, render, frames]}]",
+        ("key: [job, perturb, base/forward/M3, figure, Z7], values: [5 nm, 9 nm], "
+         "scales: [{key: [job, render, frames]}]",
          "factors.m2z", "zero in the base"),
     ],
 )  # fmt: skip
