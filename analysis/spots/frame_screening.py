@@ -34,6 +34,7 @@ __all__ = [
     "noise_ratio",
     "screen_frames",
     "shown_noise",
+    "subtracted_level",
 ]
 
 Array = NDArray[np.float64]
@@ -63,6 +64,8 @@ _NOISE_OFF, _MOST_SIGMAS = 0.15, 4.0
 off, in standard deviations, for cosmic rays."""
 _LIT = 0.02
 """Share of the peak from which a pixel is in the light, where movement and smear look like noise."""
+_LEAST_LEVEL_DN = 1.0
+"""By which the level of frames is below the dark level before it counts as subtracted."""
 _MEDIAN = math.pi / 2.0
 """Variance of a median over that of a mean, of many normal numbers."""
 
@@ -483,6 +486,28 @@ def shown_noise(
     own = float(noise.frame_variance_dn2(level))
     read = noise.dark_noise_e**2 + (ratio**2 - 1.0) * own / noise.gain_dn_per_e**2
     return replace(noise, dark_noise_e=math.sqrt(read))
+
+
+def subtracted_level(
+    frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = None, released: Released = _kept
+) -> float:
+    """Return by how much the level of frames beside the spot is below the detector's dark level, DN; 0 where it is not.
+
+    Light only adds, so that a level of frames below that in the dark was subtracted from them. Their shot noise is that
+    of the light above the level that is left.
+
+    Args:
+        frames: (N, H, W) grey values.
+        noise: of the detector.
+        bad: (H, W) pixels that are not to be used; None for none.
+        released: is told when some frames have been gone over.
+    """
+    stack = _Stack.of(frames, bad, released, blank=True)
+    middle = stack.median()[~stack.bad]
+    away = noise.dark_level_dn - float(np.median(middle))
+    pixel = noise.dark_variance_dn2 / len(stack) + noise.dsnu_variance_dn2
+    # a median of whole numbers stands up to half a grey value off
+    return away if away > _LEAST_LEVEL_DN + 6.0 * math.sqrt(_MEDIAN * pixel / middle.size) else 0.0
 
 
 def _basis(reference: Array) -> Array:

@@ -74,7 +74,8 @@ class NoiseModel:
             value = getattr(self, field.name)
             if field.name == "further":
                 continue
-            if not math.isfinite(value) or value < 0:
+            # of frames whose level was subtracted the dark signal, too, was, and so more than the offset
+            if not math.isfinite(value) or (value < 0 and field.name != "offset_dn"):
                 raise ValueError(f"noise model: {field.name} must be finite and >= 0, found {value!r}")
         if self.gain_dn_per_e == 0:
             raise ValueError("noise model: gain_dn_per_e must be > 0")

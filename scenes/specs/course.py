@@ -16,7 +16,7 @@ from scenes.yaml import units
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, Paths, Reference, Spec, validate
+from scenes.yaml.spec import ZERO_IS_NONE, Name, Paths, Reference, Spec, validate
 from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile
 
 TemperatureChange = Annotated[float, Quantity(units.TEMPERATURE_DIFFERENCE, largest="1000 K", unsigned="100 K")]
@@ -27,10 +27,10 @@ TemperatureGradient = Annotated[
 Rotation = Annotated[tuple[float, float, float], Vector(Quantity(units.ANGLE, largest="5 deg"))]
 Shift = Annotated[tuple[float, float, float], Vector(Quantity(units.LENGTH, largest="100 mm"))]
 ScaleChange = Annotated[float, Quantity(units.SCALE, largest="1 percent")]
-RadiusChange = Annotated[float, Quantity(units.SCALE, largest="10 percent")]
-ConicChange = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1.0, le=1.0)]
-IndexChange = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-0.1, le=0.1)]
-AbbeChange = Annotated[float, Quantity(units.SCALE, largest="50 percent")]
+RadiusChange = Annotated[float, Quantity(units.SCALE, largest="10 percent"), ZERO_IS_NONE]
+ConicChange = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1.0, le=1.0), ZERO_IS_NONE]
+IndexChange = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-0.1, le=0.1), ZERO_IS_NONE]
+AbbeChange = Annotated[float, Quantity(units.SCALE, largest="50 percent"), ZERO_IS_NONE]
 _TERM = re.compile(r"Z([1-9][0-9]{0,3})")
 
 

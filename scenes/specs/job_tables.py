@@ -18,7 +18,7 @@ from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
 from scenes.yaml.finish_files import ENDING, read_bsdf, read_coating
 from scenes.yaml.input_file import digest_of
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Reference, Spec, Text, Whole, short_for
+from scenes.yaml.spec import ZERO_IS_NONE, Reference, Spec, Text, Whole, short_for
 from scenes.yaml.units import SCALE
 
 Checksum = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
@@ -98,9 +98,9 @@ def _table(value: Any) -> Any:
 
 
 _uniform = short_for("change", str, int, float)
-PlainTemperature = Annotated[TemperatureSpec, _uniform]
-"""With its keys, or the uniform change alone."""
-TableTemperature = Annotated[TableTemperatureSpec, _uniform, BeforeValidator(_table)]
+PlainTemperature = Annotated[TemperatureSpec, ZERO_IS_NONE, _uniform]
+"""With its keys, or the uniform change alone; zero is as none where nothing that carries the body is warmed."""
+TableTemperature = Annotated[TableTemperatureSpec, ZERO_IS_NONE, _uniform, BeforeValidator(_table)]
 """With its keys, or the uniform change or the table's name alone."""
 
 

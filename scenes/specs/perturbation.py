@@ -25,10 +25,10 @@ from scenes.specs.course import (
 from scenes.specs.motion_text import meant, node_named, perturbation_in_words
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, Paths, Spec
+from scenes.yaml.spec import ZERO_IS_NONE, Name, Paths, Spec
 from scenes.yaml.units import LENGTH
 
-FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
+FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um"), ZERO_IS_NONE]
 
 ACTIONS = ("rotate", "shift", "figure", "scale", "radius", "conic", "index", "abbe", "temperature")
 """What can be done to a node, as its perturbation names it; `NodeInfo.allows` says which of them."""

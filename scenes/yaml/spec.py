@@ -436,18 +436,38 @@ def _field_metadata(model: type[Spec], key: KeyPath) -> list[Any]:
     return []
 
 
+class ZeroIsNone:
+    """Metadata of the type of a number that may be absent: zero has the same effect as no value."""
+
+
+ZERO_IS_NONE = ZeroIsNone()
+
+
 def annotation_at(model: type[Spec], key: KeyPath) -> Any:
     """The type that a model declares for the value at `key`, without its annotations; None if `key` leads nowhere."""
-    annotation: Any = model
+    return _bare(_declared_at(model, key))
+
+
+def metadata_at(model: type[Spec], key: KeyPath) -> tuple[Any, ...]:
+    """Return the metadata of the type that a model declares for the value at `key`, of an optional value, too."""
+    declared = _declared_at(model, key)
+    if typing.get_origin(declared) in (types.UnionType, typing.Union):
+        declared = next(item for item in typing.get_args(declared) if item is not type(None))
+    return getattr(declared, "__metadata__", ())
+
+
+def _declared_at(model: type[Spec], key: KeyPath) -> Any:
+    declared: Any = model
     for part in key:
+        annotation = _bare(declared)
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
             field = annotation.model_fields.get(str(part))
-            annotation = _bare(field.annotation) if field is not None else None
+            declared = field.annotation if field is not None else None
         else:
             # A mapping's value type stands last, and so does the item type of a tuple without its ellipsis.
             items = [item for item in typing.get_args(annotation) if item is not Ellipsis]
-            annotation = _bare(items[-1]) if items else None
-    return annotation
+            declared = items[-1] if items else None
+    return declared
 
 
 def _bare(annotation: Any) -> Any:

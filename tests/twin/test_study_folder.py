@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,7 @@ def setup(tmp_path_factory) -> StudySetup:
 
 def fresh(setup: StudySetup) -> StudySetup:
     """As a new process sees it."""
-    return StudySetup(setup.study, setup.tree)
+    return replace(setup)
 
 
 def work(path: Path | Numbered, setup: StudySetup, **options: bool) -> Path:

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,13 +43,13 @@ responses:
 def without(setup: StudySetup, file: str) -> StudySetup:
     """The study without responses from a file of the results."""
     kept = {name: response for name, response in setup.study.responses.items() if response.key[0] != file}
-    return StudySetup(setup.study.model_copy(update={"responses": FrozenMap(kept)}), setup.tree)
+    return replace(setup, study=setup.study.model_copy(update={"responses": FrozenMap(kept)}))
 
 
 def without_noise(setup: StudySetup) -> StudySetup:
     """The study without responses that depend on the noise."""
     kept = {name: setup.study.responses[name] for name in ("df", "height")}
-    return StudySetup(setup.study.model_copy(update={"responses": FrozenMap(kept)}), setup.tree)
+    return replace(setup, study=setup.study.model_copy(update={"responses": FrozenMap(kept)}))
 
 
 FEW = re.sub(r"(?m)^  (turn|coma|warmth|exposure|error|gamma|angle): .*\n", "", STUDY)
@@ -134,7 +135,7 @@ def test_what_needs_images_is_by_the_whole_job(small, backend):
         update={"key": (*setup.study.responses["df"].key[:-1], "d_f_um_sigma")}
     )
     one = {"factors": FrozenMap(m2z=setup.study.factors["m2z"]), "responses": FrozenMap(spread=spread)}
-    found = study_gradient(StudySetup(setup.study.model_copy(update=one), setup.tree), backend)
+    found = study_gradient(replace(setup, study=setup.study.model_copy(update=one)), backend)
     assert found.method[:, 0].tolist() == [AD] * 8 + [WHOLE]
     assert np.isnan(found.ad[8, 0])
     assert np.isfinite(found.differences[8, 0])

@@ -9,10 +9,12 @@ from scipy.stats import kstest, norm, truncnorm
 
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import STUDY, write_study
+from twin.live.knobs import factor_knobs
+from twin.study.gradient.study_gradient import GradientFactor
 from twin.study.runs import setup
 from twin.study.runs.base_job import leaf, with_values
 from twin.study.runs.plan import Plan
-from twin.study.runs.render_base import BLOCK
+from twin.study.runs.render_base import BLOCK, read_job
 from twin.study.runs.sampling import unit_cube
 from twin.study.runs.setup import StudySetup, resolve_study, study_from_text
 
@@ -121,6 +123,50 @@ def test_a_new_node_and_a_new_figure_term_are_made(tmp_path) -> None:
     assert "Z11" in made["figure"]
 
 
+M2 = "base/forward/M2"
+NEUTRAL = {
+    "figure, Z11": ("30 nm", "10 nm"),
+    "radius": ("40 ppm", "90 ppm"),
+    "conic": ("0.2", "0.1"),
+    "temperature, change": ("3 K", "1 K"),
+}
+
+
+@pytest.mark.parametrize("key", NEUTRAL)
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_place_without_a_value_starts_where_nothing_happens(tmp_path, key, order) -> None:
+    """The base of a derivative and of a knob is the job's own, whichever values the factor lists and in which order."""
+    values = f"values: [{', '.join(NEUTRAL[key][::order])}]"
+    path = write_study(tmp_path, ("base/forward/M2, shift, 2]", f"{M2}, {key}]"), (NORMAL, values))
+    made = resolve_study(path)
+    assert GradientFactor.of(made, "m2z").value == 0.0
+    assert factor_knobs(made)[0].value == 0.0
+    job = read_job(made.base).job.perturb[M2]
+    assert job.uses() == (("temperature",) if "temperature" in key else ())
+    assert not job.heat.warms
+    again = study_from_text(made.to_yaml())
+    assert (again.tree, again.base, again.content) == (made.tree, made.base, made.content)
+
+
+def test_a_temperature_that_is_inherited_is_no_zero(tmp_path) -> None:
+    """M2 of the warmed camera is at 4 K in the base, where the place of the factor is none; runs are as ever."""
+    path = write_study(
+        tmp_path, ("base/forward/M2, shift, 2]", f"{M2}, temperature, change]"), (NORMAL, "uniform: [1 K, 2 K]")
+    )
+    with (tmp_path / "job.yaml").open("a", encoding="utf-8") as file:
+        file.write("perturb: {base/forward: {temperature: 4 K}}\n")
+    made = resolve_study(path)
+    assert read_job(made.base).job.perturb[M2].temperature is None
+    assert study_from_text(made.to_yaml()).base == made.base
+    run = dict(Plan.of(made).run(0).values)
+    place = ("job", "perturb", M2, "temperature", "change")
+    assert 1.0 <= read_job(with_values(made.tree, run.items())).job.perturb[M2].heat.change <= 2.0
+    assert place in run
+    for start in (lambda: GradientFactor.of(made, "m2z"), lambda: factor_knobs(made)):
+        with pytest.raises(InputError, match=r"factors\.m2z\.key: the base has no number here to start from"):
+            start()
+
+
 REFUSED = [
     (("M2, shift, 2]", "M2, shfit, 2]"), "factors.m2z.key[3]", "'shift'"),
     (("M2, shift, 2]", "M2, shift]"), "factors.m2z.key", "not a single value"),
@@ -180,6 +226,9 @@ def test_scaled_values(tmp_path) -> None:
         ("scales: [{key: [job, render, frames], power: 0.5}], values: [-1, 2]", "scales[0].power", "no such number"),
         ("scales: [{key: [job, render, frames]}], values: [1, 1e9]", "factors.m2z.values", "outside the limits"),
         ("key: [job, perturb, base/forward/M2, shift, 2], values: [1 um, 2 um], scales: [{key: [job, render, frames]}]",
+         "factors.m2z", "zero in the base"),
+        ("key: [job, perturb, base/forward/M3, figure, Z7], values: [5 nm, 9 nm], "
+         "scales: [{key: [job, render, frames]}]",
          "factors.m2z", "zero in the base"),
     ],
 )  # fmt: skip

@@ -11,9 +11,10 @@ from scipy import stats
 
 from scenes.specs.study import ParetoSpec
 from tests.twin.study_data import columns, dataset, study_of
+from twin.study.report.conclusions import warnings
 from twin.study.report.linear_model import linear_model
-from twin.study.report.sensitivity_indices import axis_functions, sensitivity_indices
-from twin.study.report.study_analysis import convergences, pareto_front, ranks_of, summary
+from twin.study.report.sensitivity_indices import NoIndices, axis_functions, sensitivity_indices
+from twin.study.report.study_analysis import StudyAnalysis, convergences, pareto_front, ranks_of, summary
 from twin.study.report.study_statistics import (
     Factor,
     StudyRuns,
@@ -269,6 +270,75 @@ def test_intervals_of_indices_hold_the_truth(shape, stated) -> None:
     assert min(inside.values()) >= least(0.94), inside
     # and they are no wider than the noise that may be a factor's: the last factor does little or nothing
     assert np.median(widths) < (0.06 if stated else 0.2)
+
+
+UNIFORM_THREE = "{" + ", ".join(f"{n}: {{key: [job, {n}], uniform: [-1.0, 1.0]}}" for n in "abc") + "}"
+
+
+def indices_of(function, runs: int, seed: int, failed=lambda y: np.zeros(len(y), bool), sigma: float = math.nan):
+    """Runs of a known function of three uniform factors, and their indices."""
+    stated = STATED if math.isfinite(sigma) else "{y: {key: [a, b_um]}}"
+    study = study_of(UNIFORM_THREE, f"{{kind: monte_carlo, runs: {runs}, seed: {seed}}}", stated, "{sobol: true}")
+    y = function(columns(study))
+    values = {"y": y} if stated != STATED else {"y": y, "y_sigma_noise": np.full(runs, sigma)}
+    data = dataset(study, values, failed(y))
+    found = StudyRuns.of(data, study)
+    return found, sensitivity_indices(found, found.responses[0])
+
+
+def test_many_failed_runs_leave_no_indices() -> None:
+    """Where 2 a + b is large runs fail: the exact shares 0.8 and 0.2 are those of a variance that no run shows."""
+    _, found = indices_of(lambda x: 2.0 * x["a"] + x["b"], 200, 1, lambda y: y > 0.5)
+    assert isinstance(found, NoIndices)
+    assert "of 200 runs have no number" in found.reason
+
+
+def test_few_failed_runs_widen_the_intervals() -> None:
+    """The truth of all runs, 0.8, 0.2 and 0, is within; what fits the others exactly alone would be told to 1e-10."""
+    for seed in range(6):
+        _, found = indices_of(lambda x: 2.0 * x["a"] + x["b"], 200, seed, lambda y: y > np.sort(y)[-4])
+        for index in found.axes:
+            truth = {"a": 0.8, "b": 0.2, "c": 0.0}[index.name]
+            for estimate in (index.first, index.total):
+                low, high = estimate.interval
+                assert low <= truth <= high
+                # three of 200 values of up to 2.5 sigma either side make some percent of the variance, each way
+                assert high - low > 0.02
+
+
+def test_a_total_index_is_no_less_than_the_first_order() -> None:
+    """A step with noise, of which 40 runs show little: without care half of the totals were less."""
+    for seed in range(8):
+        _, found = indices_of(lambda x: (x["a"] > 0.6) + 0.2 * x["b"], 40, seed)
+        for index in found.axes:
+            assert index.total.value >= index.first.value
+            assert all(t >= f for t, f in zip(index.total.interval, index.first.interval, strict=True))
+
+
+@pytest.mark.slow
+def test_intervals_hold_where_a_peak_is_narrow() -> None:
+    """A peak of 5% of a factor's range, which 100 runs meet some six times; the total of a is 0.84 by quadrature."""
+    a = np.linspace(-1.0, 1.0, 200_001)
+    peak = np.var(np.exp(-0.5 * ((a - 0.3) / 0.02) ** 2))
+    truth = peak / (peak + 0.1**2 / 3.0)
+    inside = 0
+    for seed in range(SEEDS):
+        _, found = indices_of(lambda x: np.exp(-0.5 * ((x["a"] - 0.3) / 0.02) ** 2) + 0.1 * x["b"], 200, seed)
+        inside += holds(next(index for index in found.axes if index.name == "a").total, truth)
+    assert inside >= least(0.95)
+
+
+def test_methods_that_disagree_are_said() -> None:
+    """A wave of nearly five periods that no polynomial follows, and noise stated that is as large and is not there."""
+    runs, found = indices_of(lambda x: np.cos(4.8 * PI * x["a"]) + 0.3 * x["b"], 400, 1, sigma=math.sqrt(0.5))
+    wrong = next(index for index in found.axes if index.name == "a")
+    assert wrong.check > 0.8
+    assert wrong.agrees is False
+    told = warnings(StudyAnalysis.of(runs))
+    assert any("of a by polynomial chaos and by RBD-FAST do not agree" in text for text in told)
+    for seed in range(4):
+        _, good = indices_of(lambda x: x["a"] * (1.0 + x["b"]) + 0.3 * x["c"], 100, seed)
+        assert all(index.agrees for index in good.axes)
 
 
 def test_a_grid_is_taken_apart_exactly() -> None:

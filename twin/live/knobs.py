@@ -14,10 +14,11 @@ from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.job import JobSpec
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.study import DesignSpec, FactorSpec
-from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
-from twin.study.runs.base_job import Tree, leaf, with_values
+from twin.study.runs.base_job import Tree, with_values
 from twin.study.runs.plan import Plan
+from twin.study.runs.sampling import number_at
 from twin.study.runs.setup import StudySetup
 
 AXES = ("x", "y", "z")
@@ -272,7 +273,7 @@ def base_with(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
     """
     factors = {name: _fixed(setup.study.factors[name], scalar) for name, scalar in scalars.items()}
     one = setup.study.model_copy(update={"factors": factors, "design": DesignSpec(kind="grid")})
-    return with_values(setup.tree, Plan.of(StudySetup(one, setup.tree)).run(0).values)
+    return with_values(setup.base, Plan.of(replace(setup, study=one)).run(0).values)
 
 
 def _fixed(factor: FactorSpec, scalar: Any) -> FactorSpec:
@@ -293,7 +294,10 @@ def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | No
         values = [mean - 4.0 * sigma, mean + 4.0 * sigma] if factor.kind == "normal" else values[2:]
     base = 1.0
     if factor.places:
-        base = _number(leaf(setup.tree, factor.places[0]), unit, values[0])
+        try:
+            base = number_at(setup.base, factor.places[0], unit)
+        except Problem as problem:
+            raise setup.error(problem, ("factors", name, *factor.key_of(0))) from None
     knobs = {} if factor.scales else _knobs(factor.places, unit)
     return FactorKnob(name, unit, min(*values, base), max(*values, base), base, numbers.whole, knobs)
 

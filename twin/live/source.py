@@ -250,7 +250,7 @@ def _of_study(file: Path, run: int | None) -> Source:
         )
     factors, name = factor_knobs(setup), setup.study.name
     if run is None:
-        resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", setup.tree, {}))
+        resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", setup.base, {}))
         return Source(resolved, about=f"the base of the study {name}", study=setup, factors=factors)
     plan = Plan.of(setup)
     if not 0 <= run < plan.runs:

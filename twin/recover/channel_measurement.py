@@ -16,6 +16,7 @@ from analysis.spots.frame_screening import (
     noise_ratio,
     screen_frames,
     shown_noise,
+    subtracted_level,
 )
 from analysis.spots.learnt_template import (
     FittedSpot,
@@ -130,6 +131,7 @@ class ChannelMeasurement:
         self._screened: list[ScreenedFrames] = []
         self._noise_ratios: list[float | None] = []
         self._noisy = False
+        self._level: tuple[Finding, ...] = ()
         self._examined: list[Examined | None] = []
         self._costs: dict[int, float] = {}
         self._widened: list[float] = []
@@ -153,7 +155,7 @@ class ChannelMeasurement:
         known = channel.correction is None and channel.transfer is None
         untouched = all(screened.clean for screened in self._screened)
         untouched &= all(one is None or one.clean for one in self._examined)
-        as_stated = known and not self._noisy
+        as_stated = known and not self._noisy and not self._level
         return whole and same and integers and as_stated and untouched and self._test.vibration == "none"
 
     def _template(self, state: StateFrames) -> SpotTemplate:
@@ -165,12 +167,18 @@ class ChannelMeasurement:
     def search(self) -> list[Issue]:
         """Compare frames with each other, and images with the shape of the spot; what is refused."""
         issues: list[Issue] = []
+        try:
+            self._show_level()
+        except FramesError as error:
+            name = self.channel.name
+            return [cannot_measure(self._test, self.channel.before, name, str(error), error.remedy)]
         self._show_noise()
         for number, state in enumerate(self.channel.states):
             burnt = ""
             try:
                 screened = self._screen(state)
                 burnt = "; ".join(found.text for found in screened.findings if found.kind == "saturation")
+                screened = replace(screened, findings=(*screened.findings, *self._level))
                 if self.shape is None:
                     screened, self._learnt_from = self._learn(screened)
                     self.shape = self._learnt_from.shape
@@ -184,12 +192,36 @@ class ChannelMeasurement:
                 break
         return issues
 
+    def _show_level(self) -> None:
+        """Let the detector have the lowest level of its frames, where that was subtracted. Raises FramesError."""
+        channel = self.channel
+        below = max(
+            subtracted_level(state.frames, channel.raw_noise, state.bad_part(channel.bad), let_go)
+            for state in channel.states
+        )
+        if below == 0.0:
+            return
+        if channel.correction is not None:
+            raise FramesError(
+                f"beside the spot the frames are {below:.3g} DN darker than without light, as if a level had been "
+                "subtracted from them that the dark frames have",
+                "frames and dark frames as they were recorded, or no dark frames",
+            )
+        low = replace(
+            channel.raw_noise,
+            offset_dn=channel.raw_noise.offset_dn - below,
+            saturation_dn=channel.raw_noise.saturation_dn - below,
+        )
+        self.channel = replace(channel, raw_noise=low, noise=low)
+        text = f"{below:.4g} DN are missing below the spot; its noise is that of the light above what is left"
+        self._level = (Finding("subtracted level", text, corrects=False),)
+
     def _show_noise(self) -> None:
         """From here on the detector has the noise of its noisiest frames, where that is more than stated."""
         channel = self.channel
         shown = []
         for state in channel.states:
-            bad = None if channel.bad is None else state.of_ccd(channel.bad)
+            bad = state.bad_part(channel.bad)
             ratio = noise_ratio(state.frames, channel.raw_noise, bad, released=let_go)
             self._noise_ratios.append(ratio)
             shown.append(shown_noise(state.frames, channel.raw_noise, ratio, bad, let_go).dark_noise_e)

@@ -18,6 +18,7 @@ from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PhotonTransfer, PixelCorrection, photon_transfer, pixel_correction
 from scenes.specs.course import moment
+from scenes.specs.detector import DetectorSpec
 from scenes.specs.measured.monitor_frames import AFTER, BEFORE, MeasurementSetup, MeasurementSpec, per_channel
 from scenes.yaml.errors import InputError, Issue, KeyPath
 from scenes.yaml.spec import Spec
@@ -154,6 +155,10 @@ class StateFrames:
         (row, column), (height, width) = self.offset, self.shape
         return whole[row : row + height, column : column + width]
 
+    def bad_part(self, bad: np.ndarray | None) -> np.ndarray | None:
+        """The part of a map of bad pixels of the whole CCD that the frames show; None for no map."""
+        return None if bad is None else self.of_ccd(bad)
+
 
 @dataclass(frozen=True, eq=False)
 class ChannelFrames:
@@ -205,7 +210,7 @@ def read_measurement(
     issues: list[Issue] = []
     for number, name in enumerate(setup.channels):
         try:
-            out.append(_channel(setup.test, name, noise, ccd))
+            out.append(_channel(setup.test, name, noise, ccd, setup.detector))
         except InputError as error:
             issues += error.issues
         advance(number + 1)
@@ -214,7 +219,9 @@ def read_measurement(
     return tuple(out)
 
 
-def _channel(test: MeasurementSpec, name: str, noise: NoiseModel, ccd: Shape | None) -> ChannelFrames:
+def _channel(
+    test: MeasurementSpec, name: str, noise: NoiseModel, ccd: Shape | None, detector: DetectorSpec
+) -> ChannelFrames:
     assert not isinstance(test.frames, str)
     files = test.frames[name]
     key: KeyPath = ("frames", name)
@@ -229,6 +236,13 @@ def _channel(test: MeasurementSpec, name: str, noise: NoiseModel, ccd: Shape | N
         )
     for state in (before, *after):
         _check_place(test, state, ccd)
+        _check_values(test, state, detector)
+    stated = "offset" in files.model_fields_set
+    _check_part(test, before, before.shape == ccd or stated, f"the CCD of {ccd[0]} x {ccd[1]} pixels", "offset")
+    same = before.shape if stated else ccd
+    for state in after:
+        known = state.shape == (same if files.offset_after is None else after[0].shape)
+        _check_part(test, state, known, f"the frames before or those of the CCD, {same[0]} x {same[1]}", "offset_after")
     dark, flat = (_maps(test, what, name, ccd, before) for what in ("dark", "flat"))
     bad = _bad(test, name, ccd, before)
     transfer = correction = None
@@ -335,6 +349,35 @@ def _check_place(test: Spec, state: StateFrames, ccd: Shape) -> None:
             "frames of the instrument's area CCD or a part of it with its offset; or rows and columns of area_ccd in"
             " the instrument that are those of the frames",
         )  # fmt: skip
+
+
+def _check_part(test: Spec, state: StateFrames, known: bool, others: str, key: str) -> None:
+    """See whether it is stated which part of the CCD the frames of a state show. Raises InputError."""
+    if not known:
+        text = f"{state.files[0]}: frames of {state.shape[0]} x {state.shape[1]} pixels are not of the size of {others}"
+        remedy = f"{key}: [ROW, COLUMN] of the CCD at which they begin, one size for all frames of a series"
+        raise _told(test, state.key, f"{text}, and nothing says where they begin", remedy)
+
+
+def _check_values(test: Spec, state: StateFrames, detector: DetectorSpec) -> None:
+    """See whether the converter can give the grey values of frames that are whole numbers. Raises InputError."""
+    largest, bits, different = 0, 0, False
+    for frame in state.frames:
+        values = frame[np.isfinite(frame)]
+        whole = values.astype(np.int64)
+        if not np.array_equal(values, whole):
+            break
+        different = different or (whole.size > 0 and int(whole.min()) < int(whole.max()))
+        largest, bits = max(largest, int(whole.max(initial=0))), bits | int(np.bitwise_or.reduce(whole, initial=0))
+    else:
+        step, most = bits & -bits if different else 1, detector.max_dn
+        if largest > most or step > 1:
+            text = f"{state.files[0]} has grey values up to {largest}"
+            text += f", all multiples of {step}" if step > 1 else ""
+            text += f"; the converter of {detector.name} with {detector.bit_depth} bits gives 0 to {most} in steps of 1"
+            remedy = f"frames divided by {step}: they are aligned to the left" if step > 1 else "the right `detector`"
+            raise _told(test, state.key, text, remedy)
+    let_go(state.frames)
 
 
 def _maps(test: MeasurementSpec, what: str, name: str, ccd: Shape, before: StateFrames) -> np.ndarray | None:

@@ -167,7 +167,7 @@ def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: i
     study = validate(StudySpec, YamlFile("", data, {}))
     tree = setup.plain()
     tree[DRAWS] = dict.fromkeys((number.name for number in bench.numbers), 0.0)
-    return StudySetup(study, tree)
+    return StudySetup(study, tree, tree)
 
 
 @dataclass(frozen=True, eq=False)

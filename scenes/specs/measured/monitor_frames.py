@@ -48,8 +48,8 @@ class ChannelFramesSpec(Spec):
     Attributes:
         before: files of the nominal state.
         after: files of the state to be measured; of a series one entry for each time, a file or a list of files.
-        offset: row and column of the CCD at which the frames' first pixel stands.
-        offset_after: the same of the frames after, where it is another one.
+        offset: row and column of the CCD at which the frames' first pixel stands; needed for frames of a part of it.
+        offset_after: the same of the frames after, where it is another one; needed where they have another size.
     """
 
     before: Files
@@ -448,12 +448,11 @@ class _FrameTable:
                 if when not in one:
                     told = when if isinstance(when, str) else f"at {moment(when)}"
                     raise InputError(Issue(f"no file of {channel} {told}", file, None, allowed="a row for each state"))
-            after = corners.get((channel, False), (0, 0))
+            corner = {"offset": corners.get((channel, True)), "offset_after": corners.get((channel, False))}
             frames[channel] = ChannelFramesSpec.model_construct(
                 before=tuple(one[BEFORE]),
                 after=tuple(tuple(one[when]) for when in order),
-                offset=corners.get((channel, True), (0, 0)),
-                offset_after=after,
+                **{key: pixel for key, pixel in corner.items() if pixel is not None},
             )
         times = tuple(when for when in order if isinstance(when, float))
         return frames, times

@@ -32,7 +32,7 @@ from twin.run.procedure import Advance, silent
 from twin.study.gradient.gradient_chain import CAP, SHARES, Chain, Slopes, extrapolated, motion_slopes, sight_gradient
 from twin.study.runs.base_job import Failure, Run, leaf
 from twin.study.runs.render_base import PERTURB, JobMaker
-from twin.study.runs.sampling import number_in, number_of, ratios, scaled
+from twin.study.runs.sampling import number_at, number_of, ratios, scaled
 from twin.study.runs.setup import StudySetup
 
 
@@ -95,7 +95,7 @@ class GradientFactor:
         cell = with_unit(value, self.unit) if self.unit else value
         out: dict[KeyPath, Any] = dict.fromkeys(self.spec.places, cell)
         if self.spec.scales:
-            tree = self.setup.tree
+            tree = self.setup.base
             try:
                 found = ratios(self.spec, tree, np.array([value]), self.unit)
                 out.update({place: scaled(number_of(leaf(tree, place)), float(r[0])) for place, r in found.items()})
@@ -106,22 +106,17 @@ class GradientFactor:
 
 def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> float:
     """The factor's value in the base, in its own unit; 1 for one that only scales."""
-    found = [leaf(setup.tree, place) for place in factor.places]
-    if not found:
-        return 1.0
     numbers: list[float] = []
-    for k, value in enumerate(found):
-        number = number_in(value, unit)
-        if number is None:
-            what = shown(value) if value is not None else "nothing"
-            problem = Problem("the base has no number here to differentiate at", what, "a number of the factor's kind")
-            raise setup.error(problem, ("factors", name, *factor.key_of(k)))
-        numbers.append(number)
-        # values that are written in several units agree to rounding
-        if abs(number - numbers[0]) > 1e-12 * abs(numbers[0]):
-            text = "the places of the factor have different values in the base, so that it has none"
-            raise setup.error(Problem(text, shown(value), shown(found[0])), ("factors", name, *factor.key_of(k)))
-    return numbers[0]
+    for k, place in enumerate(factor.places):
+        try:
+            numbers.append(number_at(setup.base, place, unit))
+            # values that are written in several units agree to rounding
+            if abs(numbers[k] - numbers[0]) > 1e-12 * abs(numbers[0]):
+                text = "the places of the factor have different values in the base, so that it has none"
+                raise Problem(text, *(shown(leaf(setup.base, factor.places[i])) for i in (k, 0)))
+        except Problem as problem:
+            raise setup.error(problem, ("factors", name, *factor.key_of(k))) from None
+    return numbers[0] if numbers else 1.0
 
 
 MOVE = 2.0

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from scenes.specs.samplers import GRID, SAMPLERS
 from twin.run.artefact import decimals_for, fixed, significant
 from twin.run.report import answer
-from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, NoIndices
+from twin.study.report.sensitivity_indices import HARMONICS, MANY_FAILED, RESAMPLES, Indices, NoIndices
 from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
 from twin.study.report.study_statistics import LEAST, Description, Estimate, Interval, Response, impossible, typeset
 
-MANY_FAILED = 0.05
 BAD_MODEL = 0.8
 
 
@@ -36,6 +35,13 @@ def warnings(found: StudyAnalysis) -> list[str]:
             )
     wrong = impossible(runs)
     out += [str(issue) for issue in wrong.issues] if wrong is not None else []
+    for name, part in found.indices.items():
+        apart = [one for one in part.axes if one.agrees is False] if isinstance(part, Indices) else []
+        if apart:
+            out.append(
+                f"{name}: the Sobol indices of {listed([one.name for one in apart])} by polynomial chaos and by "
+                "RBD-FAST do not agree, so that neither holds; more runs will tell."
+            )
     doubts = [text for text in runs.doubts if text]
     if doubts:
         # the same words about other numbers are one reason
@@ -71,7 +77,10 @@ def indices_texts(found: StudyAnalysis) -> list[str]:
             f"From the given runs ({design_title(found.runs.kind)}; not a design made for the indices): polynomial "
             f"chaos, whose squared coefficients are the parts of the variance. Intervals from {RESAMPLES} resamples of "
             "the runs, for the terms that were chosen and as far into the tails as these runs reach; what the terms "
-            "leave may belong to any factor and counts for every upper end, less the noise that the runs state. "
+            "leave may belong to any factor and counts for every upper end, less the noise that the runs state. What "
+            f"happens in less than {percent(3.7 / max(found.runs.count, 4), 1)} of the factors' distribution may have "
+            "been met by no run and is in no interval. Runs without a number count as any within the range of the "
+            "others. "
             f"RBD-FAST with {HARMONICS} harmonics beside it."
         ]
     else:

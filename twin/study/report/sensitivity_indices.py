@@ -164,6 +164,11 @@ RUNS_PER_TERM = 2.5
 RESAMPLES = 1000
 HARMONICS = 10
 """Harmonics of the factor's cycle that RBD-FAST sums."""
+MANY_FAILED = 0.05
+"""Share of runs without a number beyond which the others say too little of the stated distributions."""
+DISAGREE = 3.0
+"""Over the root of the number of runs: distance of RBD-FAST's index from the interval of polynomial chaos at which they
+disagree, five standard deviations of the former for smooth responses of 100 to 300 runs."""
 
 
 @dataclass(frozen=True)
@@ -175,12 +180,14 @@ class Index:
         first: share of the variance that the axis explains alone.
         total: share that is gone when the axis is fixed.
         check: first order by RBD-FAST, which needs no model; None where it cannot be used.
+        agrees: whether that lies within the interval of ``first``, but for its noise; None without it.
     """
 
     factors: tuple[str, ...]
     first: Estimate
     total: Estimate
     check: float | None = None
+    agrees: bool | None = None
 
     @property
     def name(self) -> str:
@@ -227,7 +234,9 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     Reliability Engineering and System Safety 93, 964, 2008); the variances are sums of its squared coefficients, less
     what their noise adds. The degree is that with the smallest error of runs left out in turn. Intervals come from 1000
     resamples of the runs. They are those of the terms that were chosen; what these leave may belong to any factor, and
-    counts for the upper end of each as far as the runs do not state it as noise.
+    counts for the upper end of each as far as the runs do not state it as noise. Where few runs have no number, the
+    intervals reach as far as any numbers within the range of the others would move them; where many have none, the
+    others have another distribution than the factors, and there are no indices.
 
     Args:
         runs: of the study.
@@ -247,6 +256,9 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     n = len(response.known)
     if n < LEAST:
         return NoIndices(f"{n} runs are too few; {LEAST} or more are needed")
+    if runs.count - n > MANY_FAILED * runs.count:
+        without = f"{runs.count - n} of {runs.count} runs have no number"
+        return NoIndices(f"{without}, so that the others do not follow the distributions of the factors")
     good = response.good & (np.cumsum(response.good) <= MOST_RUNS)
     try:
         chaos = _Chaos.fitted(axes, good, response.values[good])
@@ -255,7 +267,7 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     if chaos is None:
         return NoIndices(f"{n} runs are too few for {len(axes)} factors")
     own = 0.0 if noise is None else noise * float(np.var(response.known, ddof=1))
-    found = chaos.indices(own, runs.study.design.seed)
+    found = chaos.indices(own, runs.study.design.seed, ~response.good)
     return Indices("chaos", found, chaos.degree, len(chaos.coefficients), chaos.held_out, chaos.rest, noise)
 
 
@@ -348,10 +360,7 @@ class _Chaos:
         good: np.ndarray,
     ) -> _Chaos | None:
         n, m = len(y), len(terms)
-        columns = np.ones((n, m + 1))
-        for k, (values, _) in enumerate(functions):
-            used = terms[:, k] > 0
-            columns[:, 1:][:, used] *= values[:, terms[used, k] - 1]
+        columns = _columns([values for values, _ in functions], terms)
         q, r = np.linalg.qr(columns)
         size = np.abs(np.diag(r))
         if size.min() < 1e-6 * size.max():
@@ -366,28 +375,60 @@ class _Chaos:
         total = float(np.sum(coefficients[1:] ** 2)) + rest
         return cls(axes, terms, coefficients[1:], y, q, r, degree, held_out, rest / total, good)
 
-    def indices(self, noise: float, seed: int) -> tuple[Index, ...]:
+    def indices(self, noise: float, seed: int, missing: np.ndarray) -> tuple[Index, ...]:
         """Indices of every axis, the largest total first.
 
         Args:
             noise: variance of the noise that the runs state, 0 where they state none.
             seed: of the resamples.
+            missing: (runs,) which runs have no number.
         """
-        first, total = self._shares()
-        lows, highs = self._resampled(noise, seed)
+        shares = self._shares()
+        ends = [
+            np.quantile(some, share, axis=0)
+            for some, share in zip(
+                self._resampled(noise, seed), (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE), strict=True
+            )
+        ]
+        if np.any(missing):
+            ends = self._with_missing(ends[0], ends[1], missing)
+        low, high = np.minimum(ends[0], shares), np.maximum(ends[1], shares)
         out = []
         for k, axis in enumerate(self.axes):
-            names = tuple(factor.name for factor in axis)
-            alone = _estimate(first[k], lows[:, 0, k], highs[:, 0, k])
-            whole = _estimate(total[k], lows[:, 1, k], highs[:, 1, k])
-            out.append(Index(names, alone, whole, _rbd_fast(axis, self.good, self.y)))
+            alone, whole = (Estimate(float(shares[i, k]), (float(low[i, k]), float(high[i, k]))) for i in (0, 1))
+            check, reach = _rbd_fast(axis, self.good, self.y), DISAGREE / math.sqrt(len(self.y))
+            agrees = None if check is None else bool(low[0, k] - reach <= check <= high[0, k] + reach)
+            out.append(Index(tuple(f.name for f in axis), alone, whole, check, agrees))
         return tuple(sorted(out, key=lambda index: -index.total.value))
 
+    def _with_missing(self, low: np.ndarray, high: np.ndarray, missing: np.ndarray) -> list[np.ndarray]:
+        """Ends of intervals (2, axes) that hold for any responses of the missing runs within the range of the others.
+
+        A run of N that is off the polynomials by d, where these have the part p of an axis, changes the variance of the
+        axis by 2 p d / N, and by d^2 / N at most beside it.
+        """
+        functions = [axis_functions(axis, missing, HIGHEST_DEGREE)[0] for axis in self.axes]
+        terms = _columns(functions, self.terms)[:, 1:] * self.coefficients
+        constant = float(np.mean(self.y - (self.q @ self.r)[:, 1:] @ self.coefficients))
+        away = constant + terms.sum(axis=1)
+        off = np.maximum(self.y.max() - away, away - self.y.min())
+        used = self.terms > 0
+        parts = np.stack([terms @ (used & (used.sum(axis=1) == 1)[:, None]), terms @ used])
+        variance, runs = float(np.var(self.y)), len(missing)
+        moved = 2.0 / runs * np.sum(np.abs(parts) * off[:, None], axis=1) / variance
+        whole = 2.0 / runs * float(np.sum(np.abs(terms.sum(axis=1)) * off)) / variance
+        added = float(np.sum(off**2)) / runs / variance
+        lowest = np.maximum(low - moved, 0.0) / (1.0 + whole + added)
+        return [lowest, np.minimum((high + moved + added) / max(1.0 - whole, TINY), 1.0)]
+
     def _parts(self, squares: np.ndarray) -> np.ndarray:
-        """Sums of squared coefficients (..., m): of each axis alone, and of all terms with it, (..., 2, axes)."""
+        """Sums of squared coefficients (..., m): of each axis alone, and of all terms with it, (..., 2, axes). Together
+        with others an axis explains no less than alone, although what is taken off for noise may be more than is there.
+        """
         used = self.terms > 0
         alone = used & (used.sum(axis=1) == 1)[:, None]
-        return np.stack([squares @ alone, squares @ used], axis=-2)
+        first = squares @ alone
+        return np.stack([first, first + np.maximum(squares @ (used & ~alone), 0.0)], axis=-2)
 
     @cached_property
     def _fit_rest(self) -> tuple[np.ndarray, float]:
@@ -427,13 +468,16 @@ class _Chaos:
         each = wide * (np.linalg.solve(self.r, self.q.T)[1:] * out).T
         spread = np.sum(each**2, axis=0)
         generator = np.random.default_rng(np.random.SeedSequence(seed))
+        # where few runs carry what is left (a narrow peak), chance decides how many do, as in Poisson's distribution;
+        # the number that carry it equally, and the upper limit of what may be expected where so many were met
+        events = float(np.sum(out**2) ** 2 / np.sum(out**4)) if rest > 0.0 else 1.0
         lows, highs = [], []
         for _ in range(RESAMPLES // 100):
             more = generator.poisson(1.0, (100, n)) - 1.0
             moved = self.coefficients + more @ each
             # about the estimate: the squares of what is added are taken off
             squares = moved**2 - self.coefficients**2 - spread + self._squares
-            unexplained = np.maximum(held_out + wide * (more @ (out**2 - held_out)) / n, 0.0)
+            unexplained = held_out * generator.gamma(events + 1.0, 1.0 / events, 100)
             whole = np.maximum(np.sum(squares, axis=-1), 0.0) + unexplained
             parts, whole = self._parts(squares), np.maximum(whole, TINY)[:, None, None]
             lows.append(np.clip(parts / whole, 0.0, 1.0))
@@ -441,10 +485,13 @@ class _Chaos:
         return np.concatenate(lows), np.concatenate(highs)
 
 
-def _estimate(value: float, lows: np.ndarray, highs: np.ndarray) -> Estimate:
-    side = 0.5 * (1.0 - CONFIDENCE)
-    low, high = float(np.quantile(lows, side)), float(np.quantile(highs, 1.0 - side))
-    return Estimate(float(value), (min(low, float(value)), max(high, float(value))))
+def _columns(functions: Sequence[np.ndarray], terms: np.ndarray) -> np.ndarray:
+    """Return the constant and the products of functions (n, m + 1) that terms (m, axes) name."""
+    columns = np.ones((len(functions[0]), len(terms) + 1))
+    for k, values in enumerate(functions):
+        used = terms[:, k] > 0
+        columns[:, 1:][:, used] *= values[:, terms[used, k] - 1]
+    return columns
 
 
 def _terms(degrees: Sequence[np.ndarray], degree: int, norm: float, runs: int) -> np.ndarray | None:

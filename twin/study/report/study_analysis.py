@@ -397,6 +397,7 @@ INDEX: Record[Index] = Record(
     Quantity("first", lambda index: index.first, "share of the variance that it explains alone", record=ESTIMATE),
     Quantity("total", lambda index: index.total, "share that is gone when it is fixed", record=ESTIMATE),
     Quantity("first_rbd_fast", lambda index: index.check, "first order by RBD-FAST, which needs no model"),
+    Quantity("rbd_fast_agrees", lambda index: index.agrees, "whether that is in the interval, but for its noise"),
 )
 INDICES: Record[Indices] = Record(
     "Sobol indices of a response.",

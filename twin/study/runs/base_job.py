@@ -19,7 +19,8 @@ from optics.numerics.physical_error import PhysicalError
 from scenes.specs.procedures import Procedure
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, shown
-from scenes.yaml.spec import Spec, annotation_at, validate
+from scenes.yaml.quantity import Quantity
+from scenes.yaml.spec import ZERO_IS_NONE, Spec, annotation_at, metadata_at, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.run.procedure import silent
 
@@ -136,13 +137,14 @@ def one_line(error: Exception) -> str:
 Tree = dict[str, Any]
 
 
-def with_place(tree: Tree, model: type[Spec], key: KeyPath) -> Tree:
+def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = False) -> Tree:
     """The tree in which ``key`` leads to a single value; what is missing but may be there is made with its defaults.
 
     Args:
         tree: plain data of a ``model``; not changed.
         model: what the tree describes.
         key: keys and list indices from the root.
+        neutral: whether a number without a default, which would be None, is zero where zero has the same effect.
 
     Raises:
         Problem: it leads nowhere; ``within`` is the part that does not fit.
@@ -159,10 +161,32 @@ def with_place(tree: Tree, model: type[Spec], key: KeyPath) -> Tree:
             node = node[part]
         else:
             raise Problem("a single value has nothing below it", shown(part), "a shorter key", within=(k,))
+    if node is None and neutral and ZERO_IS_NONE in (metadata := metadata_at(model, key)):
+        quantity = next((item for item in metadata if isinstance(item, Quantity)), None)
+        out = with_values(out, [(key, 0.0 if quantity is None else quantity.format(0.0))])
     if isinstance(node, dict | list):
         below = names_text(node) if isinstance(node, dict) else f"0 to {len(node) - 1}"
         raise Problem("not a single value", shown(node), f"one of {below} after it")
     return out
+
+
+def says_nothing(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
+    """Return whether all that ``with_place`` adds for ``key`` has the same effect as its absence.
+
+    Args:
+        tree: plain data of a ``model``.
+        model: what the tree describes.
+        key: keys and list indices from the root, which lead somewhere.
+    """
+    node: Any = tree
+    for k, part in enumerate(key):
+        node = node[part] if isinstance(node, list) else node.get(part) if node is not None else None
+        if node is None and not isinstance(part, int):
+            owner = annotation_at(model, key[:k])
+            filled = owner.model_fields[part].default is not None if _is_model(owner) else k < len(key) - 1
+            if not filled and ZERO_IS_NONE not in metadata_at(model, key[: k + 1]):
+                return False
+    return True
 
 
 def key_now(model: type[Spec], key: KeyPath) -> KeyPath:

@@ -102,7 +102,7 @@ class Plan:
     def _ratios(self, column: Column, values: np.ndarray) -> dict[KeyPath, np.ndarray]:
         factor = self.setup.study.factors[column.name]
         try:
-            return ratios(factor, self.setup.tree, values, column.unit) if factor.scales else {}
+            return ratios(factor, self.setup.base, values, column.unit) if factor.scales else {}
         except Problem as problem:
             raise self.setup.error(problem, ("factors", column.name)) from None
 

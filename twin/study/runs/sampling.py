@@ -190,12 +190,32 @@ def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
     """The factor's value in the base, in its own unit; 1 for a factor that is itself the ratio."""
     if not factor.places:
         return 1.0
-    value = leaf(tree, factor.places[0])
-    number = number_in(value, unit)
-    if number is None:
-        raise Problem("nothing to compare it with", f"{shown(value)} in the base", "a number like the factor's")
+    number = number_at(tree, factor.places[0], unit)
     if number == 0.0:
         raise Problem("nothing to compare it with", "zero in the base", "scales in a factor without a key")
+    return number
+
+
+def number_at(base: Tree, place: KeyPath, unit: str) -> float:
+    """Return the number that the base has at the place of a factor, in a unit.
+
+    Args:
+        base: the base's own tree, without values of factors.
+        place: of the factor.
+        unit: of the factor's numbers, empty for pure numbers.
+
+    Raises:
+        Problem: the base has no value there, or none of that kind.
+    """
+    try:
+        value = leaf(base, place)
+    except Problem:
+        value = None
+    number = None if value is None else number_in(value, unit)
+    if number is None:
+        found = "nothing" if value is None else f"{shown(value)} in the base"
+        allowed = "a number like the factor's, which the base's file states"
+        raise Problem("the base has no number here to start from", found, allowed)
     return number
 
 

@@ -26,7 +26,7 @@ from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.old_keys import tell
 from scenes.yaml.spec import Source, Spec, validate
 from twin.run.provenance import source_digest, versions
-from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, key_now, with_place, with_values
+from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, key_now, says_nothing, with_place, with_values
 
 BY_NAME = ("instrument", "disturbances")
 """Keys of a job whose files are parts of the resolved base, beside the job; a change of the name would change nothing.
@@ -43,11 +43,15 @@ class StudySetup:
 
     Attributes:
         study: as the user wrote it, with the tables' values.
-        tree: plain data of the resolved base, as its config.yaml holds them, with a place for every factor.
+        tree: plain data of the resolved base with a place for every factor; where the base has no value, and none has
+            the same effect, one of the factor's.
+        base: the same without any value of a factor: a place is there only if the base has a value at it, or one
+            that has the same effect as none.
     """
 
     study: StudySpec
     tree: Tree
+    base: Tree
 
     @cached_property
     def job(self) -> BaseJob:
@@ -56,7 +60,7 @@ class StudySetup:
 
     def to_yaml(self) -> str:
         """Text of the study's config.yaml, which ``resolve_study`` reads back to the same values."""
-        return yaml_file.dump_yaml({"study": self.study.plain(), "base": self.tree})
+        return yaml_file.dump_yaml({"study": self.study.plain(), "base": self.base})
 
     @cached_property
     def content(self) -> str:
@@ -66,7 +70,7 @@ class StudySetup:
         # in their order: what is drawn for a factor, and the column of a response, go by their numbers
         study["factors"] = list(study["factors"].items())
         study["responses"] = [{k: v for k, v in one.items() if k != "unit"} for one in study["responses"].values()]
-        content = json.dumps([study, self.tree, self.job.block], sort_keys=True)
+        content = json.dumps([study, self.base, self.job.block], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
 
     @cached_property
@@ -128,7 +132,7 @@ def base_of(setup: StudySetup) -> Spec:
     source = setup.study.source
     if source.prefix:  # a study's config.yaml holds it
         below = {key[1:]: line for key, line in source.lines.items() if key[:1] == ("base",)}
-        return validate(setup.job.model, yaml_file.YamlFile(source.file, setup.tree, below))
+        return validate(setup.job.model, yaml_file.YamlFile(source.file, setup.base, below))
     return setup.job.resolve(_base_file(setup.study))
 
 
@@ -208,24 +212,34 @@ def _base_file(study: StudySpec) -> Path:
 
 def _placed(study: StudySpec, tree: Tree) -> StudySetup:
     """The study, with a place for every factor in its base; the factors' extreme values are tried by the schema."""
-    setup = StudySetup(study, tree)
+    setup, base = StudySetup(study, tree, tree), tree
     model = setup.job.model
+    changed: list[tuple[KeyPath, KeyPath, bool]] = []
     for name, factor in study.factors.items():
-        for k, place in enumerate(factor.places):
-            try:
-                _refuse_names(study, place)
-                tree = with_place(tree, model, place)
-            except Problem as problem:
-                raise setup.error(problem, ("factors", name, *factor.key_of(k))) from None
-        for k, scale in enumerate(factor.scales):
-            try:
-                _refuse_names(study, scale.key)
-                tree = with_place(tree, model, scale.key)
-            except Problem as problem:
-                raise setup.error(problem, ("factors", name, "scales", k, "key")) from None
+        changed += [(place, ("factors", name, *factor.key_of(k)), True) for k, place in enumerate(factor.places)]
+    for name, factor in study.factors.items():
+        changed += [(s.key, ("factors", name, "scales", k, "key"), False) for k, s in enumerate(factor.scales)]
+    for place, at, is_set in changed:
+        try:
+            _refuse_names(study, place)
+            tree = with_place(tree, model, place, neutral=is_set)
+            if says_nothing(base, model, place) and not _inherited(base, place):
+                base = with_place(base, model, place, neutral=is_set)
+        except Problem as problem:
+            raise setup.error(problem, at) from None
     # an entry that was made for one factor may need another factor's value to be valid
     tree = with_values(tree, [(place, f.scalars()[-1]) for f in study.factors.values() for place in _unset(tree, f)])
-    return StudySetup(study, tree)
+    return StudySetup(study, tree, base)
+
+
+def _inherited(base: Tree, place: KeyPath) -> bool:
+    """Return whether a place belongs to a temperature that a body takes from a warmed body that carries it."""
+    if place[:2] != ("job", "perturb") or place[3:4] != ("temperature",):
+        return False
+    perturb, node = base["job"].get("perturb", {}), str(place[2])
+    warmed = {path for path, what in perturb.items() if "temperature" in what}
+    warmed |= set(base["job"].get("course", {}).get("temperature", {}))
+    return node not in warmed and any(node.startswith(f"{path}/") for path in warmed)
 
 
 def _refuse_names(study: StudySpec, place: KeyPath) -> None:
@@ -276,7 +290,7 @@ def _with_tables(study: StudySpec) -> StudySpec:
         try:
             new.numbers()
         except Problem as problem:
-            raise StudySetup(study, {}).error(problem, key) from None
+            raise StudySetup(study, {}, {}).error(problem, key) from None
         factors[name] = new
     out = study.model_copy(update={"factors": FrozenMap(factors)}).with_source(study.source)
     assert isinstance(out, StudySpec)
