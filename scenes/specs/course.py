@@ -11,6 +11,7 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.spans import number_of
 from optics.thermal.heat import Temperature
 from scenes.yaml import units
 from scenes.yaml.csv_table import rows_of
@@ -176,7 +177,7 @@ class CourseSpec(Spec):
             self._one_for_each_time(("temperature", path), {"change": heat.change, "gradient": heat.gradient})
         for path, moves in self.motion.items():
             self._one_for_each_time(("motion", path), moves.given)
-        if self.detail is not None and self.detail not in self.times:
+        if self.detail is not None and number_of(self.detail, self.times) is None:
             raise no_such_time(self.detail, self.times, "one of times").below("detail")
         return self
 
@@ -202,7 +203,8 @@ class CourseSpec(Spec):
     @property
     def shown(self) -> int:
         """Number of the time that is shown in full, from 0."""
-        return len(self.times) - 1 if self.detail is None else self.times.index(self.detail)
+        number = None if self.detail is None else number_of(self.detail, self.times)
+        return len(self.times) - 1 if number is None else number
 
     def fields(self, k: int) -> dict[str, Temperature]:
         """Node path -> what the table adds to its temperature at time number ``k``."""

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.spans import number_of
 from scenes.specs.course import Moment, no_such_time
 from scenes.specs.disturbances import JobDisturbances, component_named
 from scenes.specs.job import AnalysisSpec, JobSpec, RenderSpec
@@ -211,7 +212,7 @@ class OrbitLoopSpec(TitledSpec):
             if wrong := self.orbit.misses(time):
                 raise wrong.below("readings")
         for k, time in enumerate(self.images.times if self.images is not None else ()):
-            if time not in self.readings.times:
+            if number_of(time, self.readings.times) is None:
                 raise no_such_time(time, self.readings.times, "the time of a reading").below("images", "times", k)
         return self
 

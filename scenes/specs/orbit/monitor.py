@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.spans import number_of
 from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment, no_such_time
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.job import AnalysisSpec, JobSpec, PerturbationSpec, RenderSpec, checked_nodes
@@ -193,7 +194,7 @@ class OrbitMonitorSpec(TitledSpec):
         for k, time in enumerate(times):
             if wrong := self.orbit.misses(time):
                 raise wrong.below("course", "times", k)
-        if self.reference not in times:
+        if number_of(self.reference, times) is None:
             raise no_such_time(self.reference, times, "one of course.times").below("reference")
         self._check_interval(self.interval, ("interval",))
         for k, interval in enumerate(self.intervals or ()):
@@ -230,7 +231,14 @@ class OrbitMonitorSpec(TitledSpec):
     @property
     def referred(self) -> int:
         """Number of the reference time, from 0."""
-        return self.course.times.index(self.reference)
+        number = number_of(self.reference, self.course.times)
+        assert number is not None
+        return number
+
+    @property
+    def reference_time(self) -> float:
+        """Return the course's time that is the reference, seconds."""
+        return self.course.times[self.referred]
 
     def measured(self, interval: float) -> list[int]:
         """Numbers of the times at which the monitor measures at this interval: from the reference on, to both sides."""

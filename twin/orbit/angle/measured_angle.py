@@ -21,6 +21,7 @@ from analysis.orbit.angles import AngleError
 from analysis.orbit.planes import PlaneError, Station, Strip
 from analysis.orbit.resection import ResectionError
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.spans import in_span
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.measured.orbit_data_setup import AnyAngle, MeasuredAngleSetup
 from scenes.specs.orbit.angle import LEAST_POINTS, usual_angles
@@ -236,7 +237,7 @@ def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
     path, moment = flight.trajectory, spec.time
     step = 2.0 * _SPAN / (_READINGS - 1)
     around = moment + step * (np.arange(_READINGS) - _READINGS // 2)
-    times = around[(around >= path.first) & (around <= path.last)]
+    times = around[in_span(around, path.first, path.last)]
     if len(times) < 5:
         end = 0.9 * min(moment - path.first, path.last - moment)
         times = moment + end * np.linspace(-1.0, 1.0, 5)

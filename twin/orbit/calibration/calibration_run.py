@@ -57,6 +57,8 @@ if TYPE_CHECKING:
 
 _EVEN = 1e-3
 """Largest deviation of an interval between readings from their median interval, relative, for even times."""
+_LEAST_EVEN = 5
+"""Readings that third differences take."""
 STEPWISE_TOLERANCE = 1e-3
 """Largest last step of a round of the stepwise solution, in sigmas."""
 
@@ -67,13 +69,14 @@ class FieldResult:
 
     Attributes:
         adjustment: simultaneous.
-        orbit: third differences of the measured positions, ITRS.
-        attitude: third differences of the measured attitude against the orbital frame, roll, pitch, yaw.
+        orbit: third differences of the measured positions, ITRS; None for fewer than five even readings.
+        attitude: third differences of the measured attitude against the orbital frame, roll, pitch, yaw, by readings
+            within the orbit's; None likewise.
     """
 
     adjustment: Adjustment
-    orbit: ThirdDifference
-    attitude: ThirdDifference
+    orbit: ThirdDifference | None
+    attitude: ThirdDifference | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,8 +198,9 @@ def run_calibration(
         measured = isinstance(setup, MeasuredCalibrationSetup)
         key, remedy = _what_to_do(error, measured)
         raise BenchError(str(error), key, remedy) from error
-    except ValueError as error:  # too few readings for third differences
-        raise BenchError(str(error), ("errors",), "errors that an adjustment can take, and more points") from error
+    except ValueError as error:  # of lines, orbit and attitude as they are given
+        key = ("data",) if isinstance(setup, MeasuredCalibrationSetup) else ("errors",)
+        raise BenchError(str(error), key, "orbit, attitude and lines of the same span, and more points") from error
 
 
 _NOISE_KEYS = {
@@ -229,8 +233,6 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     campaign = source_of(setup, shown, advance)
     parts = 6 + len(campaign.passes)
     advance("calibration", 1, parts)
-    # readings that are too few for them are told before anything is adjusted
-    differences = {one.name: _third_differences(one) for one in campaign.passes}
     latitude = latitude_fits(campaign, simultaneous(campaign))
     rates = rate_priors(campaign, latitude)
     campaign = drift_looked_for(campaign, rates)
@@ -238,7 +240,7 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     advance("calibration", 2, parts)
     fields = {}
     for k, one in enumerate(campaign.passes):
-        fields[one.name] = FieldResult(calibrated_alone(campaign, one), *differences[one.name])
+        fields[one.name] = FieldResult(calibrated_alone(campaign, one), *third_differences(one))
         advance("calibration", 3 + k, parts)
     first = campaign.spec.schemes[0][0]
     control = next(p.control for p in campaign.passes if p.name == first)
@@ -316,18 +318,26 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
     return np.array([known[name] for name in names])
 
 
-def _third_differences(one: FieldPass) -> tuple[ThirdDifference, ThirdDifference]:
-    measured = one.measured
-    fixes, looks = (_even(t) for t in (measured.table.orbit_time, measured.table.attitude_time))
+def third_differences(one: FieldPass) -> tuple[ThirdDifference | None, ThirdDifference | None]:
+    """Return the third differences of orbit and attitude of a pass; None for fewer than five even readings."""
+    measured, table = one.measured, one.measured.table
+    fixes, looks = _even(table.orbit_time), _even(table.attitude_time[measured.known(table.attitude_time)])
+    places = table.position[np.isin(table.orbit_time, fixes)]
     turned = np.swapaxes(measured.orbital_to_itrs(looks), 1, 2) @ measured.body_to_itrs(looks)
     # small angles: the skew part of the rotation
     skew = 0.5 * (turned - np.swapaxes(turned, 1, 2))
     angles = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1)
-    return third_difference(fixes, measured.position(fixes)), third_difference(looks, angles)
+    orbit, attitude = (
+        third_difference(time, values) if len(time) >= _LEAST_EVEN else None
+        for time, values in ((fixes, places), (looks, angles))
+    )
+    return orbit, attitude
 
 
 def _even(time: np.ndarray) -> np.ndarray:
-    """The longest run of readings that are evenly spaced; five at least, or the analysis says so."""
+    """Return the longest run of readings that are evenly spaced."""
+    if len(time) < 2:
+        return time
     step = np.diff(time)
     even = np.abs(step - np.median(step)) < _EVEN * np.median(step)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], even, [False]]).astype(int)))

@@ -437,8 +437,9 @@ def _rank(run: CalibrationRun) -> Section:
 def _data(run: CalibrationRun) -> Section:
     rows: list[tuple[Cell, ...]] = []
     for name, result in run.fields.items():
-        orbit, attitude = result.orbit.rms, result.attitude.rms / ARCSEC
-        rows.append((name, *map(float, orbit), *map(float, attitude)))
+        orbit, attitude = (None if one is None else one.rms for one in (result.orbit, result.attitude))
+        cells = (orbit, None if attitude is None else attitude / ARCSEC)
+        rows.append((name, *(v for one in cells for v in ((None,) * 3 if one is None else map(float, one)))))
     table = Table(
         "third-differences",
         "RMS of third differences",

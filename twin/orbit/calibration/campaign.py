@@ -140,9 +140,13 @@ class FieldPass:
 
     @property
     def middle(self) -> float:
-        """Mean time at which control points were seen, seconds of the trajectory."""
+        """Mean time at which control points were seen, seconds of the trajectory; where that lies in a gap of the
+        readings, the time of the point nearest to it.
+        """
         sensors = self.data.sensors
-        return float(np.mean(np.concatenate([sensors[k].time(r.line) for k, r in self.control_images.items()])))
+        times = np.concatenate([sensors[k].time(r.line) for k, r in self.control_images.items()])
+        mean = np.mean(times)
+        return float(mean if self.measured.known(mean) else times[np.argmin(np.abs(times - mean))])
 
     @property
     def seconds_apart(self) -> float:
@@ -165,15 +169,25 @@ class FieldPass:
         return replace(self, control_ground=ground, control=replace(self.control, ground=ground))
 
     def later(self, seconds: float) -> FieldPass:
-        """The pass with rays of the station and attitude so many seconds later; image points stay as they are."""
+        """The pass with rays of the station and attitude so many seconds later; image points stay as they are.
+
+        Where readings end before that, what lies beyond them is what lies before the exposure, reversed.
+        """
+        path = self.measured
 
         def moved(rays: Mapping[str, Rays]) -> FrozenMap[str, Rays]:
             found = {}
             for name, row in rays.items():
-                path = self.data.sensors[name].trajectory
                 assert row.time is not None
-                time = row.time + self.data.phase + seconds
-                found[name] = replace(row, station=path.position(time), attitude=path.body_to_itrs(time))
+                time = row.time + self.data.phase
+                beyond = ~path.known(time + seconds)
+                there = time + np.where(beyond, -seconds, seconds)
+                station, attitude = path.position(there), path.body_to_itrs(there)
+                if np.any(beyond):  # the motion goes on as it came
+                    here = path.body_to_itrs(time[beyond])
+                    station[beyond] = 2.0 * path.position(time[beyond]) - station[beyond]
+                    attitude[beyond] = here @ np.swapaxes(attitude[beyond], 1, 2) @ here
+                found[name] = replace(row, station=station, attitude=attitude)
             return FrozenMap(found)
 
         control = replace(self.control, rays=moved(self.control.rays))

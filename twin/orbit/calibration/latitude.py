@@ -98,8 +98,11 @@ def rate_priors(campaign: Campaign, fits: tuple[LatitudeFit, ...]) -> tuple[Prio
 
 def _sine_rate(one: FieldPass, reference: float) -> float:
     """Change of sin(latitude - reference) at a pass's middle by the measured orbit, 1/s."""
-    middle = one.middle
-    ends = one.measured.position(np.array([middle - 1.0, middle + 1.0]))
+    path, middle, step = one.measured, one.middle, np.array([-1.0, 1.0])
+    known = path.known(middle + step)[:, None]
+    # by the velocity where a second farther there are no readings
+    on = path.position(middle) + step[:, None] * path.velocity(middle)
+    ends = np.where(known, path.position(middle + np.where(known[:, 0], step, 0.0)), on)
     latitude = one.data.earth.geodetic(ends)[1]
     return float(np.diff(np.sin(latitude - reference))[0] / 2.0)
 

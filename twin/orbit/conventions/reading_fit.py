@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from optics.geometry.pose import rotation_matrix
+from optics.numerics.spans import in_span
 from scenes.yaml.errors import InputError, Problem
 from twin.orbit.conventions.pass_readings import LineClock, PassConventions, PassReadings
 from twin.orbit.flight.earth import Earth, east_north_up
@@ -223,7 +224,7 @@ class PassBench:
         """Places (n, 3) at the heights of the ground points, ITRS, metres, and the line time at each, seconds."""
         clock = self.readings.lines[name]
         number = line_of(meant, raw, clock)
-        beyond = (number < clock.line[0] - 1.0) | (number > clock.line[-1] + 1.0)
+        beyond = ~in_span(number, clock.line[0] - 1.0, clock.line[-1] + 1.0)
         if np.any(beyond):
             worst = float(number[int(np.argmax(beyond))])
             told = f"{clock.line[0]:.10g} to {clock.line[-1]:.10g}"
@@ -231,12 +232,12 @@ class PassBench:
         times, line_time = line_times(clock, meant, self.epoch, number)
         path, camera = platform.path, self.cameras[name]
         pixel = pixel_of(meant, raw, camera.pixels) + step
-        outside = (pixel < -0.5) | (pixel > camera.pixels - 0.5)
+        outside = ~in_span(pixel, -0.5, camera.pixels - 0.5)
         if np.any(outside):
             worst = float(pixel[int(np.argmax(outside))])
             raise ImpossibleError(f"pixel {worst:.6g} of {name} does not exist, which has {camera.pixels}")
         first, last = path.first, path.last
-        if np.any((times < first) | (times > last)):
+        if not np.all(in_span(times, first, last)):
             raise ImpossibleError(f"{name} was exposed outside of orbit and attitude")
         height = Earth().geodetic(self.readings.ground.points.itrs[raw.point])[2] + rise
         tick = (last - first) / _LINES

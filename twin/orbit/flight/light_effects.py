@@ -23,6 +23,18 @@ EARTH_RATE = 7.292115146706979e-5
 """Rotation of the Earth, rad/s: derivative of the Earth rotation angle (IERS Conventions 2010, eq. 5.15)."""
 _FIXED_POINT_STEPS = 3
 
+
+def carried_with_earth(place: np.ndarray) -> np.ndarray:
+    """Return the velocity of places that turn with the Earth, against the stars in axes of the ITRS, m/s.
+
+    The Earth's axis is taken as Z: polar motion (1e-6 rad) changes it by 1 mm/s.
+
+    Args:
+        place: ITRS, (..., 3), metres.
+    """
+    return EARTH_RATE * np.stack([-place[..., 1], place[..., 0], np.zeros(place.shape[:-1])], axis=-1)
+
+
 # Standard atmosphere (ICAO, 1993), dry air.
 _PRESSURE_EXPONENT = 5.255879
 _LAPSE = 0.0065  # K/m

@@ -21,6 +21,7 @@ from optics.geometry.pose import about_axis, rotation_matrix
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.spans import in_span
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
@@ -205,13 +206,13 @@ class LineCamera:
         Raises:
             ValueError: a pixel outside the line.
         """
-        return self._series(self.origins, pixel)
+        return self._series(self.origins, self._checked(pixel))
 
     def _vector(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A vector along the look and its derivative by the pixel, both (N, 3)."""
-        change = self._series(chebyshev.chebder(self.directions), pixel) * (2.0 / self.pixels)
-        vector = self._series(self.directions, pixel)
-        at = np.asarray(pixel, dtype=np.float64)
+        at = self._checked(pixel)
+        change = self._series(chebyshev.chebder(self.directions), at) * (2.0 / self.pixels)
+        vector = self._series(self.directions, at)
         for piece in self.pieces:
             here = (at >= piece.first - 0.5) & (at <= piece.last + 0.5)
             width = piece.last - piece.first + 1
@@ -221,10 +222,13 @@ class LineCamera:
             change[here] = np.moveaxis(chebyshev.chebval(place, slope), 0, -1)
         return vector, change
 
-    def _series(self, coefficients: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-        pixel = np.asarray(pixel, dtype=np.float64)
-        if not np.all((pixel >= -0.5) & (pixel <= self.pixels - 0.5)):
+    def _checked(self, pixel: np.ndarray) -> np.ndarray:
+        """Return pixels on the line; those outside it by rounding lie at its end, on the piece that ends there."""
+        if not np.all(in_span(pixel, -0.5, self.pixels - 0.5)):
             raise ValueError(f"a pixel outside the line {self.name!r}: it reaches from -0.5 to {self.pixels - 0.5}")
+        return np.clip(pixel, -0.5, self.pixels - 0.5)
+
+    def _series(self, coefficients: np.ndarray, pixel: np.ndarray) -> np.ndarray:
         place = (2.0 * pixel + 1.0) / self.pixels - 1.0
         return np.moveaxis(chebyshev.chebval(place, coefficients), 0, -1)
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.spans import in_span
 from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, FLATTENING, Earth, EarthRotation, ut1_of
 
 if TYPE_CHECKING:
@@ -136,7 +137,7 @@ class Orbit:
             ValueError: a time is not a number or outside the orbit.
         """
         t = np.asarray(seconds, dtype=np.float64)
-        if not np.all((t >= self.first) & (t <= self.last)):
+        if not np.all(in_span(t, self.first, self.last)):
             raise UnphysicalError(
                 f"time outside the orbit, which is known from {self.first:g} s to {self.last:g} s: found "
                 f"{np.min(t):g} s to {np.max(t):g} s"

@@ -15,7 +15,8 @@ from scipy.interpolate import CubicSpline, KroghInterpolator
 from scipy.spatial.transform import Rotation
 
 from optics.numerics.physical_error import UnphysicalError
-from twin.orbit.flight.light_effects import EARTH_RATE
+from optics.numerics.spans import in_span
+from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.trajectory import Attitude, Trajectory, readings
 
 Array = NDArray[np.float64]
@@ -181,12 +182,12 @@ class TabulatedTrajectory:
     def known(self, seconds: ArrayLike) -> np.ndarray:
         """Whether orbit and attitude are known at times (...), which is not before, after, or in a gap of readings."""
         t = np.asarray(seconds, dtype=np.float64)
-        found = (t >= self.table.usable[0]) & (t <= self.table.usable[1])
+        found = in_span(t, self.first, self.last)
         for time in (self.table.orbit_time, self.table.attitude_time):
             after = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(time) - 2)
+            begin, end = time[after], time[after + 1]
             # a reading at the end of a gap is known
-            in_gap = self._gaps(time)[after] & (t > time[after]) & (t < time[after + 1])
-            found &= (t >= time[0]) & (t <= time[-1]) & ~in_gap
+            found &= ~self._gaps(time)[after] | in_span(t, begin, begin) | in_span(t, end, end)
         return found
 
     def position(self, seconds: Any) -> np.ndarray:
@@ -198,13 +199,8 @@ class TabulatedTrajectory:
         return np.asarray(self._velocity(self._checked(seconds)))
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
-        """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3).
-
-        The Earth's axis is taken as Z: polar motion (1e-6 rad) changes it by 1 mm/s.
-        """
-        place = self.position(seconds)
-        carried = EARTH_RATE * np.stack([-place[..., 1], place[..., 0], np.zeros(place.shape[:-1])], axis=-1)
-        return self.velocity(seconds) + carried
+        """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        return np.asarray(self.velocity(seconds) + carried_with_earth(self.position(seconds)))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
         """Axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
@@ -243,7 +239,7 @@ class TabulatedTrajectory:
         if not np.all(good):
             wrong = float(np.ravel(t)[int(np.argmin(np.ravel(good)))])
             where = f"which reach from {self.first:.9g} s to {self.last:.9g} s"
-            kind = "in a gap of" if self.first <= wrong <= self.last else "outside of"
+            kind = "in a gap of" if in_span(wrong, self.first, self.last) else "outside of"
             raise UnphysicalError(f"the time {wrong:.9g} s lies {kind} the readings of orbit and attitude, {where}")
         return t
 

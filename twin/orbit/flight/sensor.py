@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
+from optics.numerics.spans import in_span
 from twin.orbit.flight import light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects, aberrated, turned_with_earth
@@ -207,5 +208,5 @@ class Sensor:
         return np.sum((self.trajectory.position(self.time(line)) - point) * outward, axis=-1) > 0.0
 
     def _require_inside(self, line: np.ndarray) -> None:
-        if not np.all((line >= -0.5) & (line <= self.lines - 0.5)):
+        if not np.all(in_span(line, -0.5, self.lines - 0.5)):
             raise ValueError(f"a line outside the image, which reaches from -0.5 to {self.lines - 0.5}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from optics.geometry.pose import about_axis, rotation_matrix
+from optics.numerics.spans import in_span
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.flight.trajectory import Trajectory, readings
@@ -147,7 +148,7 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
     """
     errors = run.spec.errors
     fixes, looks = (
-        times[(times >= path.first) & (times <= path.last)]
+        times[in_span(times, path.first, path.last)]
         for times in (readings(path.first, path.last, one.interval) for one in (errors.gps, errors.star_tracker))
     )
     found: Record[Trajectory] = Record(

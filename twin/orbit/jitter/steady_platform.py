@@ -14,7 +14,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.spatial.transform import Rotation
 
-from twin.orbit.flight.light_effects import EARTH_RATE
+from optics.numerics.spans import in_span
+from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.trajectory import Attitude
 
@@ -73,9 +74,7 @@ class SteadyPlatform:
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
         """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3)."""
-        place = self.position(seconds)
-        carried = EARTH_RATE * np.stack([-place[..., 1], place[..., 0], np.zeros(place.shape[:-1])], axis=-1)
-        return np.asarray(self.velocity(seconds) + carried)
+        return np.asarray(self.velocity(seconds) + carried_with_earth(self.position(seconds)))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
         """Axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
@@ -119,7 +118,7 @@ class TurnedPlatform:
 
 def _inside(time: np.ndarray, first: float, last: float, path: TabulatedTrajectory) -> np.ndarray:
     """Readings between two times; where there are few, moments that are joined from them."""
-    found = time[(time >= first) & (time <= last)]
+    found = time[in_span(time, first, last)]
     if len(found) < 2 * _ORBIT:
         found = np.linspace(first, last, 4 * _ORBIT)
     return np.asarray(found[path.known(found)])

@@ -28,6 +28,7 @@ from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.unseen_motions import UnseenMode, floor, unseen_modes
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.spans import number_of
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.specs.orbit.monitor import PARAMETERS
@@ -337,7 +338,9 @@ def _passed(
     }
     images = []
     for time in setup.test.images.times if setup.test.images is not None else ():
-        k = setup.test.readings.times.index(time)
+        number = number_of(time, setup.test.readings.times)
+        assert number is not None  # the file was checked
+        k = number
         changes = {name: model.on_ground(name, course.positions[k]) for name in pair}
         foci = {name: float(traced_quantities[k, model.row(name, "defocus")]) for name in pair}
         given = nominal, calibrated, changes, foci, fly(setup.test, seed), stream(seed, _IMAGES, k)

@@ -3,7 +3,8 @@ model of a scene in the geometry of its sensor.
 
 - Rows and columns of the image count from 1, the centre of the first pixel. Row r is exposed at START + (r - 1)
   LINE_PERIOD; times are UTC.
-- Positions and velocities are Earth-fixed, and velocities against the turning Earth.
+- Positions and velocities are Earth-fixed. Velocities are against the turning Earth; those against the stars, as the
+  ground segment of Pléiades writes them, are recognised by omega x P, which is taken off.
 - A quaternion Q0 .. Q3 has its scalar first and turns the body's axes into the Earth-fixed ones, v_earth = R(q) v_body.
   It is given in samples, or as polynomials of (t - OFFSET) / SCALE, where t is seconds of the day of START, which are
   then made unit.
@@ -20,16 +21,27 @@ imagery user guide of Pléiades; FIRST_COL is added as that program found it, wh
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.spans import in_span
 from scenes.yaml.errors import InputError, Issue, names_text, shown
+from twin.orbit.flight.light_effects import carried_with_earth
+from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.measured.clock import Readings
-from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
+from twin.orbit.measured.platform_readings import (
+    SPEED_TOLERANCE,
+    AttitudeReadings,
+    OrbitReadings,
+    require_orbit,
+    require_unit,
+    velocity_misfit,
+)
 from twin.orbit.measured.text_file import readings, require_rising
 from twin.orbit.measured.xml_file import Element, read_xml
 
@@ -52,8 +64,6 @@ _MARGIN = 0.05
 """Share of an image's time, before its first line and after its last one, for which attitudes are sampled."""
 _NEAR = 0.1
 """Seconds for which an orbit is carried on beyond its readings: the third derivative of its positions makes 2 um."""
-_MOVED = 0.02
-"""Share of the speed by which velocities may differ from the positions' change; those against the stars do by 6 %."""
 _LINES_OFF = 3.0
 
 
@@ -97,6 +107,7 @@ class DimapPass:
         pitch: of the detector's pixels, metres; None where the file does not say.
         settings: what the file says was done to it, by key.
         refracted: whether its geometry knows refraction.
+        inertial_velocity: whether its velocities were those against the stars.
         light_speed: whether it says that the speed of light was taken into account, of which nothing is known here.
         accuracy: ACCURACY_STDV, metres; None where there is none.
         rpc: names of files with its rational polynomials.
@@ -117,6 +128,7 @@ class DimapPass:
     pitch: float | None
     settings: Mapping[str, str]
     refracted: bool
+    inertial_velocity: bool
     light_speed: bool
     accuracy: float | None
     rpc: tuple[str, ...]
@@ -127,9 +139,13 @@ class DimapPass:
         return (self.lines - 1) * self.line_time
 
     def samples(self) -> AttitudeReadings:
-        """The attitude as readings; of polynomials those about the time of the image."""
+        """The attitude as readings; of polynomials those about the time of the image.
+
+        Samples that begin and end with the first and the last line do not hold the halves of these lines outside: the
+        spline through them is carried on by up to a sample's interval.
+        """
         if isinstance(self.attitude, AttitudeReadings):
-            return self.attitude
+            return self._spanning_samples(self.attitude)
         start, span = float(self.first_line.second[0]), max(self.duration, self.line_time)
         second = start + span * np.linspace(-_MARGIN, 1.0 + _MARGIN, _SAMPLES + 1)
         # half a line beyond the ends is part of the image
@@ -145,30 +161,50 @@ class DimapPass:
         Raises:
             InputError: it does by more than that.
         """
-        start, stop = -self.line_time, self.duration + self.line_time
         time = self._since(self.orbit.clock)
         assert self.orbit.velocity is not None
         position, velocity = self.orbit.position, self.orbit.velocity
-        for at, end, place in ((start, 0, 0), (stop, -1, len(time))):
-            gap = time[end] - at if end == 0 else at - time[end]
-            if gap <= 0.0:
-                continue
-            if gap > _NEAR:
+        for at, end in self._ends_beyond(time):
+            step = at - time[end]
+            if abs(step) > _NEAR:
                 problem = f"the image {'begins before' if end == 0 else 'ends after'} the ephemeris"
-                found, allowed = f"by {gap:.6g} s", f"{_NEAR:g} s at most"
+                found, allowed = f"by {abs(step):.6g} s", f"{_NEAR:g} s at most"
                 raise InputError(Issue(problem, self.file, None, ("Ephemeris",), found, allowed))
-            other = 1 if end == 0 else -2
+            other, place = (1, 0) if end == 0 else (-2, len(time))
             rate = (velocity[end] - velocity[other]) / (time[end] - time[other])
             # noise of velocities a few milliseconds apart is no acceleration
             rate = rate if abs(time[end] - time[other]) > 0.5 else -_GRAVITY * position[end] / _norm(position[end]) ** 3
-            step = at - time[end]
             position = np.insert(position, place, position[end] + velocity[end] * step + 0.5 * rate * step**2, axis=0)
             velocity = np.insert(velocity, place, velocity[end] + rate * step, axis=0)
             time = np.insert(time, place, at)
+        return OrbitReadings(self.file, self._clock(time), position, velocity, "ITRS", "UTC")
+
+    def _spanning_samples(self, attitude: AttitudeReadings) -> AttitudeReadings:
+        """Return samples of the attitude with one more at either end where the image reaches a moment beyond them."""
+        assert attitude.quaternion is not None
+        time = self._since(attitude.clock)
+        far = min(_NEAR, float(np.median(np.diff(time))))
+        more = [at for at, end in self._ends_beyond(time) if abs(at - time[end]) <= far]
+        if not more:
+            return attitude
+        # as the samples are joined everywhere else
+        turns = CubicSpline(time, joined_quaternions(attitude.quaternion))(np.array(more))
+        order = np.argsort(times := np.concatenate([time, more]))
+        quaternion = np.concatenate([attitude.quaternion, turns / np.linalg.norm(turns, axis=1, keepdims=True)])
+        return replace(attitude, clock=self._clock(times[order]), quaternion=quaternion[order])
+
+    def _ends_beyond(self, time: Array) -> list[tuple[float, int]]:
+        """Return the ends of the image, with a line to spare, that lie outside of readings at times (N,), and which
+        of the readings is next to each: 0 or -1.
+        """
+        ends = ((-self.line_time, 0), (self.duration + self.line_time, -1))
+        return [(at, end) for at, end in ends if not in_span(at, time[0], time[-1])]
+
+    def _clock(self, time: Array) -> Readings:
+        """Return clock readings at times (N,), seconds from the first line."""
         second = time + float(self.first_line.second[0])
         day = np.floor(second / _DAY)
-        clock = Readings(int(self.first_line.day[0]) + day.astype(np.int64), second - _DAY * day)
-        return OrbitReadings(self.file, clock, position, velocity, "ITRS", "UTC")
+        return Readings(int(self.first_line.day[0]) + day.astype(np.int64), second - _DAY * day)
 
     def _since(self, clock: Readings) -> Array:
         """Seconds (N,) from the first line."""
@@ -207,7 +243,7 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
     size = root.one("Raster_Data", "Raster_Dimensions")
     lines, pixels = size.whole("NROWS", most=2_000_000), size.whole("NCOLS", most=200_000)
     first, period = _times(model.one("Time"), lines)
-    orbit = _orbit(model.one("Ephemeris"), str(path))
+    orbit, inertial = _orbit(model.one("Ephemeris"), str(path))
     attitude = _attitude(model.one("Attitudes"), str(path), int(first.day[0]))
     calibration = model.one("Geometric_Calibration", "Instrument_Calibration")
     forward, right = _looks(calibration, band)
@@ -233,6 +269,7 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
         None if pitch is None else pitch.number(least=1e-7, most=1e-3, unit=_LENGTH),
         FrozenMap(settings),
         _switch(said, "ATMOSPHERIC_REFRACTION_SETTING"),
+        inertial,
         _switch(said, "LIGHT_SPEED_SETTING"),
         None if accuracy is None else accuracy.number(least=0.0, most=1e5),
         tuple(one.attributes["href"] for one in named if one.attributes.get("href")),
@@ -298,7 +335,8 @@ def _clock(items: list[Element], file: str) -> Readings:
     return clock
 
 
-def _orbit(ephemeris: Element, file: str) -> OrbitReadings:
+def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
+    """Return the readings, and whether their velocities were those against the stars."""
     points = ephemeris.all("Point_List", "Point")
     if len(points) < 4:
         ephemeris.wrong("too few points of the orbit", str(len(points)), "4 or more in Point_List")
@@ -306,13 +344,13 @@ def _orbit(ephemeris: Element, file: str) -> OrbitReadings:
     position = np.stack([one.one("LOCATION_XYZ").floats(3) for one in points])
     velocity = np.stack([one.one("VELOCITY_XYZ").floats(3) for one in points])
     require_orbit(file, position, lines)
-    step = (np.diff(clock.day) * _DAY + np.diff(clock.second))[:, None]
-    moved = np.linalg.norm(np.diff(position, axis=0) / step - 0.5 * (velocity[1:] + velocity[:-1]), axis=1)
-    share = moved / np.linalg.norm(velocity[1:], axis=1).clip(1.0)
-    if np.median(share) > _MOVED:
+    share, inertial = velocity_misfit((clock.day - clock.day[0]) * _DAY + clock.second, position, velocity)
+    if inertial:
+        velocity = velocity - carried_with_earth(position)
+    elif np.median(share) > SPEED_TOLERANCE:
         found = f"they differ by {100.0 * np.median(share):.3g} % in the median"
         points[0].one("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")
-    return OrbitReadings(file, clock, position, velocity, "ITRS", "UTC")
+    return OrbitReadings(file, clock, position, velocity, "ITRS", "UTC"), inertial
 
 
 def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | AttitudePolynomial:

@@ -15,6 +15,7 @@ import erfa
 import numpy as np
 
 from analysis.units import ARCSEC
+from optics.numerics.spans import in_span
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, TIME
@@ -61,7 +62,7 @@ class EarthOrientation:
         """
         day, second = calendar_reading(epoch)
         begin, end = (day + (second + t) / DAY for t in (first, last))
-        if begin < self.mjd[0] or end > self.mjd[-1]:
+        if not np.all(in_span(DAY * (np.array([begin, end]) - day), *(DAY * (self.mjd[[0, -1]] - day)))):
             found = f"{calendar(int(self.mjd[0]))} to {calendar(int(self.mjd[-1]))}"
             needed = f"a table that holds {calendar(int(begin))} to {calendar(int(end))}"
             raise InputError(

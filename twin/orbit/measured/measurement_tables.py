@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.orbit.calibration_parameters import level_covariance
+from optics.numerics.spans import in_span
 from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec
 from scenes.specs.measured.orbit_data_setup import DATA_FILE
 from scenes.specs.measured.pass_files import PlatformFilesSpec
@@ -203,7 +204,7 @@ def _line_times_of(
         at = LineTimes.of(line - line[0], time)
         ends = at.at(np.array([-0.5, at.line[-1] + 0.5]))
         for end, row in zip(ends, (rows[0], rows[-1]), strict=True):
-            if not path.first <= end <= path.last:
+            if not in_span(end, path.first, path.last):
                 allowed = f"within orbit and attitude, {path.first:.9g} s to {path.last:.9g} s; leave out other lines"
                 raise table.error(int(row), "time", "a line outside the readings", f"{end:.9g} s", allowed)
         found[name], origins[name] = at, float(line[0])
@@ -316,7 +317,7 @@ def _image_points_of(
             ("line", line, last, origins[name]),
             ("pixel", pixel, pixels - 1, conventions.first_pixel),
         ):
-            out = np.flatnonzero((value < -0.5) | (value > most + 0.5))
+            out = np.flatnonzero(~in_span(value, -0.5, most + 0.5))
             if len(out):
                 low, high = (v + half + first for v in (-0.5, most + 0.5))
                 row = int(order[out[0]])

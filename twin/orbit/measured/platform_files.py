@@ -14,6 +14,7 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from optics.numerics.spans import in_span
 from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
@@ -24,7 +25,13 @@ from twin.orbit.measured import earth_orientation, orbit_files
 from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
 from twin.orbit.measured.dimap_file import is_dimap, read_dimap
 from twin.orbit.measured.earth_orientation import EarthOrientation, TableRotation
-from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
+from twin.orbit.measured.platform_readings import (
+    AttitudeReadings,
+    OrbitReadings,
+    require_orbit,
+    require_own_velocity,
+    require_unit,
+)
 from twin.orbit.measured.text_file import first_lines, require_rising
 
 if TYPE_CHECKING:
@@ -119,6 +126,8 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         "xyz" if turned else _stated(spec_of, "sequence", spec_of.sequence, None, "the sequence of the angles"),
         Attitude(spec_of.nadir != "geocentric", spec_of.steering == "yaw"),
     )
+    if found.orbit_frame == "ITRS":
+        require_own_velocity(orbit)
     return PlatformReadings(orbit, attitude, _earth(spec, folder, orbit, found)), found
 
 
@@ -132,7 +141,7 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
 
     Raises:
         InputError: a leap second that is none, no Earth orientation for an inertial frame, attitude by an orbital frame
-            at a time without orbit.
+            at times without orbit.
     """
     orbit, attitude = readings.orbit, readings.attitude
     usable: Instants | None = None
@@ -150,16 +159,19 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
             allowed = "`earth_orientation:` with a table, or `earth:` with UT1 - UTC and the pole"
             raise InputError(Issue(what, orbit.file, None, (), None, allowed))
         first, last = min(time[0], turn_time[0]), max(time[-1], turn_time[-1])
-        rotation = readings.earth.rotation(epoch, float(first) - 2.0, float(last) + 2.0)
+        rotation = readings.earth.rotation(epoch, float(first), float(last))
     position, velocity = _in_itrs(orbit, meant.orbit_frame, time, rotation)
     matrix = _body(attitude, meant)
     if meant.attitude_frame == "orbital":
         unit = np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
         flown = TabulatedTrajectory(PlatformTable.of(epoch, time, position, velocity, time[[0, -1]], unit), meant.law)
-        try:
-            matrix = flown.orbital_to_itrs(turn_time) @ matrix
-        except ValueError as error:
-            raise InputError(Issue(f"attitude against the orbit: {error}", attitude.file)) from None
+        known = flown.known(turn_time)
+        if np.sum(known) < 2:
+            found = f"{turn_time[0]:.9g} s to {turn_time[-1]:.9g} s, and orbit from {flown.first:.9g} s"
+            allowed = "two readings or more within the orbit's, as the attitude is against it"
+            raise InputError(Issue("attitude at times without orbit", attitude.file, None, (), found, allowed))
+        turn_time = turn_time[known]
+        matrix = flown.orbital_to_itrs(turn_time) @ matrix[known]
     elif rotation is not None and meant.attitude_frame != "ITRS":
         matrix = to_itrs(meant.attitude_frame, rotation)(turn_time) @ matrix
     quaternion = Rotation.from_matrix(matrix).as_quat(canonical=False)
@@ -192,7 +204,7 @@ def _one_segment(readings: PlatformReadings, meant: Conventions) -> tuple[OrbitR
             None if one.usable is None else _instants(orbit.file, one.usable, meant.orbit_scale, meant.orbit_offset)
         )
         first, last = (time[one.first], time[one.last]) if usable is None else usable.since(start)
-        count = int(np.sum((turn_time >= first) & (turn_time <= last)))
+        count = int(np.sum(in_span(turn_time, first, last)))
         if count > best_count:
             best, best_count, best_usable = one, count, usable
     own = slice(best.first, best.last + 1)

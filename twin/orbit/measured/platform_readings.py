@@ -12,6 +12,7 @@ from scenes.specs.measured.orbit_data import ConventionsSpec
 from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.yaml.csv_table import Table
 from scenes.yaml.errors import InputError, Issue, names_text, shown
+from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.platform_table import PlatformTable
 from twin.orbit.measured.clock import Readings
 
@@ -129,7 +130,7 @@ Array = NDArray[np.float64]
 
 _LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
 """Metres from the Earth's centre: of satellites that map the Earth."""
-_SPEED_TOLERANCE = 0.02
+SPEED_TOLERANCE = 0.02
 """Relative tolerance of a velocity. Positions of 1 m noise 1 s apart differ by less, and the velocity against the stars
 differs by 6 % and more."""
 _UNIT_TOLERANCE = 1e-3
@@ -240,14 +241,43 @@ def _check_turns(table: Table, order: NDArray[np.intp], quaternion: Array) -> No
         raise table.error(row, "q1", "a jump of the attitude", found, "leave out wrong readings")
 
 
+def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, bool]:
+    """Return by how much velocities differ from the change of Earth-fixed places, and whether they are recognised as
+    those against the stars, which are larger by omega x P.
+
+    Args:
+        time: (N,), seconds.
+        place: (N, 3), ITRS, metres.
+        speed: (N, 3), in axes of the ITRS, m/s.
+
+    Returns:
+        Relative differences (N - 1,), and whether the velocities less omega x P fit while they themselves do not.
+    """
+    rate = np.diff(place, axis=0) / np.diff(time)[:, None]
+    # across a long step the chord is shorter than the arc, and lies to its side; that is no error of the velocity
+    own, turning = (
+        np.linalg.norm(rate - 0.5 * (v[1:] + v[:-1]), axis=1) / np.linalg.norm(rate, axis=1).clip(1.0)
+        for v in (speed, speed - carried_with_earth(place))
+    )
+    return own, bool(np.median(own) > SPEED_TOLERANCE >= np.median(turning))
+
+
+def require_own_velocity(orbit: OrbitReadings) -> None:
+    """InputError if velocities of Earth-fixed positions are those against the stars."""
+    time = (orbit.clock.day - orbit.clock.day[0]) * 86400.0 + orbit.clock.second
+    if orbit.velocity is not None and velocity_misfit(time, orbit.position, orbit.velocity)[1]:
+        raise InputError(Issue(INERTIAL, orbit.file, None, (), None, _AGAINST_EARTH))
+
+
+INERTIAL = "the velocities are against the stars, larger than those of the Earth-fixed positions by omega x P"
+_AGAINST_EARTH = "velocities against the same axes as the positions, or none"
+
+
 def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, place: Array, speed: Array) -> None:
     """InputError unless the velocity is the rate of change of the places."""
-    rate = np.diff(place, axis=0) / np.diff(time)[:, None]
-    mean = 0.5 * (speed[1:] + speed[:-1])
-    # across a long step the chord is shorter than the arc, and lies to its side; that is no error of the velocity
-    far = np.linalg.norm(rate - mean, axis=1) / np.linalg.norm(rate, axis=1)
-    if np.median(far) > _SPEED_TOLERANCE:
+    far, inertial = velocity_misfit(time, place, speed)
+    if np.median(far) > SPEED_TOLERANCE:
         row = int(order[int(np.argsort(far)[len(far) // 2])])
         found = f"they differ by {100.0 * np.median(far):.3g} % in the median"
-        allowed = "velocities against the same axes as the positions; those against the stars differ by 6 % and more"
-        raise table.error(row, "vx", "not the velocity of these positions", found, allowed)
+        problem = INERTIAL if inertial else "not the velocity of these positions"
+        raise table.error(row, "vx", problem, found, _AGAINST_EARTH)

@@ -220,7 +220,7 @@ class MonitorSeries:
             return np.asarray(every[:, self._own])
         out = []
         for k, number in enumerate(numbers):
-            one, span = slice(k, k + 1), stated.between(spec.reference, spec.course.times[number])
+            one, span = slice(k, k + 1), stated.between(spec.reference_time, spec.course.times[number])
             shifts = Shifts(before[one], after[one], measured.covariance[one], cameras, span)
             out.append(Posterior().gain(shifts)[0, self._own])
         return np.array(out)
@@ -239,7 +239,7 @@ class MonitorSeries:
         if stated is not None:
             left = []
             for gain, number in zip(gains, numbers, strict=True):
-                span = stated.between(self.spec.reference, self.spec.course.times[number])
+                span = stated.between(self.spec.reference_time, self.spec.course.times[number])
                 root = (gain @ span.spots - span.parameters[self._own]) @ span.root
                 left.append(root @ root.T)
             total = noise + np.array(left)
@@ -259,7 +259,7 @@ class MonitorSeries:
         times = np.array(self.spec.course.times)
         with one_blas_thread():
             found = smooth(
-                stated, times[at], measured.shifts[at], _Some(noise, at), times, reference=self.spec.reference
+                stated, times[at], measured.shifts[at], _Some(noise, at), times, reference=self.spec.reference_time
             )
         own, late = self._own, found.smoothed
         block = np.ix_(np.arange(len(times)), own, own)
