@@ -2,8 +2,10 @@
 
 Lines are found one after the other, the strongest first: the highest power of the periodogram is a line if its chance
 is below the stated rate; then all lines found so far are fitted together, frequencies included, and the search goes on
-beside them. Observations that no oscillation explains (wrong matches) are left out, and taken up again if a line that
-is found later explains them.
+beside them. Where moments are nearly even, a faster oscillation shows power in the search, too: each frequency up to a
+stated one that explains what was found as well is an alias of it, and a line is that of them which is right but for
+the false-alarm rate, or it is any of those that are named. Observations that no oscillation explains (wrong matches)
+are left out, and taken up again if a line that is found later explains them.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline
 
+from analysis.orbit.jitter_aliases import farthest, peaks
 from analysis.orbit.jitter_spectrum import Array, JitterError, Observations, Periodogram, periodogram
 
 MOST_LINES = 20
@@ -26,6 +29,10 @@ _ASTRAY = 1.0
 """Resolution elements: a fit that goes farther from the highest power has not found what makes it."""
 _CELL = 1.0
 """Resolution elements to each side of a line that is fitted in which none else is sought."""
+_MOST_ALIASES = 24
+"""Frequencies that are fitted in place of a line, those of the highest power."""
+_ALIKE = 0.8
+"""Share of a line's power that an alias has at least, by the approximation that selects it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +46,10 @@ class Lines:
         sine, cosine: (K, A) radians.
         covariance: of frequency, sine and cosine of the first line, then of the next, (K (1 + 2 A), ...), with the
             variance of the noise that the observations show.
-        chance: (K,) largest probability that noise alone would have shown one like it, anywhere, when it was found.
+        chance: (K,) largest probability that noise alone would have shown one like it, anywhere in the search, when it
+            was found.
         origin: moment from which phases count, seconds.
+        aliases: (K,) other frequencies, hertz, that explain the observations as well, but for the false-alarm rate.
     """
 
     frequency: Array
@@ -49,6 +58,7 @@ class Lines:
     covariance: Array
     chance: Array
     origin: float
+    aliases: tuple[tuple[float, ...], ...] = ()
 
     @property
     def amplitude(self) -> Array:
@@ -114,16 +124,18 @@ class Found:
         before: periodogram of the observations, with the variances of their kinds as they were found.
         after: the same beside all lines that were found.
         used: (R,) observations that were not left out as wrong.
-        factor: variance of the noise over that of the covariances, of the first kind of observations.
+        factors: (K,) variance of the noise over that of the covariances, of each kind of errors.
         threshold: power of ``after`` that noise alone exceeds with the stated probability.
+        beyond: frequency up to which aliases were looked for, hertz.
     """
 
     lines: Lines
     before: Periodogram
     after: Periodogram
     used: NDArray[np.bool_]
-    factor: float
+    factors: Array
     threshold: float
+    beyond: float
 
     @property
     def detectable(self) -> Array:
@@ -132,7 +144,9 @@ class Found:
         return np.where(self.before.blind[:, None], np.inf, least)
 
 
-def search(given: Observations, lowest: float, highest: float, false_alarm: float) -> Found:
+def search(
+    given: Observations, lowest: float, highest: float, false_alarm: float, beyond: float | None = None
+) -> Found:
     """Find oscillations.
 
     Args:
@@ -140,14 +154,18 @@ def search(given: Observations, lowest: float, highest: float, false_alarm: floa
         lowest: frequency, hertz.
         highest: likewise.
         false_alarm: probability of finding any where there is none, over all frequencies looked at.
+        beyond: frequency up to which aliases of what is found are looked for, hertz; None for ``highest``.
 
     Raises:
         JitterError: observations that say nothing of jitter.
     """
     used = _good(given, None)
+    used = _good(given.evened(given.taken(used).factors()), None)
     frequency: list[float] = []
     chance: list[float] = []
+    aliases: list[tuple[float, ...]] = []
     lines: Lines | None = None
+    reach = lowest, farthest(given, max(highest, beyond or highest))
     while True:
         kept = given.taken(used)
         factors = _beside(kept, lines).factors()
@@ -161,26 +179,71 @@ def search(given: Observations, lowest: float, highest: float, false_alarm: floa
         probability = float(now.chance(now.power[best]))
         if probability > false_alarm:
             break
-        more, chances = [*frequency, float(now.frequency[best])], [*chance, probability]
+        chances = [*chance, probability]
         try:
-            fitted = _fitted(kept, np.array(more), np.array(chances))
-            again = _good(given, fitted)
+            fitted = _fitted(kept, np.array([*frequency, float(now.frequency[best])]), np.array(chances))
+            fitted, others = _unaliased(kept, lines, fitted, reach, false_alarm)
+            again = _good(given.evened(factors), fitted)
             kept = given.taken(again).evened(factors)
             fitted = _fitted(kept, fitted.frequency, np.array(chances))
             # a strong line was noise to the factors before
             kept = given.taken(again)
-            kept = kept.evened(_beside(kept, fitted).factors())
+            factors = _beside(kept, fitted).factors()
+            kept = kept.evened(factors)
             fitted = _fitted(kept, fitted.frequency, np.array(chances))
         except JitterError:
             # what is left is no oscillation beside the others, such as one whose amplitude changes
             break
         lines, used, frequency, chance = fitted, again, fitted.frequency.tolist(), chances
+        aliases.append(others)
     before = now if lines is None else periodogram(kept, lowest, highest)
     if lines is None:
         axes = given.axes
         none = np.zeros((0, axes))
         lines = Lines(np.zeros(0), none, none, np.zeros((0, 0)), np.zeros(0), given.middle)
-    return Found(lines, before, now, used, float(factors[0]), now.threshold(false_alarm))
+    lines = replace(lines, aliases=tuple(aliases))
+    return Found(lines, before, now, used, factors, now.threshold(false_alarm), reach[1])
+
+
+def _unaliased(
+    kept: Observations, lines: Lines | None, fitted: Lines, reach: tuple[float, float], false_alarm: float
+) -> tuple[Lines, tuple[float, ...]]:
+    """Return all lines with the last one at the frequency that explains it best, and other frequencies that explain it
+    as well.
+
+    Args:
+        kept: observations that are used.
+        lines: that were found before; None for none.
+        fitted: the same and the last.
+        reach: lowest and highest frequency of aliases, hertz.
+        false_alarm: likelihood, against the best, above which a frequency is an alias.
+    """
+    beside, at, cell = _beside(kept, lines), fitted.frequency[-1], _CELL / kept.span
+    frequency, power = peaks(beside, *reach)
+    here = np.abs(frequency - at) <= cell
+    noise, margin = _left(kept, fitted) / kept.freedom, 2.0 * np.log(1.0 / false_alarm)
+    least = _ALIKE * float(power[here].max(initial=0.0)) - margin * noise
+    away = np.all(np.abs(frequency[:, None] - fitted.frequency) > cell, axis=1)
+    found = [(_left(kept, fitted), fitted)]
+    for candidate in frequency[away & (power >= least)][:_MOST_ALIASES]:
+        try:
+            other = _fitted(kept, np.append(fitted.frequency[:-1], candidate), fitted.chance)
+            rest = periodogram(_beside(kept, other), max(at - 2.0 * cell, reach[0]), at + 2.0 * cell)
+        except JitterError:
+            continue
+        if rest.chance(rest.power[rest.best]) > false_alarm:
+            found.append((_left(kept, other), other))
+    least_square = min(square for square, _ in found)
+    alike = [one for square, one in found if kept.freedom * np.log(square / least_square) <= margin]
+    # what lies in the search is taken where nothing tells it apart
+    line = fitted if alike[0] is fitted else min(found, key=lambda item: item[0])[1]
+    return line, tuple(sorted(float(one.frequency[-1]) for one in alike if one is not line))
+
+
+def _left(given: Observations, lines: Lines) -> float:
+    """Return the square sum that lines and nuisance leave of the observations."""
+    left = given.rest(given.value - _predicted(given, lines))
+    return float(left @ left)
 
 
 def _beside(given: Observations, lines: Lines | None) -> Observations:

@@ -46,7 +46,9 @@ _RANK = 1e-6
 _NEVER = 1e-280
 """Probability below which none is told apart."""
 _LEAST_ROWS = 30
-_STEPS = 30
+_REWEIGHTED = 3
+_LEAST_FACTOR = 0.01
+"""Variance over the stated one below which none is estimated: a tenth of the stated sigma."""
 
 
 class JitterError(MeasurementError, ValueError):
@@ -63,8 +65,9 @@ class Observations:
         time: (G, J) moments that those of a group compare, seconds.
         weight: (R, J, A) by radian about each axis at each moment; zero where there are fewer moments.
         nuisance: (R, P) columns of what else is unknown, of any rank.
-        kind: (R,) whole numbers from 0 on: observations whose variances may be wrong by factors of their own, such as
-            those that know of the places' heights beforehand.
+        mix: (R, K, W) by which the noise of an observation is made of the W unit errors of each of K kinds that its
+            group has. The variance of each kind, such as the coordinates of one line or the heights that are known
+            beforehand, may be wrong by a factor of its own.
     """
 
     value: Array
@@ -72,7 +75,7 @@ class Observations:
     time: Array
     weight: Array
     nuisance: Array
-    kind: NDArray[np.intp]
+    mix: Array
 
     @classmethod
     def of(
@@ -83,6 +86,7 @@ class Observations:
         weight: ArrayLike,
         nuisance: ArrayLike,
         kind: ArrayLike | None = None,
+        mix: ArrayLike | None = None,
     ) -> Observations:
         """Checked.
 
@@ -92,7 +96,8 @@ class Observations:
             time: (G, J), seconds.
             weight: (R, J, A), by radian.
             nuisance: (R, P).
-            kind: (R,); None for all alike.
+            kind: (R,) whole numbers from 0 on, of observations with independent errors; None for all alike.
+            mix: (R, K, W) instead of kind.
 
         Raises:
             JitterError: shapes that do not match, values that are not finite, too few observations.
@@ -105,9 +110,12 @@ class Observations:
             raise JitterError(f"observations of shapes {shapes} do not match")
         if w.shape[1] != t.shape[1] or np.any(np.diff(g) < 0) or np.any(g < 0) or np.any(g >= len(t)):
             raise JitterError(f"observations of shapes {shapes} do not match, or their groups are mixed")
-        if not all(np.all(np.isfinite(a)) for a in (v, t, w, n)):
+        made = _unmixed(g, len(t), sort) if mix is None else np.array(mix, np.float64)
+        if made.ndim != 3 or len(made) != len(v):
+            raise JitterError(f"{len(v)} observations do not match mixtures of shape {made.shape}")
+        if not all(np.all(np.isfinite(a)) for a in (v, t, w, n, made)):
             raise JitterError("an observation is not finite")
-        found = cls(v, g, t, w, n, sort)
+        found = cls(v, g, t, w, n, made)
         if found.freedom < _LEAST_ROWS:
             unknown = len(v) - found.freedom
             raise JitterError(f"{len(v)} observations with {unknown} unknowns are too few for a spectrum")
@@ -195,27 +203,90 @@ class Observations:
         where = np.asarray(keep)
         some, group = np.unique(self.group[where], return_inverse=True)
         value, weight, nuisance = self.value[where], self.weight[where], self.nuisance[where]
-        return Observations(value, group, self.time[some], weight, nuisance, self.kind[where])
+        return Observations(value, group, self.time[some], weight, nuisance, self.mix[where])
 
     def factors(self) -> Array:
-        """Variance of each kind's noise by what the nuisance leaves, over that it was whitened by; 1 where there are
-        too few to tell.
+        """Return the variance of each kind of errors over the stated one, (K,), by what the nuisance leaves.
+
+        Combinations of the kinds that have fewer than 30 degrees of freedom, such as the difference of two lines that
+        are only seen against each other, keep their stated ratio.
+
+        Notes:
+            Minimum norm quadratic unbiased estimation (Rao, J. Multivariate Analysis 1, 1971), repeated with the
+            weights that it gives.
         """
-        square, freedom = self.rest(self.value) ** 2, 1.0 - np.sum(self.known**2, axis=1)
-        count = int(self.kind.max(initial=0)) + 1
-        of_kind = np.bincount(self.kind, freedom, count)
-        enough = of_kind >= _LEAST_ROWS
-        return np.where(enough, np.bincount(self.kind, square, count) / np.where(enough, of_kind, 1.0), 1.0)
+        factors = np.ones(self.mix.shape[1])
+        for _ in range(_REWEIGHTED):
+            factors = factors * self.evened(factors)._factors()
+        return factors
+
+    def _factors(self) -> Array:
+        """Return `factors` for the present weights."""
+        left, known, mix = (self._of_groups(v) for v in (self.rest(self.value)[:, None], self.known, self.mix))
+        by_kind = [mix[:, :, k] for k in range(mix.shape[2])]
+        spread = [m @ m.swapaxes(1, 2) for m in by_kind]
+        seen = [one @ known for one in spread]
+        taken = [np.tensordot(known, one, ((0, 1), (0, 1))) for one in seen]
+        square = np.array([np.sum((m.swapaxes(1, 2) @ left) ** 2) for m in by_kind])
+        normal = np.array(
+            [
+                [
+                    np.sum(spread[k] * spread[m]) - 2.0 * np.sum(seen[k] * seen[m]) + np.sum(taken[k] * taken[m].T)
+                    for m in range(len(spread))
+                ]
+                for k in range(len(spread))
+            ]
+        )
+        size, way = np.linalg.eigh(normal)
+        inverse = np.where(size >= _LEAST_ROWS, 1.0 / np.maximum(size, _LEAST_ROWS), 0.0)
+        return np.asarray(np.maximum(1.0 + (way * inverse) @ way.T @ (square - normal.sum(axis=1)), _LEAST_FACTOR))
 
     def evened(self, factors: ArrayLike) -> Observations:
-        """The same with variances multiplied by a factor (kinds,) of each kind."""
-        size = 1.0 / np.sqrt(np.maximum(np.asarray(factors, np.float64), _NEVER))[self.kind]
-        weight, nuisance = self.weight * size[:, None, None], self.nuisance * size[:, None]
-        return replace(self, value=self.value * size, weight=weight, nuisance=nuisance)
+        """Return the observations whitened anew, with the variance of each kind of errors multiplied by its factor
+        (K,).
+        """
+        scaled = self.mix * np.sqrt(np.maximum(np.asarray(factors, np.float64), _NEVER))[:, None]
+        mix = self._of_groups(scaled.reshape(len(scaled), -1))
+        spread = mix @ mix.swapaxes(1, 2)
+        # rows that a group lacks
+        spread += np.where(np.any(mix != 0.0, axis=2), 0.0, 1.0)[:, :, None] * np.eye(mix.shape[1])
+        root = np.linalg.inv(np.linalg.cholesky(spread))
+        row = self._row
+
+        def white(columns: Array) -> Array:
+            flat = self._of_groups(columns.reshape(len(columns), -1))
+            return np.asarray((root @ flat)[self.group, row].reshape(columns.shape))
+
+        value, weight, nuisance = (white(v) for v in (self.value, self.weight, self.nuisance))
+        return replace(self, value=value, weight=weight, nuisance=nuisance, mix=white(scaled))
+
+    @cached_property
+    def _row(self) -> NDArray[np.intp]:
+        """Number (R,) of each observation within its group."""
+        return _within(self.group, len(self.time))
+
+    def _of_groups(self, columns: Array) -> Array:
+        """Columns (R, ...) by group and number within it, (G, M, ...); zero where a group has fewer."""
+        out = np.zeros((len(self.time), int(self._row.max(initial=0)) + 1, *columns.shape[1:]))
+        out[self.group, self._row] = columns
+        return out
 
     def beside(self, columns: Array) -> Observations:
         """The same with further columns (R, P) of what is unknown."""
         return replace(self, nuisance=np.concatenate([self.nuisance, columns], axis=1))
+
+
+def _within(group: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """Number of each observation within its group, of numbers (R,) that do not fall."""
+    return np.asarray(np.arange(len(group)) - np.searchsorted(group, np.arange(count))[group])
+
+
+def _unmixed(group: NDArray[np.intp], count: int, kind: NDArray[np.intp]) -> Array:
+    """`Observations.mix` of observations with independent errors, of kinds (R,)."""
+    row = _within(group, count)
+    out = np.zeros((len(kind), int(kind.max(initial=0)) + 1, int(row.max(initial=0)) + 1))
+    out[np.arange(len(kind)), kind, row] = 1.0
+    return out
 
 
 def _powers(time: Array, degree: int) -> Array:

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.angle import LightEffectsSpec, Moment, TerrainHeight
 from scenes.specs.orbit.calibration import LineTime
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, PayloadTestSpec
@@ -80,6 +81,9 @@ class JitterSearchSpec(Spec):
         return self
 
 
+PointNoise = Annotated[Number, Field(gt=0.0, le=10.0)]
+
+
 class BandPointsSpec(Spec):
     """Places that all lines see.
 
@@ -87,6 +91,9 @@ class BandPointsSpec(Spec):
         count: how many.
         duration: of the strip that they are spread over, seconds of flight.
         noise: standard deviation of an image coordinate, pixels, independent from line to line.
+        line_noise: line -> its standard deviation where it differs from `noise`, which the measurements state of all.
+        rows: interval of the rows that the places lie on, seconds of flight; None for places anywhere.
+        row_spread: standard deviation of a place's moment about its row, seconds.
         height: mean height of the ground, metres.
         relief: heights are even between height - relief and height + relief, metres.
         wrong: share of image points that lie somewhere else within 20 pixels.
@@ -94,7 +101,10 @@ class BandPointsSpec(Spec):
 
     count: Annotated[Whole, Field(ge=30, le=20_000)] = 1000
     duration: Annotated[float, Quantity(TIME, above_zero=True, largest="1000 s")]
-    noise: Annotated[Number, Field(gt=0.0, le=10.0)] = 0.1
+    noise: PointNoise = 0.1
+    line_noise: Annotated[dict[Name, PointNoise], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
+    rows: Annotated[float, Quantity(TIME, above_zero=True, largest="1000 s")] | None = None
+    row_spread: Annotated[float, Quantity(TIME, smallest="0 s", largest="10 s")] = 0.0
     height: TerrainHeight = 0.0
     relief: Annotated[float, Quantity(LENGTH, smallest="0 m", largest="5 km")] = 0.0
     wrong: Annotated[Number, Field(ge=0.0, le=0.4)] = 0.0

@@ -389,6 +389,9 @@ def resolve_jitter(path: str | Path) -> JitterSetup:
         test = load.load_named(OrbitJitterSpec, load.ORBIT, path)
         setup = JitterSetup.model_construct(test=test, camera=load_payload(test))
     require_lines(setup.test, setup.test.lines, setup.camera)
+    for name in setup.test.points.line_noise:
+        if name not in setup.camera.lines:
+            raise setup.test.error(unknown("no such line", name, setup.camera.lines), ("points", "line_noise", name))
     return setup
 
 

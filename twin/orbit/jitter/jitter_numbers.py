@@ -54,6 +54,17 @@ class FoundLine:
         lines = self.one.found.lines
         return float(lines.frequency[self.number]), float(lines.frequency_sigma[self.number])
 
+    @property
+    def in_search(self) -> bool:
+        """Return whether the frequency is one of those that were searched."""
+        search = self.run.setup.test.search
+        return bool(search.lowest <= self.frequency[0] <= search.highest)
+
+    @property
+    def aliases(self) -> tuple[float, ...]:
+        """Return the other frequencies, hertz, that explain the observations as well."""
+        return self.one.found.lines.aliases[self.number]
+
     def of_axes(self, values: np.ndarray) -> dict[str, float]:
         """Axis -> value of a row (A,)."""
         return {axis: float(v) for axis, v in zip(self.run.axes, values, strict=True)}
@@ -99,6 +110,11 @@ def blind_multiples(one: PassJitter) -> list[BlindMultiple]:
             k = int(np.argmin(np.abs(before.frequency - frequency)))
             out.append(BlindMultiple(first, second, gap, order, frequency, float(share[k]), bool(before.blind[k])))
     return out
+
+
+def noise_factors(one: PassJitter) -> dict[str, float]:
+    """Return line -> standard deviation of its noise over that of its points' covariances."""
+    return dict(zip(one.sights.lines, np.sqrt(one.found.factors[:-1]).tolist(), strict=True))
 
 
 def transfers(run: JitterRun, one: PassJitter) -> dict[str, dict[str, float]]:
@@ -165,6 +181,12 @@ LINE: Record[FoundLine] = Record(
         lambda one: one.one.found.lines.chance[one.number],
         "largest probability that noise alone shows one like it, anywhere",
     ),
+    Quantity("in_search", lambda one: one.in_search, "whether the frequency is one of those that were searched"),
+    Quantity(
+        "aliases_hz",
+        lambda one: list(one.aliases),
+        "other frequencies that explain the observations as well: the oscillation is at any of these",
+    ),
     Quantity(
         "true_frequency_hz",
         lambda one: None if one.truth is None else one.truth[0],
@@ -212,9 +234,11 @@ PASS: Record[_Searched] = Record(
     Quantity("pixel_arcsec", lambda s: s.one.sights.pixel, "angle of a pixel along the line"),
     Quantity(
         "noise_factor",
-        lambda s: np.sqrt(s.one.found.factor),
-        "what remains without the oscillations, over what the covariances of the points say",
+        lambda s: noise_factors(s.one),
+        "line -> what remains without the oscillations, over what the covariances of its points say",
+        converted=False,
     ),
+    Quantity("aliases_sought_to_hz", lambda s: s.one.found.beyond, "highest frequency of aliases"),
     Quantity("oscillations", lambda s: found_lines(s.run, s.one), "the strongest first", record=LINE),
     Quantity(
         "chance_of_the_next",

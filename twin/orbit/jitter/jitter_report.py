@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from analysis.units import ARCSEC
-from twin.orbit.jitter.jitter_numbers import blind_multiples, found_lines, transfers
+from twin.orbit.jitter.jitter_numbers import FoundLine, blind_multiples, found_lines, noise_factors, transfers
 from twin.orbit.jitter.jitter_plots import figure_svg
 from twin.orbit.jitter.jitter_run import JitterRun, PassJitter
 from twin.run.artefact import Cell, CsvFile, SvgFigure, Table, decimals_for, fixed, significant
@@ -16,6 +16,8 @@ _COURSE = 0.02
 """Seconds between rows of the course at least."""
 _ROWS = 5000
 _MOST_WRONG = 0.3
+_NAMED = 8
+"""Aliases that a sentence names."""
 _FIT = 1.3
 """Times the covariances' noise: more is worth a warning."""
 
@@ -61,8 +63,21 @@ def _verdict(run: JitterRun) -> tuple[str, tuple[str, ...]]:
     return answer(
         f"{more}, the largest at {fixed(f, decimals_for(sigma))} ± {fixed(sigma, decimals_for(sigma))} Hz: {sizes}",
         f"the false-alarm rate is {rate:g} over all frequencies that were looked at",
+        "; ".join(text for one in every for text in _doubts(one)),
         "see Blind frequencies for those that the lines cannot see",
     )
+
+
+def _doubts(one: FoundLine) -> list[str]:
+    """Return what makes a frequency another one than it seems."""
+    frequency = f"{one.frequency[0]:.4g} Hz"
+    doubts = []
+    if not one.in_search:
+        doubts.append(f"{frequency} lies beyond the search, in which it shows as a slower oscillation")
+    if one.aliases:
+        others = ", ".join(f"{f:.4g}" for f in one.aliases[:_NAMED]) + (" ..." if len(one.aliases) > _NAMED else "")
+        doubts.append(f"{frequency} may as well be {others} Hz: the points' moments do not tell them apart")
+    return doubts
 
 
 def _facts(run: JitterRun) -> tuple[tuple[str, str], ...]:
@@ -115,8 +130,9 @@ def _spectrum(run: JitterRun, one: PassJitter, suffix: str, head: str) -> Sectio
         "nothing is interpolated. The readings of the attitude serve as a slow reference only, so that their noise "
         "and their interval are not in the spectrum.",
         f"{found.used.mean():.1%} of the observations were used; the rest were wrong matches. What remains beside the "
-        f"oscillations is {np.sqrt(found.factor):.3g} times the noise that the points' covariances say; the highest "
-        f"power in it has a chance of {significant(left, 2)}.",
+        f"oscillations is the noise that the points' covariances say times {_factors(one)}; the highest "
+        f"power in it has a chance of {significant(left, 2)}. Aliases of what was found were looked for up to "
+        f"{found.beyond:.4g} Hz.",
     )
     f, before = found.before.frequency, found.before
     rows: list[tuple[Cell, ...]] = []
@@ -164,6 +180,10 @@ def _spectrum(run: JitterRun, one: PassJitter, suffix: str, head: str) -> Sectio
         digits=4,
     )
     return Section(f"Spectrum{head}", text, (disparity, spectrum, table, full))
+
+
+def _factors(one: PassJitter) -> str:
+    return ", ".join(f"{factor:.2g} in {line}" for line, factor in noise_factors(one).items())
 
 
 def _blind(one: PassJitter, suffix: str, head: str) -> Section:
@@ -217,9 +237,10 @@ def _warnings(run: JitterRun) -> tuple[str, ...]:
     for name, one in run.passes.items():
         if one.found.used.mean() < 1.0 - _MOST_WRONG:
             found.append(f"{1.0 - one.found.used.mean():.0%} of the observations of {name} were left out as wrong")
-        if np.sqrt(one.found.factor) > _FIT:
+        if max(noise_factors(one).values()) > _FIT:
             found.append(
-                f"what remains in {name} is {np.sqrt(one.found.factor):.2g} times the noise that the points' "
-                "covariances say: noise of a band, or covariances that are too small"
+                f"what remains in {name} is the noise that the points' covariances say times {_factors(one)}: noise of "
+                "a band, or covariances that are too small"
             )
+        found += [f"{name}: {text}" for line in found_lines(run, one) for text in _doubts(line)]
     return tuple(found)

@@ -116,7 +116,9 @@ def run_jitter(setup: AnyJitter, backend: Backend | None, seed: int, advance: Ad
         try:
             sights = sights_of(one, cameras, spec.lines, spec.search, effects)
             given = sights.observations
-            lines = search(given, spec.search.lowest, spec.search.highest, spec.search.false_alarm)
+            sought = spec.search
+            fastest = 0.5 / max(one.line_times[name].line_time for name in sights.lines)
+            lines = search(given, sought.lowest, sought.highest, sought.false_alarm, fastest)
             spline = spec.search.spline
             kept = given.taken(lines.used)
             course = None if spline is None else splined(kept, spline.interval, spline.sigma)
@@ -151,12 +153,17 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
     sensors = {name: Sensor.of_lines(cameras[name], trajectory, earth, times, effects) for name in names}
     many = int(np.ceil(_SPARE * wanted.count))
     first = sensors[names[0]]
-    seconds = spec.time + wanted.duration * (place.uniform(size=many) - 0.5)
+    away = wanted.duration * (place.uniform(size=many) - 0.5)
+    if wanted.rows is not None:
+        spread = wanted.row_spread * np.clip(place.standard_normal(many), -3.0, 3.0)
+        away = np.clip(wanted.rows * np.rint(away / wanted.rows) + spread, *(0.5 * wanted.duration * np.array([-1, 1])))
+    seconds = spec.time + away
     pixel = place.uniform(0.0, first.camera.pixels - 1.0, many)
     height = wanted.height + wanted.relief * place.uniform(-1.0, 1.0, many)
     points = first.ground((seconds - first.first_line_time) / first.line_time, pixel, height)
     seen = {name: np.stack(sensor.image(points), axis=-1) for name, sensor in sensors.items()}
-    edge = 10.0 * wanted.noise + _WRONG
+    noise = {name: wanted.line_noise.get(name, wanted.noise) for name in names}
+    edge = 10.0 * max(noise.values()) + _WRONG
     inside = np.ones(many, bool)
     for name, at in seen.items():
         last = np.array([count, sensors[name].camera.pixels]) - 1.0 - edge
@@ -168,7 +175,7 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
         raise BenchError(problem, ("points", "duration"), "a shorter strip within the orbit, or other `lines`")
     images = {}
     for name, at in seen.items():
-        off = wanted.noise * image.standard_normal((len(kept), 2))
+        off = noise[name] * image.standard_normal((len(kept), 2))
         bad = false.uniform(size=len(kept)) < wanted.wrong
         off[bad] += false.uniform(-_WRONG, _WRONG, (len(kept), 2))[bad]
         found = at[kept] + off

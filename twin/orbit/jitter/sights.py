@@ -35,6 +35,8 @@ _STEP = 10.0
 _EXACT = 1e-3
 """Metres: of points that are said to be exact."""
 _LEAST_POINTS = 15
+_NOISE, _ROUNDS = 4.0, 4
+"""Sigmas of a measured line within which it may be noise, and rounds that leave out the others."""
 _FAR = 200.0
 """Pixels between lines and what is known of camera and platform."""
 
@@ -260,58 +262,66 @@ def _whitened(
             good &= np.all(np.isfinite(one.reshape(len(one), -1)), axis=1)
         rows = which[good]
         seen[rows, k] = True
-        value[rows, k], by[rows, k], time[rows, k] = off[good], slope[good], line.seconds[good]
+        moments = _moments(line, off[:, 0], basis[which])
+        value[rows, k], by[rows, k], time[rows, k] = off[good], slope[good], moments[good]
         turn[rows, k] = np.stack(turns, axis=-1)[good]
         spread[rows, k, :, k] = line.covariance[good]
         residual[name] = off
     values: list[np.ndarray] = []
     times: list[np.ndarray] = []
-    weights, columns, groups, kinds = [], [], [], []
+    weights, columns, groups, mixes = [], [], [], []
     for used, rows in _alike(seen, prior.tie):
         m, n = len(used), len(rows)
         root = np.linalg.inv(np.linalg.cholesky(spread[rows][:, used][:, :, :, used].reshape(n, 2 * m, 2 * m)))
         seen_by = root @ by[rows][:, used].reshape(n, 2 * m, 3)
         before, off = prior.of(rows, place[rows])
-        free, own = _free(seen_by, before)
+        # combinations of observations that no place on the ground explains
+        free = np.linalg.svd(np.concatenate([seen_by, before], axis=1))[0][:, :, 3:].swapaxes(1, 2)
         measured = np.concatenate([(root @ value[rows][:, used].reshape(n, 2 * m, 1))[..., 0], off], axis=1)
         values.append((free @ measured[..., None]).ravel())
         root = free[:, :, : 2 * m] @ root
         left = root.shape[1]
         weight = np.zeros((n, left, count, axes))
         column = np.zeros((n, left, count, 2, width))
+        mix = np.zeros((n, left, count + 1, 3))
+        mix[:, :, count, : before.shape[1]] = free[:, :, 2 * m :]
         for j, k in enumerate(used):
             part = root[:, :, 2 * j : 2 * j + 2]
             weight[:, :, k] = part @ turn[rows, k]
             column[:, :, k] = part[..., None] * basis[rows][:, None, None, :]
+            mix[:, :, k, :2] = free[:, :, 2 * j : 2 * j + 2]
         weights.append(weight.reshape(-1, count, axes))
         columns.append(column.reshape(n * left, -1))
-        kinds.append(np.tile(own, n))
+        mixes.append(mix.reshape(n * left, count + 1, 3))
         groups.append(np.repeat(np.arange(n), left) + sum(len(part) for part in times))
         times.append(time[rows])
     if not values:
         raise SightsError("no point is seen by two lines where camera and platform expect it, to 200 pixels")
-    given = Observations.of(*(np.concatenate(part) for part in (values, groups, times, weights, columns, kinds)))
-    return given, residual
+    parts = (values, groups, times, weights, columns, mixes)
+    value, group, time, weight, nuisance, mix = (np.concatenate(part) for part in parts)
+    return Observations.of(value, group, time, weight, nuisance, mix=mix), residual
 
 
-def _free(seen: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Combinations of observations that no place on the ground explains, white as all of them are.
+def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return the times (n,) at which points cross a line, seconds, without the noise of the measured lines.
+
+    A measured line is wrong by the same noise as what is observed, so that a time that follows from it goes with the
+    observation; where points lie on rows, all of the scatter of their times is this noise.
 
     Args:
-        seen: (n, 2 m, 3) derivatives of what lines see by the place.
-        before: (n, k, 3) of what is known of it before.
-
-    Returns:
-        Rows (n, 2 m + k - 3, 2 m + k): first those of the lines alone, then those that use what is known before; and
-        which of them do, 0 or 1.
+        line: with the measured places.
+        off: measured less expected lines (n,), of which noise is what is smooth no more, as far as its sigma allows.
+        basis: (n, width) smooth functions of the points.
     """
-    n, many, known = len(seen), seen.shape[1], before.shape[1]
-    alone = np.linalg.svd(seen)[0][:, :, 3:]
-    alone = np.concatenate([alone, np.zeros((n, known, many - 3))], axis=1)
-    place = np.concatenate([seen, before], axis=1)
-    others = np.linalg.svd(np.concatenate([place, alone], axis=2))[0][:, :, many:]
-    free = np.concatenate([alone, others], axis=2).swapaxes(1, 2)
-    return free, np.repeat([0, 1], [many - 3, known])
+    sigma = np.sqrt(line.covariance[:, 0, 0])
+    kept = np.isfinite(off)
+    for _ in range(_ROUNDS):
+        if kept.sum() < 2 * basis.shape[1]:
+            return line.seconds
+        left = off - basis @ np.linalg.lstsq(basis[kept], off[kept], rcond=None)[0]
+        kept = np.abs(left) <= _NOISE * np.maximum(sigma, 1.4826 * np.median(np.abs(left[kept])))
+    noise = np.clip(np.nan_to_num(left), -_NOISE * sigma, _NOISE * sigma)
+    return np.asarray(line.sensor.time(line.place[:, 0] - noise))
 
 
 def _alike(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
