@@ -18,8 +18,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.monitor.filter_state import Belief, Innovation, Observed, Whitened
 from analysis.monitor.jump_detection import Jump, Step
-from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Whitened, series_of
+from analysis.monitor.series_filter import SeriesFilter, series_of
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.untold_jumps import added
 
@@ -41,6 +42,8 @@ class Followed:
         innovations: one for each reading, in the order of time.
         jumps: that were told, in the order in which they were; filtered changes know of them from then on.
         belief: after the last reading.
+        left_out: numbers of readings that were taken for bad ones, the last one where that is not decided yet, too;
+            changes do not know of them.
     """
 
     filtered: SeriesChanges
@@ -48,6 +51,7 @@ class Followed:
     innovations: tuple[Innovation, ...]
     jumps: tuple[Jump, ...]
     belief: Belief
+    left_out: tuple[int, ...] = ()
 
 
 def follow(
@@ -72,6 +76,7 @@ def follow(
     belief, filtered = how.start(earliest), _of_nothing(len(times))
     innovations: list[Innovation] = []
     left: list[Array] = []
+    bad: list[int] = []
     ahead = 0
     for k, one in enumerate(observed):
         if ahead < len(order) and times[order[ahead]] < one.time:
@@ -81,6 +86,10 @@ def follow(
             ahead += 1
         left.append(belief.left)
         belief, found = how.update(belief, one)
+        if found.earlier is not None:
+            bad.pop()
+        if found.bad is not None:
+            bad.append(k)
         innovations.append(found)
         advance(k + 1)
     now = how.blended(belief)
@@ -89,10 +98,12 @@ def follow(
     jumps = tuple(one.jump for one in innovations if one.jump is not None)
     knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
     begin = knowing.start(earliest)
-    left = hinted(how, knowing, begin, observed, left)
-    late = smoothed(knowing, begin, observed, times, left, knowing.parameters_of)
+    good = [k for k in range(len(observed)) if k not in bad]
+    taken = [observed[k] for k in good]
+    left = hinted(how, knowing, begin, taken, [left[k] for k in good])
+    late = smoothed(knowing, begin, taken, times, left, knowing.parameters_of)
     width = how.stated.parameters.shape[0]
-    return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief)
+    return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief, tuple(bad))
 
 
 def _of_nothing(count: int) -> list[tuple[Array, Array]]:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from scipy.special import pdtrc
 
 from analysis.monitor.disturbances import FALSE_ALARM
+from analysis.monitor.filter_state import Belief, Observed
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.limits import Quantity
-from analysis.monitor.series_filter import Belief, Observed, SeriesFilter
+from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.series_following import hinted, jointly, smoothed
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import one_blas_thread

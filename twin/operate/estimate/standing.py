@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from analysis.monitor.filter_state import Belief, Innovation, Observed, Track
 from analysis.monitor.jump_detection import Jump
-from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Track
+from analysis.monitor.series_filter import SeriesFilter
 from twin.operate.estimate.operation_model import OperationModel, packed, unpacked
 from twin.operate.record.entries import MICRO
 
