@@ -28,13 +28,19 @@ from scipy.special import gammaln, logsumexp
 from analysis.monitor.filter_state import BadReading, Track
 from analysis.monitor.untold_jumps import Jumper
 
-__all__ = ["LEAST_CHI_SQUARE", "MOST", "RECENT", "UNSURE", "bad_reading", "jump_evidence"]
+__all__ = ["LEAST_CHI_SQUARE", "MOST", "MOST_FOR_JUMP", "RECENT", "SURE", "UNSURE", "bad_reading", "jump_evidence"]
 
 Array = NDArray[np.float64]
 SHARE = 1e-3
 """Chance beforehand that a reading is bad."""
 UNSURE = math.log(0.05 / 0.95)
-"""Logarithm of the odds of a bad reading from which on it is set aside: 20 to 1 for a jump or for nothing."""
+"""Logarithm of the odds of a bad reading against one to which nothing has happened, above which it may be set aside."""
+SURE = math.log(1e-3)
+"""Logarithm of its odds against the first one after a jump, above which it is: an error at one coordinate and a jump of
+a body that moves spots in any way look alike, and it is not well known how often readings are bad.
+"""
+MOST_FOR_JUMP = 0.8
+"""Chance at most that a reading which was set aside counts with as the first after a jump, for the same reason."""
 RECENT, MOST = 10, 5
 """Where so many of the last readings were left out, none more is: then the prior is wrong, and not the readings."""
 LEAST_CHI_SQUARE = -2.0 * (math.log(SHARE) - UNSURE)

@@ -32,10 +32,20 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dtrtrs
+from scipy.special import expit
 
 from analysis.chi_square import limit_of
 from analysis.measurement_error import UndeterminedError
-from analysis.monitor.bad_readings import LEAST_CHI_SQUARE, MOST, RECENT, UNSURE, bad_reading, jump_evidence
+from analysis.monitor.bad_readings import (
+    LEAST_CHI_SQUARE,
+    MOST,
+    MOST_FOR_JUMP,
+    RECENT,
+    SURE,
+    UNSURE,
+    bad_reading,
+    jump_evidence,
+)
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track, Whitened
 from analysis.monitor.jump_detection import (
@@ -225,22 +235,23 @@ class SeriesFilter:
         response = space.moved(track.response, then, now) if len(track.response) else track.response
         return Track(mean, covariance, response, track.score, track.information)
 
-    def update(self, belief: Belief, observed: Observed) -> tuple[Belief, Innovation]:
+    def update(self, belief: Belief, observed: Observed, sure: bool = False) -> tuple[Belief, Innovation]:
         """Take one reading.
 
         Args:
             belief: so far.
             observed: the reading, not before the time of ``belief``.
+            sure: whether somebody has decided that it is good.
 
         Raises:
             UndeterminedError: the reading has no noise and says what is known already.
         """
         if not observed.spots:
-            other = belief.aside and replace(belief.aside, taken=self.update(belief.aside.taken, observed)[0])
+            put = belief.aside and replace(belief.aside, taken=self.update(belief.aside.taken, observed)[0])
             now = self.at(replace(belief, aside=None), observed.time)
             state, found = self.taken(now.state, observed)
             search = None if now.search is None else self.taken(now.search, observed)[0]
-            return replace(now, state=state, search=search, aside=other), found
+            return replace(now, state=state, search=search, aside=put), found
         aside = belief.aside
         own = self._look(replace(belief, aside=None), observed, aside is not None)
         if aside is not None:
@@ -251,7 +262,8 @@ class SeriesFilter:
             own = replace(own, innovation=replace(own.innovation, settled=True))
             recent = (*belief.recent[:-1], not kept)
             own = replace(own, before=replace(own.before, recent=recent), after=replace(own.after, recent=recent))
-        if own.log_odds > UNSURE and sum(own.before.recent) < MOST:
+        unsure = own.bad is not None and own.bad.log_ratio > UNSURE and own.log_odds > SURE
+        if unsure and not sure and sum(own.before.recent) < MOST:
             found = replace(own.innovation, bad=own.bad)
             put = Aside(self._whole(own.after)[0], found, own.log_odds)
             return replace(own.before, recent=(*own.before.recent, True)[-RECENT:], aside=put), found
@@ -460,7 +472,7 @@ class SeriesFilter:
             belief: so far.
         """
         if belief.aside is not None:
-            share = 1.0 / (1.0 + math.exp(min(belief.aside.log_odds, 700.0)))
+            share = min(MOST_FOR_JUMP, float(expit(-belief.aside.log_odds)))
             bad, good = (self.blended(one) for one in (replace(belief, aside=None), belief.aside.taken))
             apart = good.mean - bad.mean
             covariance = (1.0 - share) * bad.covariance + share * good.covariance

@@ -32,8 +32,8 @@ from twin.operate.estimate.following import Break, Course, Following, FoundJump,
 from twin.operate.estimate.operation_model import OperationModel, traced_model
 from twin.operate.estimate.plans import plan_digest
 from twin.operate.estimate.standing import Standing, Taking
-from twin.operate.record.entries import MICRO, digest_of_data, utc_text
-from twin.operate.record.history import History, content_of
+from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
+from twin.operate.record.history import USED, History, content_of
 from twin.run.provenance import source_digest
 
 __all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "Operation", "SensorState", "beyond"]
@@ -42,8 +42,6 @@ Array = NDArray[np.float64]
 DAY = 86_400 * MICRO
 EVERY = 1000
 """Readings after which it is kept for good where the estimate stands."""
-_USED = ("monitor", "temperature")
-"""Sorts of entries that change the estimate; events do by what they step."""
 HEAD = 16
 """Readings since it was kept after which it is kept at all: to follow as many again is as quick as to write it down."""
 _MODEL, _HEAD = -1, 0
@@ -144,9 +142,15 @@ class Operation:
 
     def _moments(self, after_us: int | None, until_us: int | None = None) -> Iterator[list[dict[str, Any]]]:
         """Entries that are used, those of one time together, in the order of time."""
-        own = (one for one in self.history.entries(after_us=after_us, until_us=until_us) if one["kind"] in _USED)
+        own = (one for one in self.history.entries(after_us=after_us, until_us=until_us) if one["kind"] in USED)
         for _, together in groupby(own, key=lambda one: int(one["time_us"])):
-            yield [{**one, "content": content_of(one)} for one in together]
+            yield [{**one, "content": content_of(one), "decided": self._decisions.get(one["id"])} for one in together]
+
+    @cached_property
+    def _decisions(self) -> dict[int, tuple[bool, str]]:
+        """Number of an entry on which somebody has decided -> whether it is included, and why."""
+        found = (content_of(one) for one in self.history.entries(DECISION))
+        return {int(one["entry"]): (bool(one["included"]), str(one["why"])) for one in found}
 
     def standing(self) -> Standing:
         """Take all readings that are new; where the estimate stands then."""
@@ -495,7 +499,9 @@ class Operation:
         spans = self._spans(after_us)
         width = len(self._taking.how.walking)
         left = np.concatenate([one.left.reshape(len(one.used), width) for one in spans])
-        return np.concatenate([one.used for one in spans]), left
+        used, pending = np.concatenate([one.used for one in spans]), self._standing.pending
+        good = used != (0 if pending is None else pending[0])
+        return used[good], left[good]
 
     def _spans(self, after_us: int | None) -> list[Standing]:
         """Where the estimate was kept for good after a time and stands now; each knows what was used since the last."""
@@ -508,7 +514,7 @@ class Operation:
         return [*(Standing.from_bytes(one.content) for one in kept), last]
 
     def _begin(self) -> int:
-        return min(int(one["time_us"]) for kind in _USED if (one := self.history.first(kind)) is not None)
+        return min(int(one["time_us"]) for kind in USED if (one := self.history.first(kind)) is not None)
 
     def _before_all(self, time: int) -> Standing | None:
         """The newest that was kept for good before a time and before all jumps that were told since; None for none."""

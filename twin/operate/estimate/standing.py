@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from analysis.monitor.filter_state import Belief, Innovation, Observed, Track
+from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.series_filter import SeriesFilter
 from twin.operate.estimate.operation_model import OperationModel, packed, unpacked
@@ -171,6 +171,8 @@ class Standing:
         told: innovations since then.
         silent: (body, time_us) of sensors that repeat themselves, and of the first of their equal readings: none counts
             from there on.
+        pending: (id, time_us) of a reading of the monitor that was set aside, of which the next one decides; it is
+            among those that were used. None for none.
     """
 
     belief: Belief
@@ -186,6 +188,7 @@ class Standing:
     left: Array = field(default_factory=lambda: np.zeros((0, 0)))
     told: tuple[tuple[int, float, int], ...] = ()
     silent: tuple[tuple[str, int], ...] = ()
+    pending: tuple[int, int] | None = None
 
     @property
     def explained(self) -> Array:
@@ -206,11 +209,32 @@ class Standing:
             self, time=max(self.time, time), left_out=(*self.left_out, (time, kind, subject, reason))[-KEPT:]
         )
 
+    def decided(self, left_out: str) -> Standing:
+        """With the decision on the reading that was set aside.
+
+        Args:
+            left_out: why it is left out; empty where it is taken after all.
+        """
+        assert self.pending is not None
+        number, time = self.pending
+        kept = [one for one in self.left_out if (one[0], one[1]) != (time, "monitor")]
+        if not left_out:
+            return replace(self, pending=None, left_out=tuple(kept))
+        good, kept = self.used != number, [*kept, (time, "monitor", "monitor", left_out)]
+        return replace(self, pending=None, left_out=tuple(kept), used=self.used[good], left=self.left[good])
+
     @property
     def found_stuck(self) -> tuple[tuple[str, int], ...]:
         """Sensors that repeat themselves, whose first equal readings have been used: (body, time_us of the first)."""
         stuck = ((one.body, one.since_us) for one in self.sensors.values() if one.stuck)
         return tuple(one for one in stuck if one not in self.silent)
+
+    def read(self, time: int, found: Innovation) -> Standing:
+        """With the innovation of a reading of the monitor that was taken."""
+        came = (time, found.chi_square, len(found.white))
+        scores = self.scores.with_one(found.white, found.log_score)
+        innovations = (*self.innovations, came)[-KEPT:]
+        return replace(self, scores=scores, innovations=innovations, told=(*self.told, came))
 
     def anew(self) -> Standing:
         """The same, counting what is used from now on."""
@@ -218,21 +242,11 @@ class Standing:
 
     def to_bytes(self) -> bytes:
         """All of it."""
-        own = self.belief
-        arrays: dict[str, np.ndarray] = {
-            "after": own.after,
-            "until": own.until,
-            "left": own.left,
-            "spread": self.spread,
-            "basis": self.basis,
-            "used": self.used,
-            "span": self.left,
-        }
-        for name, track in (("state", own.state), ("search", own.search)):
-            if track is not None:
-                arrays |= {f"{name}_{part}": getattr(track, part) for part in _STATES}
+        belief, arrays = _plain_belief(self.belief, "")
+        arrays |= {"spread": self.spread, "basis": self.basis, "used": self.used, "span": self.left}
         plain = {
-            "belief": {"time": own.time, "last": own.last},
+            "belief": belief,
+            "pending": self.pending,
             "time": self.time,
             "scores": asdict(self.scores),
             "innovations": self.innovations,
@@ -248,15 +262,7 @@ class Standing:
     def from_bytes(cls, content: bytes) -> Standing:
         """What `to_bytes` gave."""
         plain, arrays = unpacked(content)
-        tracks = [
-            Track(*(arrays[f"{name}_{part}"] for part in _STATES)) if f"{name}_mean" in arrays else None
-            for name in ("state", "search")
-        ]
-        assert tracks[0] is not None
-        told = plain["belief"]
-        belief = Belief(
-            told["time"], told["last"], arrays["after"], arrays["until"], tracks[0], tracks[1], arrays["left"]
-        )
+        belief = _belief(plain["belief"], arrays, "")
         sensors = [Sensor(**{**one, "far": tuple(one["far"])}) for one in plain["sensors"]]
         return cls(
             belief,
@@ -272,7 +278,43 @@ class Standing:
             arrays["span"],
             tuple((time, square, degrees) for time, square, degrees in plain["told"]),
             tuple((body, time) for body, time in plain["silent"]),
+            None if plain["pending"] is None else (plain["pending"][0], plain["pending"][1]),
         )
+
+
+def _plain_belief(own: Belief, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """A belief as plain data and arrays, whose names begin alike."""
+    plain: dict[str, Any] = {"time": own.time, "last": own.last, "recent": own.recent, "aside": None}
+    arrays = {f"{name}{part}": getattr(own, part) for part in ("after", "until", "left")}
+    for which, track in (("state", own.state), ("search", own.search)):
+        if track is not None:
+            arrays |= {f"{name}{which}_{part}": getattr(track, part) for part in _STATES}
+    if own.aside is not None:
+        found, (taken, more) = own.aside.innovation, _plain_belief(own.aside.taken, f"{name}aside_")
+        arrays |= {**more, f"{name}aside_white": found.white}
+        bad = None if found.bad is None else asdict(found.bad)
+        plain["aside"] = {"log_odds": own.aside.log_odds, "log_score": found.log_score, "bad": bad, "taken": taken}
+    return plain, arrays
+
+
+def _belief(plain: dict[str, Any], arrays: Mapping[str, np.ndarray], name: str) -> Belief:
+    """What `_plain_belief` was given; of a reading that was set aside only what it was against its prediction."""
+    tracks = [
+        Track(*(arrays[f"{name}{which}_{part}"] for part in _STATES)) if f"{name}{which}_mean" in arrays else None
+        for which in ("state", "search")
+    ]
+    assert tracks[0] is not None
+    aside, put = None, plain["aside"]
+    if put is not None:
+        read, bad = (
+            Observed(put["taken"]["time"], np.empty(0), np.empty((0, 0))),
+            put["bad"] and BadReading(**put["bad"]),
+        )
+        found = Innovation(read, arrays[f"{name}aside_white"], put["log_score"], None, bad)
+        aside = Aside(_belief(put["taken"], arrays, f"{name}aside_"), found, put["log_odds"])
+    after, until, left = (arrays[f"{name}{part}"] for part in ("after", "until", "left"))
+    recent = tuple(plain["recent"])
+    return Belief(plain["time"], plain["last"], after, until, tracks[0], tracks[1], left, recent, aside)
 
 
 def _jump(plain: dict[str, Any]) -> Jump:
@@ -322,9 +364,15 @@ class Taking:
 
         Args:
             standing: before.
-            entries: of one time, each with its content as plain data.
+            entries: of one time, each with its content as plain data and, as ``decided``, whether somebody includes it
+                and why; None where nobody has decided.
         """
         standing = replace(standing, time=max(standing.time, int(entries[0]["time_us"])))
+        for one in entries:
+            if (decided := one["decided"]) is not None and not decided[0]:
+                reason = f"entry {one['id']} was excluded: {decided[1]}"
+                standing = standing.without(int(one["time_us"]), str(one["kind"]), str(one["subject"]), reason)
+        entries = [one for one in entries if one["decided"] is None or one["decided"][0]]
         warm = sorted((one for one in entries if one["kind"] == "temperature"), key=lambda one: str(one["subject"]))
         for one in warm:
             standing = self._temperature(standing, one)
@@ -352,7 +400,7 @@ class Taking:
         return Observed(time, (place - self.reference).ravel(), np.diag(sigma.ravel() ** 2))
 
     def _updated(self, standing: Standing, entry: Mapping[str, Any], observed: Observed) -> tuple[Standing, Innovation]:
-        belief, found = self.how.update(standing.belief, observed)
+        belief, found = self.how.update(standing.belief, observed, entry["decided"] is not None)
         used = np.append(standing.used, np.int64(entry["id"]))
         # of no motion that may jump there is nothing to count rows by
         before = standing.left.reshape(len(standing.used), len(self.how.walking))
@@ -367,12 +415,13 @@ class Taking:
         standing = replace(standing, sensors={**standing.sensors, body: sensor})
         if self.how.heat is None or body not in self.how.heat.sensors:
             return standing.without(time, "temperature", body, "nothing is stated of its temperature")
-        if sensor.stuck or (body, sensor.since_us) in standing.silent:
+        included = entry["decided"] is not None
+        if not included and (sensor.stuck or (body, sensor.since_us) in standing.silent):
             return standing.without(time, "temperature", body, "its sensor repeats itself")
         observed = self.observed(entry)
         there = self.how.at(standing.belief, observed.time)
         white = float(self.how.whitened(there.state, observed).white[0])
-        far = abs(white) > FAR
+        far = abs(white) > FAR and not included
         standing = replace(standing, sensors={**standing.sensors, body: sensor.judged(far)})
         if far:
             reason = f"{abs(white):.3g} standard deviations from what was expected"
@@ -383,17 +432,31 @@ class Taking:
         time = int(entry["time_us"])
         if entry["content"]["numbers"].get("sigma_holds") is False:
             return standing.without(time, "monitor", "monitor", "its own sigma does not hold")
-        observed = self.observed(entry)
+        observed, before = self.observed(entry), standing.belief.aside
         standing, found = self._updated(standing, entry, observed)
+        if found.settled and standing.pending is not None and before is not None:
+            number, when = standing.pending
+            standing = standing.decided("" if found.earlier else self._bad(number, before.innovation))
+            if found.earlier is not None:
+                standing = standing.read(when, found.earlier)
+        if found.bad is not None:
+            number = int(entry["id"])
+            reason = f"{self._bad(number, found)}; the next reading decides whether it is left out"
+            return replace(standing, pending=(number, time)).without(time, "monitor", "monitor", reason)
         belief, space, rows = standing.belief, self.how.space, self.model.rows
         values = rows @ self.how.parameters_of(belief.mean, belief.covariance, observed.time)[0]
         rest = values - rows @ space.heat_outputs(belief.mean, observed.time)[space.width :]
-        came = (time, found.chi_square, len(found.white))
+        spread = np.stack([values, values**2, rest, rest**2])
         return replace(
-            standing,
-            scores=standing.scores.with_one(found.white, found.log_score),
-            innovations=(*standing.innovations, came)[-KEPT:],
-            told=(*standing.told, came),
+            standing.read(time, found),
             jumps=standing.jumps if found.jump is None else (*standing.jumps, Told(time, found.jump)),
-            spread=standing.spread + np.stack([values, values**2, rest, rest**2]),
+            spread=standing.spread + (spread if found.earlier is None else 2.0 * spread),
         )
+
+    def _bad(self, number: int, found: Innovation) -> str:
+        """Why a reading is taken for a bad one."""
+        assert found.bad is not None
+        camera, channel = self.model.spots[found.bad.coordinate // 2]
+        axis = ("row", "column")[found.bad.coordinate % 2]
+        text = f"entry {number}: the {axis} of the spot {camera}/{channel} is {abs(found.bad.z):.3g} sigma from what"
+        return f"{text} is expected of it, and no jump of stated size explains that"

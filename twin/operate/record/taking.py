@@ -89,7 +89,7 @@ class Taking:
             self.seen[stream] = max(one.time, self.seen.get(stream, one.time))
         before = source is not None
         if kept or refused or not before:
-            self._write(given, taking, None if source is None else int(source[0]), kept, refused)
+            self.write(given, taking, None if source is None else int(source[0]), kept, refused)
         told = tuple((one.line, one.reason) for one, _ in refused)
         return Taken(given.file, len(kept), again, told, before)
 
@@ -159,7 +159,7 @@ class Taking:
             "sigma from these; recover the frames against its images before, or begin another record"
         )
 
-    def _write(
+    def write(
         self,
         given: Given,
         taking: str,
@@ -167,6 +167,15 @@ class Taking:
         kept: list[tuple[Entry, str]],
         refused: list[tuple[Refused, str | None]],
     ) -> None:
+        """Add rows to the record, and drop what was kept of estimates that these change.
+
+        Args:
+            given: what they come from.
+            taking: digest by which that is recognised.
+            source: its id; None where the record does not have it yet.
+            kept: entries with their digests.
+            refused: what is not taken, with the digest of its entry where it has one.
+        """
         moment = utc_text(now())
         if source is None:
             row = {"file": given.file, "sha256": given.sha256, "taking": taking, "taken_utc": moment}
