@@ -229,11 +229,47 @@ class SeriesFilter:
         space = self.space
         covariance = self._stepped(space.spread(track.covariance, then, now), then, now)
         if left is not None and len(left):
-            walk = self._walk * np.sqrt(left * (now - then))
-            covariance[space.level, space.level] += walk @ walk.T
+            covariance = self._with_walk(covariance, left, now - then)
         mean = space.moved(track.mean[:, None], then, now)[:, 0]
         response = space.moved(track.response, then, now) if len(track.response) else track.response
         return Track(mean, covariance, response, track.score, track.information)
+
+    def _with_walk(self, covariance: Array, left: Array, over: float) -> Array:
+        walk, level = self._walk * np.sqrt(left * over), self.space.level
+        out = covariance.copy()
+        out[level, level] += walk @ walk.T
+        return out
+
+    def with_walk(self, belief: Belief, left: Array, over: float) -> Belief:
+        """What is known where jumps have come meanwhile that are not told.
+
+        Args:
+            belief: without them.
+            left: (m,) share of the mean square of jumps at their rate that they have.
+            over: seconds.
+        """
+        covariance = self._with_walk(belief.covariance, left, over)
+        return replace(belief, state=replace(belief.state, covariance=covariance))
+
+    def loosened(self, belief: Belief, observed: Observed, times: float) -> Belief:
+        """What is known where a sensor reads more than stated: the states are less well known in the direction in which
+        its reading moves them, and as well as before in all others.
+
+        Args:
+            belief: at the time of the reading.
+            observed: one number of a sensor.
+            times: by which the standard deviation of what it reads is larger.
+        """
+
+        def loose(track: Track) -> Track:
+            rows = self.read(track.mean, track.covariance, observed)[1]
+            along = track.covariance @ rows[0]
+            more = (times**2 - 1.0) / float(rows[0] @ along) * np.outer(along, along)
+            return replace(track, covariance=track.covariance + more)
+
+        put = belief.aside and replace(belief.aside, taken=self.loosened(belief.aside.taken, observed, times))
+        search = None if belief.search is None else loose(belief.search)
+        return replace(belief, state=loose(belief.state), search=search, aside=put)
 
     def update(self, belief: Belief, observed: Observed, sure: bool = False) -> tuple[Belief, Innovation]:
         """Take one reading.

@@ -11,6 +11,7 @@ the second takes these for steps of their chances and sizes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -100,7 +101,7 @@ def follow(
     begin = knowing.start(earliest)
     good = [k for k in range(len(observed)) if k not in bad]
     taken = [observed[k] for k in good]
-    left = hinted(how, knowing, begin, taken, [left[k] for k in good])
+    begin, left = hinted(how, knowing, begin, taken, [left[k] for k in good])
     late = smoothed(knowing, begin, taken, times, left, knowing.parameters_of)
     width = how.stated.parameters.shape[0]
     return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief, tuple(bad))
@@ -112,8 +113,9 @@ def _of_nothing(count: int) -> list[tuple[Array, Array]]:
 
 def hinted(
     how: SeriesFilter, knowing: SeriesFilter, start: Belief, observed: Sequence[Observed], left: Sequence[Array]
-) -> list[Array]:
-    """N times (m,) what share of the mean square of jumps could not be told, with jumps that all readings hint at.
+) -> tuple[Belief, list[Array]]:
+    """What is known before the first reading, and N times (m,) what share of the mean square of jumps could not be
+    told, with jumps that all readings hint at.
 
     Args:
         how: the filter that looked for jumps.
@@ -123,7 +125,7 @@ def hinted(
         left: as for `smoothed`.
     """
     if not how.jumpers or not observed:
-        return list(left)
+        return start, list(left)
     at = how.space.level
     levels = [how.space.level_of(one.motions)[at] @ one.root for one in how.jumpers]
     scores = np.empty((len(observed), at.stop - at.start))
@@ -137,12 +139,13 @@ def hinted(
     smoothed(plain, replace(start, left=none), observed, none, [none] * len(observed), knowing.parameters_of, note)
     score = [scores @ level for level in levels]
     information = [level.T @ (known_of @ level) for level in levels]
-    gap = np.diff([one.time for one in observed], prepend=observed[0].time)
+    first = how.before_s if math.isnan(start.last) else 0.0
+    gap = np.diff([one.time for one in observed], prepend=observed[0].time - first)
     place = {k: i for i, k in enumerate(how.walking.tolist())}
     out = np.array(left)
     for one, more in zip(how.jumpers, added(score, information, gap, how.jumpers, how.window), strict=True):
         out[:, [place[k] for k in one.motions]] += more
-    return list(out)
+    return how.with_walk(start, out[0] - left[0], first), list(out)
 
 
 def smoothed(

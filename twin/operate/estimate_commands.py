@@ -53,10 +53,13 @@ def forecast(
         course = operation.forecast(times)
         requirements = [one.to_dict() for one in following.breaks]
         data = {"record": history.url, "instrument": history.name, **course.to_dict(), "requirements": requirements}
+        data |= {"doubts": list(following.doubts)}
 
         def show(console: Console) -> None:
             print_verdict(console, f"{history.name}: forecast from {course.utc[0]} to {course.utc[-1]}")
             _show_course(course, console)
+            for doubt in following.doubts:
+                line(console, f"warning: {doubt}")
             show_requirements(following, console)
 
         tell(errors, as_json, quiet, data, show)
@@ -212,12 +215,8 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
         one, two = (100.0 * part / scores.components for part in (scores.within_one, scores.within_two))
         text = f"{one:.1f} % within one sigma (68.3 % expected), {two:.1f} % within two (95.4 %)"
         line(console, f"predictions before the readings came: {text}; mean log score {scores.log_score:.2f}")
-    if following.widened > 1.0:
-        text = f"all sigmas are {following.widened:.3g} times as wide as it would make them"
-        line(console, f"warning: the last readings contradict what is stated; {text}")
-    if following.too_many_jumps:
-        text = f"{len(following.jumps)} jumps are more than is stated: something else moves, or more of it"
-        line(console, f"warning: {text}")
+    for doubt in following.doubts:
+        line(console, f"warning: {doubt}")
     for jump in following.jumps:
         between = f"between {utc_text(jump.after_us)} and {utc_text(jump.until_us)}"
         sizes = ", ".join(f"{name.removeprefix(f'{jump.body} ')} {sized(z, s, u)}" for name, u, z, s in jump.sizes)

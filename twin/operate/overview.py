@@ -302,15 +302,7 @@ class Overview:
 
     def doubts(self) -> list[str]:
         """What a reader should know before using the numbers."""
-        told, out = self.following, []
-        if told.widened > 1.0:
-            out.append(
-                "the last readings contradict what is stated; all sigmas are "
-                f"{told.widened:.3g} times as wide as it would make them"
-            )
-        if told.too_many_jumps:
-            out.append(f"{len(told.jumps)} jumps are more than is stated: something else moves, or more of it")
-        return out
+        return list(self.following.doubts)
 
     def open_alarms(self) -> list[Mapping[str, Any]]:
         """Alarms that nobody has acknowledged, the newest first."""

@@ -278,7 +278,7 @@ _RELIEFS = 4.0
 def _warnings(
     following: Following, time: int, scene: int | None, export: Export | None, left: Sequence[LeftOut], prior: Prior
 ) -> tuple[str, ...]:
-    out = []
+    out = list(following.doubts)
     if scene is not None and abs(scene - time) > APART:
         out.append(f"the scene was taken at {utc_text(scene)}, and the estimate is for {utc_text(time)}")
     for one in following.breaks:

@@ -234,7 +234,7 @@ class Operation:
         jumps = tuple(self._found(one.time, one.jump) for one in standing.jumps)
         sensors = []
         for one in standing.sensors.values():
-            state, since, reason = one.state(standing.time)
+            state, since, reason = one.state(standing.time, one.body not in standing.together)
             sensors.append(SensorState(one.body, state, since, one.last_us, reason))
         names = [f"{one.group} {one.key}" for one in self.quantities]
         return Following(
@@ -251,7 +251,18 @@ class Operation:
             self._widened,
             self.too_many_jumps,
             self._breaks(),
+            standing.bad,
+            standing.pending is not None,
+            self._too_small(),
         )
+
+    def _too_small(self) -> tuple[str, ...]:
+        """Causes of the temperatures of bodies whose sensors disagree with what is stated at the same time."""
+        stated, heat, accused = self.model.how.stated, self.model.how.heat, self._standing.accused
+        if heat is None:
+            return ()
+        lasting = (k for k in heat.motions.tolist() if stated.bodies[k] in accused and not stated.laws[k].white)
+        return tuple(dict.fromkeys(stated.causes[k] for k in lasting))
 
     def _found(self, told: int, jump: Jump) -> FoundJump:
         sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
@@ -308,7 +319,7 @@ class Operation:
     def _widened(self) -> float:
         """Of sigmas now, where the last readings contradict what is stated."""
         squares = self._unexplained(self._standing.innovations)
-        return float(widening(squares, [len(squares)], False)[0])
+        return float(widening(squares, [len(squares)], False, self._unexplained(self._standing.first))[0])
 
     @cached_property
     def too_many_jumps(self) -> bool:
@@ -359,7 +370,7 @@ class Operation:
         told = [one for span in self._spans(None) for one in span.told]
         squares = self._unexplained(told)
         number = np.searchsorted([time for time, _, _ in told], times, side="right")
-        out = widening(squares, number, True)
+        out = widening(squares, number, True, self._unexplained(self._standing.first))
         out[times >= self._standing.time] = self._widened
         return out
 
@@ -492,7 +503,8 @@ class Operation:
             belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
         )
         knowing = replace(taking.how, steps=steps, window=0)
-        return knowing, belief, observed, hinted(taking.how, knowing, belief, observed, list(left))
+        belief, with_hints = hinted(taking.how, knowing, belief, observed, list(left))
+        return knowing, belief, observed, with_hints
 
     def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
         """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""

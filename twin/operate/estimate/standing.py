@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from analysis.chi_square import limit_of
+from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.series_filter import SeriesFilter
@@ -20,12 +22,16 @@ from twin.operate.estimate.operation_model import OperationModel, packed, unpack
 from twin.operate.record.entries import MICRO
 
 Array = NDArray[np.float64]
+SPANS = (1, 3, 10)
+"""Readings in a row that are held together against what was expected of them."""
 KEPT = 200
 """Innovations and readings that were left out, of which the last are kept."""
 FAR = 6.0
 """Standard deviations of a sensor's reading from what was expected, beyond which it is not used."""
 RECENT = 10
 """Readings of a sensor by which it is judged."""
+LOOSE = 3.0
+"""Standard deviations beyond which a reading widens what is stated of temperatures, where several sensors disagree."""
 DOUBTS = 3
 """Of these, how many far ones make a sensor doubtful."""
 SILENT = 10.0
@@ -45,7 +51,7 @@ class Sensor:
         value: of the newest, kelvin; repeats: how often it came in a row before it; since_us: first of these.
         step: smallest difference of two readings that followed each other, kelvin; infinite before there is one.
         sigma: of its readings, kelvin.
-        far: whether each of the last readings was far from what was expected of it.
+        recent: the last readings against what was expected of each, in standard deviations.
         stuck: whether it repeats itself.
     """
 
@@ -58,7 +64,7 @@ class Sensor:
     since_us: int = 0
     step: float = math.inf
     sigma: float = 0.0
-    far: tuple[bool, ...] = ()
+    recent: tuple[float, ...] = ()
     stuck: bool = False
 
     def came(self, time: int, value: float, sigma: float) -> Sensor:
@@ -81,15 +87,27 @@ class Sensor:
             stuck=bool(repeats >= 3 and alike**repeats * max(self.readings, 1) < CHANCE),
         )
 
-    def judged(self, far: bool) -> Sensor:
-        """With what is thought of its newest reading."""
-        return replace(self, far=(*self.far, bool(far))[-RECENT:])
+    def judged(self, white: float) -> Sensor:
+        """With its newest reading against what was expected of it."""
+        return replace(self, recent=(*self.recent, white)[-RECENT:])
 
-    def state(self, now: int) -> tuple[str, int, str]:
+    @property
+    def far(self) -> int:
+        """How many of its last readings were far from what was expected."""
+        return sum(abs(white) > FAR for white in self.recent)
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether its last readings together are further from what was expected than by chance."""
+        square = sum(white**2 for white in self.recent)
+        return bool(self.recent) and square > float(limit_of(FALSE_ALARM, len(self.recent)))
+
+    def state(self, now: int, alone: bool) -> tuple[str, int, str]:
         """``ok``, ``dead``, ``stuck`` or ``doubtful``; since when, microseconds; and why.
 
         Args:
             now: time of the newest reading of all.
+            alone: whether no other sensor disagrees with what is stated as it does.
         """
         if self.stuck:
             return "stuck", self.since_us, f"{self.repeats + 1} readings in a row of {self.value:.6g} K"
@@ -101,12 +119,9 @@ class Sensor:
                 self.last_us,
                 f"nothing came for {silent:.3g} days; it used to every {usual / MICRO / 86_400.0:.3g}",
             )
-        if sum(self.far) >= DOUBTS:
-            return (
-                "doubtful",
-                self.last_us,
-                f"{sum(self.far)} of the last {len(self.far)} readings far from what was expected",
-            )
+        if self.far >= DOUBTS and alone:
+            text = f"{self.far} of the last {len(self.recent)} readings far from what was expected"
+            return "doubtful", self.last_us, text
         return "ok", self.first_us, ""
 
 
@@ -173,6 +188,9 @@ class Standing:
             from there on.
         pending: (id, time_us) of a reading of the monitor that was set aside, of which the next one decides; it is
             among those that were used. None for none.
+        bad: (time_us, reason) of the last readings of the monitor that were taken for bad ones, and of a pending one.
+        first: as ``innovations``, of the first readings of all.
+        accused: bodies whose sensors have disagreed with what is stated at the same time as others.
     """
 
     belief: Belief
@@ -189,6 +207,9 @@ class Standing:
     told: tuple[tuple[int, float, int], ...] = ()
     silent: tuple[tuple[str, int], ...] = ()
     pending: tuple[int, int] | None = None
+    bad: tuple[tuple[int, str], ...] = ()
+    first: tuple[tuple[int, float, int], ...] = ()
+    accused: tuple[str, ...] = ()
 
     @property
     def explained(self) -> Array:
@@ -218,10 +239,12 @@ class Standing:
         assert self.pending is not None
         number, time = self.pending
         kept = [one for one in self.left_out if (one[0], one[1]) != (time, "monitor")]
+        bad = tuple(one for one in self.bad if one[0] != time)
         if not left_out:
-            return replace(self, pending=None, left_out=tuple(kept))
-        good, kept = self.used != number, [*kept, (time, "monitor", "monitor", left_out)]
-        return replace(self, pending=None, left_out=tuple(kept), used=self.used[good], left=self.left[good])
+            return replace(self, pending=None, left_out=tuple(kept), bad=bad)
+        good, bad = self.used != number, (*bad, (time, left_out))
+        kept = [*kept, (time, "monitor", "monitor", left_out)]
+        return replace(self, pending=None, left_out=tuple(kept), bad=bad, used=self.used[good], left=self.left[good])
 
     @property
     def found_stuck(self) -> tuple[tuple[str, int], ...]:
@@ -229,12 +252,21 @@ class Standing:
         stuck = ((one.body, one.since_us) for one in self.sensors.values() if one.stuck)
         return tuple(one for one in stuck if one not in self.silent)
 
+    @property
+    def together(self) -> tuple[str, ...]:
+        """Bodies whose sensors disagree with what is stated, where several do: it is then the prior that is wrong, and
+        not all of these sensors. Empty where one disagrees, or none.
+        """
+        found = tuple(sorted(one.body for one in self.sensors.values() if one.disagrees))
+        return found if len(found) > 1 else ()
+
     def read(self, time: int, found: Innovation) -> Standing:
         """With the innovation of a reading of the monitor that was taken."""
         came = (time, found.chi_square, len(found.white))
         scores = self.scores.with_one(found.white, found.log_score)
         innovations = (*self.innovations, came)[-KEPT:]
-        return replace(self, scores=scores, innovations=innovations, told=(*self.told, came))
+        first = (*self.first, came)[: SPANS[-1]]
+        return replace(self, scores=scores, innovations=innovations, told=(*self.told, came), first=first)
 
     def anew(self) -> Standing:
         """The same, counting what is used from now on."""
@@ -247,6 +279,9 @@ class Standing:
         plain = {
             "belief": belief,
             "pending": self.pending,
+            "bad": self.bad,
+            "first": self.first,
+            "accused": self.accused,
             "time": self.time,
             "scores": asdict(self.scores),
             "innovations": self.innovations,
@@ -263,7 +298,7 @@ class Standing:
         """What `to_bytes` gave."""
         plain, arrays = unpacked(content)
         belief = _belief(plain["belief"], arrays, "")
-        sensors = [Sensor(**{**one, "far": tuple(one["far"])}) for one in plain["sensors"]]
+        sensors = [Sensor(**{**one, "recent": tuple(one["recent"])}) for one in plain["sensors"]]
         return cls(
             belief,
             plain["time"],
@@ -279,6 +314,9 @@ class Standing:
             tuple((time, square, degrees) for time, square, degrees in plain["told"]),
             tuple((body, time) for body, time in plain["silent"]),
             None if plain["pending"] is None else (plain["pending"][0], plain["pending"][1]),
+            tuple((time, reason) for time, reason in plain["bad"]),
+            tuple((time, square, degrees) for time, square, degrees in plain["first"]),
+            tuple(plain["accused"]),
         )
 
 
@@ -421,9 +459,14 @@ class Taking:
         observed = self.observed(entry)
         there = self.how.at(standing.belief, observed.time)
         white = float(self.how.whitened(there.state, observed).white[0])
-        far = abs(white) > FAR and not included
-        standing = replace(standing, sensors={**standing.sensors, body: sensor.judged(far)})
-        if far:
+        sensor = sensor.judged(white)
+        standing = replace(standing, sensors={**standing.sensors, body: sensor})
+        if body in standing.together:  # then it is not the sensor that is wrong
+            times = max(abs(white), 1.0)
+            loose = self.how.loosened(there, observed, times) if times > LOOSE else there
+            accused = tuple(sorted({*standing.accused, *standing.together}))
+            standing = replace(standing, belief=loose, accused=accused)
+        elif abs(white) > FAR and not included:
             reason = f"{abs(white):.3g} standard deviations from what was expected"
             return standing.without(time, "temperature", body, reason)
         return self._updated(standing, entry, observed)[0]
@@ -442,7 +485,8 @@ class Taking:
         if found.bad is not None:
             number = int(entry["id"])
             reason = f"{self._bad(number, found)}; the next reading decides whether it is left out"
-            return replace(standing, pending=(number, time)).without(time, "monitor", "monitor", reason)
+            standing = replace(standing, pending=(number, time), bad=(*standing.bad, (time, reason))[-KEPT:])
+            return standing.without(time, "monitor", "monitor", reason)
         belief, space, rows = standing.belief, self.how.space, self.model.rows
         values = rows @ self.how.parameters_of(belief.mean, belief.covariance, observed.time)[0]
         rest = values - rows @ space.heat_outputs(belief.mean, observed.time)[space.width :]
