@@ -14,6 +14,10 @@ as a mixture over the readings between which it can have come; so sigma is wide 
 the body that may jump are then free to have done so: what the readings did not tell yet of the others cannot be found
 later, since the places of the jump are given up.
 
+A reading that is more likely bad than the first after a jump is set aside (`bad_readings`). The next one decides: what
+is known without it goes on beside what is known with it, until one of the two foretells that reading better. What is
+known meanwhile is the mixture of both.
+
 Jumps too small to be told are taken for a walk of their mean square, as in `jump_detection.with_unfound`, and what is
 known now and of the future counts those that the last readings hint at by their chances (`untold_jumps`).
 """
@@ -28,10 +32,22 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dtrtrs
+from scipy.special import expit
 
 from analysis.chi_square import limit_of
 from analysis.measurement_error import UndeterminedError
+from analysis.monitor.bad_readings import (
+    LEAST_CHI_SQUARE,
+    MOST,
+    MOST_FOR_JUMP,
+    RECENT,
+    SURE,
+    UNSURE,
+    bad_reading,
+    jump_evidence,
+)
 from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track, Whitened
 from analysis.monitor.jump_detection import (
     Amounts,
     Candidate,
@@ -48,7 +64,7 @@ from analysis.monitor.state_space import HeatInputs, StateSpace
 from analysis.monitor.told_jumps import Bodies, mixed
 from analysis.monitor.untold_jumps import Hint, Jumper, blended, jumpers
 
-__all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Track", "Whitened", "of_shifts", "series_of"]
+__all__ = ["SeriesFilter", "series_of"]
 
 Array = NDArray[np.float64]
 _NEARLY = 1e-11
@@ -56,136 +72,23 @@ _NEARLY = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
-    """One reading: of all spots, or of d sensors or combinations of parameters.
+class _Look:
+    """A reading of spots, looked at.
 
     Attributes:
-        time: seconds.
-        value: (D,) shifts of the spots since the reference, px; (d,) of another reading, in its unit.
-        noise: its covariance.
-        sensors: numbers of the sensors of `HeatInputs` that read it, d of them.
-        parameters: (d, P) rows on the parameters that it reads.
+        before: what is known at its time without it; after: with it.
+        innovation: of it.
+        log_odds: logarithm of the odds that it is bad.
+        likely: logarithm of the density of the reading, good or bad, with a jump or without one.
+        bad: what speaks for it being bad; None where that was not worked out.
     """
 
-    time: float
-    value: Array
-    noise: Array
-    sensors: tuple[int, ...] = ()
-    parameters: Array | None = None
-
-    @property
-    def spots(self) -> bool:
-        """Whether it is one of the spots."""
-        return not self.sensors and self.parameters is None
-
-
-def of_shifts(times: ArrayLike, shifts: Array, noise: Array) -> tuple[Observed, ...]:
-    """Readings of spots.
-
-    Args:
-        times: (N,) seconds, in any order.
-        shifts: (N, D) px.
-        noise: (D, D) of each, or (N, D, D), px^2.
-    """
-    when = np.asarray(times, np.float64)
-    each = np.broadcast_to(noise, (len(when), *noise.shape[-2:]))
-    return tuple(Observed(float(when[k]), shifts[k], each[k]) for k in np.argsort(when, kind="stable"))
-
-
-@dataclass(frozen=True, eq=False)
-class Innovation:
-    """A reading against what was expected of it before it came.
-
-    Attributes:
-        observed: the reading.
-        white: (d,) the difference in independent standard deviations.
-        log_score: logarithm of the density that was stated for what came.
-        jump: told at this reading; None for none.
-    """
-
-    observed: Observed
-    white: Array
-    log_score: float
-    jump: Jump | None = None
-
-    @property
-    def chi_square(self) -> float:
-        """Of as many degrees of freedom as numbers were read."""
-        return float(self.white @ self.white)
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """A filter, and what steps just before each of L readings would do to it.
-
-    Attributes:
-        mean: (n,); covariance: (n, n).
-        response: (L, n, q) of the mean to steps of unit outputs.
-        score: (L, q) b of the module's text; information: (L, q, q) J.
-    """
-
-    mean: Array
-    covariance: Array
-    response: Array
-    score: Array
-    information: Array
-
-    def alone(self) -> Track:
-        """The filter without steps that are looked for."""
-        return replace(self, response=self.response[:0], score=self.score[:0], information=self.information[:0])
-
-
-@dataclass(frozen=True, eq=False)
-class Whitened:
-    """A reading divided by the root of its covariance.
-
-    Attributes:
-        root: Cholesky factor (d, d) of its covariance, noise included.
-        white: (d,) root^-1 (value - what was expected).
-        rows: (d, n) root^-1 H; gain: (d, n) root^-1 H P; picked: (d, q) root^-1 what unit outputs do to it.
-    """
-
-    root: Array
-    white: Array
-    rows: Array
-    gain: Array
-    picked: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Belief:
-    """All that is known from the readings so far.
-
-    Attributes:
-        time: of the newest reading or of the start, seconds.
-        last: time of the newest reading of spots; NaN before the first.
-        after, until: (L,) between which times each step that is looked for comes, seconds.
-        state: the filter. search: the one that looks for jumps, which knows of no walk; None where they are the same.
-        left: (m,) what share of the mean square of jumps cannot be told, of each motion of a stated rate.
-    """
-
-    time: float
-    last: float
-    after: Array
-    until: Array
-    state: Track
-    search: Track | None
-    left: Array
-
-    @property
-    def mean(self) -> Array:
-        """(n,) of the states."""
-        return self.state.mean
-
-    @property
-    def covariance(self) -> Array:
-        """(n, n) of the states."""
-        return self.state.covariance
-
-    @property
-    def looking(self) -> Track:
-        """The filter that looks for jumps."""
-        return self.state if self.search is None else self.search
+    before: Belief
+    after: Belief
+    innovation: Innovation
+    log_odds: float
+    likely: float
+    bad: BadReading | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +106,8 @@ class SeriesFilter:
         parameters_read: whether there are readings of parameters among those of spots.
         steps: that are known of beside what is stated.
         unfound: whether jumps too small to be told count, where it is stated how often a motion jumps.
+        before_s: seconds before the first reading of spots in which bodies may have jumped, too; 0 for none.
+        leaving_out: whether a reading may be bad.
     """
 
     stated: Disturbances
@@ -214,6 +119,8 @@ class SeriesFilter:
     parameters_read: bool = False
     steps: tuple[Step, ...] = ()
     unfound: bool = True
+    before_s: float = 0.0
+    leaving_out: bool = True
     _may: tuple[Candidate, ...] = field(init=False, default=())
 
     def __post_init__(self) -> None:
@@ -313,7 +220,8 @@ class SeriesFilter:
         """
         state = self._moved(belief.state, belief.time, time, belief.left)
         search = None if belief.search is None else self._moved(belief.search, belief.time, time, None)
-        return replace(belief, time=max(time, belief.time), state=state, search=search)
+        aside = belief.aside and replace(belief.aside, taken=self.at(belief.aside.taken, time))
+        return replace(belief, time=max(time, belief.time), state=state, search=search, aside=aside)
 
     def _moved(self, track: Track, then: float, now: float, left: Array | None) -> Track:
         if now <= then:
@@ -321,36 +229,122 @@ class SeriesFilter:
         space = self.space
         covariance = self._stepped(space.spread(track.covariance, then, now), then, now)
         if left is not None and len(left):
-            walk = self._walk * np.sqrt(left * (now - then))
-            covariance[space.level, space.level] += walk @ walk.T
+            covariance = self._with_walk(covariance, left, now - then)
         mean = space.moved(track.mean[:, None], then, now)[:, 0]
         response = space.moved(track.response, then, now) if len(track.response) else track.response
         return Track(mean, covariance, response, track.score, track.information)
 
-    def update(self, belief: Belief, observed: Observed) -> tuple[Belief, Innovation]:
+    def _with_walk(self, covariance: Array, left: Array, over: float) -> Array:
+        walk, level = self._walk * np.sqrt(left * over), self.space.level
+        out = covariance.copy()
+        out[level, level] += walk @ walk.T
+        return out
+
+    def with_walk(self, belief: Belief, left: Array, over: float) -> Belief:
+        """What is known where jumps have come meanwhile that are not told.
+
+        Args:
+            belief: without them.
+            left: (m,) share of the mean square of jumps at their rate that they have.
+            over: seconds.
+        """
+        covariance = self._with_walk(belief.covariance, left, over)
+        return replace(belief, state=replace(belief.state, covariance=covariance))
+
+    def loosened(self, belief: Belief, observed: Observed, times: float) -> Belief:
+        """What is known where a sensor reads more than stated: the states are less well known in the direction in which
+        its reading moves them, and as well as before in all others.
+
+        Args:
+            belief: at the time of the reading.
+            observed: one number of a sensor.
+            times: by which the standard deviation of what it reads is larger.
+        """
+
+        def loose(track: Track) -> Track:
+            rows = self.read(track.mean, track.covariance, observed)[1]
+            along = track.covariance @ rows[0]
+            more = (times**2 - 1.0) / float(rows[0] @ along) * np.outer(along, along)
+            return replace(track, covariance=track.covariance + more)
+
+        put = belief.aside and replace(belief.aside, taken=self.loosened(belief.aside.taken, observed, times))
+        search = None if belief.search is None else loose(belief.search)
+        return replace(belief, state=loose(belief.state), search=search, aside=put)
+
+    def update(self, belief: Belief, observed: Observed, sure: bool = False) -> tuple[Belief, Innovation]:
         """Take one reading.
 
         Args:
             belief: so far.
             observed: the reading, not before the time of ``belief``.
+            sure: whether somebody has decided that it is good.
 
         Raises:
             UndeterminedError: the reading has no noise and says what is known already.
         """
-        now = self.at(belief, observed.time)
-        if observed.spots and self._may and observed.time > belief.last:
-            now = self._with_step(now, belief.last, observed.time)
-        state, found = self.taken(now.state, observed)
-        search = None if now.search is None else self.taken(now.search, observed)[0]
-        last = observed.time if observed.spots else now.last
-        now = replace(now, state=state, search=search, last=last)
-        if not (observed.spots and self._may and len(now.until)):
-            return now, found
-        now = replace(now, left=self._unseen(now))
-        jump = self._told(now)
-        if jump is not None:
-            now, jump = self._jumped(now, jump)
-        return now, replace(found, jump=jump)
+        if not observed.spots:
+            put = belief.aside and replace(belief.aside, taken=self.update(belief.aside.taken, observed)[0])
+            now = self.at(replace(belief, aside=None), observed.time)
+            state, found = self.taken(now.state, observed)
+            search = None if now.search is None else self.taken(now.search, observed)[0]
+            return replace(now, state=state, search=search, aside=put), found
+        aside = belief.aside
+        own = self._look(replace(belief, aside=None), observed, aside is not None)
+        if aside is not None:
+            other = self._look(aside.taken, observed, True)
+            kept = aside.log_odds + own.likely < other.likely
+            if kept:
+                own = replace(other, innovation=replace(other.innovation, earlier=aside.innovation))
+            own = replace(own, innovation=replace(own.innovation, settled=True))
+            recent = (*belief.recent[:-1], not kept)
+            own = replace(own, before=replace(own.before, recent=recent), after=replace(own.after, recent=recent))
+        unsure = own.bad is not None and own.bad.log_ratio > UNSURE and own.log_odds > SURE
+        if unsure and not sure and sum(own.before.recent) < MOST:
+            found = replace(own.innovation, bad=own.bad)
+            put = Aside(self._whole(own.after)[0], found, own.log_odds)
+            return replace(own.before, recent=(*own.before.recent, True)[-RECENT:], aside=put), found
+        after = replace(own.after, recent=(*own.after.recent, False)[-RECENT:])
+        now, jump = self._whole(after, True)
+        return now, replace(own.innovation, jump=jump)
+
+    def _look(self, belief: Belief, observed: Observed, weighed: bool) -> _Look:
+        """What is known of spots before a reading and with it, and what speaks for it being bad.
+
+        Args:
+            belief: before, nothing set aside.
+            observed: the reading.
+            weighed: whether to work out how likely it is also where it is surely good.
+        """
+        before = self.at(belief, observed.time)
+        now = before
+        first = math.isnan(belief.last) and self.before_s > 0.0
+        if self._may and (first or observed.time > belief.last):
+            now = self._with_step(now, observed.time - self.before_s if first else belief.last, observed.time)
+        w = self.whitened(now.state, observed)
+        state, found = self.taken(now.state, observed, w)
+        search, judged = None, found
+        if now.search is not None:
+            w = self.whitened(now.search, observed)
+            search, judged = self.taken(now.search, observed, w)
+        after = replace(now, state=state, search=search, last=observed.time)
+        if not self.leaving_out or not (weighed or judged.chi_square > LEAST_CHI_SQUARE):
+            return _Look(before, after, found, -math.inf, judged.log_score)
+        bad = bad_reading(w.white, w.root, observed.noise)
+        if not weighed and bad.log_ratio <= UNSURE:
+            return _Look(before, after, found, -math.inf, judged.log_score)
+        gap = now.until - now.after
+        jumping = [jump_evidence(one.looking, gap, self._jumping, self.life_s, observed.noise) for one in (now, after)]
+        good = jumping[1] - jumping[0]
+        likely = judged.log_score + float(np.logaddexp(bad.log_ratio, good))
+        return _Look(before, after, found, bad.log_ratio - good, likely, bad)
+
+    def _whole(self, belief: Belief, telling: bool = False) -> tuple[Belief, Jump | None]:
+        """With what share of jumps cannot be told after a reading, and with the jump that is told."""
+        if not (self._may and len(belief.until)):
+            return belief, None
+        now = replace(belief, left=self._unseen(belief))
+        jump = self._told(now) if telling else None
+        return (now, None) if jump is None else self._jumped(now, jump)
 
     def _with_step(self, belief: Belief, after: float, until: float) -> Belief:
         """With a step that is looked for just before a reading; the oldest is given up."""
@@ -497,6 +491,11 @@ class SeriesFilter:
         return replace(belief, state=state, search=search, after=empty, until=empty), told
 
     @cached_property
+    def _jumping(self) -> tuple[Jumper, ...]:
+        """All bodies that may jump, those of which no rate is stated once in the life."""
+        return jumpers(self.stated, self._may, self.life_s)
+
+    @cached_property
     def jumpers(self) -> tuple[Jumper, ...]:
         """Bodies that jump at a stated rate."""
         return jumpers(self.stated, self._may) if self.unfound else ()
@@ -508,6 +507,15 @@ class SeriesFilter:
         Args:
             belief: so far.
         """
+        if belief.aside is not None:
+            share = min(MOST_FOR_JUMP, float(expit(-belief.aside.log_odds)))
+            bad, good = (self.blended(one) for one in (replace(belief, aside=None), belief.aside.taken))
+            apart = good.mean - bad.mean
+            covariance = (1.0 - share) * bad.covariance + share * good.covariance
+            covariance = covariance + share * (1.0 - share) * np.outer(apart, apart)
+            state = replace(bad.state.alone(), mean=bad.mean + share * apart, covariance=covariance)
+            none = bad.until[:0]
+            return replace(bad, after=none, until=none, state=state, search=None)
         if not self.jumpers or not len(belief.until):
             return belief
         track, looking, hints, moved = belief.state, belief.looking, [], []

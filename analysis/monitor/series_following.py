@@ -11,6 +11,7 @@ the second takes these for steps of their chances and sizes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -18,8 +19,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.monitor.filter_state import Belief, Innovation, Observed, Whitened
 from analysis.monitor.jump_detection import Jump, Step
-from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Whitened, series_of
+from analysis.monitor.series_filter import SeriesFilter, series_of
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.untold_jumps import added
 
@@ -41,6 +43,8 @@ class Followed:
         innovations: one for each reading, in the order of time.
         jumps: that were told, in the order in which they were; filtered changes know of them from then on.
         belief: after the last reading.
+        left_out: numbers of readings that were taken for bad ones, the last one where that is not decided yet, too;
+            changes do not know of them.
     """
 
     filtered: SeriesChanges
@@ -48,6 +52,7 @@ class Followed:
     innovations: tuple[Innovation, ...]
     jumps: tuple[Jump, ...]
     belief: Belief
+    left_out: tuple[int, ...] = ()
 
 
 def follow(
@@ -72,6 +77,7 @@ def follow(
     belief, filtered = how.start(earliest), _of_nothing(len(times))
     innovations: list[Innovation] = []
     left: list[Array] = []
+    bad: list[int] = []
     ahead = 0
     for k, one in enumerate(observed):
         if ahead < len(order) and times[order[ahead]] < one.time:
@@ -81,6 +87,10 @@ def follow(
             ahead += 1
         left.append(belief.left)
         belief, found = how.update(belief, one)
+        if found.earlier is not None:
+            bad.pop()
+        if found.bad is not None:
+            bad.append(k)
         innovations.append(found)
         advance(k + 1)
     now = how.blended(belief)
@@ -89,10 +99,12 @@ def follow(
     jumps = tuple(one.jump for one in innovations if one.jump is not None)
     knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
     begin = knowing.start(earliest)
-    left = hinted(how, knowing, begin, observed, left)
-    late = smoothed(knowing, begin, observed, times, left, knowing.parameters_of)
+    good = [k for k in range(len(observed)) if k not in bad]
+    taken = [observed[k] for k in good]
+    begin, left = hinted(how, knowing, begin, taken, [left[k] for k in good])
+    late = smoothed(knowing, begin, taken, times, left, knowing.parameters_of)
     width = how.stated.parameters.shape[0]
-    return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief)
+    return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief, tuple(bad))
 
 
 def _of_nothing(count: int) -> list[tuple[Array, Array]]:
@@ -101,8 +113,9 @@ def _of_nothing(count: int) -> list[tuple[Array, Array]]:
 
 def hinted(
     how: SeriesFilter, knowing: SeriesFilter, start: Belief, observed: Sequence[Observed], left: Sequence[Array]
-) -> list[Array]:
-    """N times (m,) what share of the mean square of jumps could not be told, with jumps that all readings hint at.
+) -> tuple[Belief, list[Array]]:
+    """What is known before the first reading, and N times (m,) what share of the mean square of jumps could not be
+    told, with jumps that all readings hint at.
 
     Args:
         how: the filter that looked for jumps.
@@ -112,7 +125,7 @@ def hinted(
         left: as for `smoothed`.
     """
     if not how.jumpers or not observed:
-        return list(left)
+        return start, list(left)
     at = how.space.level
     levels = [how.space.level_of(one.motions)[at] @ one.root for one in how.jumpers]
     scores = np.empty((len(observed), at.stop - at.start))
@@ -126,12 +139,13 @@ def hinted(
     smoothed(plain, replace(start, left=none), observed, none, [none] * len(observed), knowing.parameters_of, note)
     score = [scores @ level for level in levels]
     information = [level.T @ (known_of @ level) for level in levels]
-    gap = np.diff([one.time for one in observed], prepend=observed[0].time)
+    first = how.before_s if math.isnan(start.last) else 0.0
+    gap = np.diff([one.time for one in observed], prepend=observed[0].time - first)
     place = {k: i for i, k in enumerate(how.walking.tolist())}
     out = np.array(left)
     for one, more in zip(how.jumpers, added(score, information, gap, how.jumpers, how.window), strict=True):
         out[:, [place[k] for k in one.motions]] += more
-    return list(out)
+    return how.with_walk(start, out[0] - left[0], first), list(out)
 
 
 def smoothed(

@@ -55,17 +55,18 @@ class Jumper:
     every_s: float
 
 
-def jumpers(stated: Disturbances, may: Sequence[Candidate]) -> tuple[Jumper, ...]:
+def jumpers(stated: Disturbances, may: Sequence[Candidate], otherwise: float | None = None) -> tuple[Jumper, ...]:
     """Bodies of which all motions that jump do so at a stated rate.
 
     Args:
         stated: disturbances.
         may: what may jump.
+        otherwise: seconds between two jumps of a motion of which no rate is stated; None for bodies with a rate alone.
     """
     out = []
     for body in dict.fromkeys(one.body for one in may):
         one = max((one for one in may if one.body == body), key=lambda one: len(one.motions))
-        rates = [stated.laws[k].every_s for k in one.motions]
+        rates = [otherwise if (rate := stated.laws[k].every_s) is None else rate for k in one.motions]
         every = [rate for rate in rates if rate is not None]
         if len(every) == len(rates):
             out.append(Jumper(one.motions, one.spots, one.root, min(every)))

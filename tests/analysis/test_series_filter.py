@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.filter_state import Observed, of_shifts
 from analysis.monitor.jump_detection import steps
-from analysis.monitor.series_filter import Observed, SeriesFilter, of_shifts
+from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.series_following import follow, jointly
 from analysis.monitor.series_smoother import smooth
 from analysis.monitor.state_space import HeatInputs, StateSpace
@@ -254,7 +255,7 @@ def test_a_factor_of_what_heat_does_is_found() -> None:
 def test_a_sensor_says_what_a_body_does() -> None:
     """With exact coefficients the answer is that of one joint normal, sensors being further rows."""
     told, heat = heated(1e-9)
-    how = SeriesFilter(told, heat=heat, window=0)
+    how = SeriesFilter(told, heat=heat, window=0, leaving_out=False)  # no motion makes such shifts
     belief = how.start(0.0)
     read, shift = np.array([0.3, -0.2]), np.full(SPOTS, 0.4)
     belief, _ = how.update(belief, Observed(1.0, read, 1e-4 * np.eye(2), (0, 1)))
@@ -270,7 +271,7 @@ def test_a_sensor_says_what_a_body_does() -> None:
 
 def test_motions_of_a_state_are_those_of_one_joint_normal() -> None:
     told, shift = stated(LAWS[:3], seed=8), np.full(SPOTS, 0.7)
-    how = SeriesFilter(told, window=0)
+    how = SeriesFilter(told, window=0, leaving_out=False)  # no motion makes such shifts
     belief, _ = how.update(how.start(0.0), Observed(0.0, shift, NOISE**2 * np.eye(SPOTS)))
     found, spread = how.motions_of(belief.mean, belief.covariance, 0.0, 0.0)
     gain = told.correlation @ told.spots.T @ np.linalg.inv(told.spot_covariance + NOISE**2 * np.eye(SPOTS))

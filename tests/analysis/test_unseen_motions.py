@@ -5,7 +5,8 @@ import pytest
 from scipy.linalg import null_space
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.series_filter import SeriesFilter, of_shifts
+from analysis.monitor.filter_state import of_shifts
+from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.unseen_motions import floor, unseen_modes
 
 MOTIONS, SPOTS, PARAMETERS = 14, 4, 3

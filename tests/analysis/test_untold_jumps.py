@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.filter_state import of_shifts
 from analysis.monitor.jump_detection import steps
-from analysis.monitor.series_filter import SeriesFilter, of_shifts
+from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.series_following import follow, hinted, smoothed
 from analysis.monitor.state_space import StateSpace
 from tests.tiers import quick

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from scenes.yaml.errors import InputError, nearest
 from scenes.yaml.standard_output import BAD_INPUT, FAILURE, print_error
-from twin.operate.estimate_commands import alarms, estimate_of, forecast, show_estimate
+from twin.operate.estimate_commands import alarms, estimate_of, exclude, forecast, include, show_estimate
 from twin.operate.followed import PlanFile
 from twin.operate.life_commands import judge, simulate
 from twin.operate.products_command import products
@@ -359,6 +359,8 @@ def export(
 
 app.command("forecast")(forecast)
 app.command("alarms")(alarms)
+app.command("exclude")(exclude)
+app.command("include")(include)
 app.command("products")(products)
 app.command("simulate")(simulate)
 app.command("judge")(judge)

@@ -123,6 +123,50 @@ def alarms(
         tell(errors, as_json, quiet, data, show)
 
 
+Numbered = Annotated[
+    int, typer.Argument(metavar="ENTRY", min=1, help="Number of the entry, as status and export name it.")
+]
+Why = Annotated[str, typer.Option(metavar="TEXT", help="The reason, which the record keeps.")]
+
+
+def exclude(record: Place, entry: Numbered, why: Why, as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """Exclude a reading from the estimate, with the reason. The record keeps the reading and the decision; `include`
+    takes it back.
+
+    Example: `python -m twin.operate exclude record 123 --why "cosmic ray on the left spot"`
+
+    Exit codes: 0 success, 2 bad input (nothing is decided), 1 anything else.
+    """
+    _decide(record, entry, False, why, as_json, quiet)
+
+
+def include(record: Place, entry: Numbered, why: Why, as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """Include a reading in the estimate that was excluded, or that the estimate left out as a bad one.
+
+    Example: `python -m twin.operate include record 123 --why "the base was turned on purpose"`
+
+    Exit codes: 0 success, 2 bad input (nothing is decided), 1 anything else.
+    """
+    _decide(record, entry, True, why, as_json, quiet)
+
+
+def _decide(record: str, entry: int, included: bool, why: str, as_json: bool, quiet: bool) -> None:
+    require_record(record)
+    from twin.operate.record.entries import one_line
+    from twin.operate.record.history import History
+
+    with told() as errors, History(record) as history:
+        if not why.strip():
+            raise InputErrorText("--why: a decision needs a reason, which the record keeps")
+        try:
+            made = history.decide(entry, included, why.strip())
+        except Problem as problem:
+            raise InputErrorText(f"ENTRY: {one_line(problem)}") from None
+        text = f"entry {entry}, {made['kind']} of {made['subject']} at {made['time_utc']}, is "
+        text += f"{'included' if included else 'excluded'}: {made['why']}"
+        tell(errors, as_json, quiet, made, lambda console: print_verdict(console, text))
+
+
 def _open_text(count: int) -> str:
     return "1 alarm is open" if count == 1 else f"{count or 'no'} alarms are open"
 

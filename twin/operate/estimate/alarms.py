@@ -64,7 +64,11 @@ def alarms_of(plan: OperationSpec, following: Following) -> Iterator[Alarm]:
         if sensor.state != "ok":
             text = f"the sensor of {sensor.body} is {sensor.state} since {utc_text(sensor.since_us)}: {sensor.reason}"
             yield Alarm(SENSOR, sensor.body, sensor.since_us, text, sensor.to_dict())
-    yield from list(_contradictions(plan, following))[-1:]
+    if following.too_small:
+        text = next(one for one in following.warnings if following.too_small[0] in one)
+        yield Alarm(CONTRADICTION, "temperatures", following.time, text, {"causes": list(following.too_small)})
+    far = [*_contradictions(plan, following), *map(_of_bad, following.bad_readings)]
+    yield from sorted(far, key=lambda one: one.time)[-1:]
 
 
 def _is_told(alarm: Alarm, before: Sequence[Row]) -> bool:
@@ -123,6 +127,14 @@ def sized(value: float, sigma: float, unit: str) -> str:
     """A number with its standard deviation, two digits of it."""
     places = decimals_for(sigma)
     return f"{fixed(value, places, sign=True)} ± {fixed(sigma, places)} {unit.replace('um', 'µm')}"
+
+
+def _of_bad(bad: tuple[int, str]) -> Alarm:
+    time, reason = bad
+    text = (
+        f"the reading of {utc_text(time)} is taken for a bad one: {reason}; twin.operate include takes it all the same"
+    )
+    return Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
 
 
 def _contradictions(plan: OperationSpec, following: Following) -> Iterator[Alarm]:

@@ -13,14 +13,12 @@ from scipy.special import ndtr
 from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
-from twin.operate.estimate.standing import Scores
+from twin.operate.estimate.standing import SPANS, Scores
 from twin.operate.record.entries import utc_text
 
 __all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "SensorState", "beyond", "widening"]
 
 Array = NDArray[np.float64]
-SPANS = (1, 3, 10)
-"""Readings in a row that are held together against what was expected of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +194,9 @@ class Following:
         widened: by how much sigmas now are wider since the last readings contradict what is stated; 1 if they do not.
         too_many_jumps: whether more jumps were told than is stated.
         breaks: the requirements.
+        bad_readings: (time_us, reason) of the last readings of the monitor that were taken for bad ones.
+        undecided: whether the newest of these may be the first after a jump; sigmas then count with both.
+        too_small: causes of the prior with which sensors of several bodies disagree at the same time.
     """
 
     time: int
@@ -211,18 +212,24 @@ class Following:
     widened: float
     too_many_jumps: bool
     breaks: tuple[Break, ...]
+    bad_readings: tuple[tuple[int, str], ...] = ()
+    undecided: bool = False
+    too_small: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> list[str]:
-        """Return what a reader should know before using the numbers."""
+        """Return what a reader has to know before the numbers are used, one sentence each."""
         out = []
         if self.widened > 1.0:
-            out.append(
-                "the last readings contradict what is stated; all sigmas are "
-                f"{self.widened:.3g} times as wide as it would make them"
-            )
+            text = f"all sigmas are {self.widened:.3g} times as wide as it would make them"
+            out.append(f"the last or the first readings contradict what is stated; {text}")
         if self.too_many_jumps:
             out.append(f"{len(self.jumps)} jumps are more than is stated: something else moves, or more of it")
+        if self.undecided:
+            out.append(f"the newest reading may be bad: {self.bad_readings[-1][1]}; until then sigmas count with both")
+        if self.too_small:
+            text = "they are stated too small, or of another course in time, and their sigmas do not hold"
+            out.append(f"sensors of several bodies together disagree with {', '.join(self.too_small)}: {text}")
         return out
 
     def to_dict(self) -> dict[str, Any]:
@@ -248,6 +255,9 @@ class Following:
             "explained": {name: share if np.isfinite(share) else None for name, share in self.explained.items()},
             "widened": self.widened,
             "too_many_jumps": self.too_many_jumps,
+            "bad_readings": [{"time_utc": utc_text(t), "reason": reason} for t, reason in self.bad_readings],
+            "undecided": self.undecided,
+            "too_small": list(self.too_small),
             "requirements": [one.to_dict() for one in self.breaks],
         }
 
@@ -264,25 +274,27 @@ def beyond(value: Array, sigma: Array, limit: float) -> Array:
     return np.asarray(ndtr((value - limit) / scale) + ndtr((-value - limit) / scale))
 
 
-def widening(squares: Array, now: Sequence[int] | NDArray[np.intp], centred: bool) -> Array:
+def widening(squares: Array, now: Sequence[int] | NDArray[np.intp], centred: bool, first: Array) -> Array:
     """(T,) by how much sigmas are wider than what is stated makes them, where readings contradict it: the root of their
     chi-square over its degrees of freedom, over the reading alone or some in a row, whichever is more. 1 where chance
-    explains them.
+    explains them. What contradicts the first readings is not forgotten: of what the spots do not show, the state rests
+    on what was stated of the start for as long as nothing explains it.
 
     Args:
         squares: (N, 2) chi-square and degrees of freedom of each reading before it came, in the order of time.
         now: (T,) number of readings up to each time.
         centred: whether readings after the time count as well.
+        first: (n, 2) of the first readings of all.
     """
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(squares, axis=0)])
     out = np.ones(len(now))
     for span in SPANS:
         last = np.asarray(now, int) + (span // 2 if centred else 0)
         last = np.clip(last, 1, len(squares))
-        first = np.maximum(last - span, 0)
-        square, degrees = (sums[last] - sums[first]).T
-        known = degrees > 0.0
-        limit = limit_of(FALSE_ALARM / len(SPANS), np.where(known, degrees, 1.0))
-        ratio = np.sqrt(square / np.where(known, degrees, 1.0))
-        out = np.maximum(out, np.where(known & (square > limit), ratio, 1.0))
+        at_start = np.sum(first[:span], axis=0).reshape(1, 2)
+        for square, degrees in ((sums[last] - sums[np.maximum(last - span, 0)]).T, at_start.T):
+            known = degrees > 0.0
+            limit = limit_of(FALSE_ALARM / len(SPANS), np.where(known, degrees, 1.0))
+            ratio = np.sqrt(square / np.where(known, degrees, 1.0))
+            out = np.maximum(out, np.where(known & (square > limit), ratio, 1.0))
     return out

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from scipy.special import pdtrc
 
 from analysis.monitor.disturbances import FALSE_ALARM
+from analysis.monitor.filter_state import Belief, Observed
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.limits import Quantity
-from analysis.monitor.series_filter import Belief, Observed, SeriesFilter
+from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.series_following import hinted, jointly, smoothed
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import one_blas_thread
@@ -31,8 +32,8 @@ from twin.operate.estimate.following import Break, Course, Following, FoundJump,
 from twin.operate.estimate.operation_model import OperationModel, traced_model
 from twin.operate.estimate.plans import plan_digest
 from twin.operate.estimate.standing import Standing, Taking
-from twin.operate.record.entries import MICRO, digest_of_data, utc_text
-from twin.operate.record.history import History, content_of
+from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
+from twin.operate.record.history import USED, History, content_of
 from twin.run.provenance import source_digest
 
 __all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "Operation", "SensorState", "beyond"]
@@ -41,8 +42,6 @@ Array = NDArray[np.float64]
 DAY = 86_400 * MICRO
 EVERY = 1000
 """Readings after which it is kept for good where the estimate stands."""
-_USED = ("monitor", "temperature")
-"""Sorts of entries that change the estimate; events do by what they step."""
 HEAD = 16
 """Readings since it was kept after which it is kept at all: to follow as many again is as quick as to write it down."""
 _MODEL, _HEAD = -1, 0
@@ -143,9 +142,15 @@ class Operation:
 
     def _moments(self, after_us: int | None, until_us: int | None = None) -> Iterator[list[dict[str, Any]]]:
         """Entries that are used, those of one time together, in the order of time."""
-        own = (one for one in self.history.entries(after_us=after_us, until_us=until_us) if one["kind"] in _USED)
+        own = (one for one in self.history.entries(after_us=after_us, until_us=until_us) if one["kind"] in USED)
         for _, together in groupby(own, key=lambda one: int(one["time_us"])):
-            yield [{**one, "content": content_of(one)} for one in together]
+            yield [{**one, "content": content_of(one), "decided": self._decisions.get(one["id"])} for one in together]
+
+    @cached_property
+    def _decisions(self) -> dict[int, tuple[bool, str]]:
+        """Number of an entry on which somebody has decided -> whether it is included, and why."""
+        found = (content_of(one) for one in self.history.entries(DECISION))
+        return {int(one["entry"]): (bool(one["included"]), str(one["why"])) for one in found}
 
     def standing(self) -> Standing:
         """Take all readings that are new; where the estimate stands then."""
@@ -229,7 +234,7 @@ class Operation:
         jumps = tuple(self._found(one.time, one.jump) for one in standing.jumps)
         sensors = []
         for one in standing.sensors.values():
-            state, since, reason = one.state(standing.time)
+            state, since, reason = one.state(standing.time, one.body not in standing.together)
             sensors.append(SensorState(one.body, state, since, one.last_us, reason))
         names = [f"{one.group} {one.key}" for one in self.quantities]
         return Following(
@@ -246,7 +251,18 @@ class Operation:
             self._widened,
             self.too_many_jumps,
             self._breaks(),
+            standing.bad,
+            standing.pending is not None,
+            self._too_small(),
         )
+
+    def _too_small(self) -> tuple[str, ...]:
+        """Causes of the temperatures of bodies whose sensors disagree with what is stated at the same time."""
+        stated, heat, accused = self.model.how.stated, self.model.how.heat, self._standing.accused
+        if heat is None:
+            return ()
+        lasting = (k for k in heat.motions.tolist() if stated.bodies[k] in accused and not stated.laws[k].white)
+        return tuple(dict.fromkeys(stated.causes[k] for k in lasting))
 
     def _found(self, told: int, jump: Jump) -> FoundJump:
         sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
@@ -303,7 +319,7 @@ class Operation:
     def _widened(self) -> float:
         """Of sigmas now, where the last readings contradict what is stated."""
         squares = self._unexplained(self._standing.innovations)
-        return float(widening(squares, [len(squares)], False)[0])
+        return float(widening(squares, [len(squares)], False, self._unexplained(self._standing.first))[0])
 
     @cached_property
     def too_many_jumps(self) -> bool:
@@ -354,7 +370,7 @@ class Operation:
         told = [one for span in self._spans(None) for one in span.told]
         squares = self._unexplained(told)
         number = np.searchsorted([time for time, _, _ in told], times, side="right")
-        out = widening(squares, number, True)
+        out = widening(squares, number, True, self._unexplained(self._standing.first))
         out[times >= self._standing.time] = self._widened
         return out
 
@@ -487,14 +503,17 @@ class Operation:
             belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
         )
         knowing = replace(taking.how, steps=steps, window=0)
-        return knowing, belief, observed, hinted(taking.how, knowing, belief, observed, list(left))
+        belief, with_hints = hinted(taking.how, knowing, belief, observed, list(left))
+        return knowing, belief, observed, with_hints
 
     def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
         """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""
         spans = self._spans(after_us)
         width = len(self._taking.how.walking)
         left = np.concatenate([one.left.reshape(len(one.used), width) for one in spans])
-        return np.concatenate([one.used for one in spans]), left
+        used, pending = np.concatenate([one.used for one in spans]), self._standing.pending
+        good = used != (0 if pending is None else pending[0])
+        return used[good], left[good]
 
     def _spans(self, after_us: int | None) -> list[Standing]:
         """Where the estimate was kept for good after a time and stands now; each knows what was used since the last."""
@@ -507,7 +526,7 @@ class Operation:
         return [*(Standing.from_bytes(one.content) for one in kept), last]
 
     def _begin(self) -> int:
-        return min(int(one["time_us"]) for kind in _USED if (one := self.history.first(kind)) is not None)
+        return min(int(one["time_us"]) for kind in USED if (one := self.history.first(kind)) is not None)
 
     def _before_all(self, time: int) -> Standing | None:
         """The newest that was kept for good before a time and before all jumps that were told since; None for none."""

@@ -28,6 +28,10 @@ from scenes.specs.operation import OperationSetup
 from twin.monitor.monitor_experiment import MonitorExperiment
 
 Array = NDArray[np.float64]
+BEFORE = 0.01
+"""Share of the mission that passes between the calibration and the first reading: so large are the chance of a jump
+then and its part of the chance of a false alarm.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,7 @@ class OperationModel:
             "life_s": self.how.life_s,
             "window": self.how.window,
             "stepping": self.how.stepping,
+            "before_s": self.how.before_s,
             "heat": None if heat is None else {"sensors": heat.sensors, "names": heat.names, "sigma": heat.sigma},
         }
         arrays: dict[str, np.ndarray] = {"sigmas": stated.sigmas, "see": stated.spots, "parameters": stated.parameters}
@@ -107,6 +112,7 @@ class OperationModel:
             life_s=plain["life_s"],
             window=plain["window"],
             stepping=tuple(plain["stepping"]),
+            before_s=plain["before_s"],
         )
         spots = tuple((camera, channel) for camera, channel in plain["spots"])
         known = {one.key: one for one in (*CAMERA_PARAMETERS, ANGLE, *GROUND)}
@@ -162,6 +168,7 @@ def traced_model(
         life_s=plan.mission,
         window=plan.window,
         stepping=tuple(k for k, cause in enumerate(stated.causes) if cause in stepping),
+        before_s=BEFORE * plan.mission,
     )
     spots = [(name, channel) for name, one in experiment.cameras.items() for channel in one.channels]
     alone = [one.parameter_jacobian @ np.linalg.pinv(one.spot_jacobian) for one in experiment.cameras.values()]

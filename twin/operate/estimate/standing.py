@@ -13,18 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from analysis.chi_square import limit_of
+from analysis.monitor.disturbances import FALSE_ALARM
+from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track
 from analysis.monitor.jump_detection import Jump
-from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Track
+from analysis.monitor.series_filter import SeriesFilter
 from twin.operate.estimate.operation_model import OperationModel, packed, unpacked
 from twin.operate.record.entries import MICRO
 
 Array = NDArray[np.float64]
+SPANS = (1, 3, 10)
+"""Readings in a row that are held together against what was expected of them."""
 KEPT = 200
 """Innovations and readings that were left out, of which the last are kept."""
 FAR = 6.0
 """Standard deviations of a sensor's reading from what was expected, beyond which it is not used."""
 RECENT = 10
 """Readings of a sensor by which it is judged."""
+LOOSE = 3.0
+"""Standard deviations beyond which a reading widens what is stated of temperatures, where several sensors disagree."""
 DOUBTS = 3
 """Of these, how many far ones make a sensor doubtful."""
 SILENT = 10.0
@@ -44,7 +51,7 @@ class Sensor:
         value: of the newest, kelvin; repeats: how often it came in a row before it; since_us: first of these.
         step: smallest difference of two readings that followed each other, kelvin; infinite before there is one.
         sigma: of its readings, kelvin.
-        far: whether each of the last readings was far from what was expected of it.
+        recent: the last readings against what was expected of each, in standard deviations.
         stuck: whether it repeats itself.
     """
 
@@ -57,7 +64,7 @@ class Sensor:
     since_us: int = 0
     step: float = math.inf
     sigma: float = 0.0
-    far: tuple[bool, ...] = ()
+    recent: tuple[float, ...] = ()
     stuck: bool = False
 
     def came(self, time: int, value: float, sigma: float) -> Sensor:
@@ -80,15 +87,27 @@ class Sensor:
             stuck=bool(repeats >= 3 and alike**repeats * max(self.readings, 1) < CHANCE),
         )
 
-    def judged(self, far: bool) -> Sensor:
-        """With what is thought of its newest reading."""
-        return replace(self, far=(*self.far, bool(far))[-RECENT:])
+    def judged(self, white: float) -> Sensor:
+        """With its newest reading against what was expected of it."""
+        return replace(self, recent=(*self.recent, white)[-RECENT:])
 
-    def state(self, now: int) -> tuple[str, int, str]:
+    @property
+    def far(self) -> int:
+        """How many of its last readings were far from what was expected."""
+        return sum(abs(white) > FAR for white in self.recent)
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether its last readings together are further from what was expected than by chance."""
+        square = sum(white**2 for white in self.recent)
+        return bool(self.recent) and square > float(limit_of(FALSE_ALARM, len(self.recent)))
+
+    def state(self, now: int, alone: bool) -> tuple[str, int, str]:
         """``ok``, ``dead``, ``stuck`` or ``doubtful``; since when, microseconds; and why.
 
         Args:
             now: time of the newest reading of all.
+            alone: whether no other sensor disagrees with what is stated as it does.
         """
         if self.stuck:
             return "stuck", self.since_us, f"{self.repeats + 1} readings in a row of {self.value:.6g} K"
@@ -100,12 +119,9 @@ class Sensor:
                 self.last_us,
                 f"nothing came for {silent:.3g} days; it used to every {usual / MICRO / 86_400.0:.3g}",
             )
-        if sum(self.far) >= DOUBTS:
-            return (
-                "doubtful",
-                self.last_us,
-                f"{sum(self.far)} of the last {len(self.far)} readings far from what was expected",
-            )
+        if self.far >= DOUBTS and alone:
+            text = f"{self.far} of the last {len(self.recent)} readings far from what was expected"
+            return "doubtful", self.last_us, text
         return "ok", self.first_us, ""
 
 
@@ -170,6 +186,11 @@ class Standing:
         told: innovations since then.
         silent: (body, time_us) of sensors that repeat themselves, and of the first of their equal readings: none counts
             from there on.
+        pending: (id, time_us) of a reading of the monitor that was set aside, of which the next one decides; it is
+            among those that were used. None for none.
+        bad: (time_us, reason) of the last readings of the monitor that were taken for bad ones, and of a pending one.
+        first: as ``innovations``, of the first readings of all.
+        accused: bodies whose sensors have disagreed with what is stated at the same time as others.
     """
 
     belief: Belief
@@ -185,6 +206,10 @@ class Standing:
     left: Array = field(default_factory=lambda: np.zeros((0, 0)))
     told: tuple[tuple[int, float, int], ...] = ()
     silent: tuple[tuple[str, int], ...] = ()
+    pending: tuple[int, int] | None = None
+    bad: tuple[tuple[int, str], ...] = ()
+    first: tuple[tuple[int, float, int], ...] = ()
+    accused: tuple[str, ...] = ()
 
     @property
     def explained(self) -> Array:
@@ -205,11 +230,43 @@ class Standing:
             self, time=max(self.time, time), left_out=(*self.left_out, (time, kind, subject, reason))[-KEPT:]
         )
 
+    def decided(self, left_out: str) -> Standing:
+        """With the decision on the reading that was set aside.
+
+        Args:
+            left_out: why it is left out; empty where it is taken after all.
+        """
+        assert self.pending is not None
+        number, time = self.pending
+        kept = [one for one in self.left_out if (one[0], one[1]) != (time, "monitor")]
+        bad = tuple(one for one in self.bad if one[0] != time)
+        if not left_out:
+            return replace(self, pending=None, left_out=tuple(kept), bad=bad)
+        good, bad = self.used != number, (*bad, (time, left_out))
+        kept = [*kept, (time, "monitor", "monitor", left_out)]
+        return replace(self, pending=None, left_out=tuple(kept), bad=bad, used=self.used[good], left=self.left[good])
+
     @property
     def found_stuck(self) -> tuple[tuple[str, int], ...]:
         """Sensors that repeat themselves, whose first equal readings have been used: (body, time_us of the first)."""
         stuck = ((one.body, one.since_us) for one in self.sensors.values() if one.stuck)
         return tuple(one for one in stuck if one not in self.silent)
+
+    @property
+    def together(self) -> tuple[str, ...]:
+        """Bodies whose sensors disagree with what is stated, where several do: it is then the prior that is wrong, and
+        not all of these sensors. Empty where one disagrees, or none.
+        """
+        found = tuple(sorted(one.body for one in self.sensors.values() if one.disagrees))
+        return found if len(found) > 1 else ()
+
+    def read(self, time: int, found: Innovation) -> Standing:
+        """With the innovation of a reading of the monitor that was taken."""
+        came = (time, found.chi_square, len(found.white))
+        scores = self.scores.with_one(found.white, found.log_score)
+        innovations = (*self.innovations, came)[-KEPT:]
+        first = (*self.first, came)[: SPANS[-1]]
+        return replace(self, scores=scores, innovations=innovations, told=(*self.told, came), first=first)
 
     def anew(self) -> Standing:
         """The same, counting what is used from now on."""
@@ -217,21 +274,14 @@ class Standing:
 
     def to_bytes(self) -> bytes:
         """All of it."""
-        own = self.belief
-        arrays: dict[str, np.ndarray] = {
-            "after": own.after,
-            "until": own.until,
-            "left": own.left,
-            "spread": self.spread,
-            "basis": self.basis,
-            "used": self.used,
-            "span": self.left,
-        }
-        for name, track in (("state", own.state), ("search", own.search)):
-            if track is not None:
-                arrays |= {f"{name}_{part}": getattr(track, part) for part in _STATES}
+        belief, arrays = _plain_belief(self.belief, "")
+        arrays |= {"spread": self.spread, "basis": self.basis, "used": self.used, "span": self.left}
         plain = {
-            "belief": {"time": own.time, "last": own.last},
+            "belief": belief,
+            "pending": self.pending,
+            "bad": self.bad,
+            "first": self.first,
+            "accused": self.accused,
             "time": self.time,
             "scores": asdict(self.scores),
             "innovations": self.innovations,
@@ -247,16 +297,8 @@ class Standing:
     def from_bytes(cls, content: bytes) -> Standing:
         """What `to_bytes` gave."""
         plain, arrays = unpacked(content)
-        tracks = [
-            Track(*(arrays[f"{name}_{part}"] for part in _STATES)) if f"{name}_mean" in arrays else None
-            for name in ("state", "search")
-        ]
-        assert tracks[0] is not None
-        told = plain["belief"]
-        belief = Belief(
-            told["time"], told["last"], arrays["after"], arrays["until"], tracks[0], tracks[1], arrays["left"]
-        )
-        sensors = [Sensor(**{**one, "far": tuple(one["far"])}) for one in plain["sensors"]]
+        belief = _belief(plain["belief"], arrays, "")
+        sensors = [Sensor(**{**one, "recent": tuple(one["recent"])}) for one in plain["sensors"]]
         return cls(
             belief,
             plain["time"],
@@ -271,7 +313,46 @@ class Standing:
             arrays["span"],
             tuple((time, square, degrees) for time, square, degrees in plain["told"]),
             tuple((body, time) for body, time in plain["silent"]),
+            None if plain["pending"] is None else (plain["pending"][0], plain["pending"][1]),
+            tuple((time, reason) for time, reason in plain["bad"]),
+            tuple((time, square, degrees) for time, square, degrees in plain["first"]),
+            tuple(plain["accused"]),
         )
+
+
+def _plain_belief(own: Belief, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """A belief as plain data and arrays, whose names begin alike."""
+    plain: dict[str, Any] = {"time": own.time, "last": own.last, "recent": own.recent, "aside": None}
+    arrays = {f"{name}{part}": getattr(own, part) for part in ("after", "until", "left")}
+    for which, track in (("state", own.state), ("search", own.search)):
+        if track is not None:
+            arrays |= {f"{name}{which}_{part}": getattr(track, part) for part in _STATES}
+    if own.aside is not None:
+        found, (taken, more) = own.aside.innovation, _plain_belief(own.aside.taken, f"{name}aside_")
+        arrays |= {**more, f"{name}aside_white": found.white}
+        bad = None if found.bad is None else asdict(found.bad)
+        plain["aside"] = {"log_odds": own.aside.log_odds, "log_score": found.log_score, "bad": bad, "taken": taken}
+    return plain, arrays
+
+
+def _belief(plain: dict[str, Any], arrays: Mapping[str, np.ndarray], name: str) -> Belief:
+    """What `_plain_belief` was given; of a reading that was set aside only what it was against its prediction."""
+    tracks = [
+        Track(*(arrays[f"{name}{which}_{part}"] for part in _STATES)) if f"{name}{which}_mean" in arrays else None
+        for which in ("state", "search")
+    ]
+    assert tracks[0] is not None
+    aside, put = None, plain["aside"]
+    if put is not None:
+        read, bad = (
+            Observed(put["taken"]["time"], np.empty(0), np.empty((0, 0))),
+            put["bad"] and BadReading(**put["bad"]),
+        )
+        found = Innovation(read, arrays[f"{name}aside_white"], put["log_score"], None, bad)
+        aside = Aside(_belief(put["taken"], arrays, f"{name}aside_"), found, put["log_odds"])
+    after, until, left = (arrays[f"{name}{part}"] for part in ("after", "until", "left"))
+    recent = tuple(plain["recent"])
+    return Belief(plain["time"], plain["last"], after, until, tracks[0], tracks[1], left, recent, aside)
 
 
 def _jump(plain: dict[str, Any]) -> Jump:
@@ -321,9 +402,15 @@ class Taking:
 
         Args:
             standing: before.
-            entries: of one time, each with its content as plain data.
+            entries: of one time, each with its content as plain data and, as ``decided``, whether somebody includes it
+                and why; None where nobody has decided.
         """
         standing = replace(standing, time=max(standing.time, int(entries[0]["time_us"])))
+        for one in entries:
+            if (decided := one["decided"]) is not None and not decided[0]:
+                reason = f"entry {one['id']} was excluded: {decided[1]}"
+                standing = standing.without(int(one["time_us"]), str(one["kind"]), str(one["subject"]), reason)
+        entries = [one for one in entries if one["decided"] is None or one["decided"][0]]
         warm = sorted((one for one in entries if one["kind"] == "temperature"), key=lambda one: str(one["subject"]))
         for one in warm:
             standing = self._temperature(standing, one)
@@ -351,7 +438,7 @@ class Taking:
         return Observed(time, (place - self.reference).ravel(), np.diag(sigma.ravel() ** 2))
 
     def _updated(self, standing: Standing, entry: Mapping[str, Any], observed: Observed) -> tuple[Standing, Innovation]:
-        belief, found = self.how.update(standing.belief, observed)
+        belief, found = self.how.update(standing.belief, observed, entry["decided"] is not None)
         used = np.append(standing.used, np.int64(entry["id"]))
         # of no motion that may jump there is nothing to count rows by
         before = standing.left.reshape(len(standing.used), len(self.how.walking))
@@ -366,14 +453,20 @@ class Taking:
         standing = replace(standing, sensors={**standing.sensors, body: sensor})
         if self.how.heat is None or body not in self.how.heat.sensors:
             return standing.without(time, "temperature", body, "nothing is stated of its temperature")
-        if sensor.stuck or (body, sensor.since_us) in standing.silent:
+        included = entry["decided"] is not None
+        if not included and (sensor.stuck or (body, sensor.since_us) in standing.silent):
             return standing.without(time, "temperature", body, "its sensor repeats itself")
         observed = self.observed(entry)
         there = self.how.at(standing.belief, observed.time)
         white = float(self.how.whitened(there.state, observed).white[0])
-        far = abs(white) > FAR
-        standing = replace(standing, sensors={**standing.sensors, body: sensor.judged(far)})
-        if far:
+        sensor = sensor.judged(white)
+        standing = replace(standing, sensors={**standing.sensors, body: sensor})
+        if body in standing.together:  # then it is not the sensor that is wrong
+            times = max(abs(white), 1.0)
+            loose = self.how.loosened(there, observed, times) if times > LOOSE else there
+            accused = tuple(sorted({*standing.accused, *standing.together}))
+            standing = replace(standing, belief=loose, accused=accused)
+        elif abs(white) > FAR and not included:
             reason = f"{abs(white):.3g} standard deviations from what was expected"
             return standing.without(time, "temperature", body, reason)
         return self._updated(standing, entry, observed)[0]
@@ -382,17 +475,32 @@ class Taking:
         time = int(entry["time_us"])
         if entry["content"]["numbers"].get("sigma_holds") is False:
             return standing.without(time, "monitor", "monitor", "its own sigma does not hold")
-        observed = self.observed(entry)
+        observed, before = self.observed(entry), standing.belief.aside
         standing, found = self._updated(standing, entry, observed)
+        if found.settled and standing.pending is not None and before is not None:
+            number, when = standing.pending
+            standing = standing.decided("" if found.earlier else self._bad(number, before.innovation))
+            if found.earlier is not None:
+                standing = standing.read(when, found.earlier)
+        if found.bad is not None:
+            number = int(entry["id"])
+            reason = f"{self._bad(number, found)}; the next reading decides whether it is left out"
+            standing = replace(standing, pending=(number, time), bad=(*standing.bad, (time, reason))[-KEPT:])
+            return standing.without(time, "monitor", "monitor", reason)
         belief, space, rows = standing.belief, self.how.space, self.model.rows
         values = rows @ self.how.parameters_of(belief.mean, belief.covariance, observed.time)[0]
         rest = values - rows @ space.heat_outputs(belief.mean, observed.time)[space.width :]
-        came = (time, found.chi_square, len(found.white))
+        spread = np.stack([values, values**2, rest, rest**2])
         return replace(
-            standing,
-            scores=standing.scores.with_one(found.white, found.log_score),
-            innovations=(*standing.innovations, came)[-KEPT:],
-            told=(*standing.told, came),
+            standing.read(time, found),
             jumps=standing.jumps if found.jump is None else (*standing.jumps, Told(time, found.jump)),
-            spread=standing.spread + np.stack([values, values**2, rest, rest**2]),
+            spread=standing.spread + (spread if found.earlier is None else 2.0 * spread),
         )
+
+    def _bad(self, number: int, found: Innovation) -> str:
+        """Why a reading is taken for a bad one."""
+        assert found.bad is not None
+        camera, channel = self.model.spots[found.bad.coordinate // 2]
+        axis = ("row", "column")[found.bad.coordinate % 2]
+        text = f"entry {number}: the {axis} of the spot {camera}/{channel} is {abs(found.bad.z):.3g} sigma from what"
+        return f"{text} is expected of it, and no jump of stated size explains that"

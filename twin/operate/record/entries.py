@@ -21,6 +21,8 @@ from twin.orbit.measured.clock import Readings, calendar, single_reading, tai_mi
 EPOCH_DAY = 51544
 """Modified Julian day from whose beginning in TAI, 2000-01-01, times are counted."""
 MICRO = 1_000_000
+DECISION = "decision"
+"""Kind of an entry by which a person excludes another entry from the estimate, or includes it."""
 _NOT_THE_INSTRUMENT = ("description", "disturbances")
 """Keys of an instrument that do not say what it is."""
 

@@ -20,8 +20,10 @@ from scenes.yaml.json_file import parse_json
 from twin.operate.record import schema
 from twin.operate.record.database import engine_of, failures_told, opened, said, url_of, writing
 from twin.operate.record.entries import (
+    DECISION,
     Alarm,
     Checkpoint,
+    Entry,
     Given,
     canonical,
     digest_of_data,
@@ -46,6 +48,8 @@ from twin.run.durable import make_folders, sync_folder
 
 LAST_CHECKED = 500
 """Entries whose digests are worked out again whenever the status is asked for; all of them take too long."""
+USED = ("monitor", "temperature")
+"""Kinds of entries that change the estimate; events do by what they step."""
 
 
 class History:
@@ -113,6 +117,42 @@ class History:
                 if not attempt:
                     raise RecordFailed(said(error)) from None
         raise AssertionError
+
+    def decide(self, number: int, included: bool, why: str) -> dict[str, Any]:
+        """Exclude an entry from the estimate, or include it whatever speaks against it, by an entry of its own: the
+        newest decision on an entry counts.
+
+        Args:
+            number: id of the entry, a reading of the monitor or a temperature.
+            included: whether it counts from now on.
+            why: the reason.
+
+        Returns:
+            ``entry``, ``kind``, ``subject``, ``time_utc``, ``included`` and ``why``.
+
+        Raises:
+            Problem: there is no such reading, or the same was decided before.
+        """
+        c = ENTRY.c
+        with writing(self._engine) as connection:
+            row = connection.execute(select(ENTRY).where(c.id == number, c.kind.in_(USED))).mappings().first()
+            if row is None:
+                allowed = "a reading of the monitor or a temperature; export writes the numbers of all entries"
+                raise Problem("no such reading", str(number), allowed)
+            own = select(c.content).where(c.kind == DECISION, c.subject == str(number)).order_by(c.id)
+            before = [parse_json(one, "the record") for one in connection.execute(own).scalars()]
+            if before and before[-1]["included"] == included:
+                text = f"entry {number} is {'included' if included else 'excluded'} already"
+                raise Problem(text, None, f"another decision; the reason then: {before[-1]['why']}")
+            content = {"entry": number, "sha256": row["sha256"], "included": included, "why": why}
+            content["number"] = len(before) + 1
+            one = Entry(DECISION, str(number), int(row["time_us"]), content)
+            command = f"twin.operate {'include' if included else 'exclude'}"
+            given = Given(command, digest_of_data(content), one.digest, [one], {})
+            taking = digest_of_data([given.sha256, given.meaning])
+            Taking(connection, self.simulated, True).write(given, taking, None, [(one, one.digest)], {})
+        keys = {key: row[key] for key in ("kind", "subject", "time_utc")}
+        return {"entry": number, **keys, "included": included, "why": why}
 
     def entries(
         self,

@@ -26,7 +26,11 @@ _WHEN = (
     _key("time_utc", "time of the reading, UTC"),
     Quantity[Row]("time_s", lambda row: row["time_us"] / MICRO, "SI seconds since 2000-01-01T00:00:00 TAI"),
 )
-_FROM = (_key("file", "from which it was taken"), _key("sha256", "by which the reading is recognised"))
+_FROM = (
+    _key("file", "from which it was taken"),
+    _key("sha256", "by which the reading is recognised"),
+    Quantity[Row]("entry", lambda row: row["id"], "number of the entry, by which exclude and include name it"),
+)
 
 
 def _value(k: int) -> Any:
@@ -68,6 +72,14 @@ TABLES: Mapping[str, Record[Row]] = {
         *_WHEN,
         _key("subject", "event"),
         Quantity("detail", lambda row: row["content"].get("detail"), "what the table says of it"),
+        *_FROM,
+    ),
+    "decision": Record(
+        "Entries that a person excluded from the estimate or included.",
+        *_WHEN,
+        Quantity("decided_entry", lambda row: row["content"]["entry"], "number of the entry"),
+        Quantity("included", lambda row: row["content"]["included"], "whether it counts from then on"),
+        Quantity("why", lambda row: row["content"]["why"], "the reason"),
         *_FROM,
     ),
     "run": Record(

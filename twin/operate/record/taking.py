@@ -92,7 +92,7 @@ class Taking:
         before = source is not None
         fresh = self._fresh(given, refused, before)
         if kept or fresh or not before:
-            self._write(given, taking, None if source is None else int(source[0]), kept, fresh)
+            self.write(given, taking, None if source is None else int(source[0]), kept, fresh)
         told = tuple((one.line, one.reason) for one, _ in refused)
         return Taken(given.file, len(kept), again, told, before, len(refused) - len(fresh))
 
@@ -177,7 +177,7 @@ class Taking:
             "sigma from these; recover the frames against its images before, or begin another record"
         )
 
-    def _write(
+    def write(
         self,
         given: Given,
         taking: str,
@@ -185,6 +185,15 @@ class Taking:
         kept: list[tuple[Entry, str]],
         refused: Mapping[str, tuple[Refused, str | None]],
     ) -> None:
+        """Add rows to the record, and drop what was kept of estimates that these change.
+
+        Args:
+            given: what they come from.
+            taking: digest by which that is recognised.
+            source: its id; None where the record does not have it yet.
+            kept: entries with their digests.
+            refused: what is not taken for the first time, by its digest, with that of its entry where it has one.
+        """
         moment = utc_text(now())
         if source is None:
             row = {"file": given.file, "sha256": given.sha256, "taking": taking, "taken_utc": moment}

@@ -15,9 +15,10 @@ import numpy as np
 
 from analysis.chi_square import chance_beyond, limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
+from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.recovery import MeasuredSpots, judged_spots
-from analysis.monitor.series_filter import Observed, SeriesFilter
+from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError

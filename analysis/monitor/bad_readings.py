@@ -1,0 +1,121 @@
+"""A reading that is wrong by itself, weighed against a jump whose size is bounded by what is stated.
+
+Both explain a reading that is far from its prediction. Beforehand a reading is bad with a small chance c, a body jumps
+before it with the chance gap / every of `untold_jumps`. A bad reading has errors at some of its D coordinates, of
+variance v each, and none at the others. With nu the difference from the prediction and S its covariance,
+
+    B(bad) = c N(nu; 0, S + V) / N(nu; 0, S)
+
+is averaged over the sizes of errors, over the number of coordinates and over which they are: the worst is added first,
+then the one that explains most of what is left, and so on. For a jump the ratio of likelihoods with it and without it,
+averaged over its size, is that of `untold_jumps`; sizes well above those stated have small chances of their own, so
+that a very large jump is believed when the next reading shows it once more, and not before. A step of the readings
+that no body explains has a place among jumps, too, with the least chance: several readings that agree with each other
+are not bad.
+
+Reference: Box, Tiao, A Bayesian approach to some outlier problems, Biometrika 55, 1968, 119.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp
+
+from analysis.monitor.filter_state import BadReading, Track
+from analysis.monitor.untold_jumps import Jumper
+
+__all__ = ["LEAST_CHI_SQUARE", "MOST", "MOST_FOR_JUMP", "RECENT", "SURE", "UNSURE", "bad_reading", "jump_evidence"]
+
+Array = NDArray[np.float64]
+SHARE = 1e-3
+"""Chance beforehand that a reading is bad."""
+UNSURE = math.log(0.05 / 0.95)
+"""Logarithm of the odds of a bad reading against one to which nothing has happened, above which it may be set aside."""
+SURE = math.log(1e-3)
+"""Logarithm of its odds against the first one after a jump, above which it is: an error at one coordinate and a jump of
+a body that moves spots in any way look alike, and it is not well known how often readings are bad.
+"""
+MOST_FOR_JUMP = 0.8
+"""Chance at most that a reading which was set aside counts with as the first after a jump, for the same reason."""
+RECENT, MOST = 10, 5
+"""Where so many of the last readings were left out, none more is: then the prior is wrong, and not the readings."""
+LEAST_CHI_SQUARE = -2.0 * (math.log(SHARE) - UNSURE)
+"""Chi-square of a reading below which it can't be set aside, since no error explains more of it than all."""
+_ERRORS = np.array([10.0, 50.0, 250.0, 1250.0, 6250.0])
+"""Sizes of errors over the noise of a coordinate, each as likely."""
+_SIZES = np.array([0.125, 0.25, 0.5, 1.0, 2.0, 8.0, 64.0])
+_LOG_SIZE = np.log([0.2, 0.2, 0.2, 0.2, 0.2, 1e-2, 1e-4])
+"""Sizes of jumps over those stated, and the logarithms of their chances."""
+_UNSTATED = math.log(1e-3)
+"""Logarithm of the chance of a step that nothing stated explains, over that of a jump of one body in the whole life."""
+
+
+def bad_reading(white: Array, root: Array, noise: Array) -> BadReading:
+    """Weigh a reading as one with errors against one without.
+
+    Args:
+        white: (D,) root^-1 times its difference from the prediction.
+        root: (D, D) Cholesky factor of the covariance of that difference.
+        noise: (D, D) of the reading.
+    """
+    count = len(white)
+    back = np.linalg.inv(root)
+    precision = back.T @ back
+    pulled = back.T @ white
+    z = pulled / np.sqrt(np.diag(precision))
+    worst = int(np.argmax(np.abs(z)))
+    size = np.diag(noise).copy()
+    size = np.where(size > 0.0, size, 1e-6 * np.diag(root @ root.T))
+    chosen = np.arange(1, count + 1)
+    beforehand = -math.log(count) - (gammaln(count + 1) - gammaln(chosen + 1) - gammaln(count - chosen + 1))
+    logs = [_with_errors(precision, pulled, scale**2 * size) + beforehand for scale in _ERRORS.tolist()]
+    total = float(logsumexp(logs)) - math.log(len(_ERRORS)) + math.log(SHARE)
+    return BadReading(total, float(z[worst]), worst)
+
+
+def _with_errors(precision: Array, pulled: Array, variance: Array) -> Array:
+    """(D,) log likelihood ratio with errors at the 1, 2, ... coordinates that explain most."""
+    free, total, out = np.ones(len(pulled), bool), 0.0, np.empty(len(pulled))
+    for number in range(len(pulled)):
+        inner = 1.0 + variance * np.diag(precision)
+        gain = np.where(free, 0.5 * (variance * pulled**2 / inner - np.log(inner)), -np.inf)
+        k = int(np.argmax(gain))
+        total += float(gain[k])
+        column, share = precision[:, k], variance[k] / inner[k]
+        precision, pulled = precision - share * np.outer(column, column), pulled - share * column * pulled[k]
+        free[k] = False
+        out[number] = total
+    return out
+
+
+def jump_evidence(track: Track, gap: Array, bodies: Sequence[Jumper], life: float, noise: Array) -> float:
+    """Logarithm of the likelihood of all readings with a jump at one of L places or none, over that with none.
+
+    Args:
+        track: the filter, with what steps at the L places would do.
+        gap: (L,) seconds within which each comes.
+        bodies: that jump.
+        life: seconds in which a step that nothing explains comes with a small chance.
+        noise: (D, D) of the reading, whose multiples are the sizes of such a step.
+    """
+    if not len(gap):
+        return 0.0
+    unstated = np.eye(track.score.shape[1])[:, : len(noise)] * np.sqrt(np.diag(noise))
+    logs = np.full(len(_ERRORS), _UNSTATED - math.log(len(_ERRORS) * life))
+    cases = [(unstated, _ERRORS, logs)]
+    cases += [(one.spots, _SIZES, _LOG_SIZE - math.log(one.every_s)) for one in bodies]
+    found = [0.0]
+    with np.errstate(divide="ignore"):
+        log_gap = np.log(gap)
+    for outputs, scale, beforehand in cases:
+        values, vectors = np.linalg.eigh(outputs.T @ track.information @ outputs)
+        along = np.einsum("kij,ki->kj", vectors, track.score @ outputs)
+        square = scale[:, None, None] ** 2
+        inner = 1.0 + square * np.maximum(values, 0.0)
+        gain = 0.5 * np.sum(square * along**2 / inner - np.log(inner), axis=2)
+        found.append(float(logsumexp(gain + beforehand[:, None] + log_gap)))
+    return float(logsumexp(found))
