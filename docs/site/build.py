@@ -23,7 +23,7 @@ GUIDES = (
     *("orbit", "loop", "block", "measured_orbit", "orbit_files", "operation", "studies", "export", "limits"),
 )
 MEANING = ("conventions", "glossary")
-PROGRAM = ("promises", "stability", "renamed", "architecture", "by_hand", "installed")
+PROGRAM = ("promises", "stability", "architecture", "by_hand", "installed")
 """Pages of docs by the part of the site in which they stand, in order; other notebooks and pages follow these."""
 NEEDED = ("sphinx", "myst_nb", "furo", "sphinx_copybutton")
 _LINK = re.compile(r"\]\((?!https?://|#|mailto:)([^)#\s]+)")

@@ -2,7 +2,7 @@
 the simulated bench and, with `measured:`, on files of a real one (docs/measured_laboratory.md).
 """
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -13,7 +13,6 @@ from scenes.specs.instrument import Frames
 from scenes.specs.perturbation import FigureTerm, PlainPerturbationSpec
 from scenes.specs.turntable import TableAngle, TurntableFiles
 from scenes.yaml.errors import Problem
-from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import Angle, AngleSigma, AngleSigmas, LengthSigma, PositiveLength, Quantity, Vector, Vector3
 from scenes.yaml.spec import Name, Number, Paths, Reference, Seed, Spec, Text, TitledSpec, Whole, one_given
 from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
@@ -271,8 +270,6 @@ class MeasuredDistortionSpec(TitledSpec):
         measured: the angles and spots.
         seed: of nothing; the fits of the turntable that compete here draw nothing.
     """
-
-    old_keys: ClassVar[OldKeys] = {"focal_length": "principal_distance"}
 
     principal_distance: PositiveLength
     measured: DistortionFiles

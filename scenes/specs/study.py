@@ -6,14 +6,12 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.motion_text import key_below, motion_of
 from scenes.specs.procedures import studied
-from scenes.specs.result_names import key_now
 from scenes.specs.samplers import GRID, SAMPLERS
 from scenes.yaml.errors import KeyPath, Problem, key_text, shown, unknown
-from scenes.yaml.old_keys import note
 from scenes.yaml.spec import (
     Flag,
     Name,
@@ -374,17 +372,6 @@ class ResponseSpec(Spec):
     sigma: Key | None = None
     noise: Key | None = None
     minus: Key | None = None
-
-    @field_validator("key", "sigma", "noise", "minus", mode="before")
-    @classmethod
-    def _key_by_new_names(cls, value: Any) -> Any:
-        if not isinstance(value, list | tuple) or not all(isinstance(part, str | int) for part in value):
-            return value
-        now = key_now(value)
-        for old, new in zip(value, now, strict=True):
-            if old != new:
-                note(value, str(old), str(new))
-        return now
 
     @model_validator(mode="after")
     def _is_of_one_unit(self) -> ResponseSpec:

@@ -18,7 +18,6 @@ import numpy as np
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import LONGEST_SHOWN, InputError, Issue, Problem, names_text, nearest, shown
 from scenes.yaml.input_file import read_bytes, read_text
-from scenes.yaml.old_keys import tell
 from scenes.yaml.units import TEMPERATURE, Kind, parse_quantity, unit_ratio
 
 LARGEST_NUMBER = 1e100
@@ -42,7 +41,6 @@ class Column:
         least, most: of its numbers, both allowed, SI units.
         whole: whether its numbers are whole.
         bare: whether the unit may be missing, and numbers are then in the SI unit.
-        old: its name until the last version, which is read with a note; "" for none.
     """
 
     name: str
@@ -53,7 +51,6 @@ class Column:
     most: float = _MOST
     whole: bool = False
     bare: bool = False
-    old: str = ""
 
     @property
     def head(self) -> str:
@@ -270,15 +267,11 @@ def _heads(
 ) -> list[tuple[Column, int, _Scale]]:
     """The columns that stand in the file, where, and how their numbers become SI ones."""
     known = {column.name: column for column in columns}
-    before = {column.old: column for column in columns if column.old}
     found: list[tuple[Column, int, _Scale]] = []
     for k, head in enumerate(heads):
         text = head.strip()
         match = _HEAD.fullmatch(text)
         name = "" if match is None else match["name"]
-        if name in before:
-            tell(file, {(text,): line}, {(text,): before[name].name})
-            name = before[name].name
         if match is None or name not in known:
             meant = nearest(name, known)
             issue = Issue(

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as data_field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, TypedDict, TypeVar, Unpack
+from typing import Annotated, Any, Self, TypedDict, TypeVar, Unpack
 
 from pydantic import (
     AfterValidator,
@@ -25,7 +25,6 @@ from pydantic import (
     PrivateAttr,
     StringConstraints,
     ValidationError,
-    model_validator,
 )
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, ErrorDetails, PydanticUndefined, core_schema
@@ -34,7 +33,6 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.examples import allowed_at, written
 from scenes.yaml.input_file import file_beside, is_file, unusable
-from scenes.yaml.old_keys import OldKeys, met, new_lines, tell, under_new_names
 from scenes.yaml.quantity import Terms
 from scenes.yaml.units import decimal_comma
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
@@ -170,20 +168,11 @@ class Spec(BaseModel):
     What checks a model is built when the first file of its kind is read (``defer_build``). A default that is itself a
     specification is therefore made by ``model_construct``, which needs no checks: an instance of the class would have
     them built at the import.
-
-    Attributes:
-        old_keys: names that keys had until the last version -> names now; they are read with a note.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False, defer_build=True)
-    old_keys: ClassVar[OldKeys] = {}
 
     _source: Source = PrivateAttr(default_factory=Source)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _by_new_names(cls, value: Any) -> Any:
-        return under_new_names(value, cls.old_keys) if cls.old_keys else value
 
     @property
     def source(self) -> Source:
@@ -315,17 +304,11 @@ def validate(model: type[SpecType], yaml: YamlFile) -> SpecType:
     Raises:
         InputError: one issue for each fault, in the order of the file.
     """
-    failure = None
-    with met() as old:
-        try:
-            spec = model.model_validate(yaml.data)
-        except ValidationError as error:
-            failure = error
-    renamed = old.by_path(yaml.data)
-    tell(yaml.file, yaml.lines, renamed)
-    source = Source(yaml.file, new_lines(yaml.lines, renamed))
-    if failure is not None:
-        issues = [_issue(model, detail, source) for detail in failure.errors(include_url=False)]
+    source = Source(yaml.file, yaml.lines)
+    try:
+        spec = model.model_validate(yaml.data)
+    except ValidationError as error:
+        issues = [_issue(model, detail, source) for detail in error.errors(include_url=False)]
         raise InputError(*sorted(issues, key=lambda issue: issue.line or 0)) from None
     spec = spec.with_source(source)
     _tell_parts(spec, source)

@@ -15,7 +15,6 @@ from typing import Any
 from tests.golden.compare import Comparison, compare, compare_elsewhere
 from tests.golden.fields import fields_of, kept_fields, write_fields
 from tests.golden.jobs import Job, run
-from tests.golden.renamed import fields_of_now, names_of_now
 from tests.golden.snapshot import Reader
 
 FOLDER = Path(__file__).parent
@@ -146,7 +145,7 @@ def check(job: Job) -> Outcome:
         raise NotComparable(f"{job.name}: made with other packages: {', '.join(other)}")
     elsewhere = here["processor"] != kept["processor"]
     snapshot, fields, seconds = take(job)
-    before = names_of_now(kept["run"])
+    before = kept["run"]
     found = compare_elsewhere(before, snapshot, job.promised) if elsewhere else compare(before, snapshot)
-    same = compare({"fields": fields_of_now(kept_fields(job.name))}, {"fields": fields})
+    same = compare({"fields": kept_fields(job.name)}, {"fields": fields})
     return Outcome(job.name, seconds, Comparison([*found.differences, *same.differences]), elsewhere)

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from scenes.specs.result_names import by_new_names
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import why_unreadable
 from scenes.yaml.json_file import read_json
@@ -180,7 +179,7 @@ def read_run(folder: Path) -> RunResults:
     for name in manifest.sha256:
         if name.rpartition(".")[2] not in PLAIN or "/" in name:
             continue
-        data = by_new_names(read_json(folder / name), name)
+        data = read_json(folder / name)
         results = {key: value for key, value in data.items() if key not in TOLD} if isinstance(data, Mapping) else data
         for key, value in leaves(results):
             if isinstance(value, np.ndarray):

@@ -17,7 +17,6 @@ import h5py
 
 from analysis.monitor import parameters
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.result_names import by_new_names
 from scenes.specs.study import unit_of
 from scenes.yaml.json_file import read_json
 from twin.run.data_files import DataColumn, DataTable
@@ -135,7 +134,7 @@ def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
         ValueError: a JSON or CSV file is not what runs write.
     """
     json_files = [name for name in files if name.endswith(".json") and name not in _OTHER_FILES]
-    data = {name: by_new_names(read_json(folder / name), name) for name in json_files}
+    data = {name: read_json(folder / name) for name in json_files}
     tables = [numbers] if (numbers := _numbers(data)) is not None else []
     tables += [table for nested in NESTED if (table := _nested(nested, data.get(nested.file, {}))) is not None]
     taken = {table.name for table in tables}

@@ -23,7 +23,7 @@ _LATER: Mapping[str, int] = FrozenMap(
     | dict.fromkeys(("mtf", "optics", "simulate", "truth", "turntable"), 3)
 )
 """Kind of file -> version, where keys went, changed their meaning or got another name since then: what a paper prints
-and whether it holds; sigmas, which were those of the noise alone; the names of `scenes.specs.result_names`."""
+and whether it holds; sigmas, which were those of the noise alone; names of keys."""
 _CAMERA = (
     "d_alpha, d_beta and d_gamma turn the camera about Y, X and Z of its own nominal axes (Z the line of sight toward "
     "the scene, Y along the line CCD, X = Y x Z), right-handed; changes are perturbed minus nominal"

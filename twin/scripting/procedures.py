@@ -16,7 +16,7 @@ from optics.numerics.backend import load_backend
 from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
-from scenes.yaml.spec import Source, Spec, annotation_at, validate
+from scenes.yaml.spec import Source, annotation_at, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.run.artefact import cell_text
 from twin.run.page import RunFacts, write_test
@@ -114,11 +114,9 @@ def perform(
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any], model: Any) -> dict[str, Any]:
-    """Plain data of a model with other values; changes may have its old keys."""
+    """Plain data of a model with other values."""
     out = dict(base)
-    renamed = model.old_keys if isinstance(model, type) and issubclass(model, Spec) else {}
-    for old, value in changes.items():
-        key = renamed.get(old, old)
+    for key, value in changes.items():
         inner = out.get(key)
         both = isinstance(value, Mapping) and isinstance(inner, Mapping)
         out[key] = _merged(inner, value, annotation_at(model, (key,))) if both and isinstance(inner, Mapping) else value

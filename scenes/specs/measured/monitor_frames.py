@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -21,7 +21,6 @@ from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, reso
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import file_beside, is_file, unusable
-from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import PositiveLength
 from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Reference, Spec, Whole, one_given, short_for, validate
 from scenes.yaml.units import MOMENT, parse_quantity
@@ -69,12 +68,6 @@ class GeometrySpec(Spec):
         field: angle from the visual axis at which the area CCDs stand, radians.
         principal_distance_across: plate scale across the line, metres; the principal distance by default.
     """
-
-    old_keys: ClassVar[OldKeys] = {
-        "focal_length": "principal_distance",
-        "focal_length_across": "principal_distance_across",
-        "pixel": "pitch",
-    }
 
     principal_distance: PositiveLength
     separation: PositiveLength

@@ -1,24 +1,19 @@
 """The intersection angle in orbit from ground points (paper 000), as a file in scenes/orbit gives it."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.specs.perturbation import PlainPerturbationSpec
 from scenes.yaml.errors import Problem
-from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
 from scenes.yaml.spec import Flag, Name, Named, Number, Paths, Reference, Seed, Spec, TitledSpec, Whole, short_for
 from scenes.yaml.units import DISTANCE, LENGTH, MOMENT
 
 LINES = ("forward", "nadir", "backward")
 """Lines of a three-line camera."""
-OLD_LINES: OldKeys = {"aft": "backward"}
-"""Name of such a line until the last version -> name now. Files that use the old one throughout are read for one
-version: the names of lines are the user's own, so that they stay in results.
-"""
 LEAST_POINTS = 3
 
 Moment = Annotated[float, Quantity(MOMENT, largest="240 h")]
@@ -47,23 +42,10 @@ def _angles(angles: Mapping[str, tuple[str, str]] | None) -> Mapping[str, tuple[
 Angles = Annotated[Named[tuple[Name, Name]] | None, AfterValidator(_angles)]
 
 
-def three_lines(names: Iterable[str]) -> tuple[str, str, str]:
-    """Which of a camera's lines are those of a three-line camera, in the order of `LINES`.
-
-    Args:
-        names: of all its lines; one with its old name stands for one that is not there.
-    """
-    there = set(names)
-    old = {new: before for before, new in OLD_LINES.items() if before in there and new not in there}
-    first, second, third = (old.get(line, line) for line in LINES)
-    return first, second, third
-
-
 def usual_angles(lines: Sequence[str]) -> Mapping[str, tuple[str, str]] | None:
     """Angles of a camera whose test names none: those of three lines, or that of a camera of two; None for others."""
-    three = three_lines(lines)
-    if set(three) <= set(lines):
-        return {"alpha": three[:2], "beta": three[1:]}
+    if set(LINES) <= set(lines):
+        return {"alpha": LINES[:2], "beta": LINES[1:]}
     return {"alpha": (lines[0], lines[1])} if len(lines) == 2 else None
 
 
@@ -182,8 +164,6 @@ class OrbitAngleSpec(TitledSpec):
         passes: how often the measurement is repeated with errors drawn anew, for the scatter.
         seed: of every random number.
     """
-
-    old_keys: ClassVar[OldKeys] = {"changes": "perturb"}
 
     camera: Reference
     angles: Angles = None

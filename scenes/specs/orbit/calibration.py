@@ -1,13 +1,12 @@
 """In-orbit calibration of a three-line camera over test fields, with cameras that may drift, as its file gives it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.orbit.angle import (
     LINES,
-    OLD_LINES,
     DatumShift,
     EffectsSpec,
     GroundSigma,
@@ -18,7 +17,6 @@ from scenes.specs.orbit.angle import (
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text, unknown
-from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import AngleSigmas, LengthSigma, Quantity, Vector
 from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, TitledSpec, Whole, not_empty, one_given
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT, TIME
@@ -35,8 +33,6 @@ class CameraDriftSpec(Spec):
         principal_distance: d_f, metres.
     """
 
-    old_keys: ClassVar[OldKeys] = {"focal_length": "principal_distance"}
-
     angles: AngleSigmas = (0.0, 0.0, 0.0)
     principal_distance: LengthSigma = 0.0
 
@@ -48,8 +44,6 @@ class MonitorReadingSpec(Spec):
         angles: of d_alpha, d_beta and d_gamma, radians.
         principal_distance: of d_f, metres.
     """
-
-    old_keys: ClassVar[OldKeys] = {"focal_length": "principal_distance"}
 
     angles: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, above_zero=True, largest="1 deg"))]
     principal_distance: Annotated[float, Quantity(LENGTH, above_zero=True, largest="5 mm")]
@@ -75,7 +69,7 @@ class StripSpec(Spec):
 
 def _of_lines(drift: Named[CameraDriftSpec]) -> Named[CameraDriftSpec]:
     for name in drift:
-        if name not in (*LINES, *OLD_LINES):
+        if name not in LINES:
             raise unknown("no such line", name, LINES, (name,))
     return drift
 
@@ -104,8 +98,6 @@ class InteriorChangeSpec(Spec):
         principal_distance: change of the principal distance, metres.
         principal_point: change of x (flight) and y (along the line), metres.
     """
-
-    old_keys: ClassVar[OldKeys] = {"focal_length": "principal_distance"}
 
     principal_distance: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
     principal_point: Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="5 mm"), 2)] = (0.0, 0.0)
@@ -290,8 +282,6 @@ class OrbitCalibrationSpec(TitledSpec):
         repeats: campaigns over the same fields with everything drawn anew, for what differs from one to the next.
         seed: of every random number.
     """
-
-    old_keys: ClassVar[OldKeys] = {"changes": "perturb"}
 
     camera: Reference
     perturb: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)

@@ -1,7 +1,7 @@
 """What a line camera in orbit sees, what is known of it, and which points are measured in its images."""
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
@@ -12,7 +12,6 @@ from scenes.specs.camera import Diffusion, TdiSpec
 from scenes.specs.orbit.angle import GroundSigma, TerrainHeight
 from scenes.specs.spectrum import WavelengthRange
 from scenes.yaml.errors import Problem
-from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Number, Reference, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
@@ -144,8 +143,6 @@ class TextureSpec(Spec):
         parcel_size: side of such a field of mean area, metres.
         roads: metres from one road to the next.
     """
-
-    old_keys: ClassVar[OldKeys] = {"fields": "parcels", "field_size": "parcel_size"}
 
     spacing: Spacing = 2.0
     mean: Annotated[Number, Field(ge=0.01, le=0.9)] = 0.18

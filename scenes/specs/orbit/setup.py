@@ -16,7 +16,7 @@ from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec
-from scenes.specs.orbit.angle import OLD_LINES, OrbitAngleSpec, three_lines, usual_angles
+from scenes.specs.orbit.angle import LINES, OrbitAngleSpec, usual_angles
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.flight import PayloadTestSpec
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec
@@ -27,7 +27,6 @@ from scenes.specs.orbit.simulate import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, line_detector, read_setup, resolve_job
 from scenes.yaml.errors import KeyPath, names_text, unknown
-from scenes.yaml.old_keys import tell
 from scenes.yaml.spec import Paths, Spec
 from scenes.yaml.units import ANGLE, format_quantity
 from scenes.yaml.yaml_file import read_yaml
@@ -37,12 +36,7 @@ PairTest = TypeVar("PairTest", OrbitMonitorSpec, OrbitLoopSpec)
 
 def load_three_line_camera(name_or_path: str | Path) -> ThreeLineCameraSpec:
     """Read a three-line payload; arguments and errors as `load_instrument`."""
-    camera = load.load_named(ThreeLineCameraSpec, load.PAYLOADS, name_or_path)
-    old: dict[KeyPath, str] = {
-        ("lines", name): new for name, new in OLD_LINES.items() if name in camera.lines and new not in camera.lines
-    }
-    tell(camera.source.file, {key: camera.source.line(key) for key in old}, old)
-    return camera
+    return load.load_named(ThreeLineCameraSpec, load.PAYLOADS, name_or_path)
 
 
 def load_payload(
@@ -425,13 +419,12 @@ def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> Non
 
 def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec) -> None:
     """InputError unless the camera has the three lines, and points and changes lie on them."""
-    lines = three_lines(camera.lines)
-    if missing := [name for name in lines if name not in camera.lines]:
+    if missing := [name for name in LINES if name not in camera.lines]:
         found = f"{names_text(tuple(camera.lines))} in {camera.name}"
         problem = f"the camera has no {' and no '.join(missing)} line"
         raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
-    _require_lines(test, test.perturb, lines)
-    _require_lines(test, test.drift, lines, "drift")
+    _require_lines(test, test.perturb, LINES)
+    _require_lines(test, test.drift, LINES, "drift")
     _require_places(test, (*test.perturb, *test.drift), camera)
     if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
         raise test.error(
@@ -439,12 +432,12 @@ def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec
             ("perturb", "nadir", "principal_point"),
             allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
         )
-    fewest = min(camera.pixels_of(name) for name in lines)
+    fewest = min(camera.pixels_of(name) for name in LINES)
     if test.points is not None:
         _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
     if test.images is None:
         return
-    _require_images_of(test, lines, camera)
+    _require_images_of(test, LINES, camera)
     for k, place in enumerate(test.images.patches):
         key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
         _require_pixel(test, key, place.pixel, pixels, f"the nadir line of {camera.name}")

@@ -1,6 +1,6 @@
 """Images of a patch of ground by every line of a camera in orbit, as a file in scenes/orbit gives them."""
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
@@ -9,7 +9,6 @@ from scenes.specs.orbit.calibration import InteriorChangeSpec, LineTime, Side
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text
-from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, TitledSpec, Whole
 
 
@@ -58,8 +57,6 @@ class OrbitSimulateSpec(TitledSpec):
         oversampling: samples of the ground along each side of a pixel.
         seed: of every random number.
     """
-
-    old_keys: ClassVar[OldKeys] = {"changes": "perturb"}
 
     camera: Reference
     lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "backward")

@@ -5,7 +5,7 @@ No prescription is needed: a line is known by its interior orientation (principa
 distortion) and by how it is mounted on the base.
 """
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
@@ -14,7 +14,6 @@ from scenes.specs.detector import PixelPitch
 from scenes.specs.instrument import LookAngle
 from scenes.specs.orbit.scene import LineImageSpec
 from scenes.yaml.errors import Problem
-from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.spec import Named, Spec, TitledSpec, Whole, not_empty
 from scenes.yaml.units import ANGLE, LENGTH, Kind
@@ -82,8 +81,6 @@ class LineCameraSpec(Spec):
         image: how it forms and records its image; None for the payload's.
         ccds: of which it is made, from pixel 0 on; empty for one straight line.
     """
-
-    old_keys: ClassVar[OldKeys] = {"focal_length": "principal_distance"}
 
     look: LookAngle
     rotate: Rotation = (0.0, 0.0, 0.0)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit.angle import three_lines
+from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.calibration.campaign import Campaign, PassTruth, campaign_of, line_model
@@ -119,7 +119,7 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
         replace(p, known_truth=one.truth, readings=one.readings) for p, one in zip(campaign.passes, flown, strict=True)
     )
     images = tuple(one.images for one in flown if one.images is not None)
-    truth = FrozenMap({k: line_model(changed, k) for k in three_lines(changed.lines)})
+    truth = FrozenMap({k: line_model(changed, k) for k in LINES})
     return replace(campaign, passes=passes, images=images or None, known_truth=truth)
 
 
@@ -152,9 +152,8 @@ def _pass(
     imager: Imager | None,
 ) -> _Flown:
     """Fly and measure."""
-    named = three_lines(payload.lines)
-    pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, named, seed)
-    readings = _sample_readings(spec, named, drift, seed)
+    pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, LINES, seed)
+    readings = _sample_readings(spec, LINES, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
     place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
     trajectory = _trajectory(name, field, spec, earth, seed)
@@ -169,11 +168,11 @@ def _pass(
     effects = light_effects(spec.effects)
     lines = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
     times = LineTimes.even(trajectory.first + 0.5 * spec.line_time, spec.line_time, lines)
-    sensors = {k: Sensor.of_lines(cameras[k], trajectory, earth, times, effects) for k in named}
+    sensors = {k: Sensor.of_lines(cameras[k], trajectory, earth, times, effects) for k in LINES}
     known, path = line_cameras(payload), TabulatedTrajectory(platform)
-    laboratory = {k: Sensor.of_lines(known[k], path, earth, times, NO_EFFECTS) for k in named}
-    models = FrozenMap({k: line_model(payload, k) for k in named})
-    pitch = FrozenMap({k: payload.pitch_of(k) for k in named})
+    laboratory = {k: Sensor.of_lines(known[k], path, earth, times, NO_EFFECTS) for k in LINES}
+    models = FrozenMap({k: line_model(payload, k) for k in LINES})
+    pitch = FrozenMap({k: payload.pitch_of(k) for k in LINES})
     pass_data = PassData(name, FrozenMap(laboratory), models, pitch, field.height)
     images = None
     if imager is None:
@@ -206,7 +205,7 @@ def _pass(
         drift,
     )
     datum = errors.datum if errors.switched_on else (0.0, 0.0, 0.0)
-    told = _measurements_of(name, platform, FrozenMap(dict.fromkeys(named, times)), points, ties, datum)
+    told = _measurements_of(name, platform, FrozenMap(dict.fromkeys(LINES, times)), points, ties, datum)
     return _Flown(told, readings, images, truth)
 
 

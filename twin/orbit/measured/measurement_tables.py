@@ -52,10 +52,7 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
         Column("role", text=True),
         *_PLACE,
         Column("sigma", LENGTH, needed=False, least=0.0, most=_LARGE),
-        *(
-            Column(f"{axis}_sigma", LENGTH, needed=False, least=0.0, most=_LARGE, old=f"sigma_{axis}")
-            for axis in ("plan", "height", *"xyz")
-        ),
+        *(Column(f"{axis}_sigma", LENGTH, needed=False, least=0.0, most=_LARGE) for axis in ("plan", "height", *"xyz")),
         *(Column(name, needed=False, least=-1.0, most=1.0) for name in _CORRELATIONS),
     ),
     "image_points": (
@@ -63,8 +60,8 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
         Column("camera", text=True),
         Column("line", least=-_MANY, most=_MANY),
         Column("pixel", least=-_MANY, most=_MANY),
-        Column("line_sigma", least=1e-6, most=1e3, old="sigma_line"),
-        Column("pixel_sigma", least=1e-6, most=1e3, old="sigma_pixel"),
+        Column("line_sigma", least=1e-6, most=1e3),
+        Column("pixel_sigma", least=1e-6, most=1e3),
         Column("correlation", needed=False, least=-0.999999, most=0.999999),
     ),
 }

@@ -189,16 +189,6 @@ def says_nothing(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
     return True
 
 
-def key_now(model: type[Spec], key: KeyPath) -> KeyPath:
-    """A key path with the names that keys of a model have now, for one that may have older ones."""
-    out: KeyPath = ()
-    for part in key:
-        owner = annotation_at(model, out)
-        renamed = owner.old_keys if isinstance(owner, type) and issubclass(owner, Spec) else {}
-        out = (*out, renamed.get(str(part), part))
-    return out
-
-
 def _entry(node: Tree, model: type[Spec], key: KeyPath, k: int, last: bool) -> Any:
     """What stands below ``key[k]`` in a mapping, made if it may be there."""
     part = key[k]

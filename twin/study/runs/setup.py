@@ -23,10 +23,9 @@ from scenes.yaml import yaml_file
 from scenes.yaml.csv_table import lines_of, table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
 from scenes.yaml.input_file import is_file, unusable
-from scenes.yaml.old_keys import tell
 from scenes.yaml.spec import Source, Spec, validate
 from twin.run.provenance import source_digest, versions
-from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, key_now, says_nothing, with_place, with_values
+from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, says_nothing, with_place, with_values
 
 BY_NAME = ("instrument", "disturbances")
 """Keys of a job whose files are parts of the resolved base, beside the job; a change of the name would change nothing.
@@ -147,7 +146,6 @@ def _resolved(yaml: yaml_file.YamlFile) -> StudySetup:
     study = validate(StudySpec, yaml)
     study = _with_tables(study)
     job = _job(study.base.command)
-    study = _by_new_names(study, job.model)
     tree = job.resolve(_base_file(study)).plain()
     setup = _placed(study, tree)
     size = len(setup.to_yaml().encode())
@@ -160,25 +158,6 @@ def _resolved(yaml: yaml_file.YamlFile) -> StudySetup:
         )
         raise study.error("the study with its tables is larger than 1 MB", ("factors",), allowed=allowed)
     return setup
-
-
-def _by_new_names(study: StudySpec, model: type[Spec]) -> StudySpec:
-    """The study whose factors name the base's keys as they are called now, with a note for each that did not."""
-    factors: dict[str, FactorSpec] = {}
-    renamed: dict[KeyPath, str] = {}
-    for name, factor in study.factors.items():
-        keys = None if factor.keys is None else tuple(key_now(model, key) for key in factor.keys)
-        own = None if factor.key is None else key_now(model, factor.key)
-        scales = tuple(one.model_copy(update={"key": key_now(model, one.key)}) for one in factor.scales)
-        now = factor.model_copy(update={"key": own, "keys": keys, "scales": scales})
-        factors[name] = now if now != factor else factor
-        before = [*factor.places, *(one.key for one in factor.scales)]
-        for old, new in zip(before, [*now.places, *(one.key for one in scales)], strict=True):
-            if old != new:
-                renamed["factors", name, key_text(old)] = key_text(new)
-    lines = {key: study.source.line(key[:2]) for key in renamed}
-    tell(study.source.file, lines, renamed)
-    return study.model_copy(update={"factors": FrozenMap(factors)}) if renamed else study
 
 
 def _again(yaml: yaml_file.YamlFile) -> StudySetup:
