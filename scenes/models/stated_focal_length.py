@@ -22,7 +22,7 @@ LARGEST_DIFFERENCE = 0.1
 line and 8 % across it; a wrong sign or unit is seldom below a third.
 """
 
-LARGEST_PUPIL_DIFFERENCE = 0.3
+LARGEST_PUPIL_DIFFERENCE = 0.4
 """Share by which the traced entrance pupil may differ from the stated one where the stop's diameter is stated as well.
 Of off-axis cameras the pupil of the axis is up to some 10 % from that of the field's middle, and the smallest mistake,
 a radius in place of a diameter, is a factor of two."""
