@@ -30,15 +30,8 @@ from optics.raytrace.first_order import FirstOrder, Paraxial, RayMatrix, first_o
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
 from optics.waves.imaging import aim_collimated
-from scenes.models.camera_axis import (
-    LAUNCH_DISTANCE,
-    LINE_AXIS,
-    AfocalError,
-    CameraAxis,
-    axis_data,
-    find_axis,
-    pupil_diameter,
-)
+from scenes.models import camera_axis
+from scenes.models.camera_axis import LAUNCH_DISTANCE, LINE_AXIS, AfocalError, CameraAxis
 from scenes.models.stated_focal_length import TracedFocalLengths, check_entrance_pupil, check_focal_length
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
@@ -235,11 +228,6 @@ class CameraModel:
         return through
 
     @property
-    def f_number(self) -> float:
-        """Focal length over the diameter of the entrance pupil."""
-        return self.paraxial.focal_length / self.entrance_pupil
-
-    @property
     def line_principal_distance(self) -> float:
         """Local principal distance along the line about the centre's chief ray, metres (the papers' f)."""
         return float(abs(self.first_order.scale[0, 0, 0]))
@@ -341,8 +329,8 @@ def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLeng
     """`_focal_lengths` of a prescription. Raises AimError, BeamMissedError, AfocalError."""
     bare = _bare(spec, {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}, {})
     to_stop, imaging, _, matrix = _chief(spec, backend, bare)
-    axis, _ = find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
-    return _focal_lengths(matrix, axis_data(backend, imaging, spec, axis, LINE_AXIS))
+    axis, _ = camera_axis.find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
+    return _focal_lengths(matrix, camera_axis.axis_data(backend, imaging, spec, axis, LINE_AXIS))
 
 
 def _chief(
@@ -368,13 +356,14 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     to_stop, imaging, launch, matrix = _chief(spec, backend, bare)
     chief = first_order(matrix)
     centre = field_direction(spec, 0.0, 0.0)
-    axis, stop_radius = find_axis(spec, backend, to_stop, imaging, centre)
-    about_axis = axis_data(backend, imaging, spec, axis, LINE_AXIS)
-    pupil = pupil_diameter(backend, to_stop, axis, stop_radius) if spec.stop_diameter else spec.entrance_pupil
+    axis, stop_radius = camera_axis.find_axis(spec, backend, to_stop, imaging, centre)
+    about_axis = camera_axis.axis_data(backend, imaging, spec, axis, LINE_AXIS)
+    pupil = (
+        camera_axis.pupil_diameter(backend, to_stop, axis, stop_radius) if spec.stop_diameter else spec.entrance_pupil
+    )
     if stated:
-        check_focal_length(
-            spec, _focal_lengths(matrix, about_axis), lambda other: _traced_focal_lengths(other, backend)
-        )
+        traced_here = _focal_lengths(matrix, about_axis)
+        check_focal_length(spec, traced_here, lambda other: _traced_focal_lengths(other, backend))
 
     traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)
     assert traced.world is not None

@@ -105,7 +105,7 @@ def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, in_focu
             right = format_quantity(spec.focal_length / factor, LENGTH)
             return f"; the stated one is likely {what}", f"focal_length: {right}"
     # surfaces that have the stated focal length are right: only where the image is taken may be wrong
-    for among in (_places(spec),) if in_focus else (_single(spec), _places(spec), _together(spec)):
+    for among in (_places(spec),) if right else (_single(spec), _places(spec), _together(spec)):
         fits = []
         for words, line, changed in among:
             try:

@@ -16,10 +16,7 @@ from optics.geometry import zernike
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import UnphysicalError
-from optics.raytrace.aim import AimError
 from optics.raytrace.line_of_sight import LineChange
-from optics.raytrace.trace import BeamMissedError
-from scenes.models.camera_axis import AfocalError
 from scenes.models.camera_design import with_plane
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
@@ -188,17 +185,6 @@ def run_camera(
     Raises:
         InputError: light of the field does not come through, or has no focus after the last mirror.
     """
-    try:
-        return _judged(setup, backend, refocus, tilt, advance)
-    except (AimError, BeamMissedError, AfocalError) as error:
-        if not setup.perturb:
-            raise
-        text = f"no camera in this state: {error}"
-        raise InputError(Issue(text, found=in_words(setup.perturb), allowed="smaller motions")) from error
-
-
-def _judged(setup: CameraSetup, backend: Backend, refocus: bool, tilt: bool, advance: Advance) -> CameraRun:
-    """Do what `run_camera` says. Raises InputError, AimError, BeamMissedError, AfocalError."""
     advance("focus", 0, 1)
     camera, moved = setup.camera, None
     built = setup.instrument is not None and bool(setup.instrument.as_built)
