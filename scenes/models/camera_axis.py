@@ -106,10 +106,10 @@ def _ring() -> np.ndarray:
 
 def _require_light(backend: Backend, systems: SystemBatch, launch: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return where rays from launch points (N, 3) end on the last surface, (N, 2). Raises BeamMissedError."""
-    place = trace(backend, systems, make_rays(backend, launch, direction)).place()[0]
-    if not np.all(np.isfinite(place)):
+    place, _, _, valid = trace(backend, systems, make_rays(backend, launch, direction)).numpy()
+    if not np.all(valid):
         raise BeamMissedError("the beam along the axis misses a surface")
-    return np.asarray(place)
+    return np.asarray(place[0, :, :2])
 
 
 def pupil_diameter(backend: Backend, to_stop: SystemBatch, axis: CameraAxis, radius: float) -> float:
