@@ -425,9 +425,7 @@ def _derived(lens: Prescription, plain: dict[str, Any], backend: Backend) -> Cam
     try:
         return derive_camera(spec, backend, stated=False)
     except InputError as error:
-        raise lens.error(
-            error.issues[0].problem, allowed="a system that brings the light of its field to the image"
-        ) from error
+        raise lens.error(error.issues[0].problem, allowed="a system that images its field") from error
     except (np.linalg.LinAlgError, FloatingPointError) as error:
         raise lens.error("no light of the field comes through the stop to the image") from error
 

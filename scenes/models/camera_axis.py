@@ -21,7 +21,7 @@ from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.imaging import aim_collimated
 from scenes.specs.camera import CameraSpec
 
-LINE_AXIS = np.array([1.0, 0.0, 0.0])
+PARENT_AXIS, LINE_AXIS = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 LAUNCH_DISTANCE = 3.0
 """How far before the prescription's origin beams from the scene are launched, metres."""
 AFOCAL = 1000.0
@@ -77,32 +77,26 @@ def find_axis(
     Raises:
         AimError, BeamMissedError: no light comes through, neither along the parent axis nor along the field's middle.
     """
-    parent = np.array([0.0, 0.0, 1.0])
-    ways = ((parent, True),) if np.array_equal(middle, parent) else ((parent, True), (middle, False))
-    for direction, on_axis in ways:
-        try:
-            axis = _axis(spec, backend, to_stop, direction, on_axis)
-            _require_light(backend, imaging, axis.base[None], direction)
-            return axis, _stop_radius(spec, backend, to_stop, axis)
-        except (AimError, BeamMissedError):
-            if direction is middle or len(ways) == 1:
-                raise
-    raise AssertionError("the last way has returned or raised")
+    try:
+        return _along(spec, backend, to_stop, imaging, PARENT_AXIS)
+    except (AimError, BeamMissedError):
+        return _along(spec, backend, to_stop, imaging, middle)
 
 
-def _axis(spec: CameraSpec, backend: Backend, to_stop: SystemBatch, direction: np.ndarray, on_axis: bool) -> CameraAxis:
-    start = -LAUNCH_DISTANCE * direction
+def _along(
+    spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, direction: np.ndarray
+) -> tuple[CameraAxis, float]:
+    """``find_axis`` along one direction. Raises AimError, BeamMissedError."""
+    start, on_axis = -LAUNCH_DISTANCE * direction, np.array_equal(direction, PARENT_AXIS)
     centre = aim_collimated(backend, to_stop, direction[None], start[None], np.zeros((1, 2)))[0][0, 0]
     optics = [mirror for mirror in spec.mirrors.values() if mirror.light != "passes"]
     centred = on_axis and not any(one.decentre or one.rotate or one.sag for one in optics)
-    return CameraAxis(direction, start if centred else centre, centre, on_axis)
-
-
-def _stop_radius(spec: CameraSpec, backend: Backend, to_stop: SystemBatch, axis: CameraAxis) -> float:
+    axis = CameraAxis(direction, start if centred else centre, centre, on_axis)
+    _require_light(backend, imaging, axis.base[None], direction)
     if spec.stop_diameter is not None:
-        return 0.5 * spec.stop_diameter
-    ring = 0.5 * spec.entrance_pupil * _ring() @ transverse_axes(axis.direction, LINE_AXIS)
-    return equal_area_radius(_require_light(backend, to_stop, axis.centre + ring, axis.direction))
+        return axis, 0.5 * spec.stop_diameter
+    ring = centre + 0.5 * spec.entrance_pupil * _ring() @ transverse_axes(direction, LINE_AXIS)
+    return axis, equal_area_radius(_require_light(backend, to_stop, ring, direction))
 
 
 def _ring() -> np.ndarray:
@@ -112,10 +106,10 @@ def _ring() -> np.ndarray:
 
 def _require_light(backend: Backend, systems: SystemBatch, launch: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return where rays from launch points (N, 3) end on the last surface, (N, 2). Raises BeamMissedError."""
-    place = trace(backend, systems, make_rays(backend, launch, direction)).place()[0]
-    if not np.all(np.isfinite(place)):
+    place, _, _, valid = trace(backend, systems, make_rays(backend, launch, direction)).numpy()
+    if not np.all(valid):
         raise BeamMissedError("the beam along the axis misses a surface")
-    return np.asarray(place)
+    return np.asarray(place[0, :, :2])
 
 
 def pupil_diameter(backend: Backend, to_stop: SystemBatch, axis: CameraAxis, radius: float) -> float:

@@ -30,15 +30,8 @@ from optics.raytrace.first_order import FirstOrder, Paraxial, RayMatrix, first_o
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
 from optics.waves.imaging import aim_collimated
-from scenes.models.camera_axis import (
-    LAUNCH_DISTANCE,
-    LINE_AXIS,
-    AfocalError,
-    CameraAxis,
-    axis_data,
-    find_axis,
-    pupil_diameter,
-)
+from scenes.models import camera_axis
+from scenes.models.camera_axis import LAUNCH_DISTANCE, LINE_AXIS, AfocalError, CameraAxis
 from scenes.models.stated_focal_length import TracedFocalLengths, check_entrance_pupil, check_focal_length
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
@@ -236,11 +229,6 @@ class CameraModel:
         return through
 
     @property
-    def f_number(self) -> float:
-        """Focal length over the diameter of the entrance pupil."""
-        return self.paraxial.focal_length / self.entrance_pupil
-
-    @property
     def line_principal_distance(self) -> float:
         """Local principal distance along the line about the centre's chief ray, metres (the papers' f)."""
         return float(abs(self.first_order.scale[0, 0, 0]))
@@ -341,22 +329,24 @@ def _focal_lengths(chief: RayMatrix, about_axis: Paraxial) -> TracedFocalLengths
 def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLengths:
     """`_focal_lengths` of a prescription. Raises AimError, BeamMissedError, AfocalError."""
     bare = _bare(spec, {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}, {})
-    _, imaging, matrix = _chief(spec, backend, bare)
-    names = tuple(spec.mirrors)
-    to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
-    axis, _ = find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
-    return _focal_lengths(matrix, axis_data(backend, imaging, spec, axis, LINE_AXIS))
+    to_stop, imaging, _, matrix = _chief(spec, backend, bare)
+    axis, _ = camera_axis.find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
+    return _focal_lengths(matrix, camera_axis.axis_data(backend, imaging, spec, axis, LINE_AXIS))
 
 
-def _chief(spec: CameraSpec, backend: Backend, bare: Assembly) -> tuple[np.ndarray, SystemBatch, RayMatrix]:
-    """Launch point (1, 3) of the centre's chief ray, the way to the image, and what steps about that ray do."""
+def _chief(
+    spec: CameraSpec, backend: Backend, bare: Assembly
+) -> tuple[SystemBatch, SystemBatch, np.ndarray, RayMatrix]:
+    """Return the systems to the stop and to the image, the launch point (1, 3) of the centre's chief ray, and its
+    derivatives.
+    """
     names = tuple(spec.mirrors)
     stop = names.index(spec.stop)
     centre = field_direction(spec, 0.0, 0.0)
-    launch = collimated(backend, assemble(bare, [names[: stop + 1]]), centre[None], np.zeros((1, 2)))[0]
-    imaging = assemble(bare, [(*names, IMAGE)])
+    to_stop, imaging = assemble(bare, [names[: stop + 1]]), assemble(bare, [(*names, IMAGE)])
+    launch = collimated(backend, to_stop, centre[None], np.zeros((1, 2)))[0]
     axes = transverse_axes(centre[None], LINE_AXIS[None])
-    return launch, imaging, ray_matrix(backend, imaging, stop, launch, centre[None], axes)
+    return to_stop, imaging, launch, ray_matrix(backend, imaging, stop, launch, centre[None], axes)
 
 
 def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
@@ -364,20 +354,17 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     bare = _bare(spec, surfaces, {})
-    to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
-    launch, imaging, matrix = _chief(spec, backend, bare)
+    to_stop, imaging, launch, matrix = _chief(spec, backend, bare)
     chief = first_order(matrix)
     centre = field_direction(spec, 0.0, 0.0)
-    axis, stop_radius = find_axis(spec, backend, to_stop, imaging, centre)
-    about_axis = axis_data(backend, imaging, spec, axis, LINE_AXIS)
-    pupil = spec.entrance_pupil
-    if spec.stop_diameter is not None:
-        pupil = pupil_diameter(backend, to_stop, axis, stop_radius)
+    axis, stop_radius = camera_axis.find_axis(spec, backend, to_stop, imaging, centre)
+    about_axis = camera_axis.axis_data(backend, imaging, spec, axis, LINE_AXIS)
+    pupil = (
+        camera_axis.pupil_diameter(backend, to_stop, axis, stop_radius) if spec.stop_diameter else spec.entrance_pupil
+    )
     if stated:
-        check_focal_length(
-            spec, _focal_lengths(matrix, about_axis), lambda other: _traced_focal_lengths(other, backend)
-        )
-        check_entrance_pupil(spec, pupil)
+        traced_here = _focal_lengths(matrix, about_axis)
+        check_focal_length(spec, traced_here, lambda other: _traced_focal_lengths(other, backend))
 
     traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)
     assert traced.world is not None
@@ -397,6 +384,8 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     distance = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
     rear_node = image_centre - distance * image_direction
+    if stated:
+        check_entrance_pupil(spec, pupil)
     frames = (camera_frame, focal_plane, chief, image_direction, rear_node)
     return CameraModel(spec, surfaces, apertures, *frames, axis, about_axis, pupil)
 

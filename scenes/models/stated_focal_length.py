@@ -22,7 +22,7 @@ LARGEST_DIFFERENCE = 0.1
 line and 8 % across it; a wrong sign or unit is seldom below a third.
 """
 
-LARGEST_PUPIL_DIFFERENCE = 0.3
+LARGEST_PUPIL_DIFFERENCE = 0.4
 """Share by which the traced entrance pupil may differ from the stated one where the stop's diameter is stated as well.
 Of off-axis cameras the pupil of the axis is up to some 10 % from that of the field's middle, and the smallest mistake,
 a radius in place of a diameter, is a factor of two."""
@@ -98,14 +98,14 @@ def _difference(traced: np.ndarray, stated: float) -> float:
     return float(np.min(np.abs(traced / stated - 1.0)))
 
 
-def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, in_focus: bool) -> tuple[str, str | None]:
+def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, place: bool) -> tuple[str, str | None]:
     """What is likely wrong, in words and as the line that would be right; nothing where no single number is."""
     for factor, what in _UNITS:
         if abs(factor * traced / spec.focal_length - 1.0) <= LARGEST_DIFFERENCE:
             right = format_quantity(spec.focal_length / factor, LENGTH)
             return f"; the stated one is likely {what}", f"focal_length: {right}"
     # surfaces that have the stated focal length are right: only where the image is taken may be wrong
-    for among in (_places(spec),) if in_focus else (_single(spec), _places(spec), _together(spec)):
+    for among in (_places(spec),) if place else (_single(spec), _places(spec), _together(spec)):
         fits = []
         for words, line, changed in among:
             try:

@@ -95,6 +95,7 @@ def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
 def first_order_table(run: CameraRun) -> Table:
     """First-order data, the report's first table."""
     n = FIRST_ORDER(run.first_order)
+    state = "as perturbed" if run.perturbed else "as built" if run.optics.built else "as designed"
 
     def far(value: float | None) -> str:
         return f"{value:.4g} m" if value is not None and abs(value) < 1e4 else "infinite"
@@ -122,7 +123,7 @@ def first_order_table(run: CameraRun) -> Table:
         ("sampling", f"λF / pixel {n['sampling_lambda_f_per_pixel']:.3f} (2 samples the cut-off); "
          f"Nyquist {n['nyquist_per_mm']:.2f}, cut-off {n['cutoff_per_mm']:.1f} cycles/mm"),
         ("length along the axis", f"{n['length_m']:.4f} m"),
-        (f"obscuration by its own parts{', as designed' if run.perturbed else ''}",
+        ("obscuration by its own parts" + (", as designed" if state != "as designed" else ""),
          ", ".join(f"{b} {100 * s:.2f}%" for b, s in n["obscuration"].items()) or "none"),
     ]  # fmt: skip
     if n["hole_radius_mm"]:
@@ -130,7 +131,7 @@ def first_order_table(run: CameraRun) -> Table:
         rows.append(("light goes through", f"{holes} (the file states none: edges: [{{blocks: circle, radius: ...}}])"))
     about = "the axis" if run.optics.model.axis.on_axis else "the field's middle, as no light comes along the axis"
     caption = (
-        f"The camera {'as perturbed' if run.perturbed else 'as designed'}, at {1e9 * run.camera.wavelength:.0f} nm. "
+        f"The camera {state}, at {1e9 * run.camera.wavelength:.0f} nm. "
         f"Focal lengths, F-number and pupils are paraxial, about {about}; all else is of the field's middle where "
         "nothing else is stated, on the image plane where it stands."
     )

@@ -288,25 +288,13 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
     "First-order data of a camera in the state in which it is judged, at its design wavelength. Focal lengths, F-"
     "number and pupils are paraxial, about the axis; all else is of the field's middle where nothing else is stated.",
     Quantity("focal_length_m", lambda d: d.paraxial.focal_length, "effective focal length, wherever the image stands"),
-    Quantity(
-        "back_focal_length_m",
-        lambda d: d.paraxial.back_focal_length,
-        "from the last mirror or lens face downstream to the paraxial focus",
-    ),
+    Quantity("back_focal_length_m", lambda d: d.paraxial.back_focal_length, "from the last mirror to the focus"),
     Quantity("principal_distance_along_line_m", lambda d: d.principal_distance_line, "image's place per angle"),
     Quantity("principal_distance_along_track_m", lambda d: d.principal_distance_track, "image's place per angle"),
     Quantity("entrance_pupil_m", lambda d: d.entrance_pupil, "diameter of the beam along the axis that fills the stop"),
-    Quantity(
-        "entrance_pupil_before_first_mirror_m",
-        lambda d: d.paraxial.entrance_pupil,
-        "from the first mirror or lens face, positive toward the scene",
-    ),
+    Quantity("entrance_pupil_before_first_mirror_m", lambda d: d.paraxial.entrance_pupil, "positive toward the scene"),
     Quantity("exit_pupil_m", lambda d: _near(d.entrance_pupil * d.paraxial.exit_magnification), "diameter"),
-    Quantity(
-        "exit_pupil_before_image_m",
-        lambda d: _near(d.paraxial.exit_pupil),
-        "negative where it lies behind the image; nothing where it is infinitely far",
-    ),
+    Quantity("exit_pupil_before_image_m", lambda d: _near(d.paraxial.exit_pupil), "none where it is at infinity"),
     Quantity("f_number", lambda d: d.paraxial.focal_length / d.entrance_pupil, "focal length over entrance pupil"),
     Quantity("working_f_number", lambda d: 0.5 / d.round_aperture, "of the round beam with the same solid angle"),
     Quantity("working_f_number_along_line", lambda d: d.working_f_number_line, "1 / (2 NA) at the image"),

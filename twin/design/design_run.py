@@ -103,9 +103,9 @@ def run_design(
     spec = camera_design.camera_of(camera, found.prescription, test.name, test.description)
     if camera.stop_diameter is not None:
         # its beams are as wide as the entrance pupil in the middle of the field
-        free = derive_camera(spec.model_copy(update={"stop_diameter": None}), backend)
-        width = np.sqrt(np.abs(determinant(free.first_order.entrance_magnification[0])))
-        spec = spec.model_copy(update={"stop_diameter": float(spec.entrance_pupil * width)})
+        free = derive_camera(spec.model_copy(update={"stop_diameter": None}), backend).first_order
+        width = spec.entrance_pupil * np.sqrt(np.abs(np.linalg.det(free.entrance_magnification[0])))
+        spec = spec.model_copy(update={"stop_diameter": float(width)})
     derive_camera(spec, backend)  # it can be used as a camera
     warnings = []
     worst = float(found.after.errors.max())

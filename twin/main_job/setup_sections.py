@@ -97,7 +97,8 @@ def setup_section(run: JobRun) -> Section:
     for name, model in instrument.cameras.items():
         focal, line = float(run.experiment.nominal_truth.principal_distance[name]), model.spec.line
         row: list[Cell] = [name, model.spec.name, float(np.degrees(spec.cameras[name].look)), focal]
-        row += [model.f_number, line.pixels, 1e6 * line.pitch, 1e3 * line.pixels * line.pitch]
+        f_number = model.paraxial.focal_length / model.entrance_pupil
+        row += [f_number, line.pixels, 1e6 * line.pitch, 1e3 * line.pixels * line.pitch]
         rows.append([*row, 1e3 * float(instrument.separation[name])] if instrument.channels else row)
     heads = ["camera", "prescription", "look angle [deg]", "principal distance [m]", "F-number", "pixels"]
     heads += ["pitch [µm]", "line [mm]", *(["distance of the area CCDs [mm]"] if instrument.channels else [])]

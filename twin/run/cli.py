@@ -120,12 +120,15 @@ def explained(errors: Console) -> Iterator[None]:
         # the work that failed has imported these; help and a bad file do not wait for them
         from optics.numerics.backend import BackendUnavailable
         from optics.numerics.llvm import LibraryMissing
+        from optics.numerics.physical_error import PhysicalError, UnphysicalError
         from twin.run.run_folder import RunFolderError
 
-        if not isinstance(error, RunFolderError | BackendUnavailable | LibraryMissing):
+        # a number that cannot be is a fault of the program; light that a state loses is one of what was asked for
+        asked = isinstance(error, RunFolderError | PhysicalError) and not isinstance(error, UnphysicalError)
+        if not asked and not isinstance(error, BackendUnavailable | LibraryMissing):
             raise
         print_error(errors, str(error))
-        raise typer.Exit(code_of(error.__cause__) if isinstance(error, RunFolderError) else FAILURE) from None
+        raise typer.Exit(code_of(error.__cause__) if asked else FAILURE) from None
 
 
 TICK_SECONDS = 8.0
