@@ -19,7 +19,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction, lenses
+from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction
 from scenes.specs.camera import BandSpec, CameraSpec, LineSpec
 from twin.camera.camera_optics import CameraOptics, rim, round_aperture
 from twin.run.quantity import Quantity, Record
@@ -132,11 +132,9 @@ def obscuration(model: CameraModel, backend: Backend) -> InTheWay:
     through: dict[str, list[np.ndarray]] = {}
     # light goes straight through planes that it passes, wherever they are told to stand, as at a mirror's vertex
     acting = [k for k, name in enumerate(paths.names) if name == IMAGE or model.spec.mirrors[name].light != "passes"]
-    glass = lenses(model.spec)
     for before, k in pairwise((-1, *acting)):
+        # what light comes from or goes to is no obstacle on the way
         ends = {paths.names[end] for end in (before, k) if end >= 0}
-        # the mirror or the lens that it comes from or goes to is no obstacle, nor is the lens's other face
-        ends |= {face for face, lens in glass.items() if lens in {glass.get(end) for end in ends}}
         for body, edge in edges.items():
             if body not in ends:
                 taken, places = _met(backend, bare, body, edge, paths.points[before + 1], paths.points[k + 1])
