@@ -9,6 +9,7 @@ traced rays have met their surface, and no kernel knows them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -257,21 +258,6 @@ class Polygon:
         if len(self.corners) < 3:
             raise ValueError(f"a polygon needs three corners or more, found {len(self.corners)}")
 
-    @property
-    def enclosing(self) -> Circle:
-        """Circle that holds the shape, about the middle of its box: the smallest one of a regular polygon with an even
-        number of corners.
-        """
-        x0, x1, y0, y1 = self.bounds
-        x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
-        return Circle(max(float(np.hypot(a - x, b - y)) for a, b in self.corners), (x, y))
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, x_max, y_min, y_max, metres."""
-        x, y = zip(*self.corners, strict=True)
-        return min(x), max(x), min(y), max(y)
-
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Mask of points inside, by how often a way along x crosses the sides."""
         inside = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)), dtype=bool)
@@ -314,6 +300,12 @@ class Edge:
             c, s = np.cos(self.turn), np.sin(self.turn)
             x, y = cx + c * (x - cx) + s * (y - cy), cy - s * (x - cx) + c * (y - cy)
         return np.asarray(self.shape.contains(x, y)) != self.blocks
+
+
+def outer_edge(aperture: Aperture | None, edges: Sequence[Edge]) -> Aperture | None:
+    """Return the smallest outer edge, but a polygon, that is stated of a surface, else its aperture."""
+    stated = [edge.shape for edge in edges if not edge.blocks and isinstance(edge.shape, Aperture)]
+    return min(stated, key=lambda shape: shape.enclosing.radius, default=aperture)
 
 
 def turned_over(edge: Edge) -> Edge:

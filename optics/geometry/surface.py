@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from optics.geometry import zernike
-from optics.geometry.aperture import Aperture, Polygon
+from optics.geometry.aperture import Aperture
 from optics.geometry.sag_terms import SagTerm, grown
 from optics.geometry.zernike import triangle_order, triangle_polynomial
 from optics.numerics.frozen_map import FrozenMap
@@ -370,7 +370,7 @@ class Surface:
         terms = tuple(grown(term, scale) for term in self.terms)
         return replace(self, curvature=self.curvature / scale, even=even, terms=terms)
 
-    def figure_disk(self, aperture: Aperture | Polygon | None) -> ZernikeFigure:
+    def figure_disk(self, aperture: Aperture | None) -> ZernikeFigure:
         """Return the Zernike figure that terms are added to: the surface's own, or one without terms over the smallest
         circle round the aperture.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture, Edge, Polygon, Ray
+from optics.geometry.aperture import Aperture, Edge, outer_edge
 from optics.geometry.pose import Pose
 from optics.geometry.surface import GridFigure, SummedFigure, Surface, ZernikeFigure
 from optics.geometry.tree import AT_REST, Motion, PlacedBodies, RigidTree, State
@@ -58,10 +58,9 @@ class Element:
     edges: tuple[Edge, ...] = ()
 
     @property
-    def outer_edge(self) -> Aperture | Polygon | None:
+    def outer_edge(self) -> Aperture | None:
         """The outer edge of the clear aperture: the smallest that its file states, else that of ``aperture``."""
-        stated = [edge.shape for edge in self.edges if not edge.blocks and not isinstance(edge.shape, Ray)]
-        return min(stated, key=lambda shape: shape.enclosing.radius, default=self.aperture)
+        return outer_edge(self.aperture, self.edges)
 
     def clear(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return which points of the surface, in its own x and y, lie in its clear aperture."""

@@ -33,8 +33,9 @@ from scenes.lens.prescription import (
 from scenes.lens.unfolding import unfolded
 from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
+from scenes.specs.glass import glass_entry
 from scenes.yaml.errors import InputError, Problem, printable
-from scenes.yaml.units import ANGLE, EXPANSION, LENGTH, format_quantity, power_of_length
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity, power_of_length
 
 PITCH = 7e-6
 """Pitch of a line CCD's pixels where none is asked for, metres."""
@@ -130,11 +131,9 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
 def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) -> ReadCamera:
     """What `camera_of` says, with the field as the prescription has it."""
     notes = list(lens.notes)
-    notes += [
-        Note(0, name, f"the glass of {glass.source}; --glasses FILE.agf takes another")
-        for name, glass in lens.glasses.items()
-        if isinstance(glass, CatalogueGlass) and glass.source
-    ]
+    sources = {name: getattr(glass, "source", "") for name, glass in lens.glasses.items()}
+    taken_from = "the glass of {}; --glasses FILE.agf takes another"
+    notes += [Note(0, name, taken_from.format(source)) for name, source in sources.items() if source]
     surfaces, stop, origin, taken = _surfaces(lens, notes)
     bias, half_x, half_y = _field(lens, surfaces, notes)
     where = {"z": written(_image(lens)[0], LENGTH)}
@@ -159,9 +158,8 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
     pupil = _pupil(lens, narrow, plain, backend, width)
     focal = narrow.line_principal_distance
     if math.isfinite(lens.object_distance):
-        nearer = f"{1e6 * focal**2 / lens.object_distance:.3g} um"
-        text = f"{lens.object_distance:.6g} m away is taken for infinity, whose image is {nearer} nearer to the optics"
-        notes.append(Note(0, "object", text))
+        nearer, far = 1e6 * focal**2 / lens.object_distance, f"{lens.object_distance:.6g} m away is taken for infinity"
+        notes.append(Note(0, "object", f"{far}, whose image is {nearer:.3g} um nearer to the optics"))
     pixels = 2.0 * focal * math.tan(half_x) / width.pitch
     if not 2.0 <= pixels <= 1e6:
         problem = "a line CCD over the whole field would have too few or too many pixels"
@@ -205,6 +203,9 @@ def _by_angles(lens: Prescription, name: str, backend: Backend, width: Width) ->
     """Return the prescription with the directions from which light comes to its fields' heights."""
     heights = np.array(lens.heights)
     if lens.field_kind == "object heights":
+        if not FAR <= abs(lens.object_distance) < math.inf:
+            found = f"{lens.object_distance:.6g} m"
+            raise lens.error("heights on an object that is near, or nowhere", None, found, "field angles: --field")
         tangents = -heights / lens.object_distance
     else:
         middle = replace(lens, fields=((0.0, 0.0),), heights=(), field_kind="angles")
@@ -342,14 +343,7 @@ def _behind(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
     if known is None or abs(known(lens.wavelength) - surface.index) > _SAME_INDEX:
         return {"index": surface.index}
     if isinstance(known, CatalogueGlass):
-        ends = [format_quantity(w, LENGTH) for w in (known.shortest, known.longest)]
-        coefficients = list(known.coefficients)
-        glass = {"name": known.name, "formula": known.formula, "coefficients": coefficients, "range": ends}
-        if known.expansion is not None:
-            glass["expansion"] = format_quantity(known.expansion, EXPANSION)
-        if known.thermal is not None:
-            glass["thermal"] = list(known.thermal)
-        return {"glass": glass}
+        return {"glass": glass_entry(known)}
     own = next((name for name, one in GLASSES.items() if one.index == known), None)
     return {"index": surface.index} if own is None else {"glass": own}
 

@@ -369,13 +369,13 @@ class Prescription:
         fields: directions (x, y) from which light comes as their tangents' angles, radians; empty where the file has
             other fields than angles.
         field_kind: what the file's fields are, for messages.
-        heights: fields that the file has as heights (x, y) on object or image, metres; empty for others.
         pupil: how wide the beam is; None where the file does not say.
         object_distance: from the object to the frame's origin, metres; infinite for a scene.
         notes: what did not come along.
         round_field: the fields say how wide a round field about the axis is, of which a camera has the square in it.
         glasses: of its surfaces by their names, those whose dispersion is known; called with a wavelength (metres) each
             gives its index.
+        heights: fields that the file has as heights (x, y) on object or image, metres; empty for others.
     """
 
     name: str
@@ -386,12 +386,12 @@ class Prescription:
     wavelengths: tuple[float, ...] = ()
     fields: tuple[tuple[float, float], ...] = ()
     field_kind: str = "angles"
-    heights: tuple[tuple[float, float], ...] = ()
     pupil: Pupil | None = None
     object_distance: float = float("inf")
     notes: tuple[Note, ...] = ()
     round_field: bool = False
     glasses: Mapping[str, Callable[[float], float]] = field(default_factory=FrozenMap)
+    heights: tuple[tuple[float, float], ...] = ()
 
     @property
     def image(self) -> LensSurface:

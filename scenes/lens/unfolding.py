@@ -45,7 +45,9 @@ def unfolded(lens: Prescription) -> Prescription:
         if surface.interaction is Interaction.REFLECT and shape.is_plane and shape.figure is None:
             mirror = np.eye(3) - 2.0 * np.outer(rotation[:, 2], rotation[:, 2])
             turn, shift = mirror @ turn, place + mirror @ (shift - place)
-            text = "a flat mirror, unfolded: its shadow in the beam and its errors are not carried"
+            text = (
+                "a flat mirror, unfolded: its errors are not carried, nor its shadow, which an edge that blocks states"
+            )
             notes.append(Note(surface.line, surface.name, text))
             surface = replace(surface, interaction=Interaction.PASS)
             if surface.name != stop and not surface.every_edge:

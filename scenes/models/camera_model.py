@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Rectangle
+from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Rectangle, outer_edge
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Body, RigidTree, State
@@ -54,7 +54,7 @@ def camera_bodies(root: str, pose: Pose, model: CameraModel) -> list[Body]:
     into_camera = model.camera_frame.inverse()
     bodies = [Body(root, pose)]
     for mirror in model.mirrors:
-        x, y = model.apertures[mirror].centre
+        x, y = model.clear_aperture(mirror).centre
         centre = (x, y, float(model.surfaces[mirror].sag(x, y)))
         own = into_camera @ model.mirror_pose(mirror)
         bodies.append(Body(f"{root}/{mirror}", own, pivots={"centre": centre}))
@@ -214,6 +214,12 @@ class CameraModel:
         """Mirror name -> what cuts light there beside the stop, of those that have it."""
         given = {name: mirror.edges for name, mirror in self.spec.mirrors.items()}
         return {name: tuple(edge.to_edge() for edge in edges) for name, edges in given.items() if edges}
+
+    def clear_aperture(self, mirror: str) -> Aperture:
+        """Return the outer edge of a surface's clear aperture, over which its figures are."""
+        outer = outer_edge(self.apertures[mirror], self.edges.get(mirror, ()))
+        assert outer is not None
+        return outer
 
     def uncut(self, met: Callable[[str], np.ndarray]) -> np.ndarray | bool:
         """Which rays all edges let through; True where there are none.
@@ -540,8 +546,8 @@ def _made(box: Rectangle, hits: np.ndarray, spec: CameraSpec, name: str) -> Aper
         return box
     if surface_of(spec.mirrors[name]).is_plane:
         half = np.array([box.half_x, box.half_y]) - margin
-        wider = float(np.nanmax(np.hypot(*np.moveaxis((hits - box.centre) / half, -1, 0))))
-        return Ellipse(*(float(wider * size + margin) for size in half), box.centre)
+        half *= np.nanmax(np.hypot(*np.moveaxis((hits - box.centre) / half, -1, 0)))
+        return Ellipse(float(half[0] + margin), float(half[1] + margin), box.centre)
     # a rim between the traced points is no farther off than the beam's middle and radius together
     middle = np.nanmean(hits, axis=1)
     radius = np.nanmax(np.hypot(*np.moveaxis(hits - middle[:, None], -1, 0)), axis=1) + np.hypot(*middle.T)

@@ -14,9 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose
-from optics.geometry.surface import Surface
 from optics.geometry.tree import Motion, State
 from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.deformation import Displacement, FaceChange
@@ -298,12 +296,13 @@ def deformed_face(instrument: Instrument, job: JobSpec, path: str, spec: Deforma
         InputError: no such frame; nodes that are not on the surface or do not cover it.
     """
     key = ("perturb", path, "deformation")
-    surface, aperture = _face(instrument, path)
+    face = instrument.assembly.face(path)
+    assert face.outer_edge is not None
     nodes = read_nodes(spec.table, spec.unit, spec.field, spec.sha256)
     pose = pose_of_frame(instrument, job, key, path, spec.frame)
     points, moves = pose.apply(nodes.points), nodes.moves @ pose.rotation.T
     try:
-        return nodal_deformation(points, moves, surface, aperture, spec.terms)
+        return nodal_deformation(points, moves, face.surface, face.outer_edge, spec.terms)
     except NodesError as error:
         text = f"{spec.table} does not describe {path}: {error}"
         raise job.error(text, (*key, "table"), allowed=error.allowed) from error
@@ -329,10 +328,3 @@ def pose_of_frame(instrument: Instrument, job: JobSpec, key: KeyPath, path: str,
         raise job.error(unknown("no such node", frame, sorted(known)), (*key, "frame"))
     placed = instrument.assembly.place()
     return placed.pose(path).inverse() @ placed.pose(frame)
-
-
-def _face(instrument: Instrument, path: str) -> tuple[Surface, Aperture]:
-    """Shape and clear aperture of a body's optical surface, the widest where several elements use it."""
-    widest = instrument.assembly.face(path)
-    assert widest.aperture is not None
-    return widest.surface, widest.aperture

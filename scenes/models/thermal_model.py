@@ -459,7 +459,7 @@ class ThermalModel:
         if path in self.mirrors:
             camera, name = self.mirrors[path]
             model = self.instrument.cameras[camera]
-            surface, aperture = model.surfaces[name], model.apertures[name]
+            surface, aperture = model.surfaces[name], model.clear_aperture(name)
             side = behind(model, name)
             outline = self._mirror_outline(path)
             low, high = outline.min(axis=0), outline.max(axis=0)
@@ -522,12 +522,12 @@ class ThermalModel:
     def _aperture(self, path: str) -> Aperture:
         """Clear aperture of a mirror or a face of a lens."""
         _, camera, name = path.split("/")
-        return self.instrument.cameras[camera].apertures[name]
+        return self.instrument.cameras[camera].clear_aperture(name)
 
     def _mirror_outline(self, path: str) -> np.ndarray:
         _, camera, name = path.split("/")
         model = self.instrument.cameras[camera]
-        xy = model.apertures[name].outline()
+        xy = model.clear_aperture(name).outline()
         return np.column_stack([xy, model.surfaces[name].sag(xy[:, 0], xy[:, 1])])
 
 

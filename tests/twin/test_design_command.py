@@ -14,6 +14,7 @@ from scenes.specs.load import EXAMPLES, LIBRARY, load_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
+from tests.scenes.test_stated_focal_length import CASSEGRAIN
 from twin.design.__main__ import app
 
 EXAMPLE = EXAMPLES / "design_gf7_short.yaml"
@@ -86,6 +87,23 @@ def test_constraints_that_contradict_the_camera(tmp_path, envelope: str, clearan
     assert f"much.yaml:{line}: {key}: no prescription near the start holds all constraints" in told
     assert remedy in told
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.second
+def test_a_telescope_about_its_axis_is_told_its_clearance(tmp_path) -> None:
+    """Its beam passes through its secondary, and the message names the clearance with which it can be designed."""
+    (tmp_path / "axis.yaml").write_text(CASSEGRAIN, "utf-8")
+    file, text = tmp_path / "on_axis.yaml", SHORT.format(envelope="101 percent", vary="M2: [conic]")
+    file.write_text(text.replace("camera: gf7", "camera: axis.yaml"), "utf-8")
+    refused = CliRunner().invoke(app, [str(file), "--out", str(tmp_path / "out"), "--quiet"])
+    assert refused.exit_code == 2
+    told = re.search(r"clearance: -(\d+) mm, as \w+ obscures its own beams", refused.output.replace("\n", " "))
+    assert told is not None, refused.output
+    # by hand: the beam reaches across the whole primary of 0.25 m, M2 as far to the other side, 77 mm and its edge
+    assert 0.25 + 0.06 < 1e-3 * int(told[1]) < 0.25 + 0.1
+    file.write_text(file.read_text("utf-8") + f"clearance: -{told[1]} mm\n", "utf-8")
+    result = CliRunner().invoke(app, [str(file), "--out", str(tmp_path / "out"), "--quiet"])
+    assert result.exit_code == 0, result.output
 
 
 def test_a_run_folder(tmp_path, monkeypatch) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Rectangle
+from optics.geometry.aperture import Circle, Edge, Ellipse, Rectangle
 from optics.geometry.surface import plane
 from optics.raytrace.assembly import Element, Interaction
 from scenes.models.camera_model import derive_camera
@@ -19,7 +19,7 @@ from scenes.yaml.yaml_file import dump_yaml
 from twin.run.artefact import Table
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.tolerance_report import tolerance_report
-from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance
+from twin.tolerance.tolerance_run import run_tolerance
 from twin.tolerance.variations import spectrum_over, states_of
 
 # a classical Cassegrain: F/2.5 primary of 0.6 m, secondary at 0.25 of its focal length before the focus, m = 4
@@ -106,10 +106,8 @@ def test_a_stated_edge_comes_before_the_beams(backend, tmp_path) -> None:
 
 def test_the_smallest_circle_of_every_shape() -> None:
     """No point of an outline lies outside, and some touch the circle on opposite sides."""
-    hexagon = Polygon(tuple((0.2 + np.cos(a), np.sin(a)) for a in np.arange(6) * np.pi / 3.0))
-    for shape in (Circle(0.3, (0.1, 0.2), 0.05), Rectangle(0.3, 0.4, (1.0, 0.0)), Ellipse(0.5, 0.2), hexagon):
-        outline = np.array(shape.corners) if isinstance(shape, Polygon) else shape.outline(4001)
-        apart = outline - shape.enclosing.centre
+    for shape in (Circle(0.3, (0.1, 0.2), 0.05), Rectangle(0.3, 0.4, (1.0, 0.0)), Ellipse(0.5, 0.2)):
+        apart = shape.outline(4001) - shape.enclosing.centre
         far = np.hypot(*apart.T)
         assert np.max(far) == pytest.approx(shape.enclosing.radius, rel=1e-6)
         touching = apart[far > (1.0 - 1e-6) * np.max(far)]
@@ -162,4 +160,3 @@ def test_the_page_names_circle_and_aperture(backend, tmp_path) -> None:
     ]
     sizes = [pytest.approx(160.0), pytest.approx(180.0)]
     assert table.rows[1] == ["second", "M2 figure", pytest.approx(radius), 0.0, 0.0, "rectangle", *sizes]
-    assert TOLERANCE(run)["figure_circle_radius_mm"] == {"first": pytest.approx(300.0), "second": pytest.approx(radius)}

@@ -32,9 +32,10 @@ def test_cameras_of_the_library_state_their_shadows(name: str, backend) -> None:
     model = derive_camera(load_camera(name), backend)
     found = obscuration(model, backend)
     assert not unstated_shadows(model, found)
-    # a mirror about its axis is round, and within the round shadow that its file states but for its margin; the corners
-    # of a square would take 3 %
-    assert max(found.shares.values(), default=0.0) < 0.01
+    # a mirror about its axis is round, and within the round shadow that its file states but for its margin: of korsch,
+    # whose field is beside the axis, (79.9^2 - 75^2) / (250^2 - 75^2) mm^2 = 1.33 %; the corners of a square would take
+    # 3 %
+    assert max(found.shares.values(), default=0.0) < (0.015 if name == "korsch" else 0.01)
 
 
 @pytest.mark.second
@@ -42,10 +43,10 @@ def test_a_mirror_in_the_beam_that_no_edge_states_is_told(tmp_path, backend) -> 
     data = {"instrument": without_edges(tmp_path), "perturb": ["M2 shift z 5 um"]}
     run = render_job(resolve_job(validate(JobSpec, YamlFile("", data, {}))), backend)
     (told,) = (text for text in run.warnings if "its own parts stand in its beam" in text)
-    # the round mirror of 0.3 of the diameter, the field and the margin about it, by 1000 rays
+    # the round mirror of 0.3 of the diameter, the field and the margin about it, by 4000 rays
     share = float(re.search(r"M2 ([\d.]+)%", told)[1])
-    beam, field, margin = 0.3 * 0.5, 2.0 * 1.05 * 0.0026, 0.01
-    assert share == pytest.approx(100.0 * ((beam + margin) * (beam + field + margin)) / 0.5**2, abs=0.4)
+    beam, field, margin = 0.3 * 0.5, 2.0 * 1.05 * 0.00264, 0.01
+    assert share == pytest.approx(100.0 * (beam + field + margin) ** 2 / 0.5**2, abs=0.2)
     assert "a pupil without that shadow" in told
     run = render_job(resolve_job(validate(JobSpec, YamlFile("", {**data, "instrument": RC}, {}))), backend)
     assert not any("its own parts" in text for text in run.warnings)

@@ -23,8 +23,8 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import aim_collimated
 from scenes.models.camera_axis import LINE_AXIS, axis_data, pupil_diameter
-from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction, focal_plane_body, lenses
-from scenes.specs.camera import CameraSpec
+from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction, focal_plane_body
+from scenes.specs.camera import BandSpec, CameraSpec, LineSpec
 from twin.camera.camera_optics import CameraOptics, rim
 from twin.run.quantity import Quantity, Record
 
@@ -83,8 +83,11 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
         if spec.mirrors[name].light == "passes":
             continue  # a stop's plate stands where its hole is not
         # the other mirrors' clear apertures have the margin already
-        out[name] = _body(model, name, Circle(edge.radius + margin) if name == spec.stop else edge)
-    lines = [(spec.line, 0.0), *((band, band.offset) for band in spec.bands.values())]
+        out[name] = _body(model, name, Circle(edge.bounds[1] + margin) if name == spec.stop else edge)
+    lines: list[tuple[LineSpec | BandSpec, float]] = [
+        (spec.line, 0.0),
+        *((band, band.offset) for band in spec.bands.values()),
+    ]
     half = 0.5 * max(line.pixels * line.pitch for line, _ in lines) + margin
     low = min(offset - 0.5 * line.pitch for line, offset in lines) - margin
     high = max(offset + 0.5 * line.pitch for line, offset in lines) + margin
@@ -133,15 +136,12 @@ def obscuration(model: CameraModel, backend: Backend) -> InTheWay:
     through: dict[str, list[np.ndarray]] = {}
     # light goes straight through planes that it passes, wherever they are told to stand, as at a mirror's vertex
     acting = [k for k, name in enumerate(paths.names) if name == IMAGE or model.spec.mirrors[name].light != "passes"]
-    glass = lenses(model.spec)
-    for before, k in pairwise((None, *acting)):
-        ends = {paths.names[end] for end in (before, k) if end is not None}
-        # the mirror or the lens that it comes from or goes to is no obstacle, nor is the lens's other face
-        ends |= {face for face, lens in glass.items() if lens in {glass.get(end) for end in ends}}
+    for before, k in pairwise((-1, *acting)):
+        # what light comes from or goes to is no obstacle on the way
+        ends = {paths.names[end] for end in (before, k) if end >= 0}
         for body, edge in edges.items():
             if body not in ends:
-                start = paths.points[0 if before is None else before + 1]
-                taken, places = _met(backend, bare, body, edge, start, paths.points[k + 1])
+                taken, places = _met(backend, bare, body, edge, paths.points[before + 1], paths.points[k + 1])
                 blocked[body] = blocked.get(body, np.zeros(taken.shape, bool)) | taken
                 through.setdefault(body, []).append(np.where(taken[..., None], places, np.nan))
     lit = _lit(model, bare, paths)

@@ -342,20 +342,18 @@ def _figure_sections(run: ToleranceRun) -> tuple[Section, ...]:
         disk, outer = element.figure_disk, element.outer_edge
         assert outer is not None
         x0, x1, y0, y1 = outer.bounds
-        blocked = " with blocked parts" if any(edge.blocks for edge in element.edges) else ""
-        shape = f"{type(outer).__name__.lower()}{blocked}"
+        shape = type(outer).__name__.lower() + ", partly blocked" * any(edge.blocks for edge in element.edges)
         lengths = [1e3 * v for v in (disk.radius, *disk.centre, x1 - x0, y1 - y0)]
         rows.append([name, run.setup.test.tolerances[name].words, *lengths[:3], shape, *lengths[3:]])
-    circle = ("radius of the circle [mm]", "x of its middle [mm]", "y of its middle [mm]")
-    heads = ("tolerance", "motion", *circle, "clear aperture", "width [mm]", "height [mm]")
-    places = (None, None, 2, 2, 2, None, 2, 2)
-    table = Table("figures", "Circles and clear apertures", "In the surface's own x and y.", heads, rows, places)
-    text = (
-        "A Zernike term is stated by its rms over the smallest circle round the clear aperture, a whole figure error "
-        "by its rms over the clear aperture itself, about its mean. Where the camera's file states no clear edge, the "
-        "clear aperture is the stop, or the outline of the beams of the whole field with the camera's edge_margin.",
+    sizes = ("circle's radius [mm]", "its x [mm]", "its y [mm]", "clear aperture", "width [mm]", "height [mm]")
+    table = Table(
+        "figures", "Circles and clear apertures", "In the surface's own x and y.", ("tolerance", "motion", *sizes), rows
     )
-    return (Section("Figure errors", text, (table,), name="figures"),)
+    text = "A Zernike term has its rms over the smallest circle round the clear aperture, a whole figure error its rms "
+    text += (
+        "over the clear aperture about its mean: a stated edge, the stop, or the beams of the field and edge_margin."
+    )
+    return (Section("Figure errors", (text,), (table,), name="figures"),)
 
 
 def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:

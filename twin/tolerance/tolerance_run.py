@@ -538,11 +538,6 @@ TOLERANCE: Record[ToleranceRun] = Record(
         "each in its unit; p90 is the value that 90 % of the cameras keep",
     ),
     Quantity("tolerances", _tolerance_plain, "each at its limits, and the share of its limit that costs the loss"),
-    Quantity(
-        "figure_circle_radius_mm",
-        lambda run: {name: face.figure_disk.radius for name, face in run.bench.figure_faces.items()},
-        "of the smallest circle round the clear aperture, over which the terms of a figure error have their rms",
-    ),
     Quantity("compensators", _moves_plain, "how far they are moved"),
     Quantity(
         "losses",

@@ -339,7 +339,7 @@ def test_what_a_camera_cannot_hold_is_refused(tmp_path: Path, backend) -> None:
     flat = "SURF 7\n  TYPE STANDARD\n  CURV 0.0"
     cases: dict[str, tuple[str, str]] = {
         "finite.zmx": (TMA.replace("DISZ INFINITY", "DISZ 500"), "the object is at a finite distance"),
-        "heights.zmx": (TMA.replace("FTYP 0", "FTYP 3"), "no directions of the field"),
+        "heights.zmx": (TMA.replace("FTYP 0", "FTYP 4"), "no directions of the field"),
         "curved.zmx": (TMA.replace(flat, flat.replace("0.0", "0.01")), "a curved image"),
         "turned.seq": (CODEV.replace("SI 0.0 0.25\n  ADE 1.5", "SI 0.0 0.25\n  ADE 70"), "an image turned too far"),
     }
