@@ -393,6 +393,7 @@ def _warnings(run: TurntableRun, data: Mapping[str, Any]) -> tuple[str, ...]:
             f"held-out readings scatter more than the compensation states: chi-square {data['heldout_chi_square']:.0f} "
             f"for {data['heldout_degrees_of_freedom']} degrees of freedom, by chance once in {1.0 / tail:.0f}"
         )
+    warnings += [doubt for table in run.tables for doubt in table.file.doubts]
     if data["suspect_angles"]:
         warnings.append(f"angles whose kept repeats scatter more than their number allows: {data['suspect_angles']}")
     return tuple(warnings)
