@@ -25,7 +25,7 @@ All positions in one unit of length (metres elsewhere in this program), values i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -290,19 +290,9 @@ class FocusVertices:
     covariance: Array
 
     def at(self, *index: int) -> FocusVertex:
-        """One of the vertices."""
-        return FocusVertex(
-            position=float(self.position[index]),
-            sigma=float(self.sigma[index]),
-            peak=float(self.peak[index]),
-            peak_sigma=float(self.peak_sigma[index]),
-            curvature=float(self.curvature[index]),
-            skew=float(self.skew[index]),
-            skew_sigma=float(self.skew_sigma[index]),
-            chi_square=float(self.chi_square[index]),
-            degrees_of_freedom=int(self.degrees_of_freedom[index]),
-            used=self.used[index],
-        )
+        """Return one of the vertices."""
+        values = {field.name: getattr(self, field.name)[index] for field in fields(FocusVertex)}
+        return FocusVertex(**{name: value if value.ndim else value.item() for name, value in values.items()})
 
 
 def focus_vertex(position: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> FocusVertex:

@@ -15,7 +15,7 @@ from analysis.units import ARCMIN, UM_PER_M
 from scenes.specs.camera_tests import MeasuredFocusSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.laboratory import focus_plots
-from twin.laboratory.focus_numbers import ROW_FAULT, PLACES, SHIMS, focus_numbers
+from twin.laboratory.focus_numbers import PLACES, ROW_FAULT, SHIMS, focus_numbers
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus
 from twin.laboratory.turntable_report import DOUBTFUL
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed

@@ -120,9 +120,9 @@ def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
     images = files.images is not None
     table = read_table(str(files.images or files.mtf), IMAGE_COLUMNS if images else MTF_COLUMNS, 5)
     sites = _sites(table)
-    mtf, sigma, reasons, doubts = (
-        _from_images(table, files, advance) if images else (table["mtf"], table["sigma"], {}, {})
-    )
+    empty: dict[int, str] = {}
+    found = _from_images(table, files, advance) if images else (table["mtf"], table["sigma"].copy(), empty, empty)
+    mtf, sigma, reasons, doubts = found
     shift = table["shift"] * _per_shift(table, files)
     excluded: dict[int, str] = {}
     limit = float(np.sqrt(limit_of(_FALSE_ALARM / len(table), 1)))
@@ -131,14 +131,15 @@ def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
             for row, away in zip(rows, outlying_points(shift[rows], mtf[rows], sigma[rows], limit), strict=True):
                 if away:
                     excluded[int(row)] = f"the MTF is {away:+.3f} from the curve through all others"
-    sigma = sigma.copy()
     sigma[list(excluded)] = np.inf
     return FocusReadings(
         table,
         tuple(site.band for site in sites),
         np.array([site.place for site in sites]),
         tuple(_scan(table, site, shift, mtf, sigma, reasons) for site in sites),
-        *(_faults(table, each) for each in (reasons, doubts, excluded)),
+        _faults(table, reasons),
+        _faults(table, doubts),
+        _faults(table, excluded),
         DataFile.of(table, [column.name for column in _WHERE]),
     )
 
@@ -263,7 +264,9 @@ def _from_images(
             results.append(result)
             advance("measure the edges", len(results), len(table))
     mtf, sigma = (np.array([result[k] for result in results], np.float64) for k in (0, 1))
-    return mtf, sigma, *({row: result[k] for row, result in enumerate(results) if result[k]} for k in (2, 3))
+    without = {row: result[2] for row, result in enumerate(results) if result[2]}
+    doubts = {row: result[3] for row, result in enumerate(results) if result[3]}
+    return mtf, sigma, without, doubts
 
 
 def _noise_model(files: FocusFiles, name: str, spec: NoiseSpec) -> NoiseModel:

@@ -32,8 +32,8 @@ SAME_READING = 1e-9
 MOST_ERROR = np.radians(1.0)
 """By how much the difference from the reference may change over the region: no dividing error is as large."""
 CIRCLE = 2.0 * np.pi
-# Columns that number repeats; share of them that rounding makes equal at most; rows of a set that was copied, at least.
-_COUNTS, _COPIED, _LEAST_SET = ("set", "repeat"), 0.8, 4
+# Columns that number repeats; share of them that rounding makes equal at most; and so many rows.
+_COUNTS, _COPIED, _LEAST_SET = ("set", "repeat"), 0.8, 3
 READING = Column("reading", ANGLE, least=-2.0 * CIRCLE, most=2.0 * CIRCLE)
 COMPARISON_COLUMNS = (
     READING,
@@ -73,16 +73,12 @@ class DataFile:
     def of(cls, table: Table, where: Sequence[str]) -> DataFile:
         """Return the file of a table whose rows were measured in the same place if these columns are equal."""
         code = {name: np.unique(each, return_inverse=True)[1].ravel() for name, each in table.columns.items()}
-        place = np.column_stack([code[name] for name in where if name in code])
-        first = np.unique(np.column_stack([code[n] for n in code if n not in _COUNTS]), axis=0, return_index=True)[1]
-        copy = np.ones(len(table), bool)
-        copy[first] = False
-        number = next((code[name] for name in _COUNTS if name in code), None)
-        if number is None:
-            copied = copy.sum() > _COPIED * (len(table) - len(np.unique(place, axis=0)))
-        else:
-            copied = np.any(np.bincount(number, copy) >= np.maximum(np.bincount(number), _LEAST_SET))
-        return cls(table.file, len(table), digest_of(Path(table.file)), int(copy.sum()) if copied else 0)
+        copy, again = np.ones((2, len(table)), bool)
+        for rows, names in ((copy, set(code) - set(_COUNTS)), (again, set(code) & set(where))):
+            rows[np.unique(np.column_stack([code[name] for name in names]), axis=0, return_index=True)[1]] = False
+        number = next((code[name] for name in _COUNTS if name in code), np.where(again, 1, 0))
+        copied = np.bincount(number, copy) > np.maximum(_COPIED * np.bincount(number), _LEAST_SET)
+        return cls(table.file, len(table), digest_of(Path(table.file)), int(copy.sum()) if np.any(copied) else 0)
 
     @property
     def doubts(self) -> tuple[str, ...]:
