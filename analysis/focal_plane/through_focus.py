@@ -25,12 +25,13 @@ All positions in one unit of length (metres elsewhere in this program), values i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.chi_square import chance_beyond
 from analysis.measurement_error import MeasurementError
 
 Array = NDArray[np.float64]
@@ -166,21 +167,36 @@ class _Lobe:
 
     def result(self, mask: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
         """Peak, position, second derivative, each (B,), and their covariance (B, 3, 3)."""
-        _, slope = self._values()
-        normal = np.einsum("bzi,bz,bzj->bij", slope, np.where(mask, self.weight, 0.0), slope)
-        size = np.sqrt(np.einsum("bii->bi", normal))
-        size = np.where(size > 0, size, 1.0)
-        inverse = np.linalg.pinv(normal / (size[:, :, None] * size[:, None, :]), hermitian=True)
-        covariance = inverse / (size[:, :, None] * size[:, None, :])
+        covariance = _covariance(self._values()[1], np.where(mask, self.weight, 0.0))
         turn = np.zeros_like(covariance)
         turn[:, 0, 0], turn[:, 1, 1] = 1.0, self.scale
         turn[:, 2, 0], turn[:, 2, 2] = -2 * self.a / self.scale**2, -2 * self.p / self.scale**2
         covariance = turn @ covariance @ np.swapaxes(turn, 1, 2)
         return self.p, self.centre + self.x0 * self.scale, -2 * self.p * self.a / self.scale**2, covariance
 
+    def skew(self, mask: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Return by how much the vertex moves where the curve may be skewed, (B,), and the sigma of that.
+
+        The curve has another width on either side of its peak, u = a (z - z0)^2 (1 +- k), to the first order of k.
+        """
+        value, slope = self._values()
+        odd = slope[:, :, 2] * np.sign(self.x - self.x0[:, None])
+        design, weight = np.concatenate([slope, odd[:, :, None]], axis=2), np.where(mask, self.weight, 0.0)
+        more = _covariance(design, weight)[:, 1, 1] - _covariance(slope, weight)[:, 1, 1]
+        return _solve(design, weight, self.v - value)[:, 1] * self.scale, np.sqrt(np.maximum(more, 0.0)) * self.scale
+
     def chi_square(self, mask: NDArray[np.bool_]) -> Array:
         """Weighted sum of squared residuals, (B,)."""
         return np.asarray(np.sum(np.where(mask, self.weight, 0.0) * (self.v - self._values()[0]) ** 2, axis=1))
+
+
+def _covariance(design: Array, weight: Array) -> Array:
+    """Return the covariances (B, P, P) of B fits with designs (B, Z, P) and weights (B, Z)."""
+    normal = np.einsum("bzi,bz,bzj->bij", design, weight, design)
+    size = np.sqrt(np.einsum("bii->bi", normal))
+    size = np.where(size > 0, size, 1.0)
+    inverse = np.linalg.pinv(normal / (size[:, :, None] * size[:, None, :]), hermitian=True)
+    return np.asarray(inverse / (size[:, :, None] * size[:, None, :]))
 
 
 def _solve(design: Array, weight: Array, data: Array) -> Array:
@@ -201,6 +217,9 @@ _SIGNIFICANT = 5.0
 _HINT = 3.0
 # Near an end of the scan a chi-square this many times the degrees of freedom means a flank and not a peak.
 _MISFIT = 10.0
+# A curve with outliers has this many points for each of them at least; one with a larger chance has none. Pairs that
+# hide each other are sought among so many points at most.
+_SOUND_TO_BAD, _EXPLAINED, _MOST_PAIRED = 4, 0.01, 50
 _REMEDY = {
     "peak below": "the peak lies beyond the lower end of the scan, {low:.6g}, or too near to it; move the scan down",
     "peak above": "the peak lies beyond the upper end of the scan, {high:.6g}, or too near to it; move the scan up",
@@ -233,6 +252,7 @@ class FocusVertex:
 
     position, sigma: of the vertex, and its standard deviation from the sigmas given (not scaled by chi-square).
     peak, peak_sigma: value at the vertex. curvature: second derivative there, negative.
+    skew, skew_sigma: by how much the vertex moves where the curve may be skewed, and the sigma of that.
     chi_square, degrees_of_freedom: of the fit. used: (Z,) which points took part, in the order given.
     """
 
@@ -241,6 +261,8 @@ class FocusVertex:
     peak: float
     peak_sigma: float
     curvature: float
+    skew: float
+    skew_sigma: float
     chi_square: float
     degrees_of_freedom: int
     used: NDArray[np.bool_]
@@ -251,6 +273,7 @@ class FocusVertices:
     """Vertices of many curves: the fields of FocusVertex with the leading axes of the input, (...).
 
     used: (..., Z). fault: (...) empty text, or why there is no vertex; there the numbers are NaN.
+    covariance: (..., 3, 3) of peak, position and curvature.
     """
 
     position: Array
@@ -258,23 +281,18 @@ class FocusVertices:
     peak: Array
     peak_sigma: Array
     curvature: Array
+    skew: Array
+    skew_sigma: Array
     chi_square: Array
     degrees_of_freedom: NDArray[np.int64]
     used: NDArray[np.bool_]
     fault: NDArray[np.str_]
+    covariance: Array
 
     def at(self, *index: int) -> FocusVertex:
-        """One of the vertices."""
-        return FocusVertex(
-            position=float(self.position[index]),
-            sigma=float(self.sigma[index]),
-            peak=float(self.peak[index]),
-            peak_sigma=float(self.peak_sigma[index]),
-            curvature=float(self.curvature[index]),
-            chi_square=float(self.chi_square[index]),
-            degrees_of_freedom=int(self.degrees_of_freedom[index]),
-            used=self.used[index],
-        )
+        """Return one of the vertices."""
+        values = {field.name: getattr(self, field.name)[index] for field in fields(FocusVertex)}
+        return FocusVertex(**{name: value if value.ndim else value.item() for name, value in values.items()})
 
 
 def focus_vertex(position: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> FocusVertex:
@@ -318,6 +336,7 @@ def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, s
     model = _Lobe(z, v, weight, start, mask)
     mask = model.settle(mask)
     peak, place, bend, covariance = model.result(mask)
+    skew, skew_sigma = model.skew(mask)
 
     fault = _faults(model, mask, place, bend, covariance)
     fault[broken.any(axis=1)] = "not finite"
@@ -338,11 +357,67 @@ def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, s
         peak=number(peak),
         peak_sigma=number(np.sqrt(covariance[:, 0, 0])),
         curvature=number(bend),
+        skew=number(skew),
+        skew_sigma=number(skew_sigma),
         chi_square=number(model.chi_square(mask)),
         degrees_of_freedom=np.where(failed, 0, used.sum(axis=1) - 3).reshape(lead),
         used=used.reshape(shape),
         fault=fault.reshape(lead),
+        covariance=covariance.reshape(*lead, 3, 3),
     )
+
+
+def outlying_points(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, limit: float) -> Array:
+    """Return by how much points of one curve disagree with the curve through all others, (Z,); 0 where they agree.
+
+    A curve that its sigmas explain has none. Else the point is sought that stands out most from the fit without it, and
+    where there is none, the two that together do, which hide each other. Sigmas that are too small for the others'
+    scatter are enlarged. A point beyond half of the peak disagrees only if it is higher than that.
+
+    Args:
+        position: (Z,), a length.
+        value: (Z,), MTF.
+        sigma: of the values, (Z,), infinite for a point that was not measured.
+        limit: in sigmas, from which a point disagrees.
+    """
+    z, v, s = (np.array(item, np.float64) for item in (position, value, sigma))
+    out = np.zeros(z.size)
+    for _ in range(z.size // _SOUND_TO_BAD):
+        left = np.flatnonzero(np.isfinite(s))
+        if left.size <= LEAST_POINTS + 1:
+            break
+        fitted = focus_vertices(z, v, s, strict=False)
+        if not fitted.fault and chance_beyond(fitted.chi_square, max(fitted.degrees_of_freedom, 1)) > _EXPLAINED:
+            break
+        pairs = np.stack(np.triu_indices(left.size if left.size <= _MOST_PAIRED else 0, 1), axis=1)
+        for groups in (left[:, None], left[pairs]):
+            away, sigmas = _deviations(z, v, s, groups)
+            worst = np.min(sigmas, axis=1, initial=np.inf)
+            if worst.size and worst.max() > limit:
+                best = int(np.argmax(worst))
+                out[groups[best]], s[groups[best]] = away[best], np.inf
+                break
+        else:
+            break
+    return out
+
+
+def _deviations(z: Array, v: Array, s: Array, groups: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Return how far groups (G, K) of points are from the curves without them, also in sigmas; 0 without a curve."""
+    spread = np.tile(s, (len(groups), 1))
+    np.put_along_axis(spread, groups, np.inf, axis=1)
+    fits = focus_vertices(z, np.broadcast_to(v, spread.shape), spread, strict=False)
+    peak, bend = fits.peak[:, None], fits.curvature[:, None]
+    away = z[groups] - fits.position[:, None]
+    u = -bend * away**2 / (2.0 * peak)
+    inside = 1.0 - u + QUARTIC * u**2
+    near = (inside > FRACTION) & (u < 0.5 / QUARTIC)
+    rest = np.where(near, v[groups] - peak * inside, np.maximum(v[groups] - FRACTION * peak, 0.0))
+    fall = 2.0 * QUARTIC * u - 1.0
+    slope = np.stack([1.0 - QUARTIC * u**2, fall * bend * away, -0.5 * fall * away**2], axis=2)
+    variance = np.where(near, np.einsum("gki,gij,gkj->gk", slope, fits.covariance, slope), 0.0) + s[groups] ** 2
+    scale = np.maximum(fits.chi_square / np.maximum(fits.degrees_of_freedom, 1), 1.0)[:, None]
+    return rest, np.nan_to_num(np.abs(rest) / np.sqrt(variance * scale))
 
 
 def _faults(

@@ -143,10 +143,8 @@ def measure_bars(
     grey = _checked(region, saturation)
     window = np.outer(*(np.sin(np.pi * (np.arange(n) + 0.5) / n) for n in grey.shape))
     # levels that fill the region count where the bars do
-    levels = [
-        _level(name, patch, noise, frames, saturation, window if np.shape(patch) == grey.shape else None)
-        for name, patch in (("dark", dark), ("bright", bright))
-    ]
+    patches = (("dark", dark), ("bright", bright))
+    levels = [_level(name, patch, noise, frames, saturation, window) for name, patch in patches]
     (low, low_sigma), (high, high_sigma) = (
         (level, math.hypot(sigma, least)) for (level, sigma), least in zip(levels, rounding[1:], strict=True)
     )
@@ -195,11 +193,8 @@ def measure_bars(
     light_sigma = math.sqrt(4.0 * float(covariance[0, 0]) + low_sigma**2 + high_sigma**2) / step
     least = _LEAST_LIGHT if np.shape(dark) == np.shape(bright) == grey.shape else 0.0
     uneven = chance_beyond((light / light_sigma) ** 2, 1) < FALSE_ALARM and abs(light) > least
-    sigma = math.hypot(
-        scale * float(rice_sigma(signal, along_sigma, across_sigma)),
-        mtf * step_sigma / step,
-        mtf * light if uneven else 0.0,
-    )
+    relative = math.hypot(step_sigma / step, light if uneven else 0.0)
+    sigma = math.hypot(scale * float(rice_sigma(signal, along_sigma, across_sigma)), mtf * relative)
     largest, least = float(grey.max()) - offset, float(grey.min()) - offset
     contrast = (largest - least) / (largest + least) if largest + least > 0 else math.nan
     transfer = contrast * (high + low - 2.0 * offset) / step
@@ -242,14 +237,9 @@ def _checked(region: ArrayLike, saturation: float | None) -> Array:
 
 
 def _level(
-    name: str,
-    patch: ArrayLike,
-    noise: NoiseModel | None,
-    frames: int,
-    saturation: float | None,
-    window: Array | None,
+    name: str, patch: ArrayLike, noise: NoiseModel | None, frames: int, saturation: float | None, window: Array
 ) -> tuple[float, float]:
-    """Return the mean of a patch, weighted by a window of its shape, and its sigma, grey values."""
+    """Return the mean of a patch, weighted by the window if it has its shape, and its sigma, grey values."""
     pixels = np.asarray(patch, dtype=np.float64).ravel()
     finite = int(np.count_nonzero(np.abs(pixels) <= LARGEST_GREY))
     if finite < max(_LEAST_PATCH, pixels.size):
@@ -261,7 +251,8 @@ def _level(
         raise BarError(
             f"the {name} patch reaches the saturation level of {saturation:g}: lower the exposure or the light"
         )
-    share = np.full(pixels.size, 1.0 / pixels.size) if window is None else window.ravel() / window.sum()
+    share = window.ravel() if np.shape(patch) == window.shape else np.ones(pixels.size)
+    share = share / share.sum()
     mean = float(share @ pixels)
     if noise is None:
         variance = float(pixels.var(ddof=1))

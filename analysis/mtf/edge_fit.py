@@ -60,11 +60,11 @@ class EdgeRows:
     bend: Array
 
     @staticmethod
-    def of(lines: Array, rows: int, columns: int, bend: Array | None = None) -> EdgeRows:
-        """Return the rows of pages with lines (P, 2), offset and slope, one page after the other."""
-        along = np.arange(rows) - (rows - 1) / 2.0
-        offset, slope = (np.repeat(part, rows) for part in lines.T)
-        return EdgeRows(offset, slope, np.tile(along, len(lines)), columns, np.empty(0) if bend is None else bend)
+    def of(lines: Array, shape: tuple[int, ...], bend: Array) -> EdgeRows:
+        """Return the rows of pages of a shape (H, W), one after the other, with lines (P, 2), offset and slope."""
+        along = np.arange(shape[0]) - (shape[0] - 1) / 2.0
+        offset, slope = np.repeat(lines, shape[0], axis=0).T
+        return EdgeRows(offset, slope, np.tile(along, len(lines)), shape[1], bend)
 
     @property
     def half(self) -> float:
@@ -98,13 +98,12 @@ class EdgeRows:
         out = beside * np.cos(angle)
         if self.bend.size:
             out -= 0.5 * self._legendre(2)[:, None] * (beside * np.sin(angle)) ** 2 * np.cos(angle) ** 3
-        return np.asarray(out.ravel())
+        return np.asarray(out, np.float64).ravel()
 
     def moved(self, change: Array) -> EdgeRows:
         """Return the rows with the coefficients of the path changed, (1 + order,), px."""
-        bend = np.zeros(max(self.bend.size, change.size - 2))
-        bend[: self.bend.size] += self.bend
-        bend[: change.size - 2] += change[2:]
+        size = max(self.bend.size, change.size - 2)
+        bend = np.pad(self.bend, (0, size - self.bend.size)) + np.pad(change[2:], (0, size + 2 - change.size))
         return replace(self, offset=self.offset + change[0], slope=self.slope + change[1] / self.half, bend=bend)
 
     def polynomials(self, order: int) -> Array:
@@ -113,8 +112,6 @@ class EdgeRows:
 
     def _legendre(self, derivative: int) -> Array:
         """Return the bend or its derivative along the edge in every row, (R,)."""
-        if not self.bend.size:
-            return np.zeros(len(self.along))
         series = legendre.legder([0.0, 0.0, *self.bend], derivative)
         return np.asarray(legendre.legval(self.along / self.half, series)) / self.half**derivative
 
@@ -158,7 +155,7 @@ def fit_edge(rising: Array, offset: float, slope: float, even: bool = False) -> 
         EdgeError: too few sampling phases, or no sharp edge.
     """
     grey = rising.ravel()
-    rows = EdgeRows.of(np.array([[offset, slope]]), *rising.shape)
+    rows = EdgeRows.of(np.array([[offset, slope]]), rising.shape, np.empty(0))
     distance = rows.distance()
     check_phases(distance, len(rising), slope)
     return fit_rows(rows, grey, core_width(distance, grey, rows.plateau), even, _LINE_STEPS[even])

@@ -235,7 +235,7 @@ class _Stack:
 
     def distance(self) -> Array:
         """Distance of all pixels from the edge in their page, along its normal, (P, H, W), px."""
-        return edge_fit.EdgeRows.of(self.line, *self.pages.shape[1:], self.bend).distance().reshape(self.pages.shape)
+        return edge_fit.EdgeRows.of(self.line, self.pages.shape[1:], self.bend).distance().reshape(self.pages.shape)
 
     @property
     def levelled(self) -> Array:
@@ -358,15 +358,15 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         assert stack is not None
         lines = stack.line
     if stack is None:
-        stack = _Stack.of(up, edge_fit.fit_edge(up[0], *lines[0], run.even))
+        stack = _Stack.of(up, edge_fit.fit_edge(up[0], float(lines[0, 0]), float(lines[0, 1]), run.even))
     # what the mean shows of light and bend is near enough to lay the pages over each other
-    flat, bend = up - stack.light, stack.bend
+    flat = up - stack.light
     # one slope for all unless they turn
     start = np.column_stack([lines[:, 0], np.full(len(up), lines[:, 1].mean())])
     left, right = (np.median(part, axis=(1, 2)) for part in (flat[..., :8], flat[..., -8:]))
     levels = np.column_stack([left, right - left])
     turning = False
-    current = _fitted(flat, start, levels, bend)
+    current = _fitted(flat, start, levels, stack.bend)
     for number in range(_STEPS):
         shift = current.differences(run.step)
         change = shift.line.copy()
@@ -376,7 +376,7 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         gain = current.levels[:, 1] / current.spread.contrast
         new = current.levels + shift.levels * gain[:, None]
         own = np.abs(change) / np.sqrt(np.diagonal(shift.covariance, axis1=1, axis2=2))
-        current = _fitted(flat, current.line + change, new, bend)
+        current = _fitted(flat, current.line + change, new, stack.bend)
         if not turning and number >= _SETTLED and shift.turned:
             turning = True
         elif number >= _SETTLED and np.max(own) < _DONE:
@@ -385,15 +385,16 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         raise EdgeError(
             "the pages cannot be laid over each other: the edge does not look alike in them; measure single pages"
         )
-    fitted = edge_fit.fit_rows(*_levelled(up, current.line, current.levels, bend), run.even)
+    rows, grey, core = _levelled(up, current.line, current.levels, stack.bend)
+    fitted = edge_fit.fit_rows(rows, grey, core, run.even)
     lines = np.column_stack([fitted.rows.offset, fitted.rows.slope])[:: up.shape[1]]
-    even = _levelled(up, lines, current.levels, bend)[1] - fitted.light
     levels = np.tile([fitted.spread.dark, fitted.spread.contrast], (len(up), 1))
-    final = _Stack(even.reshape(up.shape), lines, fitted.spread, levels, fitted.rows.bend, stack.light)
+    even = (grey - fitted.light).reshape(up.shape)
+    final = _Stack(even, lines, fitted.spread, levels, fitted.rows.bend, stack.light)
     sigma = np.stack([np.diag(one) for one in shift.covariance])
     normal = np.cos(np.arctan(final.line[:, 1])) ** 2
-    jitter = float(np.mean(normal * (sigma[:, 0] + turning * sigma[:, 1] * np.mean(final.along**2))))
-    fitted = replace(fitted, jitter=jitter)
+    jitter = normal * (sigma[:, 0] + turning * sigma[:, 1] * np.mean(final.along**2))
+    fitted = replace(fitted, jitter=float(np.mean(jitter)))
     chi = final.differences(run.step)
     # of pages that differ: how far the lines stand apart
     apart = final.line - final.line.mean(axis=0)
@@ -408,7 +409,7 @@ def _levelled(up: Array, lines: Array, levels: Array, bend: Array) -> tuple[edge
         page = int(np.argmin(levels[:, 1]))
         raise EdgeError(f"page {page} of those that are not repeated shows no edge; leave it out")
     grey = (dark + (up - levels[:, :1, None]) * (contrast / levels[:, 1:, None])).ravel()
-    rows = edge_fit.EdgeRows.of(lines, *up.shape[1:], bend)
+    rows = edge_fit.EdgeRows.of(lines, up.shape[1:], bend)
     if rows.plateau < 10.0:
         raise EdgeError(
             "the edge moves so far between the pages that it comes within 10 px of the region's side: take a wider"

@@ -142,10 +142,10 @@ def edge_result(
     along, across = (np.sqrt(np.sum(part * (covariance @ part), axis=0)) for part in (turned.real, turned.imag))
     signal = signal_modulus(modulus, along, across)
 
-    path = _path_errors(fitted, grey - model, variance)
+    slope_sigma, curvature, curvature_sigma, squares = _path_errors(fitted, grey - model, variance)
     cosine = math.cos(math.atan(float(fitted.rows.slope.mean())))
     # A path that is off by e(v) blurs: 1 - mean cos(2 pi f e cosine) is a sum of k chi^2, its mean square as below.
-    blurs = 0.5 * path.blur * (2.0 * np.pi * frequency[:, None] * cosine) ** 2
+    blurs = 0.5 * squares * (2.0 * np.pi * frequency[:, None] * cosine) ** 2
     blur = np.sqrt(blurs.sum(axis=1) ** 2 + 2.0 * np.sum(blurs**2, axis=1))
     # pages that are laid over each other by their noise: an error of one sign, as much up as down by its size
     jitter = 0.5 * (2.0 * np.pi * frequency) ** 2 * fitted.jitter
@@ -175,11 +175,11 @@ def edge_result(
         ),
         noise_bias=measured_bias(modulus, across),
         angle=line.sign * math.atan(float(fitted.rows.slope.mean())),
-        angle_sigma=path.slope_sigma * cosine**2,
+        angle_sigma=slope_sigma * cosine**2,
         position=offset,
         position_sigma=math.sqrt(float(lift @ covariance @ lift)) / steep / cosine,
-        curvature=line.sign * path.curvature,
-        curvature_sigma=path.curvature_sigma,
+        curvature=line.sign * curvature,
+        curvature_sigma=curvature_sigma,
         order=fitted.order,
         light=fitted.change,
         light_sigma=np.sqrt(np.diag(covariance)[spread.spline_count : -3]),
@@ -244,39 +244,23 @@ def _structure(fitted: FittedEdge, residual: Array, variance: Array) -> Structur
     return min(out, key=lambda found: found.chance)
 
 
-@dataclass(frozen=True, eq=False)
-class _PathErrors:
-    """Standard deviations of a fitted path.
-
-    slope_sigma: of its slope. curvature, curvature_sigma: mean second derivative and its sigma, 1/px.
-    blur: (order,) mean square of its error along the rows by the coefficients of order 1 and up, px^2.
+def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> tuple[float, float, float, Array]:
+    """Return the sigma of the path's slope, its mean second derivative with sigma, 1/px, and its mean squares of error
+    along the rows by the coefficients of order 1 and up, (order,), px^2, from residuals (N,) and variances (N,).
     """
-
-    slope_sigma: float
-    curvature: float
-    curvature_sigma: float
-    blur: Array
-
-
-def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> _PathErrors:
-    """Return the errors of the path from the residuals of all pixels (N,) and their variances (N,)."""
     rows, order = fitted.rows, fitted.order
     parts, near = path_parts(rows, fitted.design, fitted.spread, max(order, 2))
-    scatter = (parts * variance[near]) @ parts.T
-    inverse = np.linalg.inv(parts @ parts.T)
-    bend = float((inverse @ (parts @ residual[near]))[2]) + (float(rows.bend[0]) if order > 1 else 0.0)
+    scatter, normal = (parts * variance[near]) @ parts.T, parts @ parts.T
+    inverse = np.linalg.inv(normal)
+    bend = float((inverse @ (parts @ residual[near]))[2]) + float(rows.bend[:1].sum())
     # the second derivative of the second Legendre polynomial is 3
     scale = 3.0 / rows.half**2
     # the coefficients without those that were not fitted
-    own = np.linalg.inv((parts @ parts.T)[: order + 1, : order + 1])
-    covariance = own @ scatter[: order + 1, : order + 1] @ own
-    blur = np.diag(covariance)[1:] * np.mean(rows.polynomials(order)[1:] ** 2, axis=1)
-    return _PathErrors(
-        slope_sigma=math.sqrt(float(covariance[1, 1])) / rows.half,
-        curvature=scale * bend,
-        curvature_sigma=scale * math.sqrt(float((inverse @ scatter @ inverse)[2, 2])),
-        blur=blur,
-    )
+    own = np.linalg.inv(normal[: order + 1, : order + 1])
+    square = np.diag(own @ scatter[: order + 1, : order + 1] @ own)[1:]
+    bend_sigma = math.sqrt(float((inverse @ scatter @ inverse)[2, 2]))
+    blur = square * np.mean(rows.polynomials(order)[1:] ** 2, axis=1)
+    return math.sqrt(square[0]) / rows.half, scale * bend, scale * bend_sigma, blur
 
 
 @dataclass(frozen=True, eq=False)

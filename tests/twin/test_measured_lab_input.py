@@ -19,6 +19,7 @@ from scenes.specs.load import SCENES
 from scenes.specs.resolved import resolve_focus_test
 from scenes.yaml.errors import InputError
 from twin.lab import app
+from twin.laboratory.focus_report import focus_report
 from twin.laboratory.focus_run import align_files
 from twin.laboratory.measured_readings import read_comparisons
 
@@ -259,6 +260,19 @@ def test_a_stack_that_the_twin_did_not_make(stack: Path) -> None:
     assert abs(run.shimmings[0].plane.slope_y - 1e-4) < 4.0 * sigma_y
     assert sigma_y < 1e-5
     assert not run.readings.no_edge
+
+
+def test_an_image_in_uneven_light_is_named(stack: Path) -> None:
+    """A light that is no plane; one that is costs sigma alone."""
+    row, column = np.mgrid[-1:1:64j, -1:1:64j]
+    for name, light in (("2_along_4", 1.0 - 0.1 * column**2), ("1_track_3", 1.0 + 0.1 * row + 0.1 * column)):
+        image = tifffile.imread(stack / f"{name}.tiff")
+        tifffile.imwrite(stack / f"{name}.tiff", np.uint16(light * image))
+    run = align_files(resolve_focus_test(stack / "focus.yaml").test)
+    with (stack / "images.csv").open() as stream:
+        line = next(k for k, text in enumerate(stream, 1) if "2_along_4" in text)
+    assert [fault.line for fault in run.readings.uneven] == [line]
+    assert f"1 images have a sigma that does not hold (lines {line} of" in " ".join(focus_report(run).warnings)
 
 
 def more(*columns: tuple[str, str]) -> Callable[[Path], None]:

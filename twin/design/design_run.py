@@ -13,7 +13,6 @@ from optics.design.design_variables import Prescription
 from optics.design.merit_function import Evaluation, MeritFunction, Operands
 from optics.design.optimiser import HELD, ITERATIONS, Design, DesignError, Held, rms_error
 from optics.design.starts import SAME, Attempt, Search, search
-from optics.numerics.array_math import determinant
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError

@@ -178,6 +178,13 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
                 f"{1e6 * slope:.0f} µm, which no sigma holds ({1e6 * sigma:.0f} µm): measure the wavefront at several "
                 "fields"
             )
+    if run.readings is not None:
+        out += run.readings.file.doubts
+        if not run.readings.numbered and run.reading.shape[1] > 1:
+            out.append(
+                "spots of a point have no set numbers and count as independent exposures, so that the sigma of a mean"
+                " of four is half of one's: a column 'set' tells which belong together"
+            )
     moved = abs(fit.value("constant"))
     if isinstance(run.test, MeasuredDistortionSpec) and moved > ZERO_SHARE * fit.sigma("principal_point"):
         sense = -1.0 if run.test.measured.reversed else 1.0

@@ -13,7 +13,7 @@ from optics.geometry.pose import rotation_vector
 from twin.laboratory.focus_bench import BudgetLine
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState
 from twin.laboratory.focus_scan import VERTEX_ERROR
-from twin.laboratory.measured_focus import ImageFault
+from twin.laboratory.measured_focus import RowFault
 from twin.laboratory.turntable_numbers import DATA_FILE, likely
 from twin.run.quantity import Quantity, Record
 from twin.targets.target_images import ALONG, TRACK
@@ -157,8 +157,8 @@ SHIMS: Record[Shimming] = Record(
     Quantity("shim_um", lambda s: _ground(s.plan.thickness), "new thickness", "new shim", 1, converted=False),
     Quantity("slide_mm", lambda s: s.plan.slide, "displacement in the mounting surface, by hand"),
 )
-IMAGE_FAULT: Record[ImageFault] = Record(
-    "An image without a measurable edge, or whose sigma does not hold.",
+ROW_FAULT: Record[RowFault] = Record(
+    "A row of the table with what is wrong with it or with its image.",
     Quantity("file", lambda one: one.file, "the table that names it"),
     Quantity("line", lambda one: one.line, "line of the table"),
     Quantity("reason", lambda one: one.reason, "why"),
@@ -188,12 +188,15 @@ MEASURED: Record[FocusRun] = Record(
     Quantity("line_level_without_turn_arcmin", lambda r: r.shimmings[0].plan.level_coupling, "error without it"),
     Quantity("expected_confocal_um_max", lambda r: r.shimmings[0].expected[0], "largest expected distance"),
     Quantity("expected_confocal_um_sigma", lambda r: r.shimmings[0].expected[1], "standard deviation"),
+    Quantity("skew_um", lambda r: r.states[0].skew[0], "move of all vertices if curves may be skewed"),
+    Quantity("skew_um_sigma", lambda r: r.states[0].skew[1], "standard deviation by noise"),
     Quantity("curves_chi_square", lambda r: r.chi_square[0], "of all curves through focus together"),
     Quantity("curves_degrees_of_freedom", lambda r: r.chi_square[1], "of all curves through focus together"),
     Quantity("curves_agree", lambda r: likely(*r.chi_square), "whether that is likely"),
     Quantity("sites", lambda r: PLACES.rows(_standing(r)), "all places"),
-    Quantity("images_without_edge", lambda r: r.readings and r.readings.no_edge, "not measured", record=IMAGE_FAULT),
-    Quantity("images_with_structure", lambda r: r.readings and r.readings.uneven, "doubtful", record=IMAGE_FAULT),
+    Quantity("images_without_edge", lambda r: r.readings and r.readings.no_edge, "not measured", record=ROW_FAULT),
+    Quantity("images_with_structure", lambda r: r.readings and r.readings.uneven, "doubtful", record=ROW_FAULT),
+    Quantity("rows_excluded", lambda r: r.readings and r.readings.excluded, "off their curves", record=ROW_FAULT),
     Quantity("files", lambda r: r.readings and [r.readings.file], "that were read", record=DATA_FILE),
 )
 

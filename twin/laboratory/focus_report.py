@@ -15,7 +15,7 @@ from analysis.units import ARCMIN, UM_PER_M
 from scenes.specs.camera_tests import MeasuredFocusSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.laboratory import focus_plots
-from twin.laboratory.focus_numbers import NO_EDGE, PLACES, SHIMS, focus_numbers
+from twin.laboratory.focus_numbers import PLACES, ROW_FAULT, SHIMS, focus_numbers
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus
 from twin.laboratory.turntable_numbers import DOUBTFUL
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed
@@ -184,12 +184,19 @@ def _warnings(run: FocusRun, data: Mapping[str, Any]) -> tuple[str, ...]:
             f"places are too small by about {np.sqrt(square / freedom):.1f}; those of plane and shims hold what places "
             "scatter"
         )
-    uneven = run.readings.uneven if run.readings else ()
-    if uneven:
+    move, noise = run.states[0].skew
+    if run.readings and chi2.sf((move / noise) ** 2, 1) < DOUBTFUL:
         out.append(
-            f"in {len(uneven)} of {len(run.readings.table)} images, first in that of line {uneven[0].line} of"
-            f" {uneven[0].file}, {uneven[0].reason}"
+            f"the curves are wider on one side of their peaks than on the other: all places may stand"
+            f" {UM_PER_M * move:+.1f} ± {UM_PER_M * noise:.1f} µm from where they are given. The common error of"
+            f" {UM_PER_M * run.shimmings[0].vertex_error:.1f} µm in the sigmas of plane and shims holds it"
         )
+    for name, faults in (("rows do not count", "excluded"), ("images have a sigma that does not hold", "uneven")):
+        rows = getattr(run.readings, faults, ())
+        if rows:
+            where = f"lines {', '.join(str(row.line) for row in rows[:9])}{', ...' if len(rows) > 9 else ''}"
+            out.append(f"{len(rows)} {name} ({where} of {rows[0].file}); of the first: {rows[0].reason}")
+    out += run.readings.file.doubts if run.readings else ()
     if len(run.edges) == 1:
         out.append(
             f"one direction only, {DIRECTION_NAMES[run.edges[0]]}: with astigmatism best focus is midway between two"
@@ -300,9 +307,9 @@ def _curves(run: FocusRun) -> Section:
         Table("curves", "Curves through focus", caption, heads, rows, digits),
     ]
     if run.readings and run.readings.no_edge:
-        gone = [{**NO_EDGE(one), "file": Path(one.file).name} for one in run.readings.no_edge]
+        gone = [{**ROW_FAULT(one), "file": Path(one.file).name} for one in run.readings.no_edge]
         note = "They have no weight."
-        artefacts.insert(1, NO_EDGE.table("no-edge", "Images without a measurable edge", note, gone))
+        artefacts.insert(1, ROW_FAULT.table("no-edge", "Images without a measurable edge", note, gone))
     text = [
         "The main peak of every curve is fitted by v = p (1 − u + 0.3 u²), u = a (z − z₀)², over the positions where "
         "it is above half of its peak; best focus of a place is midway between its directions, which astigmatism moves "

@@ -58,6 +58,20 @@ class FocusState:
         return np.array([scan.defocus_sigma for scan in self.scans])
 
     @property
+    def skew(self) -> tuple[float, float]:
+        """Return by how much the places move together if curves may be skewed, and its sigma by noise, metres.
+
+        It is the weighted mean over the places of an edge's direction, and the mean of the directions.
+        """
+        moves, squares = [], []
+        for edge in self.scans[0].vertex:
+            curves = [scan.vertex[edge] for scan in self.scans]
+            weight = np.array([1.0 / max(curve.skew_sigma, 1e-300) ** 2 for curve in curves])
+            moves.append(np.average([curve.skew for curve in curves], weights=weight))
+            squares.append(1.0 / weight.sum())
+        return float(np.mean(moves)), float(np.sqrt(np.sum(squares)) / len(moves))
+
+    @property
     def confocal(self) -> tuple[float, float]:
         """Largest distance of any site from best focus and its sigma by noise, metres."""
         return float(np.max(np.abs(self.defocus))), float(np.max(self.defocus_sigma))
@@ -268,7 +282,10 @@ def align_files(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silen
     state = FocusState(found.scans, level)
     present = np.array(spec.shims or [spec.mount.thickness] * len(spec.mount.holes))
     try:
-        shimming = decide(found.places, state, mount_of(spec), present, (spec.vertex_error, spec.vertex_trend))
+        move, noise = state.skew
+        # what the skew of the curves says beyond its noise all places share
+        shared = float(np.sqrt(spec.vertex_error**2 + max(move**2 - noise**2, 0.0)))
+        shimming = decide(found.places, state, mount_of(spec), present, (shared, spec.vertex_trend))
     except ObservabilityError as error:
         raise found.table.error(0, "x", str(error).removeprefix("focal plane: ")) from error
     return FocusRun(

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex
+from analysis.chi_square import limit_of
+from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex, outlying_points
 from analysis.images.image_file import ImageError, ImageFile, Region
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
@@ -47,6 +48,8 @@ IMAGE_COLUMNS = (
     *(Column(name, needed=False, whole=True, least=0.0, most=1e7) for name in ("page", "row", "column")),
     *(Column(name, needed=False, whole=True, least=1.0, most=1e5) for name in ("height", "width")),
 )
+_FALSE_ALARM = 1e-3
+"""Rate at which one of all rows of a sound table is excluded."""
 _REGION = ("row", "column", "height", "width")
 
 
@@ -70,8 +73,8 @@ class _Place:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageFault:
-    """An image in which no edge could be measured, or whose MTF has a sigma that does not hold, and why."""
+class RowFault:
+    """A row of the table with what is wrong with it or with its image."""
 
     file: str
     line: int
@@ -89,6 +92,7 @@ class FocusReadings:
         scans: curves through focus of the sites.
         no_edge: images that could not be measured.
         uneven: images with structure that their edge does not explain.
+        excluded: rows that disagree with the curve of all others and do not count.
         file: the table's.
     """
 
@@ -96,8 +100,9 @@ class FocusReadings:
     bands: tuple[str, ...]
     places: Array
     scans: tuple[SiteScan, ...]
-    no_edge: tuple[ImageFault, ...]
-    uneven: tuple[ImageFault, ...]
+    no_edge: tuple[RowFault, ...]
+    uneven: tuple[RowFault, ...]
+    excluded: tuple[RowFault, ...]
     file: DataFile
 
 
@@ -115,24 +120,33 @@ def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
     images = files.images is not None
     table = read_table(str(files.images or files.mtf), IMAGE_COLUMNS if images else MTF_COLUMNS, 5)
     sites = _sites(table)
-    mtf, sigma, reasons, doubts = (
-        _from_images(table, files, advance) if images else (table["mtf"], table["sigma"], {}, {})
-    )
+    empty: dict[int, str] = {}
+    found = _from_images(table, files, advance) if images else (table["mtf"], table["sigma"].copy(), empty, empty)
+    mtf, sigma, reasons, doubts = found
     shift = table["shift"] * _per_shift(table, files)
+    excluded: dict[int, str] = {}
+    limit = float(np.sqrt(limit_of(_FALSE_ALARM / len(table), 1)))
+    for site in sites:
+        for rows in site.rows.values():
+            for row, away in zip(rows, outlying_points(shift[rows], mtf[rows], sigma[rows], limit), strict=True):
+                if away:
+                    excluded[int(row)] = f"the MTF is {away:+.3f} from the curve through all others"
+    sigma[list(excluded)] = np.inf
     return FocusReadings(
         table,
         tuple(site.band for site in sites),
         np.array([site.place for site in sites]),
         tuple(_scan(table, site, shift, mtf, sigma, reasons) for site in sites),
-        _images(table, reasons),
-        _images(table, doubts),
-        DataFile.of(table),
+        _faults(table, reasons),
+        _faults(table, doubts),
+        _faults(table, excluded),
+        DataFile.of(table, [column.name for column in _WHERE]),
     )
 
 
-def _images(table: Table, reasons: Mapping[int, str]) -> tuple[ImageFault, ...]:
-    """Return the images of the rows of a table with their reasons."""
-    return tuple(ImageFault(table.file, int(table.lines[row]), reasons[row]) for row in sorted(reasons))
+def _faults(table: Table, reasons: Mapping[int, str]) -> tuple[RowFault, ...]:
+    """Return the rows of a table that have reasons."""
+    return tuple(RowFault(table.file, int(table.lines[row]), reasons[row]) for row in sorted(reasons))
 
 
 def _per_shift(table: Table, files: FocusFiles) -> Array | float:
@@ -250,7 +264,9 @@ def _from_images(
             results.append(result)
             advance("measure the edges", len(results), len(table))
     mtf, sigma = (np.array([result[k] for result in results], np.float64) for k in (0, 1))
-    return mtf, sigma, *({row: result[k] for row, result in enumerate(results) if result[k]} for k in (2, 3))
+    without = {row: result[2] for row, result in enumerate(results) if result[2]}
+    doubts = {row: result[3] for row, result in enumerate(results) if result[3]}
+    return mtf, sigma, without, doubts
 
 
 def _noise_model(files: FocusFiles, name: str, spec: NoiseSpec) -> NoiseModel:

@@ -5,6 +5,7 @@ Rows are sorted before anything is computed, so that their order in a file chang
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,6 +33,8 @@ SAME_READING = 1e-9
 MOST_ERROR = np.radians(1.0)
 """By how much the difference from the reference may change over the region: no dividing error is as large."""
 CIRCLE = 2.0 * np.pi
+# Columns that number repeats; share of them that rounding makes equal at most; and so many rows.
+_COUNTS, _COPIED, _LEAST_SET = ("set", "repeat"), 0.8, 3
 READING = Column("reading", ANGLE, least=-2.0 * CIRCLE, most=2.0 * CIRCLE)
 COMPARISON_COLUMNS = (
     READING,
@@ -56,16 +59,33 @@ SPOT_COLUMNS = (
 
 @dataclass(frozen=True)
 class DataFile:
-    """A file that was read: its path, rows and SHA-256, so that a result can be held against its data."""
+    """A file that was read: its path, rows and SHA-256, so that a result can be held against its data.
+
+    copied: number of rows that repeat another one to the last digit, if all rows of a set do, or most of those that
+        repeat a measurement where sets have no number.
+    """
 
     file: str
     rows: int
     sha256: str
+    copied: int
 
     @classmethod
-    def of(cls, table: Table) -> DataFile:
-        """The file of a table that was read."""
-        return cls(table.file, len(table), digest_of(Path(table.file)))
+    def of(cls, table: Table, where: Sequence[str]) -> DataFile:
+        """Return the file of a table whose rows were measured in the same place if these columns are equal."""
+        code = {name: np.unique(each, return_inverse=True)[1].ravel() for name, each in table.columns.items()}
+        copy, again = np.ones((2, len(table)), bool)
+        for rows, names in ((copy, set(code) - set(_COUNTS)), (again, set(code) & set(where))):
+            rows[np.unique(np.column_stack([code[name] for name in names]), axis=0, return_index=True)[1]] = False
+        number = next((code[name] for name in _COUNTS if name in code), np.where(again, 1, 0))
+        copied = np.bincount(number, copy) > np.maximum(_COPIED * np.bincount(number), _LEAST_SET)
+        return cls(table.file, len(table), digest_of(Path(table.file)), int(copy.sum()) if np.any(copied) else 0)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Return what speaks against the file."""
+        text = "of a repeated measurement equal another one to the last digit: were they copied? Sigmas count them all"
+        return (f"{self.copied} rows of {self.file} {text}",) if self.copied else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +117,7 @@ class SpotReadings:
         lines: in the file, (N, S); 0 where nothing was measured.
         file: they stand in.
         head: of its readings.
+        numbered: the sets have numbers in the file.
     """
 
     reading: Array
@@ -106,6 +127,7 @@ class SpotReadings:
     lines: Places
     file: DataFile
     head: str
+    numbered: bool
 
 
 def read_turntable(files: TurntableFiles) -> tuple[Comparisons, ...]:
@@ -209,7 +231,7 @@ def read_comparisons(path: str, reference_sigma: float, fewest: int = 4, around:
         remedy = "less than 1 deg: reading minus reference, both counted in the same sense and in the unit of the head"
         raise table.error(int(cells.first[worst]), name, text, allowed=remedy)
     series = CalibrationSeries(angle, matrix, reference_sigma, present=None if np.all(present) else present)
-    return Comparisons(series, cells.matrix(table.lines, 0), DataFile.of(table), table.heads[READING.name])
+    return Comparisons(series, cells.matrix(table.lines, 0), DataFile.of(table, ["reading"]), table.heads[READING.name])
 
 
 def read_spots(files: DistortionFiles) -> SpotReadings:
@@ -265,9 +287,9 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
     across = cells.matrix(table["across"], None)[rank] if "across" in table else None
     lines = cells.matrix(table.lines, 0)[rank]
     whole = None if np.all(present) else present[rank]
-    return SpotReadings(
-        filled["reading"][rank], spots, whole, across, lines, DataFile.of(table), table.heads[READING.name]
-    )
+    file = DataFile.of(table, ["point" if numbered else "reading"])
+    head, named = table.heads[READING.name], "set" in table
+    return SpotReadings(filled["reading"][rank], spots, whole, across, lines, file, head, named)
 
 
 def _places(table: Table, files: DistortionFiles) -> tuple[Array, Array, Array]:

@@ -31,6 +31,7 @@ DATA_FILE: Record[DataFile] = Record(
     Quantity("file", lambda f: f.file, "path as given"),
     Quantity("rows", lambda f: f.rows, "rows below its heads"),
     Quantity("sha256", lambda f: f.sha256, "SHA-256 of its contents"),
+    Quantity("copied", lambda f: f.copied, "rows that repeat another one to the last digit"),
 )
 REJECTED: Record[Comparisons] = Record(
     "A comparison that Chauvenet's criterion takes out, and where it stands.",

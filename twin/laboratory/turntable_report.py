@@ -395,6 +395,7 @@ def _warnings(run: TurntableRun, data: Mapping[str, Any]) -> tuple[str, ...]:
     if len(holes := np.degrees(gaps(run.series.angle))):
         arcs = ", ".join(f"{first:.9g} to {last:.9g} deg" for first, last in holes)
         warnings.append(f"the calibration has gaps in which no reading is compensated: {arcs}")
+    warnings += [doubt for table in run.tables for doubt in table.file.doubts]
     if data["suspect_angles"]:
         warnings.append(f"angles whose kept repeats scatter more than their number allows: {data['suspect_angles']}")
     return tuple(warnings)
