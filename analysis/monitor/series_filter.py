@@ -126,6 +126,11 @@ class SeriesFilter:
     def __post_init__(self) -> None:
         object.__setattr__(self, "_may", candidates(self._stacked) if self.window else ())
 
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """What may jump: motions alone, and those of a body together."""
+        return self._may
+
     @cached_property
     def space(self) -> StateSpace:
         """The states."""

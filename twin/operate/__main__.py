@@ -18,7 +18,16 @@ from rich.console import Console
 
 from scenes.yaml.errors import InputError, nearest
 from scenes.yaml.standard_output import FAILURE, print_error
-from twin.operate.estimate_commands import alarms, estimate_of, exclude, forecast, include, show_estimate
+from twin.operate.estimate_commands import (
+    alarms,
+    estimate_of,
+    exclude,
+    forecast,
+    include,
+    power_rows,
+    show_estimate,
+    show_power,
+)
 from twin.operate.followed import PlanFile
 from twin.operate.life_commands import judge, simulate
 from twin.operate.products_command import products
@@ -206,7 +215,7 @@ def _new_alarms(errors: Console, history: History, quiet: bool) -> list[str]:
     except (InputErrorText, InputError) as error:
         print_error(errors, f"what was taken is in the record, and the estimate cannot be worked out: {error}")
         return []
-    return [] if found is None else [f"alarm: {one.text}" for one in found[1]]
+    return [] if found is None else [f"alarm: {one.text}" for one in found[2]]
 
 
 def _is_stated(instrument: str | None, history: History) -> bool:
@@ -253,13 +262,14 @@ def status(record: Place, plan: PlanFile = None, as_json: AsJson = False, quiet:
         found = estimate_of(errors, history, plan, quiet or as_json)
         rows = history.alarms()
         opened = sum(one["acknowledged"] is None for one in rows)
-        estimate = None if found is None else found[0].to_dict()
+        estimate = None if found is None else {**found[1].to_dict(), "jumps_found": power_rows(found[0])}
         data = {**history.status(), "estimate": estimate, "open_alarms": opened}
 
         def show(console: Console) -> None:
             _show(data, console)
             if found is not None:
-                show_estimate(found[0], rows, console)
+                show_estimate(found[1], rows, console)
+                show_power(data["estimate"]["jumps_found"], console)
 
         tell(errors, as_json, quiet, data, show)
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 
@@ -15,10 +16,12 @@ from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict, print_whole, result_table
 
 if TYPE_CHECKING:
-    from twin.operate.estimate.operation import Course, Following
+    from twin.operate.estimate.operation import Course, Following, Operation
     from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
 
+POWER = ("size_half", "size_95_percent")
+"""Keys of the smallest jumps of which half and 95 percent are found, over the stated size."""
 STEPS = 4
 """Columns of a forecast after the first, now."""
 
@@ -180,8 +183,8 @@ def alarm_line(row: Mapping[str, Any]) -> str:
 
 def estimate_of(
     errors: Console, history: History, plan: Path | None = None, quiet: bool = False
-) -> tuple[Following, list[Alarm]] | None:
-    """The estimate under a plan, and the alarms that are new, which are then in the record; None where there is no plan
+) -> tuple[Operation, Following, list[Alarm]] | None:
+    """The estimate under a plan, what it says, and the alarms that are new, which are then in the record; None where there is no plan
     or nothing to follow.
 
     Args:
@@ -193,7 +196,8 @@ def estimate_of(
     setup = plan_of(history, plan)
     if setup is None or (plan is None and history.first("monitor") is None):
         return None
-    return known_of(followed(history, setup, errors, quiet))
+    operation = followed(history, setup, errors, quiet)
+    return (operation, *known_of(operation))
 
 
 def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], console: Console) -> None:
@@ -249,6 +253,38 @@ def _show_course(course: Course, console: Console) -> None:
         cells = zip(course.values[:, k].tolist(), course.sigmas[:, k].tolist(), strict=True)
         unit = one.parameter.unit
         table.add_row(name_of(f"{one.group} {one.key}", course.quantities), *(sized(v, s, unit) for v, s in cells))
+    print_whole(console, table)
+
+
+def power_rows(operation: Operation) -> list[dict[str, Any]]:
+    """The smallest jumps that are found, as plain data: a row for each body and number of readings."""
+    from analysis.monitor.detection_power import READINGS
+
+    return [
+        {
+            "body": one.body,
+            "readings": n,
+            **{key: None if np.isnan(v) else v for key, v in zip(POWER, row, strict=True)},
+        }
+        for one in operation.power()
+        for n, row in zip(READINGS, one.sizes.tolist(), strict=True)
+    ]
+
+
+def show_power(rows: Sequence[Mapping[str, Any]], console: Console) -> None:
+    """A row for each body: the smallest jumps that are found, over the stated sizes."""
+    numbers = list(dict.fromkeys(one["readings"] for one in rows))
+    if not numbers:
+        return
+    line(console, "smallest jumps that are found, over the stated size of all motions of the body together:")
+    table = result_table()
+    table.add_column("jump of")
+    for number in numbers:
+        for share in ("half", "95 %"):
+            table.add_column(f"{share} within {number}", justify="right")
+    for body in dict.fromkeys(one["body"] for one in rows):
+        cells = [one[key] for one in rows if one["body"] == body for key in POWER]
+        table.add_row(body, *("none" if size is None else f"{size:.2g}" for size in cells))
     print_whole(console, table)
 
 

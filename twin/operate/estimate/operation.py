@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import pdtrc
 
+from analysis.monitor.detection_power import Power, detection_power
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.filter_state import Belief, Observed
 from analysis.monitor.jump_detection import Jump, Step
@@ -29,7 +30,7 @@ from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
-from twin.operate.estimate.operation_model import OperationModel, traced_model
+from twin.operate.estimate.operation_model import OperationModel, packed, traced_model, unpacked
 from twin.operate.estimate.plans import plan_digest
 from twin.operate.estimate.standing import Standing, Taking
 from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
@@ -44,8 +45,12 @@ EVERY = 1000
 """Readings after which it is kept for good where the estimate stands."""
 HEAD = 16
 """Readings since it was kept after which it is kept at all: to follow as many again is as quick as to write it down."""
-_MODEL, _HEAD = -1, 0
-"""Numbers under which a record keeps what was traced, and where the estimate stands after all readings."""
+_POWER, _MODEL, _HEAD = -2, -1, 0
+"""Numbers under which a record keeps which jumps are found, what was traced, and where the estimate stands after all
+readings.
+"""
+_CADENCE = 1.2
+"""Factor by which readings come at other intervals, from which on it is worked out anew which jumps are found."""
 
 
 class Operation:
@@ -255,6 +260,26 @@ class Operation:
             standing.pending is not None,
             self._too_small(),
         )
+
+    def power(self) -> tuple[Power, ...]:
+        """Return the smallest jump of each body that is found, at the mean interval of the readings so far; empty where
+        there is one reading.
+        """
+        count, noise = self._standing.scores.readings, self.model.how.reference_noise
+        if count < 2 or noise is None:
+            return ()
+        interval = (self._standing.time - self.epoch) / MICRO / (count - 1)
+        kept = self.history.checkpoint(self.key, number=_POWER)
+        if kept is not None:
+            plain, arrays = unpacked(kept.content)
+            if max(interval / plain["interval"], plain["interval"] / interval) < _CADENCE:
+                return tuple(Power(body, own) for body, own in zip(plain["bodies"], arrays["sizes"], strict=True))
+        with one_blas_thread():
+            found = detection_power(self.model.how, interval, noise)
+        arrays = {"sizes": np.array([one.sizes for one in found])}
+        content = packed({"interval": interval, "bodies": [one.body for one in found]}, arrays)
+        self.history.save_checkpoint(self.key, _POWER, -(2**62), 0, content)
+        return found
 
     def _too_small(self) -> tuple[str, ...]:
         """Causes of the temperatures of bodies whose sensors disagree with what is stated at the same time."""
