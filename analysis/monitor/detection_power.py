@@ -21,23 +21,18 @@ from numpy.typing import NDArray
 
 from analysis.chi_square import limit_of
 from analysis.monitor.filter_state import Observed
+from analysis.monitor.jump_detection import UNSEEN
 from analysis.monitor.series_filter import SeriesFilter
 
 __all__ = ["READINGS", "SHARES", "Power", "detection_power"]
 
 Array = NDArray[np.float64]
-READINGS = (1, 3, 10)
-"""Numbers of readings after a jump within which it is to be found."""
-SHARES = (0.5, 0.95)
-"""Shares of jumps that are found."""
-SIZES = np.geomspace(0.03, 100.0, 71)
+READINGS, SHARES = (1, 3, 10), (0.5, 0.95)
+"""Numbers of readings after a jump within which it is found, and in which share of cases."""
+_SIZES = np.geomspace(0.03, 100.0, 71)
 """Sizes that are tried, over those stated: 12 percent apart."""
-DRAWS = 400
-"""Jumps of each size: 95 percent of them are known to 1.1 percent."""
-_BEFORE = 20
-"""Readings before the step, after which its information changes no more than by percents."""
-_UNSEEN = 1e-9
-"""Of the largest eigenvalue of the information, below which a direction is not looked for; as in `jump_detection`."""
+_DRAWS, _BEFORE = 400, 20
+"""Jumps of each size, by which 95 percent are known to 1.1; and readings before, by which information is steady."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +47,14 @@ class Power:
 
     body: str
     sizes: Array
+
+    @property
+    def plain(self) -> dict[str, float | None]:
+        """Share and number of readings -> size; None for none."""
+        keys = [f"{round(100 * share)}_percent_within_{n}" for n in READINGS for share in SHARES]
+        return {
+            key: size if size == size else None for key, size in zip(keys, self.sizes.ravel().tolist(), strict=True)
+        }
 
 
 def detection_power(how: SeriesFilter, interval: float, noise: Array, seed: int = 0) -> tuple[Power, ...]:
@@ -68,7 +71,7 @@ def detection_power(how: SeriesFilter, interval: float, noise: Array, seed: int 
         return ()
     looks = float(how.looks(interval))
     tests = [[_test(one.spots, j, how.stated.jump_false_alarm / looks) for one in may] for j in informations]
-    out = []
+    out: list[Power] = []
     for body in dict.fromkeys(one.body for one in may):
         own = max((one for one in may if one.body == body), key=lambda one: len(one.motions))
         found = _found(own.spots, informations, tests, np.random.default_rng([seed, len(out)]))
@@ -78,8 +81,8 @@ def detection_power(how: SeriesFilter, interval: float, noise: Array, seed: int 
 
 def _informations(how: SeriesFilter, interval: float, noise: Array) -> Array:
     """(N, q, q) on a step, by 1 to N readings after it."""
-    belief, out = how.start(0.0), []
-    nothing = np.zeros(len(noise))
+    belief, nothing = how.start(0.0), np.zeros(len(noise))
+    out: list[Array] = []
     for k in range(_BEFORE + READINGS[-1]):
         belief, _ = how.update(belief, Observed(k * interval, nothing, noise))
         if k >= _BEFORE and len(belief.until):
@@ -90,7 +93,7 @@ def _informations(how: SeriesFilter, interval: float, noise: Array) -> Array:
 def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float]:
     """(r, q) what makes independent numbers of a score, and the limit of the sum of their squares."""
     values, vectors = np.linalg.eigh(spots.T @ information @ spots)
-    seen = values > _UNSEEN * values.max()
+    seen = values > UNSEEN * values.max()
     return (vectors[:, seen] / np.sqrt(values[seen])).T @ spots.T, float(limit_of(chance, int(np.sum(seen))))
 
 
@@ -98,15 +101,15 @@ def _found(
     spots: Array, informations: Array, tests: Sequence[Sequence[tuple[Array, float]]], rng: np.random.Generator
 ) -> Array:
     """(N, S) shares of jumps of each size that are found with 1 to N readings."""
-    amounts = rng.standard_normal((DRAWS, spots.shape[1]))
+    amounts = rng.standard_normal((_DRAWS, spots.shape[1]))
     amounts *= np.sqrt(spots.shape[1]) / np.linalg.norm(amounts, axis=1, keepdims=True)
-    step, noise, before = amounts @ spots.T, np.zeros((DRAWS, len(spots))), np.zeros_like(informations[0])
-    told, out = np.zeros((len(SIZES), DRAWS), bool), []
+    step, noise, before = amounts @ spots.T, np.zeros((_DRAWS, len(spots))), np.zeros_like(informations[0])
+    told, out = np.zeros((len(_SIZES), _DRAWS), bool), []
     for information, those in zip(informations, tests, strict=True):
         values, vectors = np.linalg.eigh(information - before)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         noise, before = noise + rng.standard_normal(noise.shape) @ root.T, information
-        score = SIZES[:, None, None] * (step @ information) + noise
+        score = _SIZES[:, None, None] * (step @ information) + noise
         for away, limit in those:
             told |= np.sum((score @ away.T) ** 2, axis=2) > limit
         out.append(told.mean(axis=1))
@@ -117,9 +120,9 @@ def _smallest(found: Array, share: float) -> float:
     """Size from which on a share of jumps is found; NaN for none."""
     less = np.flatnonzero(found < share)
     first = less[-1] + 1 if len(less) else 0
-    if first == len(SIZES):
+    if first == len(_SIZES):
         return float("nan")
     if first == 0:
-        return float(SIZES[0])
+        return float(_SIZES[0])
     part = (share - found[first - 1]) / (found[first] - found[first - 1])
-    return float(SIZES[first - 1] * (SIZES[first] / SIZES[first - 1]) ** part)
+    return float(_SIZES[first - 1] * (_SIZES[first] / _SIZES[first - 1]) ** part)

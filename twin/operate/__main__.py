@@ -23,8 +23,6 @@ from twin.operate.estimate_commands import (
     estimate_of,
     exclude,
     forecast,
-    include,
-    power_rows,
     show_estimate,
     show_power,
 )
@@ -262,14 +260,17 @@ def status(record: Place, plan: PlanFile = None, as_json: AsJson = False, quiet:
         found = estimate_of(errors, history, plan, quiet or as_json)
         rows = history.alarms()
         opened = sum(one["acknowledged"] is None for one in rows)
-        estimate = None if found is None else {**found[1].to_dict(), "jumps_found": power_rows(found[0])}
+        power = () if found is None else found[0].power()
+        jumps_found = {one.body: one.plain for one in power}
+        estimate = None if found is None else {**found[1].to_dict(), "jumps_found": jumps_found}
         data = {**history.status(), "estimate": estimate, "open_alarms": opened}
 
         def show(console: Console) -> None:
             _show(data, console)
             if found is not None:
                 show_estimate(found[1], rows, console)
-                show_power(data["estimate"]["jumps_found"], console)
+            if power:
+                show_power(power, console)
 
         tell(errors, as_json, quiet, data, show)
 
@@ -338,7 +339,6 @@ def export(
 app.command("forecast")(forecast)
 app.command("alarms")(alarms)
 app.command("exclude")(exclude)
-app.command("include")(include)
 app.command("products")(products)
 app.command("simulate")(simulate)
 app.command("judge")(judge)

@@ -362,7 +362,7 @@ def _left_out_section(history: History, overview: Overview) -> Section:
 
 
 def _warnings(overview: Overview, end: int) -> tuple[str, ...]:
-    out = overview.doubts()
+    out = list(overview.following.doubts)
     age = (end - overview.time) / DAY
     if age > 1.0:
         out.append(f"the newest reading is {age:.0f} d older than the end of the day")

@@ -212,7 +212,7 @@ def page_state(history: History, overview: Overview) -> dict[str, Any]:
             overview.state_sentence(),
             overview.change_sentence(latest - DAY, latest + 1, "in the last 24 hours"),
             *overview.break_sentences(),
-            *(sentence(one).rstrip(".") for one in overview.doubts()),
+            *(sentence(one).rstrip(".") for one in list(overview.following.doubts)),
         ],
         "holds": all(one.holds_now for one in told.breaks),
         "predictions": overview.score_sentence(),

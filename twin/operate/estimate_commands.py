@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich.console import Console
 
@@ -16,12 +15,11 @@ from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict, print_whole, result_table
 
 if TYPE_CHECKING:
+    from analysis.monitor.detection_power import Power
     from twin.operate.estimate.operation import Course, Following, Operation
     from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
 
-POWER = ("size_half", "size_95_percent")
-"""Keys of the smallest jumps of which half and 95 percent are found, over the stated size."""
 STEPS = 4
 """Columns of a forecast after the first, now."""
 
@@ -126,34 +124,26 @@ def alarms(
         tell(errors, as_json, quiet, data, show)
 
 
-Numbered = Annotated[
-    int, typer.Argument(metavar="ENTRY", min=1, help="Number of the entry, as status and export name it.")
-]
-Why = Annotated[str, typer.Option(metavar="TEXT", help="The reason, which the record keeps.")]
+def exclude(
+    record: Place,
+    entry: Annotated[int, typer.Argument(metavar="ENTRY", min=1, help="Number of the entry, as status says.")],
+    why: Annotated[str, typer.Option(metavar="TEXT", help="The reason, which the record keeps.")],
+    include: Annotated[
+        bool, typer.Option("--include", help="Include it again, or although the estimate left it out as a bad one.")
+    ] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Exclude a reading from the estimate, or include it, with the reason. The record keeps the reading and all
+    decisions; the newest counts.
 
+    For example:
 
-def exclude(record: Place, entry: Numbered, why: Why, as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Exclude a reading from the estimate, with the reason. The record keeps the reading and the decision; `include`
-    takes it back.
-
-    Example: `python -m twin.operate exclude record 123 --why "cosmic ray on the left spot"`
-
-    Exit codes: 0 success, 2 bad input (nothing is decided), 1 anything else.
-    """
-    _decide(record, entry, False, why, as_json, quiet)
-
-
-def include(record: Place, entry: Numbered, why: Why, as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Include a reading in the estimate that was excluded, or that the estimate left out as a bad one.
-
-    Example: `python -m twin.operate include record 123 --why "the base was turned on purpose"`
+        python -m twin.operate exclude record 123 --why "cosmic ray on the left spot"
+        python -m twin.operate exclude record 123 --include --why "the base was turned on purpose"
 
     Exit codes: 0 success, 2 bad input (nothing is decided), 1 anything else.
     """
-    _decide(record, entry, True, why, as_json, quiet)
-
-
-def _decide(record: str, entry: int, included: bool, why: str, as_json: bool, quiet: bool) -> None:
     require_record(record)
     from twin.operate.record.entries import one_line
     from twin.operate.record.history import History
@@ -162,11 +152,11 @@ def _decide(record: str, entry: int, included: bool, why: str, as_json: bool, qu
         if not why.strip():
             raise InputErrorText("--why: a decision needs a reason, which the record keeps")
         try:
-            made = history.decide(entry, included, why.strip())
+            made = history.decide(entry, include, why.strip())
         except Problem as problem:
             raise InputErrorText(f"ENTRY: {one_line(problem)}") from None
-        text = f"entry {entry}, {made['kind']} of {made['subject']} at {made['time_utc']}, is "
-        text += f"{'included' if included else 'excluded'}: {made['why']}"
+        text = "entry {entry}, {kind} of {subject} at {time_utc}, is ".format(**made)
+        text += f"{'included' if include else 'excluded'}: {made['why']}"
         tell(errors, as_json, quiet, made, lambda console: print_verdict(console, text))
 
 
@@ -184,8 +174,8 @@ def alarm_line(row: Mapping[str, Any]) -> str:
 def estimate_of(
     errors: Console, history: History, plan: Path | None = None, quiet: bool = False
 ) -> tuple[Operation, Following, list[Alarm]] | None:
-    """The estimate under a plan, what it says, and the alarms that are new, which are then in the record; None where there is no plan
-    or nothing to follow.
+    """The estimate under a plan, what it says, and the alarms that are new, which are then in the record; None where
+    there is no plan or nothing to follow.
 
     Args:
         errors: where it is told how far it is.
@@ -256,35 +246,13 @@ def _show_course(course: Course, console: Console) -> None:
     print_whole(console, table)
 
 
-def power_rows(operation: Operation) -> list[dict[str, Any]]:
-    """The smallest jumps that are found, as plain data: a row for each body and number of readings."""
-    from analysis.monitor.detection_power import READINGS
-
-    return [
-        {
-            "body": one.body,
-            "readings": n,
-            **{key: None if np.isnan(v) else v for key, v in zip(POWER, row, strict=True)},
-        }
-        for one in operation.power()
-        for n, row in zip(READINGS, one.sizes.tolist(), strict=True)
-    ]
-
-
-def show_power(rows: Sequence[Mapping[str, Any]], console: Console) -> None:
+def show_power(found: Sequence[Power], console: Console) -> None:
     """A row for each body: the smallest jumps that are found, over the stated sizes."""
-    numbers = list(dict.fromkeys(one["readings"] for one in rows))
-    if not numbers:
-        return
-    line(console, "smallest jumps that are found, over the stated size of all motions of the body together:")
     table = result_table()
-    table.add_column("jump of")
-    for number in numbers:
-        for share in ("half", "95 %"):
-            table.add_column(f"{share} within {number}", justify="right")
-    for body in dict.fromkeys(one["body"] for one in rows):
-        cells = [one[key] for one in rows if one["body"] == body for key in POWER]
-        table.add_row(body, *("none" if size is None else f"{size:.2g}" for size in cells))
+    for head in ("smallest jump found, over the stated", *(key.replace("_", " ") for key in found[0].plain)):
+        table.add_column(head)
+    for one in found:
+        table.add_row(one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values()))
     print_whole(console, table)
 
 

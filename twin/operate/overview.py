@@ -300,10 +300,6 @@ class Overview:
             f"({100.0 * one.expected:.1f} and {100.0 * two.expected:.1f} %)"
         )
 
-    def doubts(self) -> list[str]:
-        """What a reader should know before using the numbers."""
-        return list(self.following.doubts)
-
     def open_alarms(self) -> list[Mapping[str, Any]]:
         """Alarms that nobody has acknowledged, the newest first."""
         found = [one for one in self.alarms if one["acknowledged"] is None]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import groupby
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,8 @@ from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
-from twin.operate.estimate.operation_model import OperationModel, packed, traced_model, unpacked
+from twin.operate.estimate.operation_model import OperationModel, traced_model
+from twin.operate.estimate.packing import packed, unpacked
 from twin.operate.estimate.plans import plan_digest
 from twin.operate.estimate.standing import Standing, Taking
 from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
@@ -45,12 +46,8 @@ EVERY = 1000
 """Readings after which it is kept for good where the estimate stands."""
 HEAD = 16
 """Readings since it was kept after which it is kept at all: to follow as many again is as quick as to write it down."""
-_POWER, _MODEL, _HEAD = -2, -1, 0
-"""Numbers under which a record keeps which jumps are found, what was traced, and where the estimate stands after all
-readings.
-"""
-_CADENCE = 1.2
-"""Factor by which readings come at other intervals, from which on it is worked out anew which jumps are found."""
+_MODEL, _HEAD = -1, 0
+"""Numbers under which a record keeps what was traced, and where the estimate stands after all readings."""
 
 
 class Operation:
@@ -116,10 +113,10 @@ class Operation:
         """What was traced; of a record that knows it already it is taken from there."""
         kept = self.history.checkpoint(self.key, number=_MODEL)
         if kept is not None:
-            return OperationModel.from_bytes(kept.content)
+            return cast("OperationModel", unpacked(kept.content, OperationModel))
         sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in self._before.values()])
         made = traced_model(self.plan, sigma, self._sensors, self.experiment)
-        self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, made.to_bytes())
+        self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, packed(made))
         return made
 
     @property
@@ -230,7 +227,7 @@ class Operation:
         return bool(np.all(np.abs(standing.basis - own) <= 1e-9 * np.abs(own).max(axis=1, keepdims=True)))
 
     def _keep(self, standing: Standing, number: int, newest: int) -> None:
-        self.history.save_checkpoint(self.key, number, standing.time, newest, standing.to_bytes())
+        self.history.save_checkpoint(self.key, number, standing.time, newest, packed(standing))
 
     def follow(self) -> Following:
         """Take all readings that are new, and tell what is known."""
@@ -269,17 +266,8 @@ class Operation:
         if count < 2 or noise is None:
             return ()
         interval = (self._standing.time - self.epoch) / MICRO / (count - 1)
-        kept = self.history.checkpoint(self.key, number=_POWER)
-        if kept is not None:
-            plain, arrays = unpacked(kept.content)
-            if max(interval / plain["interval"], plain["interval"] / interval) < _CADENCE:
-                return tuple(Power(body, own) for body, own in zip(plain["bodies"], arrays["sizes"], strict=True))
         with one_blas_thread():
-            found = detection_power(self.model.how, interval, noise)
-        arrays = {"sizes": np.array([one.sizes for one in found])}
-        content = packed({"interval": interval, "bodies": [one.body for one in found]}, arrays)
-        self.history.save_checkpoint(self.key, _POWER, -(2**62), 0, content)
-        return found
+            return detection_power(self.model.how, interval, noise)
 
     def _too_small(self) -> tuple[str, ...]:
         """Causes of the temperatures of bodies whose sensors disagree with what is stated at the same time."""
@@ -344,7 +332,16 @@ class Operation:
     def _widened(self) -> float:
         """Of sigmas now, where the last readings contradict what is stated."""
         squares = self._unexplained(self._standing.innovations)
-        return float(widening(squares, [len(squares)], False, self._unexplained(self._standing.first))[0])
+        told = [time for time, _, _ in self._standing.innovations]
+        return float(widening(squares, [len(squares)], False, self._lasting(told))[0])
+
+    def _lasting(self, told: Sequence[int]) -> list[tuple[int, Array]]:
+        """What is not forgotten: what contradicts the first readings, and what bodies of jumps do not explain; and
+        the number of readings of these times before it.
+        """
+        out = [(0, self._unexplained(self._standing.first))]
+        jumps = [] if self.too_many_jumps else self._standing.jumps
+        return out + [(int(np.searchsorted(told, one.time)) + 1, np.array([one.jump.rest])) for one in jumps]
 
     @cached_property
     def too_many_jumps(self) -> bool:
@@ -395,7 +392,7 @@ class Operation:
         told = [one for span in self._spans(None) for one in span.told]
         squares = self._unexplained(told)
         number = np.searchsorted([time for time, _, _ in told], times, side="right")
-        out = widening(squares, number, True, self._unexplained(self._standing.first))
+        out = widening(squares, number, True, self._lasting([time for time, _, _ in told]))
         out[times >= self._standing.time] = self._widened
         return out
 
