@@ -23,39 +23,55 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp
+from scipy.special import expit, gammaln, logsumexp
 
 from analysis.monitor.filter_state import BadReading, Track
 from analysis.monitor.untold_jumps import Jumper
 
-__all__ = ["LEAST_CHI_SQUARE", "MOST", "MOST_FOR_JUMP", "RECENT", "SURE", "UNSURE", "bad_reading", "jump_evidence"]
+__all__ = ["RECENT", "bad_reading", "chance_good", "jump_evidence", "may_be_bad"]
 
 Array = NDArray[np.float64]
-SHARE = 1e-3
-"""Chance beforehand that a reading is bad."""
-UNSURE = math.log(0.05 / 0.95)
-"""Logarithm of the odds of a bad reading against one to which nothing has happened, above which it may be set aside."""
-SURE = math.log(1e-3)
-"""Logarithm of its odds against the first one after a jump, above which it is: an error at one coordinate and a jump of
-a body that moves spots in any way look alike, and it is not well known how often readings are bad.
-"""
-MOST_FOR_JUMP = 0.8
-"""Chance at most that a reading which was set aside counts with as the first after a jump, for the same reason."""
-RECENT, MOST = 10, 5
-"""Where so many of the last readings were left out, none more is: then the prior is wrong, and not the readings."""
-LEAST_CHI_SQUARE = -2.0 * (math.log(SHARE) - UNSURE)
-"""Chi-square of a reading below which it can't be set aside, since no error explains more of it than all."""
+# chance beforehand that a reading is bad
+_SHARE = 1e-3
+# logarithms of the odds above which a reading is set aside, against one to which nothing has happened and against the
+# first one after a jump: the second is low, since an error at one coordinate and a jump of a body that moves spots in
+# any way look alike, and since nobody knows well how often readings are bad
+_UNSURE, _SURE = math.log(0.05 / 0.95), math.log(1e-3)
+# chance at most that a reading which was set aside counts with as the first after a jump, for the same reason
+_MOST_FOR_JUMP = 0.8
+# where so many of the last readings were left out, none more is: then the prior is wrong, and not the readings
+RECENT, _MOST = 10, 5
+# sizes of errors over the noise of a coordinate, each as likely
 _ERRORS = np.array([10.0, 50.0, 250.0, 1250.0, 6250.0])
-"""Sizes of errors over the noise of a coordinate, each as likely."""
+# sizes of jumps over those stated, and the logarithms of their chances
 _SIZES = np.array([0.125, 0.25, 0.5, 1.0, 2.0, 8.0, 64.0])
 _LOG_SIZE = np.log([0.2, 0.2, 0.2, 0.2, 0.2, 1e-2, 1e-4])
-"""Sizes of jumps over those stated, and the logarithms of their chances."""
+# logarithm of the chance of a step that nothing stated explains, over that of a jump of one body in the whole life
 _UNSTATED = math.log(1e-3)
-"""Logarithm of the chance of a step that nothing stated explains, over that of a jump of one body in the whole life."""
 
 
-def bad_reading(white: Array, root: Array, noise: Array) -> BadReading:
-    """Weigh a reading as one with errors against one without.
+def may_be_bad(bad: BadReading | None, log_odds: float, recent: Sequence[bool]) -> bool:
+    """Return whether a reading is set aside until the next one.
+
+    Args:
+        bad: what speaks for it being bad; None where nothing does.
+        log_odds: logarithm of the odds of that against all else.
+        recent: whether each of the last readings was left out.
+    """
+    return bad is not None and bad.log_ratio > _UNSURE and log_odds > _SURE and sum(recent) < _MOST
+
+
+def chance_good(log_odds: float) -> float:
+    """Return the chance with which a reading that is set aside counts as a good one meanwhile.
+
+    Args:
+        log_odds: logarithm of the odds that it is bad.
+    """
+    return min(_MOST_FOR_JUMP, float(expit(-log_odds)))
+
+
+def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
+    """Return a reading as one with errors weighed against one without; None where it cannot be set aside.
 
     Args:
         white: (D,) root^-1 times its difference from the prediction.
@@ -63,6 +79,8 @@ def bad_reading(white: Array, root: Array, noise: Array) -> BadReading:
         noise: (D, D) of the reading.
     """
     count = len(white)
+    if 0.5 * float(white @ white) + math.log(_SHARE) < _UNSURE:  # no errors explain more than all of it
+        return None
     back = np.linalg.inv(root)
     precision = back.T @ back
     pulled = back.T @ white
@@ -73,7 +91,7 @@ def bad_reading(white: Array, root: Array, noise: Array) -> BadReading:
     chosen = np.arange(1, count + 1)
     beforehand = -math.log(count) - (gammaln(count + 1) - gammaln(chosen + 1) - gammaln(count - chosen + 1))
     logs = [_with_errors(precision, pulled, scale**2 * size) + beforehand for scale in _ERRORS.tolist()]
-    total = float(logsumexp(logs)) - math.log(len(_ERRORS)) + math.log(SHARE)
+    total = float(logsumexp(logs)) - math.log(len(_ERRORS)) + math.log(_SHARE)
     return BadReading(total, float(z[worst]), worst)
 
 
@@ -105,12 +123,10 @@ def jump_evidence(track: Track, gap: Array, bodies: Sequence[Jumper], life: floa
     if not len(gap):
         return 0.0
     unstated = np.eye(track.score.shape[1])[:, : len(noise)] * np.sqrt(np.diag(noise))
-    logs = np.full(len(_ERRORS), _UNSTATED - math.log(len(_ERRORS) * life))
-    cases = [(unstated, _ERRORS, logs)]
+    cases = [(unstated, _ERRORS, np.full(len(_ERRORS), _UNSTATED - math.log(len(_ERRORS) * life)))]
     cases += [(one.spots, _SIZES, _LOG_SIZE - math.log(one.every_s)) for one in bodies]
     found = [0.0]
-    with np.errstate(divide="ignore"):
-        log_gap = np.log(gap)
+    log_gap = np.log(np.maximum(gap, 1e-300))
     for outputs, scale, beforehand in cases:
         values, vectors = np.linalg.eigh(outputs.T @ track.information @ outputs)
         along = np.einsum("kij,ki->kj", vectors, track.score @ outputs)

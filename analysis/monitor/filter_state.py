@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from analysis.monitor.jump_detection import Jump
 
-__all__ = ["Aside", "BadReading", "Belief", "Innovation", "Observed", "Track", "Whitened", "of_shifts"]
+__all__ = ["Aside", "BadReading", "Belief", "Innovation", "Observed", "Track", "Whitened"]
 
 Array = NDArray[np.float64]
 
@@ -36,19 +36,6 @@ class Observed:
     def spots(self) -> bool:
         """Whether it is one of the spots."""
         return not self.sensors and self.parameters is None
-
-
-def of_shifts(times: ArrayLike, shifts: Array, noise: Array) -> tuple[Observed, ...]:
-    """Readings of spots.
-
-    Args:
-        times: (N,) seconds, in any order.
-        shifts: (N, D) px.
-        noise: (D, D) of each, or (N, D, D), px^2.
-    """
-    when = np.asarray(times, np.float64)
-    each = np.broadcast_to(noise, (len(when), *noise.shape[-2:]))
-    return tuple(Observed(float(when[k]), shifts[k], each[k]) for k in np.argsort(when, kind="stable"))
 
 
 @dataclass(frozen=True)

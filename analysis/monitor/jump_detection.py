@@ -37,6 +37,7 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 
 __all__ = [
     "MOST",
+    "UNSEEN",
     "Amounts",
     "Candidate",
     "Jump",
@@ -56,7 +57,7 @@ __all__ = [
 Array = NDArray[np.float64]
 MOST = 100
 """Jumps that are looked for in one series."""
-_UNSEEN = 1e-9
+UNSEEN = 1e-9
 """Of the largest eigenvalue of J, in standard deviations that are stated: what the spots see less of is not looked for,
 since there float64 leaves nothing of it."""
 _UNLIKELY = 1e-4
@@ -123,6 +124,7 @@ class Jump:
             this body; empty for the motions above alone.
         change: (D + P) of the spots, px, and of the parameters by the jump, whichever body it was; empty where that is
             not worked out. spread: covariance of its error; width: D.
+        rest: chi-square and degrees of freedom of what no jump of this body explains of a step at the same time.
     """
 
     body: str
@@ -142,6 +144,7 @@ class Jump:
     change: tuple[float, ...] = ()
     spread: tuple[tuple[float, ...], ...] = ()
     width: int = 0
+    rest: tuple[float, int] = (0.0, 0)
 
     @cached_property
     def law(self) -> TimeLaw:
@@ -287,7 +290,7 @@ def likeliest(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturba
     for c, one in enumerate(may):
         values, vectors = np.linalg.eigh(one.spots.T @ information @ one.spots)
         along = np.einsum("kij,ki->kj", vectors, score @ one.spots)
-        seen = values > _UNSEEN * values.max()
+        seen = values > UNSEEN * values.max()
         squares[c] = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
         logs[c] = _log_chance(squares[c], np.sum(seen, axis=1))
     which, k = np.unravel_index(int(np.argmin(logs)), logs.shape)

@@ -25,27 +25,16 @@ known now and of the future counts those that the last readings hint at by their
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dtrtrs
-from scipy.special import expit
 
 from analysis.chi_square import limit_of
 from analysis.measurement_error import UndeterminedError
-from analysis.monitor.bad_readings import (
-    LEAST_CHI_SQUARE,
-    MOST,
-    MOST_FOR_JUMP,
-    RECENT,
-    SURE,
-    UNSURE,
-    bad_reading,
-    jump_evidence,
-)
+from analysis.monitor.bad_readings import RECENT, bad_reading, chance_good, jump_evidence, may_be_bad
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track, Whitened
 from analysis.monitor.jump_detection import (
@@ -59,12 +48,11 @@ from analysis.monitor.jump_detection import (
     likeliest,
     untold_share,
 )
-from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import HeatInputs, StateSpace
 from analysis.monitor.told_jumps import Bodies, mixed
 from analysis.monitor.untold_jumps import Hint, Jumper, blended, jumpers
 
-__all__ = ["SeriesFilter", "series_of"]
+__all__ = ["SeriesFilter"]
 
 Array = NDArray[np.float64]
 _NEARLY = 1e-11
@@ -108,6 +96,7 @@ class SeriesFilter:
         unfound: whether jumps too small to be told count, where it is stated how often a motion jumps.
         before_s: seconds before the first reading of spots in which bodies may have jumped, too; 0 for none.
         leaving_out: whether a reading may be bad.
+        candidates: what may jump, motions alone and those of a body together.
     """
 
     stated: Disturbances
@@ -121,10 +110,10 @@ class SeriesFilter:
     unfound: bool = True
     before_s: float = 0.0
     leaving_out: bool = True
-    _may: tuple[Candidate, ...] = field(init=False, default=())
+    candidates: tuple[Candidate, ...] = field(init=False, default=())
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_may", candidates(self._stacked) if self.window else ())
+        object.__setattr__(self, "candidates", candidates(self._stacked) if self.window else ())
 
     @cached_property
     def space(self) -> StateSpace:
@@ -191,7 +180,7 @@ class SeriesFilter:
             between: seconds between the two readings of the look, of any shape.
         """
         share = np.asarray(between, np.float64) / self.life_s
-        return np.asarray(self.window * len(self._may) / np.minimum(share, 1.0))
+        return np.asarray(self.window * len(self.candidates) / np.minimum(share, 1.0))
 
     def _limit(self, belief: Belief) -> float:
         """Ratio below which no candidate can be told, whatever its number of motions."""
@@ -209,7 +198,7 @@ class SeriesFilter:
         size, q = self.space.size, self._stacked.spots.shape[0]
         track = Track(mean, covariance, np.zeros((0, size, q)), np.zeros((0, q)), np.zeros((0, q, q)))
         empty, left = np.zeros(0), np.ones(len(self.walking))
-        return Belief(time, math.nan, empty, empty, track, track if len(left) and self._may else None, left)
+        return Belief(time, math.nan, empty, empty, track, track if len(left) and self.candidates else None, left)
 
     def at(self, belief: Belief, time: float) -> Belief:
         """What will be known at a later time, if no reading comes until then.
@@ -298,8 +287,7 @@ class SeriesFilter:
             own = replace(own, innovation=replace(own.innovation, settled=True))
             recent = (*belief.recent[:-1], not kept)
             own = replace(own, before=replace(own.before, recent=recent), after=replace(own.after, recent=recent))
-        unsure = own.bad is not None and own.bad.log_ratio > UNSURE and own.log_odds > SURE
-        if unsure and not sure and sum(own.before.recent) < MOST:
+        if not sure and may_be_bad(own.bad, own.log_odds, own.before.recent):
             found = replace(own.innovation, bad=own.bad)
             put = Aside(self._whole(own.after)[0], found, own.log_odds)
             return replace(own.before, recent=(*own.before.recent, True)[-RECENT:], aside=put), found
@@ -318,7 +306,7 @@ class SeriesFilter:
         before = self.at(belief, observed.time)
         now = before
         first = math.isnan(belief.last) and self.before_s > 0.0
-        if self._may and (first or observed.time > belief.last):
+        if self.candidates and (first or observed.time > belief.last):
             now = self._with_step(now, observed.time - self.before_s if first else belief.last, observed.time)
         w = self.whitened(now.state, observed)
         state, found = self.taken(now.state, observed, w)
@@ -327,20 +315,19 @@ class SeriesFilter:
             w = self.whitened(now.search, observed)
             search, judged = self.taken(now.search, observed, w)
         after = replace(now, state=state, search=search, last=observed.time)
-        if not self.leaving_out or not (weighed or judged.chi_square > LEAST_CHI_SQUARE):
+        bad = bad_reading(w.white, w.root, observed.noise) if self.leaving_out else None
+        if bad is None and not weighed:
             return _Look(before, after, found, -math.inf, judged.log_score)
-        bad = bad_reading(w.white, w.root, observed.noise)
-        if not weighed and bad.log_ratio <= UNSURE:
-            return _Look(before, after, found, -math.inf, judged.log_score)
+        log_ratio = -math.inf if bad is None else bad.log_ratio
         gap = now.until - now.after
         jumping = [jump_evidence(one.looking, gap, self._jumping, self.life_s, observed.noise) for one in (now, after)]
         good = jumping[1] - jumping[0]
-        likely = judged.log_score + float(np.logaddexp(bad.log_ratio, good))
-        return _Look(before, after, found, bad.log_ratio - good, likely, bad)
+        likely = judged.log_score + float(np.logaddexp(log_ratio, good))
+        return _Look(before, after, found, log_ratio - good, likely, bad)
 
     def _whole(self, belief: Belief, telling: bool = False) -> tuple[Belief, Jump | None]:
         """With what share of jumps cannot be told after a reading, and with the jump that is told."""
-        if not (self._may and len(belief.until)):
+        if not (self.candidates and len(belief.until)):
             return belief, None
         now = replace(belief, left=self._unseen(belief))
         jump = self._told(now) if telling else None
@@ -451,19 +438,25 @@ class SeriesFilter:
         most = np.sum(track.score * np.linalg.solve(information, track.score[:, :, None])[:, :, 0], axis=1)
         if 1.01 * most.max() < self._limit(belief):
             return None
-        one = likeliest([Steps(belief.after, belief.until, track.score, track.information)], self._may, self._stacked)
+        one = likeliest(
+            [Steps(belief.after, belief.until, track.score, track.information)], self.candidates, self._stacked
+        )
         if one is None:
             return None
         # `likeliest` counts its own looks at these readings
-        alone = one.chance / (len(self._may) * len(belief.until))
+        alone = one.chance / (len(self.candidates) * len(belief.until))
         chance = min(1.0, alone * float(self.looks(one.until - one.after)))
-        return replace(one, chance=chance) if chance <= self.stated.jump_false_alarm else None
+        if chance > self.stated.jump_false_alarm:
+            return None
+        place, seen = int(np.argmin(np.abs(belief.until - one.until))), self.space.width
+        rest = max(float(most[place]) - 2.0 * one.log_ratio, 0.0), max(seen - len(one.motions), 1)
+        return replace(one, chance=chance, rest=rest)
 
     def _jumped(self, belief: Belief, jump: Jump) -> tuple[Belief, Jump]:
         """What is known once a jump is told, and the jump with its sizes."""
         looking, own = ((track.score, track.information) for track in (belief.looking, belief.state))
         gap = belief.until - belief.after
-        bodies = Bodies.of(self._may, jump, belief.until, gap, looking, own)
+        bodies = Bodies.of(self.candidates, jump, belief.until, gap, looking, own)
         levels = [self.space.level_of(one.motions) @ one.root for one in bodies.own]
         state, search = belief.state, belief.search
         mean, covariance = bodies.known(state.mean, state.covariance, state.response, levels, bodies.amounts)
@@ -472,7 +465,7 @@ class SeriesFilter:
             mean, covariance = bodies.known(search.mean, search.covariance, search.response, levels, bodies.judged)
             search = replace(search.alone(), mean=mean, covariance=covariance)
         # sizes are those of the motions that explain it best, had they jumped alone
-        alone, weight = next(one for one in self._may if one.motions == jump.motions), bodies.weight.sum(axis=0)
+        alone, weight = next(one for one in self.candidates if one.motions == jump.motions), bodies.weight.sum(axis=0)
         named = Amounts.of(*own, alone.spots, jump.times)
         size, size_spread = mixed([named], [self.stated.sigmas[list(alone.motions), None] * alone.root], weight[None])
         does = [self.space.outputs_of(one.motions) @ one.root for one in bodies.own]
@@ -493,12 +486,12 @@ class SeriesFilter:
     @cached_property
     def _jumping(self) -> tuple[Jumper, ...]:
         """All bodies that may jump, those of which no rate is stated once in the life."""
-        return jumpers(self.stated, self._may, self.life_s)
+        return jumpers(self.stated, self.candidates, self.life_s)
 
     @cached_property
     def jumpers(self) -> tuple[Jumper, ...]:
         """Bodies that jump at a stated rate."""
-        return jumpers(self.stated, self._may) if self.unfound else ()
+        return jumpers(self.stated, self.candidates) if self.unfound else ()
 
     def blended(self, belief: Belief) -> Belief:
         """What is known where jumps that are not told count by their chances, of the state now and of forecasts; later
@@ -508,7 +501,7 @@ class SeriesFilter:
             belief: so far.
         """
         if belief.aside is not None:
-            share = min(MOST_FOR_JUMP, float(expit(-belief.aside.log_odds)))
+            share = chance_good(belief.aside.log_odds)
             bad, good = (self.blended(one) for one in (replace(belief, aside=None), belief.aside.taken))
             apart = good.mean - bad.mean
             covariance = (1.0 - share) * bad.covariance + share * good.covariance
@@ -529,17 +522,6 @@ class SeriesFilter:
         return replace(
             belief, after=none, until=none, state=replace(track.alone(), mean=mean, covariance=covariance), search=None
         )
-
-    def changes(self, belief: Belief, times: ArrayLike) -> SeriesChanges:
-        """Forecast from what is known: parameters at times that are not before the newest reading.
-
-        Args:
-            belief: so far.
-            times: (T,) seconds.
-        """
-        now = self.blended(belief)
-        found = [self.parameters(now, time) for time in np.asarray(times, np.float64).tolist()]
-        return series_of(found, self.stated.parameters.shape[0])
 
     def parameters(self, belief: Belief, time: float) -> tuple[Array, Array]:
         """Parameters (P,) and their covariance (P, P).
@@ -591,15 +573,3 @@ class SeriesFilter:
 def _even(square: Array) -> Array:
     """A covariance, symmetric to the bit."""
     return np.asarray(0.5 * (square + square.T))
-
-
-def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:
-    """Parameters and covariances at T times as one series; what noise alone does is not known, NaN.
-
-    Args:
-        found: (P,) and (P, P) at each time.
-        width: P.
-    """
-    values = np.array([one for one, _ in found]).reshape(-1, width)
-    total = np.array([one for _, one in found]).reshape(-1, width, width)
-    return SeriesChanges(values, np.full_like(total, np.nan), total)

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.filter_state import Observed, of_shifts
+from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import steps
 from analysis.monitor.series_filter import SeriesFilter
-from analysis.monitor.series_following import follow, jointly
+from analysis.monitor.series_following import jointly
 from analysis.monitor.series_smoother import smooth
 from analysis.monitor.state_space import HeatInputs, StateSpace
+from tests.analysis.followed_series import follow, forecast, of_shifts
 
 LAWS = (
     TimeLaw(),
@@ -260,7 +261,7 @@ def test_a_sensor_says_what_a_body_does() -> None:
     read, shift = np.array([0.3, -0.2]), np.full(SPOTS, 0.4)
     belief, _ = how.update(belief, Observed(1.0, read, 1e-4 * np.eye(2), (0, 1)))
     belief, _ = how.update(belief, Observed(1.0, shift, NOISE**2 * np.eye(SPOTS)))
-    found = how.changes(belief, [1.0])
+    found = forecast(how, belief, [1.0])
     rows = np.concatenate([np.pad(heat.rows, ((0, 0), (0, 2))), told.spots])
     noise = np.diag([1e-4, 1e-4, *[NOISE**2] * SPOTS])
     across = told.parameters @ rows.T

@@ -5,9 +5,9 @@ import pytest
 from scipy.linalg import null_space
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.filter_state import of_shifts
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.unseen_motions import floor, unseen_modes
+from tests.analysis.followed_series import of_shifts
 
 MOTIONS, SPOTS, PARAMETERS = 14, 4, 3
 SWING, DRIFT = TimeLaw(period_s=5000.0, drift_s=50_000.0), TimeLaw(drift_s=900.0)

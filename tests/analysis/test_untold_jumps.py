@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.filter_state import of_shifts
 from analysis.monitor.jump_detection import steps
 from analysis.monitor.series_filter import SeriesFilter
-from analysis.monitor.series_following import follow, hinted, smoothed
+from analysis.monitor.series_following import hinted, smoothed
 from analysis.monitor.state_space import StateSpace
+from tests.analysis.followed_series import follow, of_shifts
 from tests.tiers import quick
 
 NOISE, EVERY = 0.3, 400.0
@@ -144,7 +144,7 @@ def test_a_hint_adds_to_the_walk_where_it_is() -> None:
         knowing = replace(how, window=0)
         nothing = [np.zeros(3)] * len(times)
         read = of_shifts(times, shifts, noise)
-        found = np.array(hinted(how, knowing, knowing.start(times[0]), read, nothing))[1:]
+        found = np.array(hinted(how, knowing, knowing.start(times[0]), read, nothing)[1])[1:]
         return found * (np.diff(times) / EVERY)[:, None]
 
     quiet, hint = more(0.0), more(0.9)

@@ -61,11 +61,10 @@ import pytest
 from scipy.stats import betabinom, binom
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.filter_state import of_shifts
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.series_filter import SeriesFilter
-from analysis.monitor.series_following import follow
 from optics.numerics.threads import one_blas_thread
+from tests.analysis.followed_series import follow, of_shifts
 from tests.oracles.missions import DAY, NEAR, YEAR, Law, Mission, mission
 
 LAW = Law()

@@ -18,7 +18,14 @@ from rich.console import Console
 
 from scenes.yaml.errors import InputError, nearest
 from scenes.yaml.standard_output import BAD_INPUT, FAILURE, print_error
-from twin.operate.estimate_commands import alarms, estimate_of, exclude, forecast, include, show_estimate
+from twin.operate.estimate_commands import (
+    alarms,
+    estimate_of,
+    exclude,
+    forecast,
+    show_estimate,
+    show_power,
+)
 from twin.operate.followed import PlanFile
 from twin.operate.life_commands import judge, simulate
 from twin.operate.products_command import products
@@ -208,7 +215,7 @@ def _new_alarms(errors: Console, history: History, quiet: bool) -> list[str]:
     except (InputErrorText, InputError) as error:
         print_error(errors, f"what was taken is in the record, and the estimate cannot be worked out: {error}")
         return []
-    return [] if found is None else [f"alarm: {one.text}" for one in found[1]]
+    return [] if found is None else [f"alarm: {one.text}" for one in found[2]]
 
 
 def _is_stated(instrument: str | None, history: History) -> bool:
@@ -272,14 +279,18 @@ def status(
         found = estimate_of(errors, history, plan, quiet or as_json)
         rows = history.alarms()
         opened = sum(one["acknowledged"] is None for one in rows)
-        estimate = None if found is None else found[0].to_dict()
+        power = () if found is None else found[0].power()
+        jumps_found = {one.body: one.plain for one in power}
+        estimate = None if found is None else {**found[1].to_dict(), "jumps_found": jumps_found}
         held = history.status(check_all)
         data = {**held, "warnings": _record_warnings(held), "estimate": estimate, "open_alarms": opened}
 
         def show(console: Console) -> None:
             _show(data, console)
             if found is not None:
-                show_estimate(found[0], rows, console)
+                show_estimate(found[1], rows, console)
+            if power:
+                show_power(power, console)
 
         tell(errors, as_json, quiet, data, show)
         if strict:
@@ -360,7 +371,6 @@ def export(
 app.command("forecast")(forecast)
 app.command("alarms")(alarms)
 app.command("exclude")(exclude)
-app.command("include")(include)
 app.command("products")(products)
 app.command("simulate")(simulate)
 app.command("judge")(judge)

@@ -15,7 +15,8 @@ from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict, print_whole, result_table
 
 if TYPE_CHECKING:
-    from twin.operate.estimate.operation import Course, Following
+    from analysis.monitor.detection_power import Power
+    from twin.operate.estimate.operation import Course, Following, Operation
     from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
 
@@ -123,34 +124,26 @@ def alarms(
         tell(errors, as_json, quiet, data, show)
 
 
-Numbered = Annotated[
-    int, typer.Argument(metavar="ENTRY", min=1, help="Number of the entry, as status and export name it.")
-]
-Why = Annotated[str, typer.Option(metavar="TEXT", help="The reason, which the record keeps.")]
+def exclude(
+    record: Place,
+    entry: Annotated[int, typer.Argument(metavar="ENTRY", min=1, help="Number of the entry, as status says.")],
+    why: Annotated[str, typer.Option(metavar="TEXT", help="The reason, which the record keeps.")],
+    include: Annotated[
+        bool, typer.Option("--include", help="Include it again, or although the estimate left it out as a bad one.")
+    ] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Exclude a reading from the estimate, or include it, with the reason. The record keeps the reading and all
+    decisions; the newest counts.
 
+    For example:
 
-def exclude(record: Place, entry: Numbered, why: Why, as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Exclude a reading from the estimate, with the reason. The record keeps the reading and the decision; `include`
-    takes it back.
-
-    Example: `python -m twin.operate exclude record 123 --why "cosmic ray on the left spot"`
-
-    Exit codes: 0 success, 2 bad input (nothing is decided), 1 anything else.
-    """
-    _decide(record, entry, False, why, as_json, quiet)
-
-
-def include(record: Place, entry: Numbered, why: Why, as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Include a reading in the estimate that was excluded, or that the estimate left out as a bad one.
-
-    Example: `python -m twin.operate include record 123 --why "the base was turned on purpose"`
+        python -m twin.operate exclude record 123 --why "cosmic ray on the left spot"
+        python -m twin.operate exclude record 123 --include --why "the base was turned on purpose"
 
     Exit codes: 0 success, 2 bad input (nothing is decided), 1 anything else.
     """
-    _decide(record, entry, True, why, as_json, quiet)
-
-
-def _decide(record: str, entry: int, included: bool, why: str, as_json: bool, quiet: bool) -> None:
     require_record(record)
     from twin.operate.record.entries import one_line
     from twin.operate.record.history import History
@@ -159,11 +152,11 @@ def _decide(record: str, entry: int, included: bool, why: str, as_json: bool, qu
         if not why.strip():
             raise InputErrorText("--why: a decision needs a reason, which the record keeps")
         try:
-            made = history.decide(entry, included, why.strip())
+            made = history.decide(entry, include, why.strip())
         except Problem as problem:
             raise InputErrorText(f"ENTRY: {one_line(problem)}") from None
-        text = f"entry {entry}, {made['kind']} of {made['subject']} at {made['time_utc']}, is "
-        text += f"{'included' if included else 'excluded'}: {made['why']}"
+        text = "entry {entry}, {kind} of {subject} at {time_utc}, is ".format(**made)
+        text += f"{'included' if include else 'excluded'}: {made['why']}"
         tell(errors, as_json, quiet, made, lambda console: print_verdict(console, text))
 
 
@@ -180,9 +173,9 @@ def alarm_line(row: Mapping[str, Any]) -> str:
 
 def estimate_of(
     errors: Console, history: History, plan: Path | None = None, quiet: bool = False
-) -> tuple[Following, list[Alarm]] | None:
-    """The estimate under a plan, and the alarms that are new, which are then in the record; None where there is no plan
-    or nothing to follow.
+) -> tuple[Operation, Following, list[Alarm]] | None:
+    """The estimate under a plan, what it says, and the alarms that are new, which are then in the record; None where
+    there is no plan or nothing to follow.
 
     Args:
         errors: where it is told how far it is.
@@ -193,7 +186,8 @@ def estimate_of(
     setup = plan_of(history, plan)
     if setup is None or (plan is None and history.first("monitor") is None):
         return None
-    return known_of(followed(history, setup, errors, quiet))
+    operation = followed(history, setup, errors, quiet)
+    return (operation, *known_of(operation))
 
 
 def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], console: Console) -> None:
@@ -249,6 +243,16 @@ def _show_course(course: Course, console: Console) -> None:
         cells = zip(course.values[:, k].tolist(), course.sigmas[:, k].tolist(), strict=True)
         unit = one.parameter.unit
         table.add_row(name_of(f"{one.group} {one.key}", course.quantities), *(sized(v, s, unit) for v, s in cells))
+    print_whole(console, table)
+
+
+def show_power(found: Sequence[Power], console: Console) -> None:
+    """A row for each body: the smallest jumps that are found, over the stated sizes."""
+    table = result_table()
+    for head in ("smallest jump found, over the stated", *(key.replace("_", " ") for key in found[0].plain)):
+        table.add_column(head)
+    for one in found:
+        table.add_row(one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values()))
     print_whole(console, table)
 
 

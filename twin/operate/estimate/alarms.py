@@ -131,9 +131,7 @@ def sized(value: float, sigma: float, unit: str) -> str:
 
 def _of_bad(bad: tuple[int, str]) -> Alarm:
     time, reason = bad
-    text = (
-        f"the reading of {utc_text(time)} is taken for a bad one: {reason}; twin.operate include takes it all the same"
-    )
+    text = f"the reading of {utc_text(time)} is taken for a bad one: {reason}; exclude --include takes it all the same"
     return Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
 
 

@@ -274,27 +274,31 @@ def beyond(value: Array, sigma: Array, limit: float) -> Array:
     return np.asarray(ndtr((value - limit) / scale) + ndtr((-value - limit) / scale))
 
 
-def widening(squares: Array, now: Sequence[int] | NDArray[np.intp], centred: bool, first: Array) -> Array:
+def widening(
+    squares: Array, now: Sequence[int] | NDArray[np.intp], centred: bool, lasting: Sequence[tuple[int, Array]] = ()
+) -> Array:
     """(T,) by how much sigmas are wider than what is stated makes them, where readings contradict it: the root of their
     chi-square over its degrees of freedom, over the reading alone or some in a row, whichever is more. 1 where chance
-    explains them. What contradicts the first readings is not forgotten: of what the spots do not show, the state rests
-    on what was stated of the start for as long as nothing explains it.
+    explains them. What contradicts the first readings, or a jump, is not forgotten: of what the spots do not
+    show, the state rests on it for as long as nothing explains it.
 
     Args:
         squares: (N, 2) chi-square and degrees of freedom of each reading before it came, in the order of time.
         now: (T,) number of readings up to each time.
         centred: whether readings after the time count as well.
-        first: (n, 2) of the first readings of all.
+        lasting: number of readings from which on it counts, and (n, 2) as ``squares``, of what is not forgotten.
     """
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(squares, axis=0)])
-    out = np.ones(len(now))
+    out, number = np.ones(len(now)), np.asarray(now, int)
+
+    def wider(square: Array, degrees: Array) -> Array:
+        known = degrees > 0.0
+        limit = limit_of(FALSE_ALARM / len(SPANS), np.where(known, degrees, 1.0))
+        return np.where(known & (square > limit), np.sqrt(square / np.where(known, degrees, 1.0)), 1.0)
+
     for span in SPANS:
-        last = np.asarray(now, int) + (span // 2 if centred else 0)
-        last = np.clip(last, 1, len(squares))
-        at_start = np.sum(first[:span], axis=0).reshape(1, 2)
-        for square, degrees in ((sums[last] - sums[np.maximum(last - span, 0)]).T, at_start.T):
-            known = degrees > 0.0
-            limit = limit_of(FALSE_ALARM / len(SPANS), np.where(known, degrees, 1.0))
-            ratio = np.sqrt(square / np.where(known, degrees, 1.0))
-            out = np.maximum(out, np.where(known & (square > limit), ratio, 1.0))
+        last = np.clip(number + (span // 2 if centred else 0), 1, len(squares))
+        out = np.maximum(out, wider(*(sums[last] - sums[np.maximum(last - span, 0)]).T))
+        for since, part in lasting:
+            out = np.maximum(out, np.where(number >= since, wider(*np.sum(part[:span], axis=0)), 1.0))
     return out

@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import groupby
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import pdtrc
 
+from analysis.monitor.detection_power import Power, detection_power
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.filter_state import Belief, Observed
 from analysis.monitor.jump_detection import Jump, Step
@@ -30,6 +31,7 @@ from scenes.yaml.errors import Problem
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
 from twin.operate.estimate.operation_model import OperationModel, traced_model
+from twin.operate.estimate.packing import packed, unpacked
 from twin.operate.estimate.plans import plan_digest
 from twin.operate.estimate.standing import Standing, Taking
 from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
@@ -111,10 +113,10 @@ class Operation:
         """What was traced; of a record that knows it already it is taken from there."""
         kept = self.history.checkpoint(self.key, number=_MODEL)
         if kept is not None:
-            return OperationModel.from_bytes(kept.content)
+            return cast("OperationModel", unpacked(kept.content, OperationModel))
         sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in self._before.values()])
         made = traced_model(self.plan, sigma, self._sensors, self.experiment)
-        self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, made.to_bytes())
+        self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, packed(made))
         return made
 
     @property
@@ -225,7 +227,7 @@ class Operation:
         return bool(np.all(np.abs(standing.basis - own) <= 1e-9 * np.abs(own).max(axis=1, keepdims=True)))
 
     def _keep(self, standing: Standing, number: int, newest: int) -> None:
-        self.history.save_checkpoint(self.key, number, standing.time, newest, standing.to_bytes())
+        self.history.save_checkpoint(self.key, number, standing.time, newest, packed(standing))
 
     def follow(self) -> Following:
         """Take all readings that are new, and tell what is known."""
@@ -255,6 +257,17 @@ class Operation:
             standing.pending is not None,
             self._too_small(),
         )
+
+    def power(self) -> tuple[Power, ...]:
+        """Return the smallest jump of each body that is found, at the mean interval of the readings so far; empty where
+        there is one reading.
+        """
+        count, noise = self._standing.scores.readings, self.model.how.reference_noise
+        if count < 2 or noise is None:
+            return ()
+        interval = (self._standing.time - self.epoch) / MICRO / (count - 1)
+        with one_blas_thread():
+            return detection_power(self.model.how, interval, noise)
 
     def _too_small(self) -> tuple[str, ...]:
         """Causes of the temperatures of bodies whose sensors disagree with what is stated at the same time."""
@@ -319,7 +332,16 @@ class Operation:
     def _widened(self) -> float:
         """Of sigmas now, where the last readings contradict what is stated."""
         squares = self._unexplained(self._standing.innovations)
-        return float(widening(squares, [len(squares)], False, self._unexplained(self._standing.first))[0])
+        told = [time for time, _, _ in self._standing.innovations]
+        return float(widening(squares, [len(squares)], False, self._lasting(told))[0])
+
+    def _lasting(self, told: Sequence[int]) -> list[tuple[int, Array]]:
+        """What is not forgotten: what contradicts the first readings, and what bodies of jumps do not explain; and
+        the number of readings of these times before it.
+        """
+        out = [(0, self._unexplained(self._standing.first))]
+        jumps = [] if self.too_many_jumps else self._standing.jumps
+        return out + [(int(np.searchsorted(told, one.time)) + 1, np.array([one.jump.rest])) for one in jumps]
 
     @cached_property
     def too_many_jumps(self) -> bool:
@@ -370,7 +392,7 @@ class Operation:
         told = [one for span in self._spans(None) for one in span.told]
         squares = self._unexplained(told)
         number = np.searchsorted([time for time, _, _ in told], times, side="right")
-        out = widening(squares, number, True, self._unexplained(self._standing.first))
+        out = widening(squares, number, True, self._lasting([time for time, _, _ in told]))
         out[times >= self._standing.time] = self._widened
         return out
 

@@ -4,20 +4,15 @@ what sensors see of it, and what is read.
 
 from __future__ import annotations
 
-import io
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.limits import Quantity, quantities
-from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import HeatInputs
 from optics.numerics.backend import load_backend
@@ -54,91 +49,6 @@ class OperationModel:
     def rows(self) -> Array:
         """(Q, 4 K) each in its unit per rad and m of the parameters of one camera after the other."""
         return np.stack([one.row for one in self.quantities])
-
-    def to_bytes(self) -> bytes:
-        """All of it, so that it need not be traced again."""
-        stated, heat = self.how.stated, self.how.heat
-        plain: dict[str, Any] = {
-            "name": stated.name,
-            "labels": stated.labels,
-            "bodies": stated.bodies,
-            "units": stated.units,
-            "causes": stated.causes,
-            "laws": [vars(law) for law in stated.laws],
-            "jump_false_alarm": stated.jump_false_alarm,
-            "spots": self.spots,
-            "quantities": [(one.group, one.key) for one in self.quantities],
-            "life_s": self.how.life_s,
-            "window": self.how.window,
-            "stepping": self.how.stepping,
-            "before_s": self.how.before_s,
-            "heat": None if heat is None else {"sensors": heat.sensors, "names": heat.names, "sigma": heat.sigma},
-        }
-        arrays: dict[str, np.ndarray] = {"sigmas": stated.sigmas, "see": stated.spots, "parameters": stated.parameters}
-        arrays |= {"correlation": stated.correlation, "rows": self.rows, "reading": self.reading}
-        if self.how.reference_noise is not None:
-            arrays["reference"] = self.how.reference_noise
-        if heat is not None:
-            arrays |= {"heat_motions": heat.motions, "heat_rows": heat.rows, "heat_factors": heat.factors}
-        return packed(plain, arrays)
-
-    @classmethod
-    def from_bytes(cls, content: bytes) -> OperationModel:
-        """What `to_bytes` gave."""
-        plain, arrays = unpacked(content)
-        laws = {canonical: _law(canonical) for canonical in {json.dumps(law) for law in plain["laws"]}}
-        stated = Disturbances(
-            plain["name"],
-            tuple(plain["labels"]),
-            tuple(plain["bodies"]),
-            tuple(plain["causes"]),
-            arrays["sigmas"],
-            tuple(plain["units"]),
-            arrays["see"],
-            arrays["parameters"],
-            arrays["correlation"],
-            tuple(laws[json.dumps(law)] for law in plain["laws"]),
-            plain["jump_false_alarm"],
-        )
-        heat = plain["heat"]
-        inputs = None
-        if heat is not None:
-            told = tuple(heat["sensors"]), arrays["heat_rows"], arrays["heat_factors"], tuple(heat["names"])
-            inputs = HeatInputs(arrays["heat_motions"], *told, heat["sigma"])
-        how = SeriesFilter(
-            stated,
-            arrays.get("reference"),
-            inputs,
-            life_s=plain["life_s"],
-            window=plain["window"],
-            stepping=tuple(plain["stepping"]),
-            before_s=plain["before_s"],
-        )
-        spots = tuple((camera, channel) for camera, channel in plain["spots"])
-        known = {one.key: one for one in (*CAMERA_PARAMETERS, ANGLE, *GROUND)}
-        own = zip(plain["quantities"], arrays["rows"], strict=True)
-        read = tuple(Quantity(group, known[key], row) for (group, key), row in own)
-        return cls(how, spots, read, arrays["reading"])
-
-
-def _law(text: str) -> TimeLaw:
-    plain = json.loads(text)
-    return TimeLaw(**{**plain, "event": tuple((time, chance) for time, chance in plain["event"])})
-
-
-def packed(plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Plain data and arrays as one sequence of bytes, always the same for the same."""
-    file = io.BytesIO()
-    text = json.dumps(plain, sort_keys=True).encode()
-    np.savez(file, allow_pickle=False, plain=np.frombuffer(text, np.uint8), **{k: arrays[k] for k in sorted(arrays)})
-    return file.getvalue()
-
-
-def unpacked(content: bytes) -> tuple[Any, dict[str, np.ndarray]]:
-    """What `packed` was given; plain data as JSON has them."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
-    return json.loads(arrays.pop("plain").tobytes()), arrays
 
 
 def traced_model(

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,11 @@ from scipy.special import erf
 
 from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
-from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track
+from analysis.monitor.filter_state import Belief, Innovation, Observed
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.series_filter import SeriesFilter
-from twin.operate.estimate.operation_model import OperationModel, packed, unpacked
+from twin.operate.estimate.operation_model import OperationModel
+from twin.operate.estimate.packing import unpacked
 from twin.operate.record.entries import MICRO
 
 Array = NDArray[np.float64]
@@ -38,7 +39,6 @@ SILENT = 10.0
 """Intervals after which a sensor from which nothing came is dead."""
 CHANCE = 1e-4
 """Of as many equal readings in a row by a sensor that works, below which it is called stuck."""
-_STATES = ("mean", "covariance", "response", "score", "information")
 
 
 @dataclass(frozen=True)
@@ -272,96 +272,10 @@ class Standing:
         """The same, counting what is used from now on."""
         return replace(self, used=self.used[:0], left=self.left[:0], told=())
 
-    def to_bytes(self) -> bytes:
-        """All of it."""
-        belief, arrays = _plain_belief(self.belief, "")
-        arrays |= {"spread": self.spread, "basis": self.basis, "used": self.used, "span": self.left}
-        plain = {
-            "belief": belief,
-            "pending": self.pending,
-            "bad": self.bad,
-            "first": self.first,
-            "accused": self.accused,
-            "time": self.time,
-            "scores": asdict(self.scores),
-            "innovations": self.innovations,
-            "told": self.told,
-            "silent": self.silent,
-            "jumps": [{"time": one.time, "jump": asdict(one.jump)} for one in self.jumps],
-            "sensors": [asdict(one) for one in self.sensors.values()],
-            "left_out": self.left_out,
-        }
-        return packed(plain, arrays)
-
     @classmethod
     def from_bytes(cls, content: bytes) -> Standing:
-        """What `to_bytes` gave."""
-        plain, arrays = unpacked(content)
-        belief = _belief(plain["belief"], arrays, "")
-        sensors = [Sensor(**{**one, "recent": tuple(one["recent"])}) for one in plain["sensors"]]
-        return cls(
-            belief,
-            plain["time"],
-            Scores(**plain["scores"]),
-            tuple((time, square, degrees) for time, square, degrees in plain["innovations"]),
-            tuple(Told(one["time"], _jump(one["jump"])) for one in plain["jumps"]),
-            {one.body: one for one in sensors},
-            tuple((time, kind, subject, reason) for time, kind, subject, reason in plain["left_out"]),
-            arrays["spread"],
-            arrays["basis"],
-            arrays["used"],
-            arrays["span"],
-            tuple((time, square, degrees) for time, square, degrees in plain["told"]),
-            tuple((body, time) for body, time in plain["silent"]),
-            None if plain["pending"] is None else (plain["pending"][0], plain["pending"][1]),
-            tuple((time, reason) for time, reason in plain["bad"]),
-            tuple((time, square, degrees) for time, square, degrees in plain["first"]),
-            tuple(plain["accused"]),
-        )
-
-
-def _plain_belief(own: Belief, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """A belief as plain data and arrays, whose names begin alike."""
-    plain: dict[str, Any] = {"time": own.time, "last": own.last, "recent": own.recent, "aside": None}
-    arrays = {f"{name}{part}": getattr(own, part) for part in ("after", "until", "left")}
-    for which, track in (("state", own.state), ("search", own.search)):
-        if track is not None:
-            arrays |= {f"{name}{which}_{part}": getattr(track, part) for part in _STATES}
-    if own.aside is not None:
-        found, (taken, more) = own.aside.innovation, _plain_belief(own.aside.taken, f"{name}aside_")
-        arrays |= {**more, f"{name}aside_white": found.white}
-        bad = None if found.bad is None else asdict(found.bad)
-        plain["aside"] = {"log_odds": own.aside.log_odds, "log_score": found.log_score, "bad": bad, "taken": taken}
-    return plain, arrays
-
-
-def _belief(plain: dict[str, Any], arrays: Mapping[str, np.ndarray], name: str) -> Belief:
-    """What `_plain_belief` was given; of a reading that was set aside only what it was against its prediction."""
-    tracks = [
-        Track(*(arrays[f"{name}{which}_{part}"] for part in _STATES)) if f"{name}{which}_mean" in arrays else None
-        for which in ("state", "search")
-    ]
-    assert tracks[0] is not None
-    aside, put = None, plain["aside"]
-    if put is not None:
-        read, bad = (
-            Observed(put["taken"]["time"], np.empty(0), np.empty((0, 0))),
-            put["bad"] and BadReading(**put["bad"]),
-        )
-        found = Innovation(read, arrays[f"{name}aside_white"], put["log_score"], None, bad)
-        aside = Aside(_belief(put["taken"], arrays, f"{name}aside_"), found, put["log_odds"])
-    after, until, left = (arrays[f"{name}{part}"] for part in ("after", "until", "left"))
-    recent = tuple(plain["recent"])
-    return Belief(plain["time"], plain["last"], after, until, tracks[0], tracks[1], left, recent, aside)
-
-
-def _jump(plain: dict[str, Any]) -> Jump:
-    lists = ("motions", "labels", "units", "sizes", "sigmas", "change")
-    chances = tuple((time, chance) for time, chance in plain["chances"])
-    rivals = dict(sorted(plain["rivals"].items(), key=lambda one: -one[1]))  # the best first, as they were
-    more = {"chances": chances, "rivals": rivals, "spread": tuple(map(tuple, plain["spread"]))}
-    more["parts"] = tuple((tuple(motions), variance) for motions, variance in plain["parts"])
-    return Jump(**{**plain, **{name: tuple(plain[name]) for name in lists}, **more})
+        """Return what `packed` made bytes of."""
+        return cast("Standing", unpacked(content, cls, Scores, Sensor, Told))
 
 
 @dataclass(frozen=True, eq=False)

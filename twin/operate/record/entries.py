@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -225,11 +224,6 @@ def digest_of_job(job: ResolvedJob) -> str:
     """SHA-256 of what a job's instrument is."""
     plain = job.plain()
     return instrument_digest(plain["instrument"], plain["cameras"])
-
-
-def all_finite(values: Sequence[float]) -> bool:
-    """Whether all numbers are finite."""
-    return all(map(math.isfinite, values))
 
 
 def one_line(error: InputError | Issue | Problem) -> str:

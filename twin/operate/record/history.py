@@ -147,8 +147,7 @@ class History:
             content = {"entry": number, "sha256": row["sha256"], "included": included, "why": why}
             content["number"] = len(before) + 1
             one = Entry(DECISION, str(number), int(row["time_us"]), content)
-            command = f"twin.operate {'include' if included else 'exclude'}"
-            given = Given(command, digest_of_data(content), one.digest, [one], {})
+            given = Given("twin.operate exclude", digest_of_data(content), one.digest, [one], {})
             taking = digest_of_data([given.sha256, given.meaning])
             Taking(connection, self.simulated, True).write(given, taking, None, [(one, one.digest)], {})
         keys = {key: row[key] for key in ("kind", "subject", "time_utc")}

@@ -29,7 +29,7 @@ _WHEN = (
 _FROM = (
     _key("file", "from which it was taken"),
     _key("sha256", "by which the reading is recognised"),
-    Quantity[Row]("entry", lambda row: row["id"], "number of the entry, by which exclude and include name it"),
+    Quantity[Row]("entry", lambda row: row["id"], "number of the entry, by which exclude names it"),
 )
 
 
