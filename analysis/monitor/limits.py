@@ -86,6 +86,29 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
     return tuple(out)
 
 
+_UNMOVED = 1e-12
+"""Share of what a motion does to a camera, angles and relative changes alike, below which derivatives are rounding."""
+
+
+def unmoved(
+    stated: Disturbances, cameras: Mapping[str, CameraCalibration], ground: GroundGeometry | None = None
+) -> frozenset[tuple[str, str]]:
+    """Return group and key of the quantities that no motion of the prior changes, so that they have no posterior.
+
+    Args:
+        stated: the prior.
+        cameras: what is calibrated of each.
+        ground: of a pair whose altitude is known.
+    """
+    unit = np.concatenate([(1.0, 1.0, 1.0, one.geometry.principal_distance_m) for one in cameras.values()])
+    size = np.max(np.abs(stated.parameters) / unit[:, None], axis=0)
+    return frozenset(
+        (one.group, one.key)
+        for one in quantities(cameras, ground)
+        if np.all(np.abs(one.row @ stated.parameters) <= _UNMOVED * float(np.abs(one.row) @ unit) * size)
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Split:
     """The variance of Q quantities by the M stated motions.

@@ -20,10 +20,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 from analysis.measurement_error import MeasurementError
 from analysis.spots import rounding
+from analysis.spots.frame_movement import (
+    FALSE_ALARM,
+    MEDIAN,
+    MOST_MOVES,
+    aligned,
+    basis_of,
+    place_scatter,
+    robust_fit,
+    shown_pixels,
+)
 from analysis.spots.noise import NoiseModel
 
 __all__ = [
@@ -42,8 +52,6 @@ Mask = NDArray[np.bool_]
 Released = Callable[[NDArray[Any]], None]
 _HELD = 1 << 25
 """Bytes of frames that are worked on at a time."""
-FALSE_ALARM = 1e-6
-"""Chance that a test finds something in clean frames of one spot in one state."""
 GROWTH_SIGMAS = 3.5
 """Neighbours of a transient belong to it from this on."""
 _DIM = 0.5
@@ -56,9 +64,8 @@ _SATURATION_SIGMAS = 4.0
 _LEAST_SHARE, _UNKNOWN, _LEAST_DRIFT_DN = 1e-3, 1e12, 0.5
 _ROUNDS = 20
 """In which the cut-off of differences follows the noise that is found."""
-_MOST_MOVES, _SMALL_PX, _LARGEST_PX = 4, 0.1, 5.0
-"""A frame that has moved by more than the second is compared with the reference there, so often at most, up to the
-third."""
+_SMALL_PX, _LARGEST_PX = 0.1, 5.0
+"""A frame that has moved by more than the first is compared with the reference there, up to the second."""
 _NOISE_OFF, _MOST_SIGMAS = 0.15, 4.0
 """By which the noise of frames may differ from the stated one, as a share of that; and where single differences are cut
 off, in standard deviations, for cosmic rays."""
@@ -66,8 +73,6 @@ _LIT = 0.02
 """Share of the peak from which a pixel is in the light, where movement and smear look like noise."""
 _LEAST_LEVEL_DN = 1.0
 """By which the level of frames is below the dark level before it counts as subtracted."""
-_MEDIAN = math.pi / 2.0
-"""Variance of a median over that of a mean, of many normal numbers."""
 
 
 class FramesError(MeasurementError, ValueError):
@@ -235,7 +240,7 @@ def screen_frames(
         findings.append(Finding("bad pixels", f"{np.count_nonzero(known)} of the bad-pixel map are left out"))
     if not np.all(finite):
         findings.append(Finding("undefined pixels", f"{np.count_nonzero(~finite)} without a value are left out"))
-    kept = _lit(stack, finite & ~known, findings)
+    kept = _lit(stack, finite & ~known, noise, findings)
     found: _Compared | None = None
     jitter = np.zeros((2, 2))
     if len(kept) > 1:
@@ -296,7 +301,7 @@ def _numbers(frames: NDArray[np.intp]) -> str:
     return f"frame{'s' * (len(frames) > 1)} {shown}{more}"
 
 
-def _lit(stack: _Stack, inside: Mask, findings: list[Finding]) -> NDArray[np.intp]:
+def _lit(stack: _Stack, inside: Mask, noise: NoiseModel, findings: list[Finding]) -> NDArray[np.intp]:
     """Numbers of the frames that hold the light; ``inside`` are the pixels that can be used in all of them."""
     edge = np.ones(stack.shape, dtype=bool)
     edge[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = False
@@ -304,7 +309,9 @@ def _lit(stack: _Stack, inside: Mask, findings: list[Finding]) -> NDArray[np.int
     light = np.array([((values - np.median(values[border])) * inside).sum() for values, _ in stack.each()])
     # the brightest but for a few: a frame may be bright by accident
     reference = float(np.sort(light)[max(len(light) - 1 - len(light) // 4, 0)])
-    dark = light < _DIM * reference
+    # the sum of faint light is noise, which is no missing light
+    spread = math.sqrt(np.count_nonzero(inside) * float(noise.frame_variance_dn2(noise.dark_level_dn)))
+    dark = light < min(_DIM * reference, reference - 5.0 * spread)
     kept = np.flatnonzero(~dark)
     if 2 * len(kept) < len(light):
         raise FramesError(
@@ -319,8 +326,8 @@ def _lit(stack: _Stack, inside: Mask, findings: list[Finding]) -> NDArray[np.int
 @dataclass(frozen=True, eq=False)
 class _Compared:
     """N frames of so many pixels against their reference: of each the number of pixels that were hit (N,), and which
-    pixels its model replaces by what values; light and level (N,) with the largest sigma of a level, offsets (N, 2) px
-    and their covariance (N, 2, 2).
+    pixels its model replaces by what values; light and level (N,) with the largest sigma of each, offsets (N, 2) px and
+    their covariance (N, 2, 2).
     """
 
     pixels: int
@@ -329,6 +336,7 @@ class _Compared:
     light: Array
     level: Array
     level_sigma: float
+    light_sigma: float
     offset: Array
     spread: Array
     jitter: Array
@@ -349,7 +357,7 @@ class _Compared:
         if drift > max(12.0 * self.level_sigma, _LEAST_DRIFT_DN):
             out.append(Finding("drifting level", f"by {drift:.3g} DN over the frames; it is fitted", corrects=False))
         flicker = float(np.ptp(self.light))
-        if flicker > 0.02:
+        if flicker > max(0.02, 12.0 * self.light_sigma):
             out.append(Finding("changing light", f"by {100.0 * flicker:.2g} % over the frames", corrects=False))
         return out
 
@@ -367,22 +375,29 @@ def _compared(stack: _Stack, noise: NoiseModel) -> _Compared:
     threshold = float(norm.isf(FALSE_ALARM / (2.0 * count * pixels)))
     # of a median the same for all frames that have not moved
     middle = stack.median(filled=True) if count > 2 else None
-    still = None if middle is None else _basis(middle)
-    excess = 1.0 + _MEDIAN / count if count > 2 else 2.0
+    places = np.zeros((count, 2))
+    shown: Mask | None = np.ones(stack.shape, dtype=bool)
+    if middle is not None:
+        shown = shown_pixels(middle, noise, count, follows)
+        if shown is not None and np.all(shown):
+            middle, places = aligned(stack.each, len(stack), middle, follows)
+    still = None if middle is None else basis_of(middle)
+    excess = 1.0 + MEDIAN / count if count > 2 else 2.0
     others = repeat(middle) if middle is not None else (values for values, _ in stack.each(backwards=True))
-    light, level, sigmas = np.empty((3, count))
+    light, level, sigmas, light_sigmas = np.empty((4, count))
     offset, spread = np.empty((count, 2)), np.empty((count, 2, 2))
     hits, replaced = np.empty(count, np.int64), []
     for k, ((frame, finite), reference) in enumerate(zip(stack.each(), others, strict=False)):
         usable = finite & follows
         weight = usable / (excess * noise.frame_variance_dn2(reference))
-        place = np.zeros(2)
-        for _ in range(_MOST_MOVES):
+        weight = weight if shown is None else weight * shown
+        place = places[k]
+        for _ in range(MOST_MOVES):
             if np.any(place):
-                basis = _basis(ndimage.shift(reference, place, order=3, mode="nearest"))
+                basis = basis_of(ndimage.shift(reference, place, order=3, mode="nearest"))
             else:
-                basis = _basis(reference) if still is None else still
-            solution, inverse = _robust(basis, frame, weight)
+                basis = basis_of(reference) if still is None else still
+            solution, inverse = robust_fit(basis, frame, weight)
             # of frames without light nothing can be said
             share = max(abs(float(solution[0])), _LEAST_SHARE)
             further = -solution[1:3] / share
@@ -393,6 +408,7 @@ def _compared(stack: _Stack, noise: NoiseModel) -> _Compared:
         sigma = np.sqrt(excess * noise.frame_variance_dn2(model))
         z = np.where(usable, (frame - model) / sigma, 0.0)
         light[k], level[k], sigmas[k] = solution[0], solution[-1], math.sqrt(max(float(inverse[-1, -1]), 0.0))
+        light_sigmas[k] = math.sqrt(max(float(inverse[0, 0]), 0.0))
         # a spot that has moved by d is its reference minus d times the slope
         offset[k] = place + further
         spread[k] = np.clip(inverse[1:3, 1:3], -_UNKNOWN, _UNKNOWN) / share**2
@@ -401,8 +417,9 @@ def _compared(stack: _Stack, noise: NoiseModel) -> _Compared:
         where = np.flatnonzero(struck | ~finite)
         hits[k] = np.count_nonzero(struck)
         replaced.append((where, model.flat[where]))
-    moved = _jitter(offset, spread, count)
-    return _Compared(pixels, hits, tuple(replaced), light, level, float(sigmas.max()), offset, spread, moved)
+    moved = np.zeros((2, 2)) if shown is None else place_scatter(offset, spread, count)
+    known = float(sigmas.max()), float(light_sigmas.max())
+    return _Compared(pixels, hits, tuple(replaced), light, level, *known, offset, spread, moved)
 
 
 def noise_ratio(
@@ -426,7 +443,7 @@ def noise_ratio(
     """
     stack = _Stack.of(frames, bad, released, blank=True)
     try:
-        kept = _lit(stack, stack.known()[0] & ~stack.bad, [])
+        kept = _lit(stack, stack.known()[0] & ~stack.bad, noise, [])
     except FramesError:
         return None
     stack = stack.taken(kept)
@@ -507,32 +524,7 @@ def subtracted_level(
     away = noise.dark_level_dn - float(np.median(middle))
     pixel = noise.dark_variance_dn2 / len(stack) + noise.dsnu_variance_dn2
     # a median of whole numbers stands up to half a grey value off
-    return away if away > _LEAST_LEVEL_DN + 6.0 * math.sqrt(_MEDIAN * pixel / middle.size) else 0.0
-
-
-def _basis(reference: Array) -> Array:
-    """(7, H, W): the reference, its first and second derivatives, and 1."""
-    order = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-    smooth = [reference, *(ndimage.gaussian_filter(reference, 1.0, one, mode="nearest") for one in order[1:])]
-    return np.stack([*smooth, np.ones_like(reference)])
-
-
-def _robust(basis: Array, frame: Array, weight: Array) -> tuple[Array, Array]:
-    """Least squares that outliers do not pull: solution and inverse normal matrix."""
-    flat, y = basis.reshape(len(basis), -1), frame.ravel()
-    scale = np.sqrt(np.maximum((flat**2).mean(axis=1), 1e-300))
-    design, base = flat / scale[:, None], weight.ravel()
-    # most pixels are background, of which the median is no outlier
-    solution = np.zeros(len(basis))
-    solution[0] = scale[0]
-    w = base
-    for _ in range(4):
-        z = np.abs(y - solution @ design) * np.sqrt(base)
-        w = base * np.where(z > 3.0, (3.0 / np.maximum(z, 3.0)) ** 2, 1.0)
-        normal = (design * w) @ design.T
-        solution = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(len(normal)), (design * w) @ y)
-    inverse = np.linalg.pinv((design * w) @ design.T, hermitian=True)
-    return solution / scale, inverse / np.outer(scale, scale)
+    return away if away > _LEAST_LEVEL_DN + 6.0 * math.sqrt(MEDIAN * pixel / middle.size) else 0.0
 
 
 def _grown(seed: Mask, grows: Mask) -> Mask:
@@ -540,20 +532,6 @@ def _grown(seed: Mask, grows: Mask) -> Mask:
     if not np.any(seed):
         return seed
     return np.asarray(ndimage.binary_propagation(seed, np.ones((3, 3)), seed | grows))
-
-
-def _jitter(offset: Array, spread: Array, count: int) -> Array:
-    """Covariance of the places beyond noise, zeros where noise explains them."""
-    if count < 3:
-        return np.zeros((2, 2))
-    away = offset - offset.mean(axis=0)
-    chi = float(np.einsum("ki,kij,kj->", away, np.linalg.pinv(spread, hermitian=True), away))
-    if chi <= chi2.isf(FALSE_ALARM, 2 * (count - 1)):
-        return np.zeros((2, 2))
-    value, vector = np.linalg.eigh(away.T @ away / (count - 1) - spread.mean(axis=0))
-    # known from few frames only: what makes the mean of the error's square over it 1 (Hotelling's T^2 in a plane)
-    few = (count - 1) / max(count - 4, 0.5)
-    return np.asarray((vector * np.maximum(value, 0.0) * few) @ vector.T)
 
 
 def _saturated(stack: _Stack, noise: NoiseModel) -> Mask:

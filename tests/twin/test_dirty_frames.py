@@ -1,10 +1,13 @@
 """What real frames hold beside the spot is found and corrected, and sigmas hold; clean frames are left as they are."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from analysis.spots.frame_screening import noise_ratio, screen_frames
+from analysis.spots.photon_transfer import pixel_correction
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.spots.static_defects import examine, lone_pixels
@@ -13,6 +16,7 @@ from scenes.models.disturbances import state_of
 from scenes.specs.job import AnalysisSpec, JobSpec
 from scenes.specs.resolved import resolve_job
 from tests.tiers import quick
+from tests.twin import dirty_frames
 from tests.twin.dirty_frames import KINDS, Drawn, clean_scene, draw, measurement, record, replace
 
 SETS = 200
@@ -99,6 +103,81 @@ def test_clean_frames_are_not_touched(bench):
             assert spot.clean
             assert spot.cost == 0.0
             assert spot.used.all()
+
+
+def moved_by(rms):
+    """Frames of both states whose spot moves from frame to frame."""
+
+    def movement(scenes, rng, shape):
+        for scene in scenes:
+            scene.offsets = rms * rng.standard_normal(scene.offsets.shape)
+
+    return movement
+
+
+def test_the_noise_of_a_subtracted_level_is_that_of_the_light(bench, monkeypatch):
+    """Real numbers whose dark level was subtracted: all that is below the data sheet's level had no shot noise, which
+    made sigma 30 % too small and took noise for cosmic rays and bad pixels.
+    """
+    template, detector, noise = bench
+    square, told = 0.0, []
+    with one_blas_thread():
+        for seed in range(300, 306):
+            drawn = draw(template, detector, (), seed)
+            low = Drawn(*(one.astype(float) - noise.dark_level_dn for one in (drawn.before, drawn.after)), drawn.shift)
+            works = [measurement(frames, template, noise) for frames in (drawn, low)]
+            for work in works:
+                assert work.search() == work.measure() == []
+            own, raw = (work.positions[1].position - work.positions[0].position for work in works[::-1])
+            np.testing.assert_allclose(own, raw, atol=1e-4)
+            spread, whole = works[1].shift_covariance(1)[0], works[0].shift_covariance(1)[0]
+            np.testing.assert_allclose(np.diag(spread), np.diag(whole), rtol=0.01)
+            square += float((own[0] - drawn.shift) @ np.linalg.solve(spread, own[0] - drawn.shift))
+            told += [finding.kind for finding in works[1].result().before.findings]
+            assert works[1].result().before.noise_ratio is None
+    assert square < chi2.isf(1e-3, 12)
+    assert told == ["subtracted level"] * 6
+
+
+def test_dark_frames_with_a_level_do_not_go_with_frames_without(bench):
+    template, detector, noise = bench
+    drawn = draw(template, detector, (), 1)
+    night = np.random.default_rng(1).normal(noise.dark_level_dn, 2.0, (4, *template.shape))
+    work = measurement(Drawn(drawn.before - 100.0, drawn.after - 100.0, drawn.shift), template, noise)
+    work.channel = replace(work.channel, correction=pixel_correction(noise, night, None))
+    (issue,) = work.search()
+    assert "darker than without light" in str(issue)
+    assert "dark frames as they were recorded" in str(issue)
+
+
+@pytest.mark.parametrize("photons", [3e4, 3e3])
+def test_faint_spots_are_not_called_moving(bench, photons, monkeypatch):
+    """Light of 1 800 electrons, of which the median is mostly noise, stood still and was called moving in every set,
+    with sigmas five times too large (chi-square 0.05).
+    """
+    monkeypatch.setattr(dirty_frames, "PHOTONS", photons)
+    found, told = squares(bench, (), range(500, 506))
+    names = {finding.kind for spots in told for spot in spots for finding in spot.findings}
+    assert not names & {"movement between frames", "smear", "drifting level", "missing light"}
+    # of 12 degrees of freedom
+    assert chi2.ppf(1e-4, 12) < found.sum() < chi2.isf(1e-4, 12)
+
+
+@pytest.mark.parametrize("rms", [0.6, pytest.param(1.0, marks=pytest.mark.second), 2.0])
+def test_a_spot_that_moves_far_is_no_spoilt_frame(bench, rms, monkeypatch):
+    """Each state was refused as dark, or its spot was taken for cosmic rays in each frame."""
+    monkeypatch.setitem(KINDS, "far", moved_by(rms))
+    found, told = squares(bench, ("far",), range(600, 602))
+    # of few frames: chi-square is divided by nearly F
+    assert found.sum() < 4.0 * chi2.isf(1e-6, 4)
+    for spots in told:
+        for spot in spots:
+            kinds = [finding.kind for finding in spot.findings]
+            assert "movement between frames" in kinds
+            assert not {"spoilt frames", "missing light"} & set(kinds)
+            size = float(re.search(r"[0-9.]+", spot.findings[kinds.index("movement between frames")].text)[0])
+            # both directions together, of nine frames, some larger as so few say
+            assert 0.5 * rms < size < 3.5 * rms
 
 
 def test_findings_tell_places_on_the_ccd(bench):

@@ -122,6 +122,28 @@ def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
     assert len(recover_numbers(found)["series"]) == 3
 
 
+def test_frames_of_different_sizes_say_where_they_begin(run, images, backend, tmp_path):
+    """Frames before and after that begin at other pixels of the CCD read as a shift of the spot; so do the times of a
+    series with one offset.
+    """
+    small, channel = tmp_path / "small.tif", run.experiment.path.channels[0]
+    key = f"{channel.camera}_{channel.name}"
+    after = tifffile.imread(images / f"{key}_after.tiff")
+    tifffile.imwrite(small, after[:, 8:88, 8:88], photometric="minisblack")
+    names = {c.key: f"{images}/{c.camera}_{c.name}" for c in run.experiment.path.channels[1:]}
+    others = "".join(f"  {k}: {{before: {n}_before.tiff, after: {n}_after.tiff}}\n" for k, n in names.items())
+    before = f"{images}/{key}_before.tiff"
+
+    def text(more, files="small.tif"):
+        return f"{HEAD}frames:\n  {channel.key}: {{before: {before}, after: {files}{more}}}\n{others}"
+
+    for more in ("", ", offset: [0, 0]"):
+        with pytest.raises(InputError, match="nothing says where they begin"):
+            measured(tmp_path, text(more), backend, run)
+    found = measured(tmp_path, text(", offset_after: [8, 8]"), backend, run)
+    np.testing.assert_allclose(found.last.recovery.after, run.recovery.after, atol=0.01)
+
+
 def test_without_an_instrument_its_geometry_and_a_learnt_shape_will_do(run, images, backend):
     """The formulas with the three numbers that a data sheet has, and the spot's shape from its own frames."""
     text = "template: measured\ndetector: monitor_ccd\nexposure: 10 ms\nframes: images\ngeometry:\n"
@@ -218,7 +240,7 @@ def burnt(frames):
 @pytest.mark.parametrize(
     ("change", "problem", "remedy"),
     quick(
-        3,
+        9,
         [
             (no_spot, "no spot", "the right file, with the light on"),
             (at_the_edge, "too near the edge", "10 pixels or more inside"),
@@ -230,6 +252,13 @@ def burnt(frames):
                 "do not lie on the CCD of 96 x 96 pixels",
                 "with its offset",
             ),
+            (
+                lambda f: f[:, 16:, 16:],
+                "frames of 80 x 80 pixels are not of the size of",
+                "offset_after: [ROW, COLUMN]",
+            ),
+            (lambda f: f * 4, "all multiples of 4; the converter of monitor_ccd", "divided by 4"),
+            (lambda f: np.where(f == f.max(), 16384, f), "grey values up to 16384", "the right `detector`"),
             (lambda f: np.stack([f, f, f], -1), "colours", "raw frames of a CCD"),
             (lambda f: np.where(f == f.max(), 1e30, f), "grey values up to 1e+30", "at most 4.29497e+09"),
         ],

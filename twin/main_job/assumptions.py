@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
+from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Split, quantities, split
 from scenes.specs.course import moment
 from scenes.specs.instrument import BASE
-from twin.main_job.monitor_reading import MonitorReading
+from twin.main_job.monitor_reading import MonitorReading, contradicted
 from twin.main_job.render_results import RenderRun
 from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import SmoothedCourse
@@ -21,7 +20,6 @@ __all__ = [
     "NOISE",
     "assumed",
     "combination",
-    "contradicted",
     "contradiction",
     "course_agrees",
     "doubted",
@@ -50,7 +48,7 @@ def assumed(reading: MonitorReading) -> str:
 
 def _from_statement(reading: MonitorReading) -> str:
     """How much of the sigmas is from the statement: the least and the largest share of the posterior's variances."""
-    shares = [share for own in reading.from_statement.values() for share in own.values()]
+    shares = [share for own in reading.from_statement.values() for share in own.values() if share is not None]
     if not shares:
         return ""
     ends = list(dict.fromkeys(plain(math.floor(1e3 * end) / 10.0, 4) for end in (min(shares), max(shares))))
@@ -58,13 +56,14 @@ def _from_statement(reading: MonitorReading) -> str:
 
 
 def contradiction(run: RenderRun) -> tuple[str, ...]:
-    """A warning where the measured shifts contradict what is stated to move; of a course at the worst of its times."""
-    found, when, rate = run.consistency, "", f"{FALSE_ALARM:g}"
-    if run.worst_of_course is not None and run.series is not None:
-        k, found = run.worst_of_course
-        when = f" at {moment(float(run.series.times[k]))}, the worst of {len(run.series.times)} times"
-        rate += " for the course"
-    return contradicted(run.experiment.disturbances, found, when, rate)
+    """A warning where the shifts of a course contradict the prior at the worst of its times. That of a single state is
+    one of the doubts of its reading.
+    """
+    if run.worst_of_course is None or run.series is None:
+        return ()
+    k, found = run.worst_of_course
+    when = f" at {moment(float(run.series.times[k]))}, the worst of {len(run.series.times)} times"
+    return contradicted(run.experiment.disturbances, found, when, f"{FALSE_ALARM:g} for the course")
 
 
 def doubted(run: RenderRun) -> tuple[str, ...]:
@@ -74,26 +73,6 @@ def doubted(run: RenderRun) -> tuple[str, ...]:
     if run.series is None:
         return (*run.reading.doubts, *run.reading.notes)
     return run.series.doubts(["/".join(channel) for channel in run.reading.channels])
-
-
-def contradicted(
-    stated: Disturbances | None, found: Consistency | None, when: str = "", rate: str = f"{FALSE_ALARM:g}"
-) -> tuple[str, ...]:
-    """A warning if the shifts of one measurement contradict the prior.
-
-    Args:
-        stated: what is stated to move, None for nothing.
-        found: whether its shifts agree with that.
-        when: which measurement it is, where there are several.
-        rate: of false alarms.
-    """
-    if stated is None or found is None or found.agrees:
-        return ()
-    return (
-        f"the shifts of the spots contradict the prior {stated.name}{when}: chi-square "
-        f"{significant(found.chi_square)} of {found.degrees} coordinates where {found.limit:.1f} is exceeded with a "
-        f"chance of {rate}{_suspected(found, stated.bodies)}; σ does not hold for this measurement",
-    )
 
 
 def course_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
@@ -131,22 +110,6 @@ def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
         f"{what} where {found.degrees} are expected and {found.limit:.4g} are the limit (chance {FALSE_ALARM:g}): "
         "the measurements contradict the prior, and the sigmas are not reliable. Look first at the measurement at "
         f"{moment(float(times[worst]))}, which contributes {together.innovations[worst]:.3g} given those before it."
-    )
-
-
-def _suspected(found: Consistency, stated: Sequence[str]) -> str:
-    if not found.suspects:
-        return ""
-    first = found.suspects[0]
-    times = significant(first.times, 2)
-    if first.body in stated:
-        return (
-            f"; motions of {first.body} would explain them best, with {times} times the standard deviations of the "
-            "prior"
-        )
-    return (
-        f"; motions of {first.body}, which the prior does not contain, would explain them best, with standard "
-        f"deviations of some {times} µm, arcsec, ppm and nm"
     )
 
 

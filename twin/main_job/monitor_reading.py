@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,7 @@ from analysis.monitor.curvature import BEYOND
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares, consistency
 from analysis.monitor.estimators import Estimator, applicable, judged
 from analysis.monitor.ground_error import GroundGeometry
-from analysis.monitor.limits import Quantity, posterior_sigma, quantities
+from analysis.monitor.limits import Quantity, posterior_sigma, quantities, unmoved
 from analysis.monitor.recovery import Recovery
 from analysis.short_repr import shows
 from analysis.spots.fit_state import FALSE_ALARM as SPOT_ALARM
@@ -23,10 +23,11 @@ from analysis.spots.fit_state import FitStates
 from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
 from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.monitor.truth import Truth
+from twin.run.artefact import significant
 from twin.run.provenance import SelfCheck
 from twin.uncertainty.monitor_limits import short_text, unseen_texts
 
-__all__ = ["CENTROID_NOTES", "STATED", "MonitorReading", "stated"]
+__all__ = ["CENTROID_NOTES", "STATED", "MonitorReading", "contradicted", "stated"]
 
 CENTROID_NOTES = {
     "ml": "maximum-likelihood fit of the calibrated spot shape",
@@ -79,7 +80,7 @@ class MonitorReading:
     @cached_property
     def table(self) -> ReadingTable:
         """All readings, beside the truth where there is one."""
-        return reading_table(self.recovery, self.cameras, self.truth, self.ground).at(0)
+        return reading_table(self.recovery, self.cameras, self.truth, self.ground, self.disturbances).at(0)
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
@@ -88,8 +89,8 @@ class MonitorReading:
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
-        """Why sigma does not hold for this measurement though nothing else says so: spots that are not as calibrated,
-        and readings that are not linear and cannot be worked out anew. Sentences without their end.
+        """Why sigma does not hold for this measurement: spots that are not as calibrated, readings that are not linear
+        and cannot be worked out anew, and shifts that contradict the prior. Sentences without their end.
         """
         out = list(self.found_wrong)
         evidence = self.recovery.evidence
@@ -102,7 +103,12 @@ class MonitorReading:
                     f"σ does not hold: the motions that the {self.estimators[name].title} reads are not small, and the "
                     f"state that it stands for cannot be traced again ({self._off(name)}); readings are linear ones"
                 )
-        return tuple(out)
+        return (*out, *self.contradiction)
+
+    @property
+    def contradiction(self) -> tuple[str, ...]:
+        """The sentence that the shifts contradict the prior, where they do."""
+        return contradicted(self.disturbances, self.consistency)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -137,23 +143,26 @@ class MonitorReading:
 
     @property
     def sigma_holds(self) -> bool:
-        """Whether nothing that was measured contradicts the sigmas."""
-        return not self.doubts and (self.consistency is None or self.consistency.agrees)
+        """Whether there are no doubts."""
+        return not self.doubts
 
     @cached_property
-    def from_statement(self) -> dict[str, dict[str, float]]:
+    def from_statement(self) -> dict[str, dict[str, float | None]]:
         """Group -> key -> share of the posterior's variance that no spot constrains, however little noise it has: what
-        rests on the statement alone. Empty where nothing is stated, and without noise.
+        rests on the statement alone; None of what no stated motion changes. Empty where nothing is stated, and without
+        noise.
         """
         stated, noise = self.disturbances, self.recovery.shift_covariance[0]
         if stated is None or not np.any(noise):
             return {}
         rows = np.stack([quantity.row for quantity in self._quantities])
         left, unseen = (posterior_sigma(rows, stated, spread) for spread in (noise, 0.0 * noise))
-        out: dict[str, dict[str, float]] = {}
+        out: dict[str, dict[str, float | None]] = {}
+        without = unmoved(stated, self.cameras, self.ground)
         for quantity, sigma, alone in zip(self._quantities, left, unseen, strict=True):
-            share = min(float(alone / sigma) ** 2, 1.0) if sigma > 0.0 else 0.0
-            out.setdefault(quantity.group, {})[quantity.key] = round(share, SHARE)
+            share = round(min(float(alone / sigma) ** 2, 1.0) if sigma > 0.0 else 0.0, SHARE)
+            missing = (quantity.group, quantity.key) in without
+            out.setdefault(quantity.group, {})[quantity.key] = None if missing else share
         return out
 
     @cached_property
@@ -217,16 +226,14 @@ class MonitorReading:
         read = self.table.groups()
         spots: dict[str, Any] = {}
         r = self.recovery
-        fits = None if r.evidence is None else (r.evidence.before, r.evidence.after)
+        fits = (None, None) if r.evidence is None else (r.evidence.before, r.evidence.after)
         for i, (camera, channel) in enumerate(self.channels):
-            first, last = (None, None) if fits is None else (_fit(own, i) for own in fits)
             spots.setdefault(camera, {})[channel] = {
-                "before": {**_spot(r.before[0, i], r.sigma_before[0, i]), **(first or {})},
-                "after": {**_spot(r.after[0, i], r.sigma_after[0, i]), **(last or {})},
+                "before": {**_spot(r.before[0, i], r.sigma_before[0, i]), **_fit(fits[0], i)},
+                "after": {**_spot(r.after[0, i], r.sigma_after[0, i]), **_fit(fits[1], i)},
             }
         out: dict[str, Any] = {"cameras": read.pop("cameras"), "spots": spots, **read}
-        if self.consistency is not None:
-            out["disturbances"] = self._stated(self.consistency)
+        out["disturbances"] = self._stated(self.consistency)
         if self.from_statement:
             out["from_statement"] = self.from_statement
         if r.curvature:
@@ -249,11 +256,13 @@ class MonitorReading:
             "holds": bool(found.holds[0]),
         }
 
-    def _stated(self, found: Consistency) -> dict[str, Any]:
-        """What the total sigmas rest on, and whether the shifts agree with it."""
-        assert self.disturbances is not None
+    def _stated(self, found: Consistency | None) -> dict[str, Any]:
+        """What the total sigmas rest on, and whether shifts agree with it; None without a prior or without noise."""
+        name = None if self.disturbances is None else self.disturbances.name
+        if found is None:
+            return {"name": name, **dict.fromkeys(_STATED_KEYS), "suspects": []}
         return {
-            "name": self.disturbances.name,
+            "name": name,
             "chi_square": _to_digits(found.chi_square),
             "chi_square_sigma_noise": found.sigma_noise,
             "degrees_of_freedom": found.degrees,
@@ -271,6 +280,42 @@ class MonitorReading:
                 for one in found.suspects
             ],
         }
+
+
+def contradicted(
+    stated: Disturbances | None, found: Consistency | None, when: str = "", rate: str = f"{FALSE_ALARM:g}"
+) -> tuple[str, ...]:
+    """A warning if the shifts of one measurement contradict the prior.
+
+    Args:
+        stated: what is stated to move, None for nothing.
+        found: whether its shifts agree with that.
+        when: which measurement it is, where there are several.
+        rate: of false alarms.
+    """
+    if stated is None or found is None or found.agrees:
+        return ()
+    return (
+        f"the shifts of the spots contradict the prior {stated.name}{when}: chi-square "
+        f"{significant(found.chi_square)} of {found.degrees} coordinates where {found.limit:.1f} is exceeded with a "
+        f"chance of {rate}{_suspected(found, stated.bodies)}; σ does not hold for this measurement",
+    )
+
+
+def _suspected(found: Consistency, stated: Sequence[str]) -> str:
+    if not found.suspects:
+        return ""
+    first = found.suspects[0]
+    times = significant(first.times, 2)
+    if first.body in stated:
+        return (
+            f"; motions of {first.body} would explain them best, with {times} times the standard deviations of the "
+            "prior"
+        )
+    return (
+        f"; motions of {first.body}, which the prior does not contain, would explain them best, with standard "
+        f"deviations of some {times} µm, arcsec, ppm and nm"
+    )
 
 
 def _fits(what: str, fits: FitStates) -> Iterator[SelfCheck]:
@@ -309,6 +354,16 @@ SHARE, OFF = 3, 1
 """Decimals of shares, and of how far linear readings are off in sigmas: noise does not move them but by chance."""
 STATED = 6
 """Decimals of a reading's sigma to which files state the reading."""
+_STATED_KEYS = (
+    "chi_square",
+    "chi_square_sigma_noise",
+    "degrees_of_freedom",
+    "limit",
+    "false_alarm",
+    "chance",
+    "chance_sigma_noise",
+    "agrees",
+)
 _STATED_SIGMA = 8
 """Significant digits of a sigma, and of a chi-square."""
 _SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
@@ -344,10 +399,10 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _fit(fits: FitStates, spot: int) -> dict[str, float]:
-    """How good the fit of a spot is; nothing where no shape was fitted."""
-    if not math.isfinite(fits.whole[0, spot]):
-        return {}
+def _fit(fits: FitStates | None, spot: int) -> dict[str, float | None]:
+    """How good the fit of a spot is; None where no shape was fitted or no fit was judged."""
+    if fits is None or not math.isfinite(fits.whole[0, spot]):
+        return dict.fromkeys(_FIT)
     values = {
         "reduced_chi_square": fits.whole,
         "reduced_chi_square_sigma_noise": fits.whole_sigma,
@@ -356,6 +411,15 @@ def _fit(fits: FitStates, spot: int) -> dict[str, float]:
         "sigma_widened": fits.widening,
     }
     return {key: _to_digits(float(value[0, spot])) for key, value in values.items()}
+
+
+_FIT = (
+    "reduced_chi_square",
+    "reduced_chi_square_sigma_noise",
+    "core_chi_square",
+    "core_chi_square_sigma_noise",
+    "sigma_widened",
+)
 
 
 def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any
 
@@ -28,6 +29,7 @@ from twin.targets.target_images import DIRECTIONS
 from twin.targets.target_images import PLACES as TARGET_PLACES
 from twin.targets.target_measurement import EdgeReading, TargetRun
 
+_DASH = "\N{EM DASH}"
 NUMBER = 7
 """Width of most numbers there."""
 _WIDE = 90
@@ -178,7 +180,9 @@ def _table(run: RenderRun, wide: bool) -> Table:
             table.add_row(f"[bold]{escape(group)}[/]")
         values = [own.true, *(row.value for row in same), own.sigma, *([own.noise] if wide else [])]
         # adding 0.0 after rounding leaves no minus before a zero
-        cells = [f"{round(value, p.decimals) + 0.0:.{p.decimals}f}" for value in values]
-        tail = f"{own.error:+.{p.decimals}f}", f"{round(own.error / own.sigma, 1) + 0.0:+.1f}"
+        cells = [_DASH if math.isnan(value) else f"{round(value, p.decimals) + 0.0:.{p.decimals}f}" for value in values]
+        tail = [f"{own.error:+.{p.decimals}f}", f"{round(own.ratio, 1) + 0.0:+.1f}"]
+        if math.isnan(own.sigma):
+            tail = [_DASH, _DASH]
         table.add_row(escape(own.parameter.label), *cells, *tail)
     return table

@@ -15,7 +15,10 @@ import numpy as np
 
 from analysis.monitor import parameters
 from analysis.monitor.calibration import CameraCalibration
+from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.limits import unmoved
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
 from analysis.monitor.recovery import Estimates, Recovery
 from analysis.units import ARCSEC
@@ -71,8 +74,8 @@ class Reading:
 
     @property
     def ratio(self) -> float:
-        """Error in sigmas; without noise it is infinite unless it is rounding."""
-        if self.sigma > 0.0:
+        """Error in sigmas; without noise it is infinite unless it is rounding, of what is not read NaN."""
+        if self.sigma > 0.0 or math.isnan(self.sigma):
             return float(self.error / self.sigma)
         return 0.0 if abs(self.error) < SAME else math.copysign(math.inf, self.error)
 
@@ -224,8 +227,10 @@ class ReadingTable:
 
 
 def plain(number: Any) -> Any:
-    """A float or nested lists, as JSON holds them; a negative zero becomes a plain one."""
-    return number + 0.0 if isinstance(number, float) else (np.asarray(number) + 0.0).tolist()
+    """A float or nested lists, as JSON holds them; a negative zero becomes a plain one, NaN None."""
+    if isinstance(number, float):
+        return None if math.isnan(number) else number + 0.0
+    return [plain(one) for one in np.asarray(number).tolist()]
 
 
 def reading_table(
@@ -233,16 +238,19 @@ def reading_table(
     cameras: Mapping[str, CameraCalibration],
     truth: Truth | None = None,
     ground: GroundGeometry | None = None,
+    prior: Disturbances | None = None,
 ) -> ReadingTable:
-    """The table of what was estimated.
+    """The table of what was estimated. Of a change that no motion of the prior makes there is no posterior: NaN.
 
     Args:
         found: by all estimators.
         cameras: what is calibrated of each.
         truth: of the same states; None of a measurement.
         ground: how a pair of known altitude sees the ground, for the truth there.
+        prior: on which the estimators rest that need one; None for none.
     """
     rows: list[Reading] = []
+    fixed_changes = frozenset() if prior is None else unmoved(prior, cameras, ground)
 
     def add(
         group: str, which: Sequence[Parameter], true: np.ndarray | None, read: Mapping[str, Sequence[np.ndarray]]
@@ -252,7 +260,12 @@ def reading_table(
             for estimator, (values, sigmas, noises) in read.items():
                 value = values[:, k]
                 own = np.full_like(value, np.nan) if true is None else true[:, k]
-                rows.append(Reading(group, parameter, estimator, own, value, value - own, sigmas[:, k], noises[:, k]))
+                sigma, noise = sigmas[:, k], noises[:, k]
+                if (group, parameter.key) in fixed_changes and (
+                    estimator not in ESTIMATORS or ESTIMATORS[estimator].stated
+                ):
+                    value = sigma = noise = np.full_like(value, np.nan)
+                rows.append(Reading(group, parameter, estimator, own, value, value - own, sigma, noise))
 
     units = np.array([one.per_si for one in parameters.CAMERA_PARAMETERS])
     for name, estimators in found.parameters.items():

@@ -241,7 +241,7 @@ def run_series(
     try:
         for found in observe(experiment, states, how):
             piece, expected = slice(done, done + len(found.numbers)), found.light.photons
-            told = found.recovery, experiment.cameras, found.truth, experiment.ground
+            told = found.recovery, experiment.cameras, found.truth, experiment.ground, experiment.disturbances
             tables.append(reading_table(*told))
             recoveries.append(together.add(found.recovery))
             angle = found.truth.angle
@@ -484,7 +484,8 @@ class CourseSmoother:
         def part(which: slice) -> ReadingTable:
             every = {"filtered": found.filtered, "smoothed": found.smoothed}
             own = {name: (one.values[which], one.noise[which], one.total[which]) for name, one in every.items()}
-            return reading_table(estimates_of(own, self._cameras, self._ground), self._cameras)
+            estimated = estimates_of(own, self._cameras, self._ground)
+            return reading_table(estimated, self._cameras, None, self._ground, stated)
 
         count = len(times)
         each = found.consistency.degrees // count

@@ -360,7 +360,8 @@ def _of_readings(readings: Sequence[MonitorReading], times: Sequence[float] | No
     told: dict[str, list[str]] = {}
     for k, reading in enumerate(readings):
         for text in (*reading.doubts, *reading.notes):
-            if text not in reading.found_wrong:
+            # the worst contradiction of a series has a limit of its own
+            if text not in reading.found_wrong and text not in reading.contradiction:
                 # the same words about other numbers are one warning
                 told.setdefault(text.partition(":")[0], []).append(f"{state_name(times, k + 1)}: {text}")
     return tuple(same[0] if len(same) == 1 else f"{same[0]} (first of {len(same)} states)" for same in told.values())

@@ -19,7 +19,6 @@ from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.short_repr import shows
 from optics.numerics.backend import Backend
-from twin.main_job.assumptions import contradicted
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_files import irradiance
 from twin.main_job.render_results import JobRun, RenderRun
@@ -288,8 +287,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     recovery, cameras = reading.recovery, list(reading.cameras)
     channels = ["/".join(channel) for channel in reading.channels]
     disturbances = "" if reading.disturbances is None else reading.disturbances.name
-    contradiction = contradicted(reading.disturbances, reading.consistency)
-    told = (*warnings, *reading.doubts, *reading.notes, *contradiction, *reading.unseen)
+    told = (*warnings, *reading.doubts, *reading.notes, *reading.unseen)
     shares = {(group, key): v for group, own in reading.from_statement.items() for key, v in own.items()}
     from_statement = pd.Series(shares, dtype=float, name="from_statement")
     if shares:

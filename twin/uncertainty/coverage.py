@@ -180,7 +180,9 @@ def run_states(
         kept = np.flatnonzero(np.all(np.abs(place) <= half, axis=(0, 2)))
         # streams of its own for each state, whichever others were lost
         for found in observe(experiment, [states[k] for k in kept], how, first + kept):
-            table = reading_table(found.recovery, experiment.cameras, found.truth, experiment.ground)
+            table = reading_table(
+                found.recovery, experiment.cameras, found.truth, experiment.ground, experiment.disturbances
+            )
             for name in estimators:
                 own = [table.row(one.group, one.key, name) for one in quantities]
                 read.setdefault(name, []).append(np.stack([row.value for row in own], axis=1))

@@ -131,7 +131,11 @@ def recorded(plan: OperationSetup, experiment: MonitorExperiment, what: Simulati
         for found in observe(experiment, states, how, piece):
             suspects = crosstalk(experiment, found.recovery.shift_covariance[0]) if suspects is None else suspects
             readings += _readings(experiment, found, what.frames, suspects)
-            tables.append(reading_table(found.recovery, experiment.cameras, found.truth, experiment.ground))
+            tables.append(
+                reading_table(
+                    found.recovery, experiment.cameras, found.truth, experiment.ground, experiment.disturbances
+                )
+            )
             numbers += found.numbers.tolist()
         advance(RENDER, int(piece[-1]) + 1, len(life.times))
     truth = ReadingTable.joined(tables).true() if tables else {}
