@@ -243,8 +243,16 @@ REFUSED = {
     "unit": (_edit('LINE_PERIOD unit="ms"', 'LINE_PERIOD unit="furlong"'), r"LINE_PERIOD: another unit"),
     "microseconds": (_edit('LINE_PERIOD unit="ms"', 'LINE_PERIOD unit="us"'), r"LINE_PERIOD: out of bounds"),
     "seconds": (_edit('LINE_PERIOD unit="ms">0.', 'LINE_PERIOD unit="ms">1.'), r"line period, number of lines and tim"),
-    "profile": (_edit("PHR_SENSOR", "PHR_ORTHO"), r"METADATA_PROFILE: a product that is not read"),
-    "version": (_edit('version="2.15"', 'version="1.1"'), r"METADATA_FORMAT: not this format"),
+    "profile": (
+        _edit("PHR_SENSOR", "PHR_ORTHO"),
+        r"METADATA_PROFILE: a profile that is not read.*polynomials",
+    ),
+    "version": (
+        _edit('version="2.15"', 'version="1.1"'),
+        r"METADATA_FORMAT: not this format.*DIMAP 1.1.*SPOT 1 to 5",
+    ),
+    "version 4": (_edit('version="2.15"', 'version="4.0"'), r"METADATA_FORMAT: not this format"),
+    "ground segment": (lambda t: t.replace("Dimap_Document", "PHR_Dimap_Document"), r"not a DIMAP file.*DIMAP_PHR"),
     "no model": (lambda t: t.replace("Refined_Model", "Sensor_Model"), r"no rigorous model"),
     "no attitude": (lambda t: t.replace("Polynomial_Quaternions", "Quaternions"), r"the attitude is not given once"),
     "degree": (_edit("<DEGREE>3<", "<DEGREE>2<"), r"COEFFICIENTS: another number of numbers"),

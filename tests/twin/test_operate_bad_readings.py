@@ -59,7 +59,7 @@ def test_a_bad_reading_is_named_left_out_and_forgotten(known, tmp_path, monkeypa
             estimate = Operation(history, plan)
             told = estimate.follow()
             assert told.undecided == (k == BAD)
-            assert any("may be bad" in doubt for doubt in told.doubts) == (k == BAD)
+            assert any("may be bad" in doubt for doubt in told.warnings) == (k == BAD)
             assert off(estimate, life, k) < 5.0
     told = Operation(history, plan).follow()
     assert not told.jumps
@@ -134,7 +134,7 @@ def test_a_contradicted_start_stays_in_sigma(known, tmp_path) -> None:
     assert start > 2.0
     told = estimate.follow()
     assert told.widened >= start
-    assert any("contradict what is stated" in doubt for doubt in told.doubts)
+    assert any("contradict what is stated" in doubt for doubt in told.warnings)
     wide = estimate._widened_at(np.array([one.time for one in entries[12:20]]))
     assert np.all(wide >= start)
 
@@ -157,7 +157,7 @@ def test_sensors_that_disagree_together_accuse_the_prior(known, tmp_path, togeth
     states = {one.body: one.state for one in told.sensors}
     assert told.too_small == (("heat",) if together else ())
     assert states == {"base/forward": "ok" if together else "doubtful", "base/backward": "ok"}
-    assert any("disagree with heat" in doubt for doubt in told.doubts) == together
+    assert any("disagree with heat" in doubt for doubt in told.warnings) == together
     texts = [one.text for one in alarms_of(plan.operation, told)]
     assert any("sensors of several bodies together" in text for text in texts) == together
 

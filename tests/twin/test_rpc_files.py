@@ -1,11 +1,14 @@
 """Rational polynomials from files, and corrected by control points."""
 
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
 from scipy.stats import chi2
 
 from scenes.yaml.errors import InputError
@@ -99,6 +102,26 @@ def test_other_files_are_refused(tmp_path: Path, model: RationalPolynomial) -> N
         read_rpc(tmp_path / "b.tif")
 
 
+@pytest.mark.parametrize("stated", [(3.25, 0.5), (None, None)])
+def test_gdal_reads_the_errors_back(tmp_path: Path, model: RationalPolynomial, stated) -> None:
+    """From NAME_RPC.TXT beside an image and from the tag in it, by GDAL itself; -1 or nothing where none are stated."""
+    written = replace(model, bias_m=stated[0], random_m=stated[1])
+    (tmp_path / "beside_RPC.TXT").write_text(written.text())
+    (tmp_path / "beside.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts()))
+    (tmp_path / "inside.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts(place=written)))
+    for name in ("beside", "inside"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(tmp_path / f"{name}.tif") as image:
+                rpc_tags, rpcs = image.tags(ns="RPC"), image.rpcs
+        assert rpcs.line_off == pytest.approx(model.offset[0], rel=1e-12)
+        if stated[0] is None:
+            assert float(rpc_tags.get("ERR_BIAS", "-1")) == -1.0
+        else:
+            found = tuple(float(rpc_tags[key].split()[0]) for key in ("ERR_BIAS", "ERR_RAND"))
+            assert found == (rpcs.err_bias, rpcs.err_rand) == stated
+
+
 def test_slopes_are_those_of_the_rigorous_sensor(sensor, model: RationalPolynomial) -> None:
     _, itrs = ground_points(sensor, 12, 1)
     longitude, latitude, height = Earth().geodetic(itrs)
@@ -148,13 +171,15 @@ def test_a_known_bias_is_recovered_within_its_sigma(sensor, model: RationalPolyn
 
 
 def test_err_bias_and_err_rand(sensor, model: RationalPolynomial) -> None:
-    """Of a shift: its sigma times the pixels on the ground. What scatters beyond the sigmas is the other."""
+    """Of a shift: its sigma times the pixels on the ground, root mean square of the two horizontal axes (GDAL, RFC 22).
+    What scatters beyond the sigmas is the other.
+    """
     place, itrs = ground_points(sensor, 40, 4)
     none, spread = np.tile(1e-8 * np.eye(3), (40, 1, 1)), np.tile(0.04 * np.eye(2), (40, 1, 1))
     noise = np.random.default_rng(5).standard_normal((40, 2))
     middle = 0.5 * (np.array([SCENE.lines, SCENE.pixels]) - 1.0)
     ground = sensor.ground(middle[0] + [0.0, 1.0, 0.0], middle[1] + [0.0, 0.0, 1.0], 1000.0)
-    size = np.linalg.norm(ground[1:] - ground[0], axis=1)
+    size = np.linalg.norm(ground[1:] - ground[0], axis=1) / np.sqrt(2.0)
     quiet = controlled(model, polynomial_correction(model, itrs, none, place + 0.2 * noise, spread, "shift")).after
     assert quiet.bias_m == pytest.approx(0.2 * np.hypot(*size) / np.sqrt(40.0), rel=0.02)
     assert quiet.random_m == 0.0

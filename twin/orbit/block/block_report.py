@@ -6,10 +6,10 @@ import numpy as np
 
 from twin.orbit.block.block_numbers import ALARM, CHANGE, GROUP
 from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun
+from twin.orbit.measured.pass_measurements import duplicates, listed
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report, Section, answer
 
-_NAMED = 8
 _TOLD = 0.1
 """Sigmas beforehand: what is told less well is listed as left to the priors."""
 
@@ -153,10 +153,12 @@ def _points(run: BlockRun) -> Section:
 
 
 def _warnings(run: BlockRun) -> tuple[str, ...]:
-    found = list(_network(run))
+    found, points = list(_network(run)), run.adjustment.assembly.block.points
+    if twice := duplicates(points.ids, points.start):
+        found.append(twice)
     if run.rejected:
         names = [f"{point} in {scene}" for point, scene in run.rejected]
-        found.append(f"left out as gross errors: {_listed(names)}")
+        found.append(f"left out as gross errors: {listed(names)}")
     if run.datum is not None and run.datum_chance < DATUM_ALARM:
         d = run.datum
         found.append(
@@ -179,18 +181,13 @@ def _warnings(run: BlockRun) -> tuple[str, ...]:
 def _network(run: BlockRun) -> list[str]:
     found, network = [], run.network
     if network.empty:
-        found.append(f"scenes without image points: {_listed(network.empty)}")
+        found.append(f"scenes without image points: {listed(network.empty)}")
     if network.alone:
-        found.append(f"scenes that share no point with another: {_listed(network.alone)}")
+        found.append(f"scenes that share no point with another: {listed(network.alone)}")
     if len(network.parts) > 1:
         parts = "; ".join(
-            f"{_listed(part)}{'' if held else ' (no control)'}"
+            f"{listed(part)}{'' if held else ' (no control)'}"
             for part, held in zip(network.parts, network.controlled, strict=True)
         )
         found.append(f"the block falls into {len(network.parts)} parts that no point connects: {parts}")
     return found
-
-
-def _listed(names: list[str] | tuple[str, ...]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more

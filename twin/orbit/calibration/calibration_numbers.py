@@ -395,16 +395,8 @@ FIELD: Record[tuple[FieldPass, FieldResult]] = Record(
     Quantity("bias", _biases, record=BIAS_OF_FIELD),
     Quantity("interior", _interior, record=INTERIOR_OF_FIELD),
     Quantity("p_value", lambda one: one[1].adjustment.p_value, "chance of a chi-square as large"),
-    Quantity(
-        "orbit_third_difference_rms_m",
-        lambda one: one[1].orbit and one[1].orbit.rms,
-        "of the measured positions, x, y, z; null for fewer than five even readings",
-    ),
-    Quantity(
-        "attitude_third_difference_rms_rad",
-        lambda one: one[1].attitude and one[1].attitude.rms,
-        "roll, pitch, yaw; null likewise",
-    ),
+    Quantity("orbit_third_difference_rms_m", lambda f: f[1].orbit and f[1].orbit.rms, "of positions, x, y, z"),
+    Quantity("attitude_third_difference_rms_rad", lambda f: f[1].attitude and f[1].attitude.rms, "roll, pitch, yaw"),
 )
 MEASURED: Record[tuple[Campaign, FieldPass, Adjustment]] = Record(
     "A measured pass: its points, what screening left out, ground sample distance.",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from analysis.units import ARCSEC
 from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
@@ -14,6 +16,7 @@ from twin.orbit.calibration.influences import SURPRISE, drift_warnings, step_war
 from twin.orbit.calibration.observations import any_effect, light_effects
 from twin.orbit.calibration.schemes import meets, values_of
 from twin.orbit.calibration.screening import meeting_of
+from twin.orbit.measured.pass_measurements import duplicates, listed
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report, answer
 
@@ -197,6 +200,9 @@ def _measured_warnings(run: CalibrationRun) -> list[str]:
     found = []
     for name, gone in run.campaign.rejected.items():
         lost = gone.entered - gone.left
+        if gone.points or gone.check_points:
+            names = [*(f"{point} in {line}" for point, line in gone.points), *gone.check_points]
+            found.append(f"{name}: left out as gross errors: {listed(names)}")
         if lost > _MANY * gone.entered:
             found.append(
                 f"{name}: {lost} of {gone.entered} image points were left out, more than {100.0 * _MANY:.0f}%: are the "
@@ -204,12 +210,15 @@ def _measured_warnings(run: CalibrationRun) -> list[str]:
             )
         wide = {line: factor for line, factor in gone.factors.items() if factor > _WIDE}
         if wide:
-            listed = ", ".join(f"{line} {factor:.1f}" for line, factor in wide.items())
+            factors = ", ".join(f"{line} {factor:.1f}" for line, factor in wide.items())
             found.append(
-                f"{name}: image points scatter more than their sigmas predict, by factors of {listed}; their sigmas "
+                f"{name}: image points scatter more than their sigmas predict, by factors of {factors}; their sigmas "
                 "were multiplied by these factors"
             )
     for one in run.campaign.passes:
+        places = np.concatenate([one.control_ground, one.check_ground])
+        if twice := duplicates(np.concatenate([one.control_ids, one.check_ids]), places):
+            found.append(f"{one.name}: {twice}")
         meeting = meeting_of(run.campaign, one, run.fields[one.name].adjustment)
         if meeting.degrees_of_freedom >= _FEW and meeting.p_value < _LEAST_CHANCE:
             found.append(

@@ -13,7 +13,7 @@ import numpy as np
 from analysis.calibration.adjustment import Adjustment
 from analysis.calibration.plausibility import FarPointsError, NoiseError
 from analysis.calibration.stepwise import Stepwise, stepwise
-from analysis.orbit.calibration_parameters import OFFSET, RATE, CalibrationError
+from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.null_space import RankError
 from analysis.orbit.third_difference import ThirdDifference, third_difference
@@ -46,7 +46,7 @@ from twin.orbit.calibration.schemes import (
     schemes_tested,
     tested_before,
 )
-from twin.orbit.calibration.screening import screened
+from twin.orbit.calibration.screening import require_labelled, screened
 from twin.orbit.calibration.strip import Strips, strips_adjusted
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.run.procedure import Advance, BenchError, silent
@@ -194,13 +194,9 @@ def run_calibration(
     """
     try:
         return _run(setup, seed, advance)
-    except CalibrationError as error:
-        measured = isinstance(setup, MeasuredCalibrationSetup)
-        key, remedy = _what_to_do(error, measured)
+    except ValueError as error:
+        key, remedy = _what_to_do(error, isinstance(setup, MeasuredCalibrationSetup))
         raise BenchError(str(error), key, remedy) from error
-    except ValueError as error:  # of lines, orbit and attitude as they are given
-        key = ("data",) if isinstance(setup, MeasuredCalibrationSetup) else ("errors",)
-        raise BenchError(str(error), key, "orbit, attitude and lines of the same span, and more points") from error
 
 
 _NOISE_KEYS = {
@@ -211,7 +207,7 @@ _NOISE_KEYS = {
 """Source of noise -> its key; image and control points have keys of their own in a simulation, sigmas in tables."""
 
 
-def _what_to_do(error: CalibrationError, measured: bool) -> tuple[tuple[str, ...], str]:
+def _what_to_do(error: ValueError, measured: bool) -> tuple[tuple[str, ...], str]:
     """Key and remedy of an error of the adjustment, in a test on measurements or in a simulation."""
     if isinstance(error, RankError):
         return ("data" if measured else "points",), "a field with width and length, and more points"
@@ -222,9 +218,11 @@ def _what_to_do(error: CalibrationError, measured: bool) -> tuple[tuple[str, ...
         return _NOISE_KEYS.get(error.largest, own), f"smaller sigmas {table}; are their units right?"
     if isinstance(error, FarPointsError):
         if measured:
-            remedy = "the points of these images: check their datum, the epoch, the conventions (`twin.orbit check`)"
-            return ("data",), f"{remedy}, or state a larger launch.bias"
+            remedy = "check the points' names and datum, the epoch, the conventions (`twin.orbit check`)"
+            return ("data",), f"{remedy}, state a larger launch.bias, or leave points out (`screening: robust`)"
         return ("errors",), "a datum and biases within what launch.bias leaves to expect"
+    if measured:
+        return ("data",), "points whose names, images and coordinates belong together, and more of them"
     return ("errors",), "errors that an adjustment can take, and more points"
 
 
@@ -294,7 +292,10 @@ def source_of(setup: AnyCalibration, seed: np.random.SeedSequence, advance: Adva
     if isinstance(setup, MeasuredCalibrationSetup):
         measured = read_measurements(setup.data, setup.camera, advance)
         campaign = campaign_of(setup.test, setup.camera, measured, setup.test.ties == "apart")
-        return screened(campaign) if setup.test.screening == "robust" else campaign
+        if setup.test.screening == "robust":
+            return screened(campaign)
+        require_labelled(campaign)
+        return campaign
     campaign = fly_fields(setup, seed, advance)
     return screened(campaign) if campaign.images is not None else campaign
 

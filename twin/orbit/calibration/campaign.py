@@ -329,6 +329,11 @@ class Rejected:
     check_points: tuple[str, ...]
     factors: Mapping[str, float]
 
+    def after(self, first: Rejected) -> Rejected:
+        """Return what was left out in two rounds, the first of which had factors of 1."""
+        points, checks = first.points + self.points, first.check_points + self.check_points
+        return Rejected(first.entered, self.left, points, first.check_entered, self.check_left, checks, self.factors)
+
 
 def interior_names(lines: Sequence[str]) -> tuple[str, ...]:
     """Names of the unknowns f, x, y of these line cameras."""

@@ -258,7 +258,7 @@ def _screening(run: CalibrationRun) -> tuple[str, ...]:
         checks = ", ".join(gone.check_points[:_LISTED])
         text = f"{name}: {gone.left} of {gone.entered} image points are used"
         text += f"; left out {listed}{more}" if listed else "; none is left out"
-        text += f"; check points whose rays do not meet: {checks}." if checks else "."
+        text += f"; check points that lie elsewhere or whose rays do not meet: {checks}." if checks else "."
         found.append(text)
     return tuple(found)
 

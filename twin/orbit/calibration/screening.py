@@ -9,19 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, siegelslopes
 
 from analysis.block.reweighting import REJECT
 from analysis.calibration.adjustment import Adjustment
+from analysis.calibration.plausibility import FarPointsError
 from analysis.orbit.forward_intersection import intersect
+from analysis.orbit.three_line_model import Rays, misclosure
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, Rejected
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.field_images import FieldImages, Screening
 from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.orbit.measured.pass_measurements import ImagePoints
+from twin.orbit.measured.pass_measurements import ImagePoints, listed
 
 _ROUNDS = 3
 _SETTLED = 1.05
@@ -35,12 +38,90 @@ _FALSE_ALARM = 1e-4
 """False-alarm rate of check points, the same as for image points in the adjustment."""
 
 
+_FAR_SCATTERS, _FAR_SIGMAS = 10.0, 20.0
+"""Scatters of a line's image points about their common misclosure, and sigmas of an image point, beyond which a point
+is not that of its name. The nearest of 100 points in a strip of 60 km lies 1000 sigmas away in the median."""
+_LEAST_OF_LINE = 8
+"""Control points in a line by which the others are judged."""
+_SLOPE_POINTS = 500
+_Kept = dict[str, dict[str, np.ndarray]]
+
+
+def mislabelled(campaign: Campaign, one: FieldPass) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return which image points of a pass show another place than the ground point of their name.
+
+    The camera's and the platform's errors move the image points of a line alike, turned and scaled a little: a straight
+    line in the pixel through the medians of misclosures, which half of the points may miss.
+
+    Returns:
+        Line -> mask of its image points (n,), of control points alone; mask of the check points (m,) that some line
+        shows elsewhere.
+    """
+    wrong, wrong_check, still = {}, np.zeros(len(one.check_ground), bool), np.zeros(3)
+    for name, rays in one.control.rays.items():
+        control = one.is_control[rays.point]
+        wrong[name] = np.zeros(len(control), bool)
+        if control.sum() < _LEAST_OF_LINE:
+            continue
+        known, model = rays.taken(control), campaign.laboratory[name]
+        miss = misclosure(model, known, one.control.ground[known.point], still, still)
+        some = np.unique(np.linspace(0, len(miss) - 1, min(_SLOPE_POINTS, len(miss))).round().astype(int))
+        fits = [siegelslopes(miss[some, k], known.image[some, 1]) for k in (0, 1)]
+
+        def size(rays: Rays, miss: np.ndarray, fits: list[Any] = fits) -> np.ndarray:
+            return np.hypot(*(miss[:, k] - fits[k][1] - fits[k][0] * rays.image[:, 1] for k in (0, 1)))
+
+        scatter = np.sqrt(_variance(size(known, miss) ** 2))
+        limit = max(_FAR_SCATTERS * scatter, _FAR_SIGMAS * campaign.noise.image)
+        wrong[name][control] = size(known, miss) > limit
+        if name in one.check:
+            check = one.check[name]
+            away = misclosure(model, check, one.check_ground[check.point], still, still)
+            wrong_check[check.point[size(check, away) > limit]] = True
+    return wrong, wrong_check
+
+
+def require_labelled(campaign: Campaign) -> None:
+    """Refuse a campaign whose image points show other places than the ground points of their names.
+
+    Raises:
+        FarPointsError: some do; with their names.
+    """
+    for name, gone in _relabelled(campaign)[1].items():
+        if gone.points:
+            shown = listed([f"{point} in {line}" for point, line in gone.points])
+            raise FarPointsError(f"calibration: image points of {name} lie elsewhere than those around: {shown}")
+
+
+def _relabelled(campaign: Campaign) -> tuple[Campaign, dict[str, Rejected]]:
+    """The campaign without mislabelled points, and field -> these."""
+    passes, gross = [], {}
+    for one in campaign.passes:
+        wrong, wrong_check = mislabelled(campaign, one)
+        kept = {name: ~mask for name, mask in wrong.items()}
+        gross[one.name] = _rejected(one, kept, ~wrong_check, {})
+        passes.append(_reduced(one, kept, np.ones(len(one.control_ground), bool), ~wrong_check))
+    if not any(one.points or one.check_points for one in gross.values()):
+        return campaign, gross
+    return _with_light(campaign, tuple(passes)), gross
+
+
+def _with_light(campaign: Campaign, passes: tuple[FieldPass, ...]) -> Campaign:
+    """The campaign with other image points, of which effects on the light are taken out as before."""
+    removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
+    return replace(campaign, passes=passes).without_effects(removed)
+
+
 def screened(campaign: Campaign) -> Campaign:
-    """The campaign without what the adjustment rejects, with sigmas of the image points that fit the residuals.
+    """The campaign without what is mislabelled or the adjustment rejects, with sigmas of the image points that fit the
+    residuals.
 
     Raises:
         CalibrationError: it cannot be adjusted.
     """
+    gross: dict[str, Rejected] = {}
+    if campaign.images is None:  # names of points that were matched here are right
+        campaign, gross = _relabelled(campaign)
     found, kept = _robust(campaign)
     total: dict[tuple[str, str], float] = {(p.name, line): 1.0 for p in campaign.passes for line in p.control_images}
     for _ in range(_ROUNDS):
@@ -57,16 +138,13 @@ def screened(campaign: Campaign) -> Campaign:
         passes.append(less)
         own = FrozenMap({line: total[one.name, line] for line in one.control_images})
         rejected[one.name] = _rejected(one, kept[one.name], keep_check, own)
-        if campaign.images is not None:
+        if campaign.images is None:
+            rejected[one.name] = rejected[one.name].after(gross[one.name])
+        else:
             shown = campaign.images[k]
             judged.append(replace(shown, screening=_counted(one, shown, kept[one.name], keep_check)))
-    removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
     images = None if campaign.images is None else tuple(judged)
-    rest = replace(campaign, passes=tuple(passes), images=images, rejected=FrozenMap(rejected))
-    return rest.without_effects(removed)
-
-
-_Kept = dict[str, dict[str, np.ndarray]]
+    return _with_light(replace(campaign, images=images, rejected=FrozenMap(rejected)), tuple(passes))
 
 
 def _robust(campaign: Campaign) -> tuple[Adjustment, _Kept]:
@@ -133,8 +211,7 @@ def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> C
         )
         for p in campaign.passes
     )
-    removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
-    return replace(campaign, passes=passes).without_effects(removed)
+    return _with_light(campaign, passes)
 
 
 def _without(
@@ -146,16 +223,21 @@ def _without(
     for name, row in one.control_images.items():
         np.add.at(seen, row.point[kept[name]], 1)
     stays = np.where(one.is_control, seen > 0, seen > 1)
-    images = {
-        name: _renumbered(row.taken(kept[name] & stays[row.point]), stays) for name, row in one.control_images.items()
-    }
     keep = np.ones(len(one.check_ground), bool)
     if one.check:
         meeting = intersect(one.check, found.cameras_of(one.name), campaign.noise, bias=found.bias(one.name))
         # three rays are six conditions of three coordinates
         keep = meeting.chi_square <= chi2.isf(_FALSE_ALARM, 2 * meeting.rays - 3)
+    return _reduced(one, kept, stays, keep), keep
+
+
+def _reduced(one: FieldPass, kept: dict[str, np.ndarray], stays: np.ndarray, keep: np.ndarray) -> FieldPass:
+    """A pass with some image points (line -> mask), some ground points (n,) and some check points (m,) alone."""
+    images = {
+        name: _renumbered(row.taken(kept[name] & stays[row.point]), stays) for name, row in one.control_images.items()
+    }
     check = {name: _renumbered(row.taken(keep[row.point]), keep) for name, row in one.check_images.items()}
-    less = replace(
+    return replace(
         one,
         control_images=FrozenMap(images),
         control_ground=one.control_ground[stays],
@@ -166,7 +248,6 @@ def _without(
         check_ground=one.check_ground[keep],
         check_ids=one.check_ids[keep],
     )
-    return less, keep
 
 
 def _renumbered(row: ImagePoints, stays: np.ndarray) -> ImagePoints:

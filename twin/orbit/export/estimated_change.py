@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.orbit.forward_intersection import CalibratedLine
+from twin.orbit.export.rational_polynomial import axis_sigma
 from twin.orbit.flight.corrected_lines import corrected_line
 from twin.orbit.flight.earth import east_north_up
 from twin.orbit.flight.line_camera import LineCamera
@@ -52,10 +53,9 @@ class GroundSigma:
 
     Attributes:
         height_m: of the points above the ellipsoid.
-        bias_m: that other images near in time have as well: root of the sum of the variances to the east and to the
-            north. A circle of this radius holds 63 to 68 % of normal errors, the more the longer their ellipse is.
+        bias_m: that other images near in time have as well, of each horizontal axis: ERR_BIAS.
         random_m: likewise of what is another in every image.
-        bias_east_m, bias_north_m: the two parts of ``bias_m``, for programs that take an error of each axis.
+        bias_east_m, bias_north_m: the two axes, whose mean square is that of ``bias_m``.
         random_east_m, random_north_m: likewise of ``random_m``.
     """
 
@@ -114,9 +114,6 @@ def ground_sigma(sensor: Sensor, calibrated: CalibratedLine, change: EstimatedCh
         ValueError: a look misses the Earth.
     """
     rows = ground_rows(sensor, calibrated, change.values, height)
-    bias, random = (
-        np.sqrt(np.mean(np.einsum("nai,ij,naj->na", rows, covariance, rows), axis=0))
-        for covariance in (change.constant, change.random)
-    )
-    total = (float(np.hypot(*bias)), float(np.hypot(*random)))
-    return GroundSigma(height, *total, *(float(v) for v in (*bias, *random)))
+    spreads = [rows @ covariance @ np.swapaxes(rows, 1, 2) for covariance in (change.constant, change.random)]
+    axes = [float(np.sqrt(np.mean(spread[:, k, k]))) for spread in spreads for k in (0, 1)]
+    return GroundSigma(height, *map(axis_sigma, spreads), *axes)

@@ -51,12 +51,12 @@ RPC_ERROR: Record[RationalPolynomial] = Record(
 GROUND: Record[GroundSigma] = Record(
     "What the error of the camera's estimated change is on the ground, root mean square over the image.",
     Quantity("height_m", lambda one: one.height_m, "of the ground above the ellipsoid"),
-    Quantity("err_bias_m", lambda one: one.bias_m, "ERR_BIAS: horizontal, in common with other images"),
-    Quantity("err_rand_m", lambda one: one.random_m, "ERR_RAND: horizontal, another in every image"),
-    Quantity("bias_east_m", lambda one: one.bias_east_m, "part of ERR_BIAS to the east"),
-    Quantity("bias_north_m", lambda one: one.bias_north_m, "part of ERR_BIAS to the north"),
-    Quantity("random_east_m", lambda one: one.random_east_m, "part of ERR_RAND to the east"),
-    Quantity("random_north_m", lambda one: one.random_north_m, "part of ERR_RAND to the north"),
+    Quantity("err_bias_m", lambda one: one.bias_m, "ERR_BIAS: of each horizontal axis, in common with other images"),
+    Quantity("err_rand_m", lambda one: one.random_m, "ERR_RAND: of each horizontal axis, another in every image"),
+    Quantity("bias_east_m", lambda one: one.bias_east_m, "the same to the east"),
+    Quantity("bias_north_m", lambda one: one.bias_north_m, "the same to the north"),
+    Quantity("random_east_m", lambda one: one.random_east_m, "the random part to the east"),
+    Quantity("random_north_m", lambda one: one.random_north_m, "the random part to the north"),
 )
 LINE: Record[ExportedLine] = Record(
     "One line's image and its models; files are paths in the run folder, None for those that were not written.",
@@ -217,6 +217,10 @@ def _sections(run: Export) -> tuple[Section, ...]:
 
 def _warnings(run: Export) -> tuple[str, ...]:
     found = []
+    if isinstance(run.source, SceneSource) and run.source.scene.read.inertial_velocity:
+        found.append(
+            "the file's velocities are against the stars, in Earth-fixed axes: omega x P has been taken off them"
+        )
     if isinstance(run.source, SceneSource) and run.source.scene.read.light_speed:
         found.append(
             "the file's LIGHT_SPEED_SETTING is true: light time and aberration are not in the model, up to 13 m along "

@@ -163,12 +163,16 @@ def read_exportable(path: Path, seed: int | None = None, band: str | None = None
     """
     if path.is_file() and path.suffix.lower() in _SCENES:
         return SceneSource(read_scene(path, band), dump_yaml({"source": str(path)} | ({"band": band} if band else {})))
+    if path.is_file() and path.suffix.lower() in _NITF:
+        allowed = "the scene's DIM_NAME.XML, or its rational polynomials as NAME_RPC.TXT, RPC_NAME.XML or GeoTIFF"
+        raise InputError(Issue("a NITF file, which is not read", str(path), allowed=allowed))
     if band is not None:
         raise InputError(Issue("only the scene of a DIMAP file has bands", str(path), None, ("band",), band))
     return read_source(path, seed)
 
 
 _SCENES = (".xml", ".dim")
+_NITF = (".ntf", ".nitf", ".nsf")
 
 
 def read_source(path: Path, seed: int | None = None) -> ExportSource:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.orbit.ground_errors import circular_error, linear_error
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
+from twin.orbit.export.rational_polynomial import axis_sigma
 from twin.orbit.flight.earth import east_north_up
 from twin.orbit.flight.sensor import Platform, Sensor
 
@@ -119,13 +120,10 @@ class AccuracyMap:
         return np.isfinite(self.longitude)
 
     def horizontal(self) -> tuple[float, float]:
-        """Roots of the sums of the variances to the east and to the north, root mean square over the scene, metres:
-        of what points have in common, and of their measured places; without heights from elsewhere.
+        """Root mean square errors of a horizontal axis over the scene, metres: of what points have in common, and of
+        their measured places; without heights from elsewhere.
         """
-        return tuple(  # type: ignore[return-value]
-            float(np.sqrt(np.mean(np.trace(part[self.seen, :2, :2], axis1=1, axis2=2))))
-            for part in (self.constant, self.random)
-        )
+        return axis_sigma(self.constant[self.seen, :2, :2]), axis_sigma(self.random[self.seen, :2, :2])
 
     def _where_seen(self, function) -> Array:  # type: ignore[no-untyped-def]
         found = np.full(len(self.line), np.nan)

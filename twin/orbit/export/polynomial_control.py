@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.orbit.image_correction import ImageCorrection, Kind, image_correction
-from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.export.rational_polynomial import RationalPolynomial, axis_sigma
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
 
 Array = NDArray[np.float64]
@@ -130,8 +130,8 @@ def _angles(count: int, at_ends: bool) -> Array:
 
 
 def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) -> tuple[float, float]:
-    """Roots of the sums of the variances to the east and to the north, root mean square over the image, metres: of the
-    correction, and of what scatters at the control points beyond their own covariances.
+    """Root mean square errors of a horizontal axis over the image, metres: of the correction, and of what scatters at
+    the control points beyond their own covariances.
     """
     steps = np.linspace(-1.0, 1.0, _GROUND_GRID)
     line, sample = (
@@ -151,8 +151,7 @@ def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) 
     known = correction.covariance_at(line[seen], sample[seen])
     found = []
     for variance in (known, np.broadcast_to(np.diag(beyond), known.shape)):
-        plane = to_ground @ variance @ np.swapaxes(to_ground, 1, 2)
-        found.append(float(np.sqrt(np.mean(np.trace(plane, axis1=1, axis2=2)))))
+        found.append(axis_sigma(to_ground @ variance @ np.swapaxes(to_ground, 1, 2)))
     return found[0], found[1]
 
 

@@ -64,13 +64,14 @@ class Controlled:
 @dataclass(frozen=True)
 class ProductPolynomial:
     """Rational polynomials that came with a product, against its rigorous model, over the image and the heights that
-    were modelled; polynomials minus rigorous.
+    the polynomials cover; polynomials minus rigorous.
 
     Attributes:
         file: where they are from.
         mean_line, mean_sample: mean difference, pixels.
         rms_line, rms_sample: root mean square about the mean, pixels.
         most: largest of all differences, pixels.
+        heights: lowest and highest ground that the polynomials cover, metres.
     """
 
     file: str
@@ -79,6 +80,7 @@ class ProductPolynomial:
     rms_line: float
     rms_sample: float
     most: float
+    heights: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,8 +60,8 @@ def _with_errors(line: ExportedLine, found: AccuracyMap, is_controlled: bool) ->
     notes = (
         f"on ground {found.height:.0f} m high points have CE90 up to {found.ce90[worst]:.4g} m, of camera, orbit "
         f"and attitude; covariance there, east east, east north, north north: {a:.6g} {b:.6g} {c:.6g} m^2",
-        f"of it in common to all points {bias:.4g} m, of measured places {random:.4g} m: roots of the sums of the "
-        "variances to the east and to the north, root mean square over the image",
+        f"of it in common to all points {bias:.4g} m, of measured places {random:.4g} m: root mean square of a "
+        "horizontal axis over the image",
     )
     isd = {**line.scanner.isd, "notes": [*line.scanner.isd["notes"], *notes]}
     return replace(line, polynomial=polynomial, scanner=replace(line.scanner, isd=FrozenMap(isd)))
@@ -120,17 +120,17 @@ def _products(run: Export, scene: DimapScene) -> Mapping[str, ProductPolynomial]
         path = folder / href
         # names in a file lead nowhere else
         if Path(href).name == href and path.is_file():
-            return FrozenMap({name: _compared(line.window.sensor, read_rpc(path), run.heights, str(path))})
+            return FrozenMap({name: _compared(line.window.sensor, read_rpc(path), str(path))})
     return FrozenMap()
 
 
-def _compared(
-    sensor: Sensor, model: RationalPolynomial, heights: tuple[float, float, float], file: str
-) -> ProductPolynomial:
+def _compared(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPolynomial:
+    """Return how far polynomials are from the sensor over the heights that they cover: beyond them they say nothing."""
+    low, high = (model.offset[4] + sign * model.scale[4] for sign in (-1.0, 1.0))
     axes = (
         np.linspace(0.0, sensor.lines - 1.0, _COMPARED[0]),
         np.linspace(0.0, sensor.camera.pixels - 1.0, _COMPARED[1]),
-        np.linspace(heights[0], heights[2], _COMPARED[2]),
+        np.linspace(low, high, _COMPARED[2]),
     )
     line, pixel, height = (v.ravel() for v in np.meshgrid(*axes, indexing="ij"))
     longitude, latitude, _ = sensor.earth.geodetic(sensor.ground(line, pixel, height))
@@ -138,4 +138,5 @@ def _compared(
     off = there - np.stack([line, pixel], axis=-1)
     mean, rms = np.mean(off, axis=0), np.std(off, axis=0)
     found = [float(value) for value in (*mean, *rms)]
-    return ProductPolynomial(file, found[0], found[1], found[2], found[3], float(np.max(np.abs(off))))
+    heights = float(low), float(high)
+    return ProductPolynomial(file, found[0], found[1], found[2], found[3], float(np.max(np.abs(off))), heights)

@@ -39,7 +39,11 @@ ACCURACY: Record[AccuracyMap] = Record(
     Quantity("ce90_largest_m", _over(lambda f: f.ce90, np.max), "the largest"),
     Quantity("le90_median_m", _over(lambda f: f.le90, np.median), "interval of 90 % of the vertical errors, median"),
     Quantity("le90_largest_m", _over(lambda f: f.le90, np.max), "the largest"),
-    Quantity("common_m", lambda f: f.horizontal()[0], "horizontal error that points have in common, root mean square"),
+    Quantity(
+        "common_m",
+        lambda f: f.horizontal()[0],
+        "error that points have in common, of each horizontal axis",
+    ),
     Quantity(
         "random_m",
         lambda f: f.horizontal()[1],
@@ -67,7 +71,11 @@ CONTROL: Record[Controlled] = Record(
         lambda one: max(one.polynomial.after.error_px),
         "largest difference of the written polynomials from the corrected ones",
     ),
-    Quantity("err_bias_m", lambda one: one.polynomial.after.bias_m, "ERR_BIAS: sigma of the correction on the ground"),
+    Quantity(
+        "err_bias_m",
+        lambda one: one.polynomial.after.bias_m,
+        "ERR_BIAS: sigma of the correction along a horizontal axis",
+    ),
     Quantity("err_rand_m", lambda one: one.polynomial.after.random_m, "ERR_RAND: what scatters beyond the covariances"),
 )
 PRODUCT: Record[ProductPolynomial] = Record(
@@ -78,6 +86,7 @@ PRODUCT: Record[ProductPolynomial] = Record(
     Quantity("rms_line_px", lambda one: one.rms_line, "root mean square about the mean, along the track"),
     Quantity("rms_sample_px", lambda one: one.rms_sample, "along the line"),
     Quantity("largest_px", lambda one: one.most, "largest of all"),
+    Quantity("heights_m", lambda one: one.heights, "lowest and highest ground of the polynomials, which is compared"),
 )
 
 
@@ -111,7 +120,7 @@ def quality_answers(quality: Quality | None) -> tuple[str, ...]:
         how = "a shift" if one.polynomial.correction.kind == "shift" else "an affine function"
         found.append(
             f"{used} of {len(one.names)} control points correct the polynomials of {name} by {how}, to {bias} m on the "
-            "ground"
+            "ground along each axis"
         )
     if quality.maps:
         name, worst = max(quality.maps.items(), key=lambda item: float(np.nanmax(item[1].ce90)))

@@ -47,9 +47,10 @@ class RationalPolynomial:
         error_px: largest difference from the rigorous sensor at places that were not fitted, lines and samples; NaN of
             polynomials that were read.
         rms_px: root mean square of them.
-        bias_m: ERR_BIAS, horizontal error on the ground that does not go with time, 68 %, so that images have it in
-            common; None where nobody states it.
-        random_m: ERR_RAND, likewise of what goes with time and is another in every image.
+        bias_m: ERR_BIAS, metres: root mean square error on the ground of each horizontal axis that does not go with
+            time, so that points and images have it in common (GDAL's RFC 22; 68 % in STDI-0002); None where nobody
+            states it.
+        random_m: ERR_RAND, likewise of what goes with time and is another in every image or point.
     """
 
     offset: Array
@@ -159,6 +160,15 @@ class RationalPolynomial:
         errors = (_UNSTATED if error is None else error for error in (self.bias_m, self.random_m))
         values = (*errors, *self.offset.tolist(), *self.scale.tolist(), *np.concatenate(parts).tolist())
         return [(_COEFFICIENTS, "d", len(values), values, True)]
+
+
+def axis_sigma(covariance: Array) -> float:
+    """Return the root mean square error of a horizontal axis, metres, as ERR_BIAS and ERR_RAND state it.
+
+    Args:
+        covariance: (N, 2, 2) to the east and to the north over an image, m^2.
+    """
+    return float(np.sqrt(0.5 * np.mean(np.trace(covariance, axis1=-2, axis2=-1))))
 
 
 _STEP = 1e-6

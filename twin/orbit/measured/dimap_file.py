@@ -33,15 +33,9 @@ from optics.numerics.spans import in_span
 from scenes.yaml.errors import InputError, Issue, names_text, shown
 from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.platform_table import joined_quaternions
+from twin.orbit.measured import platform_readings
 from twin.orbit.measured.clock import Readings
-from twin.orbit.measured.platform_readings import (
-    SPEED_TOLERANCE,
-    AttitudeReadings,
-    OrbitReadings,
-    require_orbit,
-    require_unit,
-    velocity_misfit,
-)
+from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
 from twin.orbit.measured.text_file import readings, require_rising
 from twin.orbit.measured.xml_file import Element, read_xml
 
@@ -292,15 +286,18 @@ _SWITCHES: Mapping[str, bool] = FrozenMap({"true": True, "1": True, "false": Fal
 def _identified(root: Element) -> tuple[str, str]:
     """Version and profile."""
     if root.tag != "Dimap_Document":
-        root.wrong("not a DIMAP file", f"<{root.tag}>", "<Dimap_Document>")
+        allowed = "<Dimap_Document>; PHR_Dimap_Document is DIMAP_PHR, of the ground segment of Pléiades"
+        root.wrong("not a DIMAP file", f"<{root.tag}>", allowed)
     identity = root.one("Metadata_Identification")
     form = identity.one("METADATA_FORMAT")
     version = form.attributes.get("version", "")
     if form.text != "DIMAP" or version.partition(".")[0] not in _VERSIONS:
-        form.wrong("not this format", shown(f"{form.text} {version}"), "DIMAP of version 2 or 3")
+        allowed = "DIMAP of version 2 or 3; version 1, of SPOT 1 to 5, has another model"
+        form.wrong("not this format", shown(f"{form.text} {version}"), allowed)
     profile = identity.one("METADATA_PROFILE")
     if profile.text not in PROFILES:
-        profile.wrong("a product that is not read", shown(profile.text), names_text(PROFILES))
+        allowed = f"{names_text(PROFILES)}; of other profiles only the rational polynomials are read"
+        profile.wrong("a profile that is not read", shown(profile.text), allowed)
     return version, profile.text
 
 
@@ -344,10 +341,12 @@ def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
     position = np.stack([one.one("LOCATION_XYZ").floats(3) for one in points])
     velocity = np.stack([one.one("VELOCITY_XYZ").floats(3) for one in points])
     require_orbit(file, position, lines)
-    share, inertial = velocity_misfit((clock.day - clock.day[0]) * _DAY + clock.second, position, velocity)
+    share, inertial = platform_readings.velocity_misfit(
+        (clock.day - clock.day[0]) * _DAY + clock.second, position, velocity
+    )
     if inertial:
         velocity = velocity - carried_with_earth(position)
-    elif np.median(share) > SPEED_TOLERANCE:
+    elif np.median(share) > platform_readings.SPEED_TOLERANCE:
         found = f"they differ by {100.0 * np.median(share):.3g} % in the median"
         points[0].one("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")
     return OrbitReadings(file, clock, position, velocity, "ITRS", "UTC"), inertial

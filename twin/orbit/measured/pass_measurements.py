@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable
@@ -130,6 +131,34 @@ class ImagePoints:
     def numbered(self, first: int) -> ImagePoints:
         """These image points with their ground points counted from ``first``."""
         return replace(self, point=self.point - first)
+
+
+_APART = 0.01
+"""Metres: two targets that images from orbit show apart lie farther from each other."""
+
+
+def duplicates(ids: NDArray[np.object_], places: Array) -> str:
+    """Return a warning that names points which are one point under two names; empty where there are none.
+
+    Args:
+        ids: (n,) names.
+        places: (n, 3), ITRS, metres; NaN where unknown.
+    """
+    known = np.flatnonzero(np.all(np.isfinite(places), axis=1))
+    pairs = sorted(cKDTree(places[known]).query_pairs(_APART))
+    if not pairs:
+        return ""
+    names = listed([f"{ids[known[a]]} = {ids[known[b]]}" for a, b in pairs])
+    return f"points at one place under two names: {names}; counted twice, they make sigmas too small"
+
+
+_NAMED = 8
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return the first of some names, and how many more there are."""
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,17 +21,11 @@ from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.trajectory import Attitude
-from twin.orbit.measured import earth_orientation, orbit_files
+from twin.orbit.measured import earth_orientation, orbit_files, platform_readings
 from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
 from twin.orbit.measured.dimap_file import is_dimap, read_dimap
 from twin.orbit.measured.earth_orientation import EarthOrientation, TableRotation
-from twin.orbit.measured.platform_readings import (
-    AttitudeReadings,
-    OrbitReadings,
-    require_orbit,
-    require_own_velocity,
-    require_unit,
-)
+from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
 from twin.orbit.measured.text_file import first_lines, require_rising
 
 if TYPE_CHECKING:
@@ -127,7 +121,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         Attitude(spec_of.nadir != "geocentric", spec_of.steering == "yaw"),
     )
     if found.orbit_frame == "ITRS":
-        require_own_velocity(orbit)
+        platform_readings.require_own_velocity(orbit)
     return PlatformReadings(orbit, attitude, _earth(spec, folder, orbit, found)), found
 
 

@@ -1,0 +1,147 @@
+"""Points whose names were exchanged, and points that have two names, in a calibration on files."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.calibration.plausibility import FarPointsError
+from scenes.yaml.yaml_file import read_yaml
+from tests.tiers import quick
+from tests.twin.orbit_files import FIELDS, edit, export, flown, read_back, set_keys, small
+from twin.orbit.calibration.calibration_run import run_calibration
+from twin.orbit.calibration.campaign_adjustment import simultaneous
+from twin.orbit.calibration.screening import mislabelled
+from twin.orbit.measured.pass_measurements import duplicates
+from twin.run.procedure import BenchError
+
+COUNT = 24
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Exported measurements of two fields of 24 control and 20 check points, screened where they are read."""
+    setup = small()
+    return export(tmp_path_factory.mktemp("data"), setup, flown(setup)).parent
+
+
+def swapped(folder: Path, place: Path, share: float, table: str, seed: int = 1) -> set[tuple[str, str]]:
+    """Copy the files with names of control points exchanged in pairs; field and name of all of them."""
+    shutil.copytree(folder, place)
+    random, found = np.random.default_rng(seed), set()
+    for name in FIELDS:
+        control = {row[0] for row in rows_of(folder / name / "ground.csv") if row[1] == "control"}
+
+        def change(heads: list[str], rows: list[list[str]], control=control, name=name):
+            which = heads.index("camera") if table == "image_points" else heads.index("role")
+            groups: dict[str, list[int]] = {}
+            for k, row in enumerate(rows):
+                if row[0] in control:
+                    groups.setdefault(row[which], []).append(k)
+            for group in groups.values():
+                pairs = random.permutation(group)[: 2 * max(1, round(0.5 * share * len(group)))].reshape(-1, 2)
+                for a, b in pairs:
+                    rows[a][0], rows[b][0] = rows[b][0], rows[a][0]
+                    found.update({(name, rows[a][0]), (name, rows[b][0])})
+            return heads, rows
+
+        edit(place / name / f"{table}.csv", change)
+    return found
+
+
+def rows_of(file: Path) -> list[list[str]]:
+    return [[cell.strip() for cell in line.split(",")] for line in file.read_text().splitlines()[1:]]
+
+
+CASES = [(table, share) for share in (0.2, 0.04, 0.4) for table in ("image_points", "ground")]
+
+
+@pytest.mark.parametrize(("table", "share"), quick(2, CASES))
+def test_exchanged_names_are_found_and_no_others(folder: Path, tmp_path: Path, table: str, share: float) -> None:
+    """In the images each line has pairs of its own, so that up to three times the share of the points is in one."""
+    wrong = swapped(folder, tmp_path / "data", share, table)
+    file = tmp_path / "data" / "calibrate.yaml"
+    set_keys(file, screening="none")
+    with pytest.raises(FarPointsError, match=r"image points of (Beijing|Anhui) lie elsewhere") as refused:
+        read_back(file)
+    named = str(refused.value)
+    assert any(f"{point} in" in named for _, point in wrong)
+    from scenes.specs.measured.orbit_data_setup import resolve_any_calibration
+    from twin.orbit.calibration.campaign import campaign_of
+    from twin.orbit.measured.measurement_tables import read_measurements
+
+    setup = resolve_any_calibration(file)
+    campaign = campaign_of(setup.test, setup.camera, read_measurements(setup.data, setup.camera), True)
+    found = set()
+    for one in campaign.passes:
+        masks, check = mislabelled(campaign, one)
+        found |= {(one.name, str(one.control_ids[k])) for n, r in one.control_images.items() for k in r.point[masks[n]]}
+        assert not check.any()
+    # neighbours within 20 sigmas of an image point, 6 pixels, would be left to robust weights
+    assert found == wrong
+
+
+def test_check_points_with_exchanged_coordinates_are_found(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "data")
+    file = tmp_path / "data" / "calibrate.yaml"
+    set_keys(file, screening="none")
+
+    def change(heads, rows):
+        checks = [k for k, row in enumerate(rows) if row[1] == "check"]
+        rows[checks[0]][0], rows[checks[5]][0] = rows[checks[5]][0], rows[checks[0]][0]
+        return heads, rows
+
+    edit(tmp_path / "data" / FIELDS[0] / "ground.csv", change)
+    _, campaign = read_back(file)
+    masks, check = mislabelled(campaign, campaign.passes[0])
+    assert check.sum() == 2
+    assert not any(mask.any() for mask in masks.values())
+
+
+def test_a_refusal_of_a_measured_test_points_to_its_data(folder: Path, tmp_path: Path) -> None:
+    swapped(folder, tmp_path / "data", 0.2, "image_points")
+    file = tmp_path / "data" / "calibrate.yaml"
+    set_keys(file, screening="none")
+    from scenes.specs.measured.orbit_data_setup import resolve_any_calibration
+
+    with pytest.raises(BenchError, match="lie elsewhere than those around") as refused:
+        run_calibration(resolve_any_calibration(file), None, 0)
+    assert refused.value.key == ("data",)
+    assert "screening: robust" in refused.value.remedy
+
+
+def test_one_point_under_two_names_is_said(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "data")
+    for table in ("ground", "image_points"):
+        edit(
+            tmp_path / "data" / FIELDS[0] / f"{table}.csv",
+            lambda heads, rows: (heads, [*rows, *(["copy", *row[1:]] for row in rows if row[0] == rows[0][0])]),
+        )
+    file = tmp_path / "data" / "calibrate.yaml"
+    set_keys(file, screening="none")
+    _, campaign = read_back(file)
+    one, other = campaign.passes
+    assert f"{one.control_ids[0]} = copy" in duplicates(one.control_ids, one.control_ground)
+    assert duplicates(other.control_ids, other.control_ground) == ""
+    assert duplicates(np.array(["a", "b"], object), np.full((2, 3), np.nan)) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("table", "share"), CASES[:4])
+def test_a_screened_calibration_is_that_without_the_exchanged(
+    folder: Path, tmp_path: Path, table: str, share: float
+) -> None:
+    """The rest are the same measurements: estimates move by what a fifth of the points less leaves open, and every
+    exchanged point is named."""
+    assert read_yaml(folder / "calibrate.yaml").data["screening"] == "none"
+    wrong = swapped(folder, tmp_path / "data", share, table)
+    file = tmp_path / "data" / "calibrate.yaml"
+    set_keys(file, screening="robust")
+    _, campaign = read_back(file)
+    _, whole = read_back(folder / "calibrate.yaml")
+    assert {(f, p) for f, gone in campaign.rejected.items() for p, _ in gone.points} >= wrong
+    found, there = simultaneous(campaign), simultaneous(whole)
+    free = np.diag(there.covariance) > 0.0
+    moved = (found.values - there.values)[free] / np.sqrt(np.diag(found.covariance)[free])
+    assert np.abs(moved).max() < 3.0
