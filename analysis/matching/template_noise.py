@@ -47,7 +47,9 @@ _LEAST = 0.4
 _OPEN = 1e-11
 # Of the points' shares.
 _QUANTILE = 0.9
-# Share where template and image have the same noise, of which interpolation passes two thirds; it is the least.
+# Share of the curvature from which the noise's energy counts as what holds a place.
+_HELD = 0.3
+# Least share for that: template and image have the same noise, of which interpolation passes two thirds.
 _EQUAL = 0.6
 # Half width of the impulse's answer and phases of a pixel at which it is taken.
 _REACH, _PHASES = 30, 64
@@ -74,8 +76,8 @@ class TemplateNoise:
         shown = self.share[good & np.isfinite(self.share)]
         if not len(shown):
             return np.zeros_like(self.inverse[:, :2, :2])
-        share = max(float(np.quantile(shown, _QUANTILE)), _EQUAL)
-        lean, lock = share * self.lean, self._lock(share)
+        share = float(np.quantile(shown, _QUANTILE))
+        lean, lock = share * self.lean, self._lock(max(share, _EQUAL))
         return np.asarray(lean[:, :, None] * lean[:, None] + lock @ np.swapaxes(lock, 1, 2))
 
     def _lock(self, share: float) -> Array:
@@ -84,10 +86,12 @@ class TemplateNoise:
         known = np.isfinite(self.inverse[:, :2, :2]).all(axis=(1, 2)) & np.isfinite(self.energy)
         out = np.full_like(self.inverse[:, :2, :2], np.nan)
         # without the curvature of the noise's energy, which holds a place that is locked
-        left = np.linalg.inv(self.inverse[known, :2, :2]) - own[known]
-        held = np.linalg.eigvalsh(left)[:, 0] > 0.0
-        left[~held] = np.nan
-        out[known] = np.linalg.inv(left) @ own[known] / (2.0 * np.pi)
+        left = np.linalg.inv(self.inverse[known, :2, :2])
+        least = np.linalg.eigvalsh(left)[:, 0]
+        left = left - own[known]
+        left[least <= own[known, 0, 0]] = np.nan
+        lock = np.linalg.inv(left) @ own[known] / (2.0 * np.pi)
+        out[known] = np.where((own[known, 0, 0] < _HELD * least)[:, None, None], 0.0, lock)
         return out
 
 

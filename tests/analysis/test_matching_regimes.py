@@ -47,17 +47,23 @@ def test_the_blocks_of_a_compression_are_recognised() -> None:
     assert not (pair_of(REGIMES["JPEG 30"], 1, 240).matched().reason == Reason.BLOCKS).any()
 
 
+def depth(step: float, seed: int) -> RegimePair:
+    """Return two layers with edges of depth of so many pixels."""
+    pair = layered(7, step=step, seed=20 + seed)[0]
+    return RegimePair(pair.first, pair.second, pair.places, pair.true, np.zeros((0, len(pair.places), 2)))
+
+
+DEPTHS = {f"depth of {step} px": step for step in (0.5, 1.5, 3.0)}
+
+
 @pytest.mark.slow
 def test_regimes_in_figures() -> None:
     """Three pairs of each regime, and edges of depth of 0.5 to 3 px; printed, judged where 20 points are accepted."""
     wrong = []
-    rows = {name: [pair_of(regime, seed) for seed in (11, 12, 13)] for name, regime in REGIMES.items()}
-    for step in (0.5, 1.5, 3.0):
-        plain = [layered(7, step=step, seed=seed)[0] for seed in (31, 32, 33)]
-        rows[f"depth of {step} px"] = [
-            RegimePair(p.first, p.second, p.places, p.true, np.zeros((0, 49, 2))) for p in plain
+    for name in (*REGIMES, *DEPTHS):
+        pairs = [
+            pair_of(REGIMES[name], seed) if name in REGIMES else depth(DEPTHS[name], seed) for seed in (11, 12, 13)
         ]
-    for name, pairs in rows.items():
         half = np.concatenate([squares(pair) for pair in pairs])
         share = len(half) / sum(len(pair.places) for pair in pairs)
         text = f"{name}: {share:.0%} accepted" + (
