@@ -37,7 +37,7 @@ from analysis.matching import window_checks
 from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates, joined
 from analysis.matching.spline import SplineStack, low_passed
 from analysis.matching.template_noise import TemplateNoise, noise_energy, template_noise
-from analysis.matching.window_checks import ResidualCorrelation, WindowHalves, WindowRelief
+from analysis.matching.window_checks import ResidualCorrelation, WindowHalves, WindowRelief, WindowScales
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -76,6 +76,7 @@ class Fits:
         template: what noise of the templates does to the places.
         relief: what is seen of displacements within the windows.
         halves: how far apart halves of the windows put the places.
+        scales: how far coarse detail puts the places from where all detail does.
     """
 
     place: Array
@@ -91,6 +92,7 @@ class Fits:
     template: TemplateNoise
     relief: WindowRelief
     halves: WindowHalves
+    scales: WindowScales
 
     def covariance(self, good: NDArray[np.bool_] | None = None) -> Array:
         """(n, 2, 2) px^2 of places, with what points good (n,) have in common; None: the converged."""
@@ -101,7 +103,8 @@ class Fits:
         """The two parts of `covariance`: of noise and interpolation, and of displacements within the window."""
         noise, hidden, tau, _usual = self._parts(good)
         relief = tau[:, None, None] * self.relief.effect
-        lean = self.template.covariance(self.reason == Reason.ACCEPTED if good is None else good)
+        common = self.reason == Reason.ACCEPTED if good is None else good
+        lean = self.template.covariance(common) + self.scales.excess(hidden, common)
         return noise * hidden[:, None, None] + lean + _INTERPOLATION**2 * np.eye(2), relief
 
     def steps(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
@@ -374,6 +377,7 @@ def _summary(
         )
     fitted = np.where(none[:, None, None], np.nan, design), np.where(none[:, None], np.nan, residual)
     hidden = np.where(none, np.nan, 1.0)
+    spread = window_checks.residual_correlation(*fitted, side, of_template.inverse)
     return Fits(
         place * hidden[:, None],
         affine * hidden[:, None, None],
@@ -384,8 +388,9 @@ def _summary(
         smoothing * hidden,
         iterations,
         reason,
-        window_checks.residual_correlation(*fitted, side, of_template.inverse),
+        spread,
         of_template,
         window_checks.window_relief(*fitted, side),
         window_checks.window_halves(*fitted, side),
+        window_checks.window_scales(*fitted, side, spread),
     )

@@ -87,6 +87,7 @@ class Reason(IntEnum):
     UNCERTAIN = 12
     RELIEF = 13
     UNTESTED = 14
+    BLOCKS = 15
 
     @property
     def text(self) -> str:
@@ -110,6 +111,7 @@ _TEXTS = {
     Reason.UNCERTAIN: "the standard deviation is too large",
     Reason.RELIEF: "parts of the window are displaced against each other",
     Reason.UNTESTED: "windows have steps of displacement here, and this one is too weak to show one",
+    Reason.BLOCKS: "compression left little but its blocks, which do not move with the scene",
 }
 
 

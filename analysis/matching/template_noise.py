@@ -22,6 +22,12 @@ The template's noise against the residuals, s_t^2 / s^2 (both in the image), is 
 how large it is: by how much the low pass that was chosen lowers the residuals against none, over what it takes of white
 noise. Nine in ten are below what is taken. It is too low where all windows are so sharp that no low pass serves, but
 there slopes are many and the lean is nothing. The place is not moved by it; its covariance gets lean lean'.
+
+**Lock.** Where structure runs along one direction, the texture along it may be so weak that the noise's energy is most
+of what holds the place: the fit then stands half way between pixels, where the lean is nothing. So the covariance also
+gets what that energy's steepest slope does to the place against the curvature that is left without the energy's own,
+2 pi^2 N s_t^2 times its mean and its wave. Template and image are taken to be as noisy as one another at least. It is
+nothing beside texture of two directions.
 """
 
 from __future__ import annotations
@@ -41,6 +47,10 @@ _LEAST = 0.4
 _OPEN = 1e-11
 # Of the points' shares.
 _QUANTILE = 0.9
+# Share of the curvature from which the noise's energy counts as what holds a place.
+_HELD = 0.3
+# Least share for that: template and image have the same noise, of which interpolation passes two thirds.
+_EQUAL = 0.6
 # Half width of the impulse's answer and phases of a pixel at which it is taken.
 _REACH, _PHASES = 30, 64
 
@@ -52,18 +62,37 @@ class TemplateNoise:
     Attributes:
         inverse: (n, q, q) H^-1.
         lean: (n, 2) px, row and column, for a share of 1.
+        energy: (n,) curvature of the noise's energy along an axis where it is largest, for a share of 1.
         share: (n,) least s_t^2 / s^2 by the low pass.
     """
 
     inverse: Array
     lean: Array
+    energy: Array
     share: Array
 
     def covariance(self, good: NDArray[np.bool_]) -> Array:
-        """(n, 2, 2) px^2 of the lean, with the share that points good (n,) show."""
+        """(n, 2, 2) px^2 of lean and lock, with the share that points good (n,) show."""
         shown = self.share[good & np.isfinite(self.share)]
-        lean = self.lean * (np.quantile(shown, _QUANTILE) if len(shown) else 0.0)
-        return np.asarray(lean[:, :, None] * lean[:, None])
+        if not len(shown):
+            return np.zeros_like(self.inverse[:, :2, :2])
+        share = float(np.quantile(shown, _QUANTILE))
+        lean, lock = share * self.lean, self._lock(max(share, _EQUAL))
+        return np.asarray(lean[:, :, None] * lean[:, None] + lock @ np.swapaxes(lock, 1, 2))
+
+    def _lock(self, share: float) -> Array:
+        """(n, 2, 2) px, by which the noise's energy may displace row and column along each axis."""
+        own = share * self.energy[:, None, None] * np.eye(2)
+        known = np.isfinite(self.inverse[:, :2, :2]).all(axis=(1, 2)) & np.isfinite(self.energy)
+        out = np.full_like(self.inverse[:, :2, :2], np.nan)
+        # without the curvature of the noise's energy, which holds a place that is locked
+        left = np.linalg.inv(self.inverse[known, :2, :2])
+        least = np.linalg.eigvalsh(left)[:, 0]
+        left = left - own[known]
+        left[least <= own[known, 0, 0]] = np.nan
+        lock = np.linalg.inv(left) @ own[known] / (2.0 * np.pi)
+        out[known] = np.where((own[known, 0, 0] < _HELD * least)[:, None, None], 0.0, lock)
+        return out
 
 
 def template_noise(
@@ -95,10 +124,11 @@ def template_noise(
     """
     count, unknowns, pixels = design.shape
     inverse, lean = np.full((count, unknowns, unknowns), np.nan), np.full((count, 2), np.nan)
+    curvature = np.full(count, np.nan)
     share = np.full(count, np.nan)
     used = np.flatnonzero(np.isfinite(residual).all(axis=1) & np.all((design**2).sum(axis=2) > 0, axis=1))
     if not used.size:
-        return TemplateNoise(inverse, lean, share)
+        return TemplateNoise(inverse, lean, curvature, share)
     apart = np.stack([window[0] - shift[used, :1], window[1] - shift[used, 1:]], axis=1)
     place = affine[used] @ apart + stack.size // 2
     # by the unknowns of the geometry: place and perhaps matrix
@@ -113,10 +143,12 @@ def template_noise(
     variance = np.einsum("np,np->n", residual[used], residual[used]) / (pixels - unknowns)
     force = variance[:, None] * _force(place, linear[used], smoothing[used], moved)
     lean[used] = np.einsum("nij,nj->ni", inverse[used, :2], force)
+    mean, wave = np.moveaxis(np.array([_noise_gain(float(one)) for one in smoothing[used]])[:, :, 0], 1, 0)
+    curvature[used] = 2.0 * np.pi**2 * pixels * variance * mean * wave
     square_sum, energy = lowered[0][used], lowered[1][used]
     with np.errstate(divide="ignore", invalid="ignore"):
         share[used] = np.where(energy > 0, np.clip(square_sum / (pixels * energy * variance), 0.0, 1.0), 0.0)
-    return TemplateNoise(inverse, lean, share)
+    return TemplateNoise(inverse, lean, curvature, share)
 
 
 def _bend(

@@ -24,6 +24,11 @@ the score q = r'Z K Z'r has the expectation s^2 tr(K G) + tau^2 tr(K G K G), G =
 test of tau = 0 (a score test of a variance component). Its moments give tau^2; the place sought is that of the window's
 middle, d(0), and what the fit makes of d instead stands in the covariance.
 
+What is wrong with an image's fine detail puts it elsewhere than coarse detail: noise of the template where slopes are
+few, aliased edges, and patterns that are fixed to the pixels of one detector, which do not move with the scene. Each
+window is fitted once more through a low pass, in one linear step; how far that lies away, beyond the noise of the
+difference, all points share as a covariance; those that stand out are not known.
+
 Few points say enough about tau alone. So they share one tau^2, the mean with the weights of its precision, taken as the
 mean of what it may be without being negative; those that stand out have their own.
 """
@@ -31,7 +36,7 @@ mean of what it may be without being negative; those that stand out have their o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,17 +226,123 @@ def residual_correlation(
     square = np.maximum(np.einsum("nij,nij->n", rest, rest), 1e-300)
     variance[used] = square / (pixels - unknowns)
     white[used] = np.einsum("niab,njab->nij", place, place)
+    influence[used] = _lagged(place)
     for k, (r, c) in enumerate(_LAGS):
-        here = (..., slice(0, side - r), slice(max(-c, 0), side - max(c, 0)))
-        there = (..., slice(r, side), slice(max(c, 0), side - max(-c, 0)))
+        here, there = _overlap(side, r, c)
         pairs = (side - r) * (side - abs(c))
-        product = np.einsum("niab,njab->nij", place[here], place[there])
-        influence[used, k] = product + np.swapaxes(product, 1, 2)
         # white noise loses this much covariance to the fit
         taken = np.einsum("nqab,nqab->n", hat[here], column[there])
         seen = np.einsum("nab,nab->n", rest[here], rest[there])
         correlation[used, k] = (seen / variance[used] + taken) / pairs
     return ResidualCorrelation(variance, white, influence, correlation, *size)
+
+
+def _overlap(side: int, row: int, column: int) -> tuple[tuple[object, ...], tuple[object, ...]]:
+    """Pixels of a window that have a neighbour in it at a lag, and these neighbours."""
+    here = (..., slice(0, side - row), slice(max(-column, 0), side - max(column, 0)))
+    return here, (..., slice(row, side), slice(max(column, 0), side - max(-column, 0)))
+
+
+def _lagged(place: Array) -> Array:
+    """(n, lags, 2, 2) by how much correlation 1 at a lag and at its opposite raises the covariance of B r, with B
+    (n, 2, side, side).
+    """
+    out = np.empty((len(place), len(_LAGS), 2, 2))
+    for k, (r, c) in enumerate(_LAGS):
+        here, there = _overlap(place.shape[-1], r, c)
+        product = np.einsum("niab,njab->nij", place[here], place[there])
+        out[:, k] = product + np.swapaxes(product, 1, 2)
+    return out
+
+
+# Rms of the Gaussian that parts coarse detail from fine, px: fine are noise, aliasing, patterns of a detector's pixels.
+_COARSE = 2.0
+# Square distance of coarse from fine that chance exceeds in 1e-3 (chi-square of two).
+_DISCORDANT = 2.0 * math.log(1e3)
+# Standard deviations of chance from which all share a distance.
+_SIGNIFICANT = 2.0
+# Medians of the distances to which one counts for all.
+_CLIPPED = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class WindowScales:
+    """How far coarse detail puts the places of n fits from where all detail does; NaN where there is no fit.
+
+    Attributes:
+        apart: (n, 2) px.
+        spread: what its covariance is made of.
+    """
+
+    apart: Array
+    spread: ResidualCorrelation
+
+    def excess(self, factor: Array, good: NDArray[np.bool_]) -> Array:
+        """Return the (n, 2, 2) covariance, px^2, that distances beyond noise ask for; NaN for those that stand out.
+
+        Args:
+            factor: (n,) of the noise.
+            good: (n,) points that share what they have in common.
+        """
+        covariance = self.spread.covariance(good) * factor[:, None, None]
+        known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(self.apart).all(axis=1)
+        common = known & good
+        out = np.zeros_like(covariance)
+        if not common.any():
+            return out
+        size = np.sqrt(_square(self.apart[common], covariance[common]))
+        held = np.minimum(1.0, _CLIPPED * np.median(size) / np.maximum(size, 1e-300))[:, None] * self.apart[common]
+        weight = 1.0 / np.trace(covariance[common], axis1=1, axis2=2) ** 2
+        weight /= weight.sum()
+        noise = np.einsum("n,nij->ij", weight, covariance[common])
+        value, vector = np.linalg.eigh(np.einsum("n,ni,nj->ij", weight, held, held) - noise)
+        chance = np.sqrt(2.0 * np.sum(weight**2)) * np.einsum("ik,ij,jk->k", vector, noise, vector)
+        shared = (vector * np.where(value > _SIGNIFICANT * chance, value, 0.0)) @ vector.T
+        out += shared
+        alone = np.zeros(len(out), bool)
+        alone[known] = _square(self.apart[known], covariance[known] + shared) > _DISCORDANT
+        # two motions, or none that the model has
+        out[alone] = np.nan
+        return out
+
+
+def window_scales(design: Array, residual: Array, side: int, spread: ResidualCorrelation) -> WindowScales:
+    """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit.
+
+    A fit to the low-passed window differs by (D W D')^-1 D W r - (D D')^-1 D r, with W the low pass twice: where the
+    model is right both see the same place, and the difference is noise (Hausman, Econometrica 46(6), 1978).
+
+    Args:
+        design: derivatives of the model, (n, q, p), the first two by place.
+        residual: (n, p), grey values; NaN where there is no fit.
+        side: of the windows, px, with p = side^2.
+        spread: of the residuals.
+    """
+    apart = np.full((len(design), 2), np.nan)
+    white, influence = np.full_like(spread.white, np.nan), np.full_like(spread.influence, np.nan)
+    scale = np.sqrt(np.einsum("nqp,nqp->nq", design, design))
+    used = np.flatnonzero(np.isfinite(residual).all(axis=1) & np.all(scale > 0, axis=1))
+    if used.size:
+        line = np.arange(side)
+        low = np.exp(-0.5 * ((line[:, None] - line) / _COARSE) ** 2)
+        low /= low.sum(axis=1, keepdims=True)
+        scaled = design[used] / scale[used, :, None]
+        twice = low.T @ low
+        coarse = (twice @ scaled.reshape(*scaled.shape[:2], side, side) @ twice).reshape(scaled.shape)
+        parts = [
+            np.linalg.pinv(one @ np.swapaxes(scaled, 1, 2), rcond=1e-9, hermitian=True)[:, :2] @ one
+            for one in (coarse, scaled)
+        ]
+        place = (parts[0] - parts[1]) / scale[used, :2, None]
+        apart[used] = np.einsum("nip,np->ni", place, residual[used])
+        place = place.reshape(len(used), 2, side, side)
+        white[used], influence[used] = np.einsum("niab,njab->nij", place, place), _lagged(place)
+    return WindowScales(apart, replace(spread, white=white, influence=influence))
+
+
+def _square(apart: Array, covariance: Array) -> Array:
+    """(n,) square distances (n, 2) in units of covariances (n, 2, 2)."""
+    return np.asarray(np.einsum("ni,ni->n", apart, np.linalg.solve(covariance, apart[..., None])[..., 0]))
 
 
 _BLOCKS = 5

@@ -200,6 +200,20 @@ class LineCamera:
         look = vector / length
         return look, (change - look * np.sum(look * change, axis=-1, keepdims=True)) / length
 
+    def relative_illumination(self, pixel: np.ndarray) -> np.ndarray:
+        """Return the light on pixels (N,) over that on the line's middle, (N,), of ground of one radiance.
+
+        An entrance pupil of one size is seen foreshortened, by cos w of the field angle w, from a pixel that looks over
+        a solid angle of its angle along the line by its angle across, pitch x cos w / f. That is cos^4 w of a
+        projection without distortion, and follows the distortion of another.
+
+        Raises:
+            ValueError: a pixel outside the line.
+        """
+        look, slope = self.look_and_slope(np.concatenate([[0.5 * (self.pixels - 1)], np.asarray(pixel, np.float64)]))
+        rate = np.linalg.norm(slope, axis=-1)
+        return np.asarray((look[1:] @ look[0]) ** 2 * rate[1:] / rate[0])
+
     def origin(self, pixel: np.ndarray) -> np.ndarray:
         """Points on the rays, body frame: pixels (N,) -> (N, 3), metres.
 

@@ -400,7 +400,8 @@ def _expected(
     count = max(16, int(_SAMPLES_AT_ONCE / oversampling**2 / (window.pixels + 2 * MARGIN)) - 2 * MARGIN)
     count = min(count, max(16, -(-window.lines // cores())))
     photons = np.empty((window.lines, window.pixels))
-    scale = optics.photons_per_reflectance
+    pixels = window.first_pixel + np.arange(window.pixels)
+    scale = optics.photons_per_reflectance * sensor.camera.relative_illumination(pixels)
 
     def strip(start: int) -> None:
         part = Window(window.first_line + start, window.first_pixel, min(count, window.lines - start), window.pixels)
