@@ -101,12 +101,9 @@ def _artefacts(
         out.append(figure)
     if found.numbers:
         rows = [
-            [
-                *(one.file, one.key, _value(one.reference), _value(one.other)),
-                *(one.difference, one.sigma, one.sigma_of, one.in_sigma),
-            ]
-            for one in sorted(found.numbers, key=lambda one: one.file != "truth.json")
-            if not is_sigma(one.key)
+            [n.file, n.key, _value(n.reference), _value(n.other), n.difference, n.sigma, n.sigma_of, n.in_sigma]
+            for n in sorted(found.numbers, key=lambda one: one.file != "truth.json")
+            if not is_sigma(n.key)
         ]
         heads = ("file", "key", *names, "difference", "sigma", "of", "in sigma")
         about = "Units are the keys' endings; sigma is that of the difference of independent measurements, of noise if "
