@@ -73,7 +73,7 @@ class StandIn:
 
     def follow(self) -> Any:
         newest, count = int(self.times[-1]), len(self.times)
-        known = {"events": self.events, "jumps": self.jumps, "breaks": self.breaks}
+        known = {"events": self.events, "jumps": self.jumps, "breaks": self.breaks, "warnings": []}
         return SimpleNamespace(time=newest, readings=count, **known)
 
     def smoothed(self, times: list[int]) -> Estimate:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from scenes.yaml.errors import InputError
 from twin.compare.__main__ import app
 from twin.compare.compare_report import compare, numbers, verdict
-from twin.compare.run_differences import read_run
+from twin.compare.run_differences import read_run, sigma_of
 from twin.main_job.render_job import render_job
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.scripting.instrument_twin import load
@@ -104,6 +104,15 @@ def test_noise_alone_is_within_some_sigma(seeded: Path, tmp_path: Path) -> None:
     assert "no input" not in " ".join(verdict(strict))  # the seed stands in config.yaml
 
 
+def test_a_sigma_says_what_it_is_of() -> None:
+    """Where a file has both, it is that of the noise."""
+    both = {("f", "x"): 1.0, ("f", "x_sigma"): 0.6, ("f", "x_sigma_noise"): 0.1, ("f", "y"): 1.0, ("f", "y_sigma"): 0.3}
+    found = {name: sigma_of(both, both, ("f", name)) for name in ("x", "y", "z")}
+    assert found["x"] == (pytest.approx(0.1 * 2**0.5), "noise")
+    assert found["y"] == (pytest.approx(0.3 * 2**0.5), "stated")
+    assert found["z"] == (None, "")
+
+
 @pytest.mark.second
 def test_files_without_a_sigma_of_the_noise_are_compared_by_the_one_they_have(seeded: Path, tmp_path: Path) -> None:
     """As runs wrote them before there were stated disturbances: `_sigma` alone, of the noise."""
@@ -119,6 +128,9 @@ def test_files_without_a_sigma_of_the_noise_are_compared_by_the_one_they_have(se
     key = "cameras.forward.model.d_f_um"
     one, other = (next(n for n in numbers if n.key == key) for numbers in (now, then))
     assert one.sigma == other.sigma is not None
+    assert (one.sigma_of, other.sigma_of) == ("noise", "stated")
+    for pair, kind in ((old, "as stated"), ([seeded / "a", seeded / "seed"], "(as stated|of the noise alone)")):
+        assert re.search(rf"[+-]\d\S* sigma {kind}", " ".join(verdict(compare(pair, 1e-9, None))))
     assert compare(old, 1e-9, 5.0).same
 
 

@@ -2,13 +2,16 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from scenes.models.camera_design import resolve_design
+from optics.design.merit_function import Operands
+from optics.design.optimiser import DesignError, Held, _require_held, judged
+from scenes.models.camera_design import beams_of, prescription_of, resolve_design
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import EXAMPLES, LIBRARY, load_camera
 from scenes.yaml.errors import InputError
@@ -16,6 +19,7 @@ from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.scenes.test_stated_focal_length import CASSEGRAIN
 from twin.design.__main__ import app
+from twin.design.design_run import HELD_BY, _held_text
 
 EXAMPLE = EXAMPLES / "design_gf7_short.yaml"
 SHORT = """\
@@ -155,6 +159,23 @@ def test_a_constraint_that_blocks_is_named(tmp_path) -> None:
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert re.search(r"Not improved, held by the principal distance \(5.5\d* m; easing it by 1 mm is worth", page)
     assert "is blurred" in page
+
+
+def test_an_anamorphism_is_a_share(backend) -> None:
+    """Of a principal distance of 5 m across the line one of 0.05 m along it less or more is 1 %."""
+    one = Held("anamorphism", 0.005, 0.05, 0.4)
+    text = _held_text((one,), "old", 5.0)
+    assert text == "the anamorphism (0.5 %, which old breaks by 1 %; easing it by 1 % is worth 0.02 waves)"
+    row = HELD_BY(one)
+    assert (row["limit_m"], row["limit_percent"]) == (None, pytest.approx(0.5))
+    assert HELD_BY(replace(one, name="envelope", limit=2.0))["limit_m"] == 2.0
+    camera = load_camera("gf7")
+    merit, found = judged(backend, prescription_of(camera), (), beams_of(camera), Operands(650e-9, anamorphism=0.005))
+    along, across = found.principal_distance, found.distance_across
+    with pytest.raises(DesignError, match=r"anamorphism \(off by ") as refused:
+        _require_held(merit, found)
+    off = float(re.search(r"off by (\S+) %", str(refused.value))[1])
+    assert off == pytest.approx(100.0 * (abs(along / across - 1.0) - 0.005), rel=2e-3)
 
 
 @pytest.mark.slow

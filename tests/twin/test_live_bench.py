@@ -89,6 +89,16 @@ def test_a_saved_job_repeats_what_was_shown(bench, first, backend, tmp_path):
     assert np.array_equal(after, run.after[:, 0])
 
 
+def test_a_job_that_is_saved_blind_says_that_it_is_the_guess(bench, first):
+    asked = changed(first, {f"{M2} shift z": 3.0})
+    plain = job_text(bench, asked)
+    blind = job_text(bench, BlindState.model_validate({**asked.model_dump(), "blind": 7}))
+    said = [line for line in blind.splitlines() if line not in plain.splitlines()]
+    assert [line[0] for line in said] == ["#", "#"]
+    assert "holds the guess of the knobs alone" in said[0]
+    assert [line for line in blind.splitlines() if line not in said] == plain.splitlines()
+
+
 @pytest.mark.second
 def test_a_recorded_course_has_the_states_that_were_shown(bench, first, backend, tmp_path):
     """The truth of every time to rounding; the noise of a course is another draw."""

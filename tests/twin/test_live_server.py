@@ -395,6 +395,8 @@ def test_what_is_hidden_is_chosen_here_and_stays_until_it_is_revealed():
     client.take(state(1))
     assert isinstance(client.state, BlindState)
     hidden = client.state.blind
+    client.take(json.dumps({"type": "save", "what": "job", "state": {"type": "state", "n": 1}}))
+    assert isinstance(client.saves[0].state, BlindState)
     client.take(state(2))
     assert client.state.blind == hidden
     client.take(json.dumps({"type": "blind", "on": False}))

@@ -32,6 +32,7 @@ from twin.operate.estimate.plans import keep_plan, kept_plan
 from twin.operate.followed import known_of
 from twin.operate.record.entries import MICRO, Alarm, Entry, utc_text
 from twin.operate.record.history import History
+from twin.run.provenance import negative_verdicts
 
 DAY = 86_400 * MICRO
 EVERY, DAYS = 4, 120
@@ -273,6 +274,18 @@ def told_of(following: Following) -> Iterator[tuple[str, str]]:
 def clean(following: Following) -> Following:
     """With nothing to be told of."""
     return replace(following, breaks=(), jumps=(), sensors=(), innovations=())
+
+
+def test_what_contradicts_the_plan_is_in_the_numbers(following: Following) -> None:
+    good = replace(clean(following), widened=1.0, too_many_jumps=False).to_dict()
+    assert (good["agrees"], good["warnings"]) == (True, [])
+    bad = replace(clean(following), widened=2.5, too_many_jumps=True).to_dict()
+    assert not bad["agrees"]
+    assert [text.partition(";")[0] for text in bad["warnings"]] == [
+        "the last readings contradict what is stated",
+        "0 jumps are more than is stated: something else moves, or more of it",
+    ]
+    assert negative_verdicts({"estimate": bad}) == ["estimate.agrees"]
 
 
 def test_what_is_told_of_requirements(following: Following) -> None:

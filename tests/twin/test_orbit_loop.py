@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
+from analysis.monitor.control_loop import margins, open_loop
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.unseen_motions import unseen_modes
 from scenes.models.disturbances import state_of
@@ -20,7 +21,10 @@ from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.loop.loop_course import Commands, LoopCourse, drifting_states, gone_through, reader
 from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model
-from twin.orbit.loop.loop_run import LoopRun, run_loop
+from twin.orbit.loop.loop_numbers import LOOP
+from twin.orbit.loop.loop_report import loop_report
+from twin.orbit.loop.loop_run import PHASE_MARGIN_DEG, LoopRun, run_loop
+from twin.run.provenance import negative_verdicts
 
 run = partial(invoke, command.app)
 ARCSEC = np.pi / 648000.0
@@ -176,6 +180,45 @@ def test_gain_nothing_is_the_open_loop_to_the_bit(idle: LoopRun) -> None:
         assert np.array_equal(errors, getattr(two.heights, name)), name
     assert np.array_equal(one.images[0].errors, two.images[0].errors)
     assert idle.margin == np.inf
+
+
+@pytest.mark.second
+def test_a_loop_near_its_limit_or_that_makes_anything_worse_leads_the_verdict(idle: LoopRun) -> None:
+    """Changes of cameras a fifth larger with the loop closed, and foci half of a percent, of which nobody speaks."""
+    told = loop_report(idle)
+    assert not told.warnings
+    near = loop_report(replace(idle, margin=1.03, radius=0.99))
+    assert near.verdict.startswith("The loop is barely stable; with the loop closed")
+    assert near.warnings[0].startswith(
+        "the loop is barely stable: gains of 1.03 times the stated ones make it unstable"
+    )
+    assert negative_verdicts(LOOP(replace(idle, margin=1.03, radius=0.99))) == ["margins_hold"]
+    assert loop_report(replace(idle, margin=0.9, radius=1.1)).verdict.startswith("The loop is unstable; ")
+    larger = np.ones(idle.open.truth.shape[1])
+    cameras = len(idle.model.cameras)
+    larger[: 4 * cameras], larger[4 * cameras :] = 1.2, 1.005
+    worse = replace(idle, closed=replace(idle.closed, truth=larger * idle.open.truth))
+    moved = np.sqrt(np.mean(idle.open.truth**2, axis=0)) > 1e-9
+    assert {name.partition(" ")[0] for name in worse.worse} >= {"angle", "d_alpha", "d_beta", "d_gamma"}
+    assert len(worse.worse) == 1 + moved[: 4 * cameras].sum()
+    for free, left in worse.worse.values():
+        assert left == pytest.approx(1.2 * free, rel=1e-12)
+    told = loop_report(worse)
+    assert told.verdict.startswith("The loop makes angle, d_alpha of forward, ")
+    assert "the loop makes angle worse: its error, RMS over the moments, is 1.20 times" in told.warnings[0]
+    assert LOOP(worse)["made_worse"] == list(worse.worse)
+
+
+@pytest.mark.parametrize("delay", range(6))
+def test_a_loop_at_the_margins_that_are_held_amplifies_twice(delay: int) -> None:
+    """At a gain of 1 / 1.5 of the limit the peak of 1 / |1 + L| is 2 and more, at half of it below 2.6."""
+    swing = np.linspace(1e-3, 0.5, 5000)
+    limit = margins(1.0, delay).limit
+    peaks = [np.max(1.0 / np.abs(1.0 + open_loop(share * limit, delay, swing))) for share in (1.0 / 1.5, 0.5)]
+    assert peaks[0] > 2.0
+    assert peaks[1] < 2.6
+    # the two margins are one limit for long delays; without a delay the phase has more room
+    assert PHASE_MARGIN_DEG - 2.0 < margins(limit / 1.5, delay).phase_deg < PHASE_MARGIN_DEG + 20.0
 
 
 @pytest.mark.second

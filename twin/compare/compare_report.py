@@ -101,16 +101,13 @@ def _artefacts(
         out.append(figure)
     if found.numbers:
         rows = [
-            [
-                *(one.file, one.key, _value(one.reference), _value(one.other)),
-                *(one.difference, one.sigma, one.sigma_of, one.in_sigma),
-            ]
-            for one in sorted(found.numbers, key=lambda one: one.file != "truth.json")
-            if not is_sigma(one.key)
+            [n.file, n.key, _value(n.reference), _value(n.other), n.difference, n.sigma, n.sigma_of, n.in_sigma]
+            for n in sorted(found.numbers, key=lambda one: one.file != "truth.json")
+            if not is_sigma(n.key)
         ]
         heads = ("file", "key", *names, "difference", "sigma", "of", "in sigma")
         about = "Units are the keys' endings; sigma is that of the difference of independent measurements, of noise if "
-        about += "runs state it, else of the total error. Runs of one seed share their noise, and differ by less."
+        about += "runs state it, else as they state it. Runs of one seed share their noise, and differ by less."
         left = len(found.numbers) - len(rows)
         about += f" {left} sigmas that changed are in compare.json." if left else ""
         out.append(Table(f"numbers-{k}", "Results", about, heads, rows, (None,) * 7 + (1,)))
@@ -307,6 +304,6 @@ def verdict(comparison: Comparison) -> list[str]:
         )
         far = max(found.numbers, key=lambda one: abs(one.in_sigma or 0.0), default=None)
         if far is not None and far.in_sigma is not None:
-            kind = "of the noise alone" if far.sigma_of == NOISE else "of the total error"
+            kind = "of the noise alone" if far.sigma_of == NOISE else "as stated"
             parts.append(f"the largest change for its sigma is {far.key}, {far.in_sigma:+.3g} sigma {kind}")
     return parts

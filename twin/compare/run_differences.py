@@ -32,7 +32,7 @@ LEFT_OUT = frozenset(
 )
 """Keys of results that say how the run was done, not what it gave."""
 NOISE = "noise"
-"""What a sigma is of that more frames lower; another is total."""
+"""What a sigma is of that more frames lower."""
 TOLD = frozenset(("verdict", "warnings"))
 """Sentences at the top of a result that follow from its numbers, which are compared themselves."""
 NAMES = ("name", "motion", "label", "field", "path", "time_s")
@@ -67,7 +67,8 @@ class NumberDifference:
         reference, other: what stands there; None where there is nothing.
         sigma: standard deviation of the difference of two independent measurements, from both runs' sigmas; None where
             the file states none.
-        sigma_of: what that is of: ``noise`` of the images alone, or the ``total`` error; empty without a sigma.
+        sigma_of: what that is of: the ``noise`` of the images alone, or ``stated``, what the file states beside the
+            number and calls by no other name; empty without a sigma.
     """
 
     file: str
@@ -328,7 +329,7 @@ def sigma_of(
     reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tuple[str, str]
 ) -> tuple[float | None, str]:
     """Return the sigma of the difference of two numbers and what it is of: of the noise of both runs, from
-    ``x_sigma_noise`` beside them in both runs, else of the total error, from ``x_sigma`` or ``sigma``. What an
+    ``x_sigma_noise`` beside them in both runs, else as stated, from ``x_sigma`` or ``sigma``. What an
     estimator makes wrong of the motions is the same in runs of the same motions, and does not scatter between them.
 
     Args:
@@ -342,7 +343,7 @@ def sigma_of(
     for name in names:
         both = [run.get((file, f"{head}{dot}{name}")) for run in (reference, other)]
         if all(_is_number(value) for value in both):
-            kind = NOISE if name.endswith(NOISE) else "total"
+            kind = NOISE if name.endswith(NOISE) else "stated"
             return math.hypot(*(float(value) for value in both if value is not None)), kind
     return None, ""
 

@@ -54,6 +54,7 @@ class MonitorReading:
         centroid: by which method the spots were found.
         found_wrong: why sigma does not hold, as far as it was found before the spots were read.
         truth: of the state, where it is simulated.
+        together: number of measurements, of which this is one, that have one false-alarm rate together.
     """
 
     channels: tuple[tuple[str, str], ...]
@@ -66,6 +67,7 @@ class MonitorReading:
     centroid: str
     found_wrong: tuple[str, ...] = ()
     truth: Truth | None = None
+    together: int = 1
 
     @property
     def estimators(self) -> dict[str, Estimator]:
@@ -172,7 +174,9 @@ class MonitorReading:
         """
         if self.disturbances is None or not np.any(self.recovery.shift_covariance):
             return None
-        return self.recovery.consistency(self.disturbances, others=self.any_motions(self.disturbances))
+        found, others = self.recovery, self.any_motions(self.disturbances)
+        rate = FALSE_ALARM / self.together
+        return consistency(found.shift[0], found.shift_covariance[0], self.disturbances, others, rate)
 
     def any_motions(self, stated: Disturbances) -> dict[str, np.ndarray]:
         """Body -> what its motions do to all spots, px per table unit, stated or not.

@@ -155,6 +155,7 @@ class RenderRun(JobRun):
             centroid=self.resolved.job.analysis.centroid,
             found_wrong=together.contradiction if together is not None else (),
             truth=self.truth,
+            together=1 if self.series is None else len(self.series.times),
         )
 
     @property
@@ -180,10 +181,7 @@ class RenderRun(JobRun):
     @property
     def sigma_holds(self) -> bool:
         """Whether nothing that was measured contradicts the sigmas; of a course at none of its times."""
-        if self.series is None:
-            return self.reading.sigma_holds
-        agrees = self.worst_of_course is None or self.worst_of_course[1].agrees
-        return agrees and bool(np.all(self.series.sigma_holds))
+        return self.reading.sigma_holds if self.series is None else bool(np.all(self.series.sigma_holds))
 
     @cached_property
     def worst_of_course(self) -> tuple[int, Consistency] | None:

@@ -155,7 +155,7 @@ def run_recover(
         if smoothed is not None and one is recoveries[-1]:
             wrong += smoothed.contradiction  # recovered.json is about the last state, and its filtered changes
         told = bench.cameras, ground, bench.disturbances, one, tables, frames, centroid, wrong
-        readings.append(MonitorReading(names, *told))
+        readings.append(MonitorReading(names, *told, together=len(recoveries)))
     of_frames = (*_unlike(results, times), *_noisy(results, times, source))
     given = (*bench.warnings, *order_warnings(channels, times), *_coarse(channels, setup))
     warnings = (*given, *of_frames, *_of_readings(readings, times), *readings[-1].unseen)
