@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sqlalchemy import Connection, RowMapping, delete, func, insert, or_, select
+from sqlalchemy import Connection, delete, func, insert, or_, select
 from sqlalchemy.exc import IntegrityError
 
 from optics.numerics.backend import load_backend
@@ -46,8 +46,6 @@ from twin.operate.record.taking import Taken, Taking
 from twin.run.data_files import WRITER
 from twin.run.durable import make_folders, sync_folder
 
-LAST_CHECKED = 500
-"""Entries whose digests are worked out again whenever the status is asked for; all of them take too long."""
 USED = ("monitor", "temperature")
 """Kinds of entries that change the estimate; events do by what they step."""
 
@@ -215,7 +213,7 @@ class History:
             streams = [(kind, subject, *_extent(connection, kind, subject)) for kind, subject in _streams(connection)]
             sources = int(connection.execute(select(func.count()).select_from(SOURCE)).scalar_one())
             guarded = schema.guarded(connection)
-            checked, altered = _altered(connection, None if every else LAST_CHECKED)
+            checked, altered = schema.altered(connection, None if every else schema.LAST_CHECKED)
         refused = [
             {
                 "file": row["file"],
@@ -520,30 +518,6 @@ def _extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, 
     own = [select(one).select_from(ENTRY).where(c.kind == kind, c.subject == subject) for one in asked]
     count, first, last = (int(connection.execute(query).scalar_one()) for query in own)
     return count, first, last
-
-
-def _altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]:
-    """Return how many of the newest entries, or of all, were compared with their digests, and what is wrong."""
-    c = ENTRY.c
-    rows = connection.execute(select(*c).order_by(c.id.desc()).limit(newest)).mappings().all()
-    wrong = [
-        f"entry {row['id']}, {row['kind']} of {row['subject']} at {row['time_utc']}, is not as it was taken"
-        for row in rows
-        if _digest(row) != row["sha256"] or row["time_utc"] != utc_text(row["time_us"])
-    ]
-    if connection.dialect.name == "sqlite":  # it counts without gaps
-        held, last = connection.execute(select(func.count(), func.max(c.id)).select_from(ENTRY)).one()
-        if held != (last or 0):
-            wrong.append(f"{(last or 0) - held} entries have been removed")
-    return len(rows), wrong[::-1]
-
-
-def _digest(row: RowMapping) -> str:
-    try:
-        content = json.loads(row["content"])
-    except ValueError:
-        return ""
-    return digest_of_data([row["kind"], row["subject"], row["time_us"], content])
 
 
 def content_of(row: Mapping[str, Any]) -> Any:

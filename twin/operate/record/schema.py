@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,6 +16,7 @@ from sqlalchemy import (
     Integer,
     LargeBinary,
     MetaData,
+    RowMapping,
     String,
     Table,
     Text,
@@ -27,9 +29,12 @@ from sqlalchemy import (
 from sqlalchemy.schema import CreateIndex, CreateTable
 
 from optics.numerics.frozen_map import FrozenMap
+from twin.operate.record.entries import digest_of_data, utc_text
 from twin.operate.record.place import NotARecord
 
 VERSION = 4
+LAST_CHECKED = 500
+"""Entries whose digests are worked out again whenever the status is asked for; all of them take too long."""
 _METADATA = MetaData()
 _NUMBER = BigInteger().with_variant(Integer(), "sqlite")
 """SQLite counts rows by itself only where their type is INTEGER."""
@@ -210,6 +215,30 @@ def guarded(connection: Connection) -> bool:
         "AND tgrelid IN (SELECT oid FROM pg_class WHERE pg_table_is_visible(oid))"
     )
     return int(connection.execute(text(query)).scalar_one()) >= 2 * (len(_METADATA.tables) - len(_DERIVED))
+
+
+def altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]:
+    """Return how many of the newest entries, or of all, were compared with their digests, and what is wrong."""
+    c = ENTRY.c
+    rows = connection.execute(select(*c).order_by(c.id.desc()).limit(newest)).mappings().all()
+    wrong = [
+        f"entry {row['id']}, {row['kind']} of {row['subject']} at {row['time_utc']}, is not as it was taken"
+        for row in rows
+        if _digest(row) != row["sha256"] or row["time_utc"] != utc_text(row["time_us"])
+    ]
+    if connection.dialect.name == "sqlite":  # it counts without gaps
+        held, last = connection.execute(select(func.count(), func.max(c.id)).select_from(ENTRY)).one()
+        if held != (last or 0):
+            wrong.append(f"{(last or 0) - held} entries have been removed")
+    return len(rows), wrong[::-1]
+
+
+def _digest(row: RowMapping) -> str:
+    try:
+        content = json.loads(row["content"])
+    except ValueError:
+        return ""
+    return digest_of_data([row["kind"], row["subject"], row["time_us"], content])
 
 
 def create(connection: Connection) -> None:
