@@ -217,6 +217,8 @@ _SIGNIFICANT = 5.0
 _HINT = 3.0
 # Near an end of the scan a chi-square this many times the degrees of freedom means a flank and not a peak.
 _MISFIT = 10.0
+# What curves of pupils may differ from the fitted form by, as a share of the peak: 1.8 % half way down.
+_FORM = 0.02
 # A curve with outliers has this many points for each of them at least; one with a larger chance has none. Pairs that
 # hide each other are sought among so many points at most.
 _SOUND_TO_BAD, _EXPLAINED, _MOST_PAIRED = 4, 0.01, 50
@@ -416,6 +418,7 @@ def _deviations(z: Array, v: Array, s: Array, groups: NDArray[np.intp]) -> tuple
     fall = 2.0 * QUARTIC * u - 1.0
     slope = np.stack([1.0 - QUARTIC * u**2, fall * bend * away, -0.5 * fall * away**2], axis=2)
     variance = np.where(near, np.einsum("gki,gij,gkj->gk", slope, fits.covariance, slope), 0.0) + s[groups] ** 2
+    variance += (_FORM * peak) ** 2
     scale = np.maximum(fits.chi_square / np.maximum(fits.degrees_of_freedom, 1), 1.0)[:, None]
     return rest, np.nan_to_num(np.abs(rest) / np.sqrt(variance * scale))
 

@@ -61,7 +61,13 @@ class EdgeRows:
 
     @staticmethod
     def of(lines: Array, shape: tuple[int, ...], bend: Array) -> EdgeRows:
-        """Return the rows of pages of a shape (H, W), one after the other, with lines (P, 2), offset and slope."""
+        """Return the rows of pages, one page after the other.
+
+        Args:
+            lines: offset and slope of each page's line, (P, 2).
+            shape: rows and columns of a page.
+            bend: as the attribute.
+        """
         along = np.arange(shape[0]) - (shape[0] - 1) / 2.0
         offset, slope = np.repeat(lines, shape[0], axis=0).T
         return EdgeRows(offset, slope, np.tile(along, len(lines)), shape[1], bend)
@@ -113,7 +119,7 @@ class EdgeRows:
     def _legendre(self, derivative: int) -> Array:
         """Return the bend or its derivative along the edge in every row, (R,)."""
         series = legendre.legder([0.0, 0.0, *self.bend], derivative)
-        return np.asarray(legendre.legval(self.along / self.half, series)) / self.half**derivative
+        return np.asarray(legendre.legval(self.along / self.half, series), np.float64) / self.half**derivative
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,20 +227,21 @@ def _fitted(
     return FittedEdge(rows, design, replace(spread, coefficients=coefficients), change @ light, change)
 
 
-def path_parts(rows: EdgeRows, design: EdgeDesign, spread: EdgeSpread, order: int) -> tuple[Array, NDArray[np.intp]]:
+def path_parts(fitted: FittedEdge, order: int) -> tuple[Array, NDArray[np.intp]]:
     """Return the derivatives of grey values by the coefficients of the path, (order + 1, M), and the pixels, (M,).
 
     Only pixels in the inner quarter of the core: farther out the fitted slope is mostly noise and would pull the path.
     """
-    close = np.abs(design.x[design.inside]) <= spread.core / CORE_WIDTHS
+    design, rows = fitted.design, fitted.rows
+    close = np.abs(design.x[design.inside]) <= fitted.spread.core / CORE_WIDTHS
     near = design.inside[close]
-    fall = -spread.core_slope(design)[close]
+    fall = -fitted.spread.core_slope(design)[close]
     return fall * rows.polynomials(order)[:, near // rows.columns], near
 
 
 def _path_step(fitted: FittedEdge, grey: Array, order: int) -> tuple[Array, Array]:
     """Return the change of the path's coefficients by least squares, (order + 1,), and their sigmas by residuals."""
-    parts, near = path_parts(fitted.rows, fitted.design, fitted.spread, order)
+    parts, near = path_parts(fitted, order)
     inverse = np.linalg.inv(parts @ parts.T)
     rest = (grey - fitted.light - fitted.spread.value(fitted.design))[near]
     change = inverse @ (parts @ rest)

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 FALSE_ALARM = 1e-4
 """Rate at which pages are aligned although the edge does not move in them."""
 MOST_PIXELS = 4_000_000
-"""Largest number of pixels of all pages together when they are aligned: the fit needs some 250 bytes for each."""
+"""Largest number of pixels of all pages together when they are aligned: the fit needs some 300 bytes for each."""
 _STEPS = 30
 _SETTLED = 2
 """Steps after which the places of pages are near enough to tell whether they turn, too."""

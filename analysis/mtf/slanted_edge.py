@@ -249,7 +249,7 @@ def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> tuple[
     along the rows by the coefficients of order 1 and up, (order,), px^2, from residuals (N,) and variances (N,).
     """
     rows, order = fitted.rows, fitted.order
-    parts, near = path_parts(rows, fitted.design, fitted.spread, max(order, 2))
+    parts, near = path_parts(fitted, max(order, 2))
     scatter, normal = (parts * variance[near]) @ parts.T, parts @ parts.T
     inverse = np.linalg.inv(normal)
     bend = float((inverse @ (parts @ residual[near]))[2]) + float(rows.bend[:1].sum())

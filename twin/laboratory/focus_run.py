@@ -66,7 +66,7 @@ class FocusState:
         moves, squares = [], []
         for edge in self.scans[0].vertex:
             curves = [scan.vertex[edge] for scan in self.scans]
-            weight = np.array([1.0 / max(curve.skew_sigma, 1e-300) ** 2 for curve in curves])
+            weight = np.array([1.0 / max(curve.skew_sigma, 1e-12) ** 2 for curve in curves])
             moves.append(np.average([curve.skew for curve in curves], weights=weight))
             squares.append(1.0 / weight.sum())
         return float(np.mean(moves)), float(np.sqrt(np.sum(squares)) / len(moves))
