@@ -9,9 +9,10 @@ import pytest
 
 from optics.geometry.tree import Motion
 from tests.hunt.dense_images import DenseImages
-from tests.hunt.hunt import RIGHT, hunt
+from tests.hunt.hunt import REFUSED, RIGHT, hunt
 from tests.hunt.legal_instruments import legal_instrument
 from tests.hunt.legal_jobs import legal_job
+from tests.hunt.legal_spans import span_hunt
 from tests.tiers import quick
 
 FEW, MANY = 6, 1000
@@ -71,3 +72,10 @@ def test_the_reference_agrees_where_images_are_known_to_be_right(experiment, def
     dense = DenseImages(path, state)
     dense.trace()
     assert np.abs(dense.photons(0, rows, columns) - image[rows, columns]).max() < 3e-6 * image.max()
+
+
+@pytest.mark.parametrize("cases", [100, pytest.param(2000, marks=pytest.mark.slow)])
+def test_no_span_is_decided_by_rounding(cases: int) -> None:
+    counts = require_honest(list(span_hunt(0, cases)))
+    assert counts[RIGHT] > 0.15 * cases
+    assert counts[REFUSED] > 0.15 * cases

@@ -22,9 +22,11 @@ from twin.orbit.export.rpc_files import read_rpc
 from twin.orbit.flight.earth import east_north_up
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.measured import xml_file
+from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.dimap_file import read_dimap
 from twin.orbit.measured.dimap_sensor import read_scene
 from twin.orbit.measured.platform_files import platform_table, read_platform
+from twin.orbit.measured.platform_readings import OrbitReadings, require_own_velocity
 
 PLEIADES = Scene()
 SPOT = Scene(
@@ -349,3 +351,71 @@ def test_line_times_of_a_scene(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             read_line_clocks(LineTimesFileSpec.model_validate(said | change), cameras, tmp_path)
+
+
+def against_the_stars(text: str) -> str:
+    """A file with velocities that are larger by omega x P, in the same axes."""
+
+    def larger(found: re.Match[str]) -> str:
+        place, speed = (np.array(found[k].split(), float) for k in (1, 2))
+        speed = speed + np.cross([0.0, 0.0, 7.292115e-5], place)
+        return found[0].replace(found[2], " ".join(map(repr, speed.tolist())))
+
+    return re.sub(r"<LOCATION_XYZ[^>]*>([^<]*)</LOCATION_XYZ>\s*<VELOCITY_XYZ[^>]*>([^<]*)<", larger, text)
+
+
+def test_velocities_against_the_stars_are_recognised(tmp_path: Path) -> None:
+    """The model is that of the same orbit; rounding of the rate of the Earth is 1e-10 m/s."""
+    path = write(tmp_path, PLEIADES)
+    usual = read_dimap(path)
+    path.write_text(against_the_stars(path.read_text()))
+    found = read_dimap(path)
+    assert (usual.inertial_velocity, found.inertial_velocity) == (False, True)
+    assert np.abs(found.orbit.velocity - usual.orbit.velocity).max() < 1e-4
+    # half of it is neither
+    halved = re.sub(r"(<VELOCITY_XYZ[^>]*>)(\S+)", lambda m: m[1] + repr(0.9 * float(m[2])), path.read_text())
+    path.write_text(halved)
+    with pytest.raises(InputError, match="not the velocity of these positions"):
+        read_dimap(path)
+
+
+def test_velocities_of_other_files_are_not_those_against_the_stars() -> None:
+    """Positions 1 s to 15 min apart: what is right never looks like the other, and the other is named."""
+    for step in (1.0, 10.0, 60.0, 300.0, 900.0):
+        t = PLEIADES.start + step * np.arange(12.0)
+        place, speed = PLEIADES.orbit(t)
+        clock_readings = Readings(np.full(12, 58000), t)
+        for velocity, wrong in ((speed, False), (speed + np.cross([0.0, 0.0, 7.292115e-5], place), step < 500.0)):
+            orbit = OrbitReadings("a.sp3", clock_readings, place, velocity, "ITRS", "UTC")
+            if wrong:
+                with pytest.raises(InputError, match=r"against the stars.*omega x P"):
+                    require_own_velocity(orbit)
+            else:
+                require_own_velocity(orbit)
+
+
+def test_an_image_that_spans_ephemeris_and_samples_keeps_its_order(tmp_path: Path) -> None:
+    """Both begin with the first line and end with the last, as of SPOT 6: half a line lies outside at either end."""
+    scene = replace(SPOT, start=80_000.0, lines=6000)
+    whole = read_scene(write(tmp_path, scene)).sensor
+    last = scene.start + (scene.lines - 1) * scene.period
+    t = np.linspace(scene.start, last, 50)
+    place, speed = scene.orbit(t)
+    points = "".join(
+        f"<Point><LOCATION_XYZ>{' '.join(map(repr, p.tolist()))}</LOCATION_XYZ>"
+        f"<VELOCITY_XYZ>{' '.join(map(repr, v.tolist()))}</VELOCITY_XYZ><TIME>{clock(scene, s)}</TIME></Point>"
+        for s, p, v in zip(t, place, speed, strict=True)
+    )
+    turns = "".join(
+        f"<Quaternion>{''.join(f'<Q{k}>{v!r}</Q{k}>' for k, v in enumerate(q.tolist()))}"
+        f"<TIME>{clock(scene, s)}</TIME></Quaternion>"
+        for s, q in zip(t, scene.quaternions(t), strict=True)
+    )
+    text = re.sub(r"<Point_List>.*</Point_List>", f"<Point_List>{points}</Point_List>", dimap(scene), flags=re.DOTALL)
+    made = f"<Quaternion_List>{turns}</Quaternion_List>"
+    text = re.sub(r"<Quaternion_List>.*</Quaternion_List>", made, text, flags=re.DOTALL)
+    (tmp_path / "DIM_SCENE.XML").write_text(text)
+    found = read_scene(tmp_path / "DIM_SCENE.XML").sensor
+    row = np.array([-0.5, 0.0, 3000.0, scene.lines - 0.5])
+    # texts of times have nanoseconds, in which the satellite moves by 7 um; over a sample of 25 ms tenfold
+    assert np.abs(found.ground(row, 10.0) - whole.ground(row, 10.0)).max() < 1e-3

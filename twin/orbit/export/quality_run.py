@@ -120,11 +120,11 @@ def _products(run: Export, scene: DimapScene) -> Mapping[str, ProductPolynomial]
         path = folder / href
         # names in a file lead nowhere else
         if Path(href).name == href and path.is_file():
-            return FrozenMap({name: _compared(line.window.sensor, read_rpc(path), str(path))})
+            return FrozenMap({name: compared(line.window.sensor, read_rpc(path), str(path))})
     return FrozenMap()
 
 
-def _compared(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPolynomial:
+def compared(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPolynomial:
     """Return how far polynomials are from the sensor over the heights that they cover: beyond them they say nothing."""
     low, high = (model.offset[4] + sign * model.scale[4] for sign in (-1.0, 1.0))
     axes = (
