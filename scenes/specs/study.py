@@ -543,7 +543,7 @@ def unit_of(key: KeyPath) -> str:
     last = "_".join(words)
     endings = [ending for ending in UNITS if last.endswith(f"_{ending}")]
     if not endings:
-        return unit_of(above[-1:]) if above else ""
+        return unit_of(tuple(above[-1:])) if above else ""
     ending = max(endings, key=len)
     first = last.removesuffix(f"_{ending}")
     if not first.endswith("_per"):

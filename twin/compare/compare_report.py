@@ -105,12 +105,12 @@ def _artefacts(
             for n in sorted(found.numbers, key=lambda one: one.file != "truth.json")
             if not is_sigma(n.key)
         ]
-        heads = ("file", "key", *names, "difference", "sigma", "of", "in sigma")
+        columns = ("file", "key", *names, "difference", "sigma", "of", "in sigma")
         about = "Units are the keys' endings; sigma is that of the difference of independent measurements, of noise if "
         about += "runs state it, else as they state it. Runs of one seed share their noise, and differ by less."
         left = len(found.numbers) - len(rows)
         about += f" {left} sigmas that changed are in compare.json." if left else ""
-        out.append(Table(f"numbers-{k}", "Results", about, heads, rows, (None,) * 7 + (1,)))
+        out.append(Table(f"numbers-{k}", "Results", about, columns, rows, (None,) * 7 + (1,)))
     if found.arrays:
         heads = ("file", "variable", "shape", "largest", "rms", "peak", "share that differs")
         rows = [[a.file, a.name, _shape(a), a.largest, a.rms, a.peak, a.share] for a in found.arrays]
