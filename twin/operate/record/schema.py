@@ -224,7 +224,7 @@ def altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]
     wrong = [
         f"entry {row['id']}, {row['kind']} of {row['subject']} at {row['time_utc']}, is not as it was taken"
         for row in rows
-        if _digest(row) != row["sha256"] or row["time_utc"] != utc_text(row["time_us"])
+        if _digest_of(row) != row["sha256"] or row["time_utc"] != utc_text(row["time_us"])
     ]
     if connection.dialect.name == "sqlite":  # it counts without gaps
         held, last = connection.execute(select(func.count(), func.max(c.id)).select_from(ENTRY)).one()
@@ -233,7 +233,7 @@ def altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]
     return len(rows), wrong[::-1]
 
 
-def _digest(row: RowMapping) -> str:
+def _digest_of(row: RowMapping) -> str:
     try:
         content = json.loads(row["content"])
     except ValueError:
