@@ -33,7 +33,7 @@ def stops(first: int, cases: int, backend: Backend) -> Iterator[Outcome]:
 
 
 def drawn(rng: np.random.Generator) -> str:
-    """Text of a camera's file without its stop's name known to be anywhere in particular."""
+    """Return the text of a camera's file with lenses or two mirrors and a stop anywhere among them."""
     width = 10.0 ** rng.uniform(-2.0, -0.3)
     rows: list[tuple[float, str]] = []
     if rng.uniform() < 0.5:
@@ -116,8 +116,8 @@ def _judged(case: str, text: str, backend: Backend) -> Outcome:
 
 
 def _matrices(spec: CameraSpec) -> tuple[list[np.ndarray], list[float], float]:
-    """Paraxial matrices from the plane z = 0 before the first surface to each surface, before it acts, and to the image;
-    the places of those that act; and along which way the light arrives. A mirror turns the sign of the index.
+    """Return paraxial matrices from the plane z = 0 before the first surface to each surface, before it acts, and to
+    the image; the places of those that act; and along which way the light arrives. A mirror turns the index's sign.
     """
     out, used, matrix, z, index, way = [], [], np.eye(2), 0.0, 1.0, 1.0
     for mirror in spec.mirrors.values():
