@@ -365,9 +365,7 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     centre = field_direction(spec, 0.0, 0.0)
     axis, stop_radius = camera_axis.find_axis(spec, backend, to_stop, imaging, centre)
     about_axis = camera_axis.axis_data(backend, imaging, spec, axis, LINE_AXIS)
-    pupil = (
-        camera_axis.pupil_diameter(backend, to_stop, axis, stop_radius) if spec.stop_diameter else spec.entrance_pupil
-    )
+    pupil = camera_axis.pupil_diameter(backend, to_stop, axis, stop_radius)
     if stated:
         traced_here = _focal_lengths(matrix, about_axis)
         check_focal_length(spec, traced_here, lambda other: _traced_focal_lengths(other, backend))
@@ -390,7 +388,7 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     distance = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
     rear_node = image_centre - distance * image_direction
-    if stated:
+    if stated or spec.stop_diameter is None:
         check_entrance_pupil(spec, pupil)
     frames = (camera_frame, focal_plane, chief, image_direction, rear_node)
     return CameraModel(spec, surfaces, apertures, *frames, axis, about_axis, pupil)

@@ -27,6 +27,10 @@ LARGEST_PUPIL_DIFFERENCE = 0.4
 Of off-axis cameras the pupil of the axis is up to some 10 % from that of the field's middle, and the smallest mistake,
 a radius in place of a diameter, is a factor of two."""
 
+SAME_PUPIL = 0.01
+"""Share by which the beam that fills the stop may differ from the beam that made it: none about an axis; cameras with
+turned surfaces map one circle to another curve and back."""
+
 
 class TracedFocalLengths(NamedTuple):
     """Focal lengths of a camera about the chief ray of its field's middle, metres.
@@ -81,12 +85,17 @@ def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengt
 
 
 def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
-    """Check the stated entrance pupil of a camera that states its stop against the traced diameter, metres.
+    """Check the stated entrance pupil of a camera against the traced diameter, metres.
 
     Raises:
-        InputError: they differ by more than ``LARGEST_PUPIL_DIFFERENCE``.
+        InputError: they differ by more than ``LARGEST_PUPIL_DIFFERENCE`` where the stop is stated, else at all: other
+            rays than those of the stated beam meet the rim of the stop.
     """
-    if abs(traced / spec.entrance_pupil - 1.0) > LARGEST_PUPIL_DIFFERENCE:
+    off = abs(traced / spec.entrance_pupil - 1.0)
+    if spec.stop_diameter is None and off > SAME_PUPIL:
+        problem = "rays of other heights than the stated beam's meet the rim of the stop, which stands near their focus"
+        raise spec.error(problem, ("stop",), allowed="a stop that rays of different heights meet in different places")
+    if off > LARGEST_PUPIL_DIFFERENCE:
         stated, found = (format_quantity(float(f"{d:.4g}"), LENGTH) for d in (spec.entrance_pupil, traced))
         problem = f"a stop of this size has an entrance pupil of {found} on the axis; the file states one of {stated}"
         allowed = f"both within {100 * LARGEST_PUPIL_DIFFERENCE:.0f} %, or the entrance pupil alone"

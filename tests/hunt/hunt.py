@@ -40,7 +40,8 @@ DENSEST = 150.0
 
 RIGHT, WARNED, REFUSED = "right", "warned", "refused"
 WRONG_READING, WRONG_IMAGE, BAD_REFUSAL, TRACEBACK = "wrong reading", "wrong image", "bad refusal", "traceback"
-DEFECTS = (WRONG_READING, WRONG_IMAGE, BAD_REFUSAL, TRACEBACK)
+WRONG_NUMBER = "wrong number"
+DEFECTS = (WRONG_READING, WRONG_IMAGE, WRONG_NUMBER, BAD_REFUSAL, TRACEBACK)
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def _of_instrument(number: int, jobs: int, folder: Path, backend: Backend, dense
     try:
         experiment = MonitorExperiment(resolve(path), backend)
     except Exception as error:
-        yield _failed(f"{number}", error, made.text)
+        yield failed(f"{number}", error, made.text)
         return
     for k in range(jobs):
         case = f"{number}.{k}"
@@ -105,14 +106,15 @@ def _of_instrument(number: int, jobs: int, folder: Path, backend: Backend, dense
         try:
             run = render_job(resolve(path), backend, experiment=experiment)
         except Exception as error:
-            yield _failed(case, error, text)
+            yield failed(case, error, text)
             if isinstance(error, InputError) and "even as designed" in str(error):
                 return
             continue
         yield _judged(case, run, text, (number * JOBS + k) % dense == 0)
 
 
-def _failed(case: str, error: Exception, text: str) -> Outcome:
+def failed(case: str, error: Exception, text: str) -> Outcome:
+    """Return what an exception makes of a case: a refusal with key and remedy, or a defect."""
     if not isinstance(error, InputError):
         last = traceback.format_exception(error)[-3:]
         return Outcome(case, TRACEBACK, f"{text}\n  " + "".join(last).strip())

@@ -13,6 +13,7 @@ from tests.hunt.hunt import REFUSED, RIGHT, hunt
 from tests.hunt.legal_instruments import legal_instrument
 from tests.hunt.legal_jobs import legal_job
 from tests.hunt.legal_spans import span_hunt
+from tests.hunt.stops import stops
 from tests.tiers import quick
 
 FEW, MANY = 6, 1000
@@ -29,6 +30,7 @@ def found(tmp_path, backend):
 
 
 def require_honest(outcomes) -> Counter:
+    outcomes = list(outcomes)
     assert not [f"{o.case}: {o.kind}: {o.text}" for o in outcomes if o.defect]
     return Counter(o.kind for o in outcomes)
 
@@ -52,6 +54,14 @@ def test_nobody_is_misled_in_a_thousand_cases(found, capsys) -> None:
         print(f"\n{MANY} cases: {dict(Counter(o.kind for o in outcomes))}")  # noqa: T201 - the test's result
     counts = require_honest(outcomes)
     assert counts[RIGHT] > 0.4 * MANY
+
+
+@pytest.mark.parametrize(
+    "cases", [pytest.param(8, marks=pytest.mark.second), pytest.param(300, marks=pytest.mark.slow)]
+)
+def test_first_order_data_wherever_the_stop_stands(backend, cases) -> None:
+    counts = require_honest(stops(0, cases, backend))
+    assert counts[RIGHT] > 0.6 * cases
 
 
 def test_cases_are_the_same_every_time_and_differ(experiment) -> None:

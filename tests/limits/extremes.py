@@ -105,7 +105,7 @@ INSTRUMENTS_BEYOND: Mapping[str, Extreme] = {
     "camera a thousand times as large": _scaled(1e3),
     "radius of M1 a thousandth": _mirror("M1", "radius", 1e-3),
     "radius of M1 a thousand times": _mirror("M1", "radius", 1e3),
-    "radius of M3 40 percent less": _mirror("M3", "radius", 0.6, "1.84 m"),
+    "radius of M3 40 percent less": _mirror("M3", "radius", 0.6, "3.21 m"),
     "conic of M1 a thousand times": _mirror("M1", "conic", 1e3, "3.12 m"),
     "conic of M2 a thousand times, turned": _mirror("M2", "conic", -1e3),
     "field of 1 arcsec": _monitor("field", "1 arcsec"),

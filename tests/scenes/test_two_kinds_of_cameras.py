@@ -43,4 +43,4 @@ def test_terms_that_one_camera_lacks_are_zero(backend) -> None:
 
 def test_cameras_that_cannot_be_traced_together_are_refused(backend) -> None:
     with pytest.raises(InputError, match=r"cameras: these cameras are too different .*; allowed: cameras with"):
-        built(backend, GF7.model_copy(update={"stop": "M1"}))
+        built(backend, GF7.model_copy(update={"stop": "M1", "stop_diameter": None}))
