@@ -30,8 +30,8 @@ _FAINT, _UNSURE = 0.01, 0.1
 """Share of noise in the squares of the slopes of a median from which only pixels about the spot count, and from which a
 movement cannot be told."""
 _LEAST_MOVED_PX, _FARTHEST_PX, _ABOUT_PX, _ALIGNED = 0.3, 12.0, 10.0, 64
-"""Movement (in the median, and the farthest of a frame) for which frames are aligned before their median is taken, the radius of
-the light that says where each is, and the number of frames of that median."""
+"""Movement (in the median, and the farthest of a frame) for which frames are aligned before their median is taken, the
+radius of the light that says where each is, and the number of frames of that median."""
 
 
 def shown_pixels(middle: Array, noise: NoiseModel, count: int, follows: Mask) -> Mask | None:
