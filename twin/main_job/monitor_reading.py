@@ -74,8 +74,8 @@ class MonitorReading:
 
     @property
     def judged(self) -> str:
-        """The estimator that the verdict is about: `posterior` where disturbances are stated, else `model`."""
-        return judged(self.estimators)
+        """The estimator of the verdict: `posterior` where stated disturbances change any reading, else `model`."""
+        return judged(name for name in self.estimators if self.table.of(name))
 
     @cached_property
     def table(self) -> ReadingTable:
