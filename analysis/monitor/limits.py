@@ -86,8 +86,9 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
     return tuple(out)
 
 
-_UNMOVED = 1e-12
-"""Share of what a motion does to a camera, angles and relative changes alike, below which derivatives are rounding."""
+_UNMOVED, _NEGLIGIBLE = 1e-7, 1e-9
+"""Share of what a motion does to a camera, angles and relative changes alike, and of what any motion does, below which
+derivatives are rounding."""
 
 
 def unmoved(
@@ -101,11 +102,12 @@ def unmoved(
         ground: of a pair whose altitude is known.
     """
     unit = np.concatenate([(1.0, 1.0, 1.0, one.geometry.principal_distance_m) for one in cameras.values()])
-    size = np.max(np.abs(stated.parameters) / unit[:, None], axis=0)
+    size = np.max(np.abs(stated.parameters) / unit[:, None], axis=0, initial=0.0)
+    least = np.maximum(_UNMOVED * size, _NEGLIGIBLE * np.max(size, initial=0.0))
     return frozenset(
         (one.group, one.key)
         for one in quantities(cameras, ground)
-        if np.all(np.abs(one.row @ stated.parameters) <= _UNMOVED * float(np.abs(one.row) @ unit) * size)
+        if np.all(np.abs(one.row @ stated.parameters) <= float(np.abs(one.row) @ unit) * least)
     )
 
 

@@ -30,14 +30,20 @@ _FAINT, _UNSURE = 0.01, 0.1
 """Share of noise in the squares of the slopes of a median from which only pixels about the spot count, and from which a
 movement cannot be told."""
 _LEAST_MOVED_PX, _FARTHEST_PX, _ABOUT_PX, _ALIGNED = 0.3, 12.0, 10.0, 64
-"""Movement (in the median, and the farthest of a frame) for which frames are aligned before their median is taken, the radius of
-the light that says where each is, and the number of frames of that median."""
+"""Movement (in the median, and the farthest of a frame) for which frames are aligned before their median is taken, the
+radius of the light that says where each is, and the number of frames of that median."""
 
 
 def shown_pixels(middle: Array, noise: NoiseModel, count: int, follows: Mask) -> Mask | None:
     """Pixels (H, W) by which the light and the movement of frames are fitted: all of a bright spot. The median of faint
     frames is noise where there is no light, and its slopes are, so that only those about the spot count; None where
     the slopes there are noise as well.
+
+    Args:
+        middle: (H, W) median of the frames, DN.
+        noise: of the detector.
+        count: number of frames.
+        follows: (H, W) pixels that follow the light.
     """
     slopes = sum(ndimage.gaussian_filter(middle, 1.0, one, mode="nearest") ** 2 for one in ((1, 0), (0, 1)))
     low = float(np.median(middle))
@@ -60,6 +66,12 @@ def aligned(
 ) -> tuple[Array, Array]:
     """The median of frames that are moved to one place, and by how much (N, 2) each is off that; the plain median and
     zeros where they hardly move. Places are first moments of the light about the brightest pixel of the median.
+
+    Args:
+        each: gives the frames (H, W), DN, one after the other, and where they have a value.
+        count: number of frames.
+        middle: (H, W) their median, DN.
+        follows: (H, W) pixels that follow the light.
     """
     low = float(np.median(middle))
     bright = ndimage.gaussian_filter(np.where(follows, middle - low, 0.0), 2.0)
@@ -87,14 +99,24 @@ def aligned(
 
 
 def basis_of(reference: Array) -> Array:
-    """(7, H, W): the reference over its median, its first and second derivatives, and 1."""
+    """(7, H, W): the reference over its median, its first and second derivatives, and 1.
+
+    Args:
+        reference: (H, W) DN.
+    """
     order = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     smooth = [reference, *(ndimage.gaussian_filter(reference, 1.0, one, mode="nearest") for one in order[1:])]
     return np.stack([smooth[0] - np.median(reference), *smooth[1:], np.ones_like(reference)])
 
 
 def robust_fit(basis: Array, frame: Array, weight: Array) -> tuple[Array, Array]:
-    """Least squares that outliers do not pull: solution and inverse normal matrix."""
+    """Least squares that outliers do not pull: solution (K,) and inverse normal matrix (K, K).
+
+    Args:
+        basis: (K, H, W) terms.
+        frame: (H, W) that is fitted.
+        weight: (H, W) one over its variance.
+    """
     flat, y = basis.reshape(len(basis), -1), frame.ravel()
     scale = np.sqrt(np.maximum((flat**2).mean(axis=1), 1e-300))
     design, base = flat / scale[:, None], weight.ravel()
@@ -112,7 +134,13 @@ def robust_fit(basis: Array, frame: Array, weight: Array) -> tuple[Array, Array]
 
 
 def place_scatter(offset: Array, spread: Array, count: int) -> Array:
-    """Covariance of the places beyond noise, zeros where noise explains them."""
+    """Covariance (2, 2) of the places beyond noise, px^2; zeros where noise explains them.
+
+    Args:
+        offset: (N, 2) places of the frames, px.
+        spread: (N, 2, 2) their covariances by noise, px^2.
+        count: number of frames.
+    """
     if count < 3:
         return np.zeros((2, 2))
     away = offset - offset.mean(axis=0)

@@ -1,11 +1,14 @@
 """The sentence that a run begins with is true, whatever was perturbed, and misreadings are warnings."""
 
+import io
+import json
 import re
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE, GROUND
@@ -13,6 +16,7 @@ from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
 from optics.geometry.tree import Motion
 from scenes.specs.resolved import resolve
 from twin.main_job.assumptions import assumed, combination
+from twin.main_job.render_command import _table
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
 from twin.main_job.verdict import FALSE_ALARM, Judgement, alarm_limit, judge, readings, recovered_numbers
@@ -332,6 +336,37 @@ def test_a_change_is_what_the_cameras_parameters_make_of_it(job) -> None:
         assert row @ true == pytest.approx(truth["cameras"]["backward"][p.key], rel=1e-12)
         assert np.count_nonzero(row) == 1
         assert row[4 + k] != 0.0
+
+
+def test_a_change_that_no_cause_makes_has_no_posterior(job, tmp_path) -> None:
+    """Focal planes that are heated evenly lengthen lines and principal distances alike: nothing turns, and a posterior
+    of 0 ± 0 was told of the turns. Files, table and verdict leave it out; the other estimators read on.
+    """
+    run = job("{base/forward/focal_plane: {rotate: 0 0 2 arcsec}}", "disturbances: paper_001")
+    numbers = recovered_numbers(run)
+    none = [key for key, value in numbers["cameras"]["forward"]["posterior"].items() if value is None]
+    assert {"d_alpha_arcsec", "d_alpha_arcsec_sigma", "d_alpha_arcsec_sigma_noise", "d_gamma_arcsec"} <= set(none)
+    assert numbers["from_statement"]["forward"]["d_alpha_arcsec"] is None
+    assert numbers["cameras"]["forward"]["model"]["d_alpha_arcsec_sigma"] > 0.0
+    console = Console(record=True, width=120, file=io.StringIO())
+    console.print(_table(run, True))
+    assert "\N{EM DASH}" in console.export_text()
+    assert "0.0 ±" not in judge(run).verdict
+    assert json.loads(json.dumps(numbers, allow_nan=False)) == numbers
+
+
+def test_sigma_holds_where_there_are_no_doubts_and_each_is_a_warning(job) -> None:
+    for motion in ("{shift: 0 0 0.1 um}", "{shift: 0 0 60 um}"):
+        run = job(f"{{base/forward/M2: {motion}}}", "disturbances: launch")
+        numbers = recovered_numbers(run)
+        assert numbers["sigma_holds"] is (not numbers["doubts"])
+        assert numbers["sigma_holds"] is numbers["disturbances"]["agrees"]
+        assert set(numbers["doubts"]) <= set(numbers["warnings"])
+        assert len(set(numbers["warnings"])) == len(numbers["warnings"])
+    for more in ("disturbances: none", "analysis: {centroid: energy}"):
+        numbers = recovered_numbers(job("{base/forward/M2: {shift: 0 0 0.1 um}}", more))
+        assert "chi_square" in numbers["disturbances"]
+        assert "reduced_chi_square" in numbers["spots"]["forward"]["left"]["after"]
 
 
 @pytest.mark.second

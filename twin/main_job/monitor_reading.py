@@ -76,8 +76,8 @@ class MonitorReading:
 
     @property
     def judged(self) -> str:
-        """The estimator that the verdict is about: `posterior` where disturbances are stated, else `model`."""
-        return judged(self.estimators)
+        """The estimator of the verdict: `posterior` where stated disturbances change any reading, else `model`."""
+        return judged(name for name in self.estimators if self.table.of(name))
 
     @cached_property
     def table(self) -> ReadingTable:
@@ -405,25 +405,18 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
 
 def _fit(fits: FitStates | None, spot: int) -> dict[str, float | None]:
     """How good the fit of a spot is; None where no shape was fitted or no fit was judged."""
-    if fits is None or not math.isfinite(fits.whole[0, spot]):
-        return dict.fromkeys(_FIT)
-    values = {
-        "reduced_chi_square": fits.whole,
-        "reduced_chi_square_sigma_noise": fits.whole_sigma,
-        "core_chi_square": fits.core,
-        "core_chi_square_sigma_noise": fits.core_sigma,
-        "sigma_widened": fits.widening,
-    }
-    return {key: _to_digits(float(value[0, spot])) for key, value in values.items()}
+    known = fits is not None and math.isfinite(fits.whole[0, spot])
+    return {key: _to_digits(float(getattr(fits, of)[0, spot])) if known else None for key, of in _FIT.items()}
 
 
-_FIT = (
-    "reduced_chi_square",
-    "reduced_chi_square_sigma_noise",
-    "core_chi_square",
-    "core_chi_square_sigma_noise",
-    "sigma_widened",
-)
+_FIT = {
+    "reduced_chi_square": "whole",
+    "reduced_chi_square_sigma_noise": "whole_sigma",
+    "core_chi_square": "core",
+    "core_chi_square_sigma_noise": "core_sigma",
+    "sigma_widened": "widening",
+}
+"""Key of a spot in files -> the number of its fit."""
 
 
 def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:

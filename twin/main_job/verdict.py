@@ -147,8 +147,8 @@ def _hidden(run: RenderRun, found: tuple[Reading, ...]) -> str:
     """The least changes that can be told from none, of the parameters of the cameras."""
     parts = []
     for p in parameters.CAMERA_PARAMETERS:
-        worst = max((r for r in found if r.parameter == p), key=lambda r: r.sigma)
-        parts.append(f"{p.symbol} {significant(FAR * worst.sigma, 2, floor=0.0)} {p.unit}")
+        sigmas = [r.sigma for r in found if r.parameter == p]
+        parts += [f"{p.symbol} {significant(FAR * max(sigmas), 2, floor=0.0)} {p.unit}"] if sigmas else []
     who = (
         f"with {run.frames} frames the noise of the images hides" if _noise_only(run) else "noise and disturbances hide"
     )
@@ -440,10 +440,12 @@ def _unstated(run: RenderRun, found: tuple[Reading, ...], told: tuple[str, ...])
 
 def _misreadings(run: RenderRun) -> tuple[str, ...]:
     """A warning for every change whose reading is wrong by more than the change, and by more than chance can do."""
-    table = {estimator: readings(run, estimator) for estimator in run.estimators}
-    limit = alarm_limit(sum(map(len, table.values())))
+    changes: dict[tuple[str, str], list[Reading]] = {}
+    for reading in (one for estimator in run.estimators for one in readings(run, estimator)):
+        changes.setdefault((reading.group, reading.parameter.key), []).append(reading)
+    limit = alarm_limit(sum(map(len, changes.values())))
     out = []
-    for same in zip(*table.values(), strict=True):
+    for same in changes.values():
         wrong = [r for r in same if abs(r.error) > max(abs(r.true), limit * r.sigma, SAME)]
         if not wrong:
             continue

@@ -154,12 +154,12 @@ class ReadingTable:
         return ReadingTable(tuple(row for row in rows if row.group != GROUND_GROUP), {})
 
     def of(self, estimator: str) -> tuple[Reading, ...]:
-        """The rows of one estimator.
+        """Return the rows of what one estimator reads.
 
         Args:
             estimator: its name.
         """
-        return tuple(row for row in self.rows if row.estimator == estimator)
+        return tuple(row for row in self.rows if row.estimator == estimator and not np.all(np.isnan(row.sigma)))
 
     def by_change(self) -> list[list[Reading]]:
         """For each change the rows of all estimators."""

@@ -91,8 +91,8 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
     else:
         parts = []
         for p in parameters.CAMERA_PARAMETERS:
-            worst = max((one for one in found if one.parameter == p), key=lambda one: one.sigma)
-            parts.append(f"{p.symbol} {significant(FAR * worst.sigma, 2, floor=0.0)} {p.unit}")
+            sigmas = [one.sigma for one in found if one.parameter == p]
+            parts += [f"{p.symbol} {significant(FAR * max(sigmas), 2, floor=0.0)} {p.unit}"] if sigmas else []
         first = (
             f"No change is detected{when}: none of the {len(found)} readings of the {title} exceeds {FAR:g} σ (σ: "
             f"{basis})"

@@ -441,7 +441,8 @@ class _FrameTable:
                 if when not in one:
                     told = when if isinstance(when, str) else f"at {moment(when)}"
                     raise InputError(Issue(f"no file of {channel} {told}", file, None, allowed="a row for each state"))
-            corner = {"offset": corners.get((channel, True)), "offset_after": corners.get((channel, False))}
+            corner: dict[str, Any] = {"offset": corners.get((channel, True))}
+            corner["offset_after"] = corners.get((channel, False))
             frames[channel] = ChannelFramesSpec.model_construct(
                 before=tuple(one[BEFORE]),
                 after=tuple(tuple(one[when]) for when in order),

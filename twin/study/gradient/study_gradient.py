@@ -113,7 +113,7 @@ def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> flo
             # values that are written in several units agree to rounding
             if abs(numbers[k] - numbers[0]) > 1e-12 * abs(numbers[0]):
                 text = "the places of the factor have different values in the base, so that it has none"
-                raise Problem(text, *(shown(leaf(setup.base, factor.places[i])) for i in (k, 0)))
+                raise Problem(text, shown(leaf(setup.base, place)), shown(leaf(setup.base, factor.places[0])))
         except Problem as problem:
             raise setup.error(problem, ("factors", name, *factor.key_of(k))) from None
     return numbers[0] if numbers else 1.0

@@ -180,8 +180,11 @@ def says_nothing(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
     """
     node: Any = tree
     for k, part in enumerate(key):
-        node = node[part] if isinstance(node, list) else node.get(part) if node is not None else None
-        if node is None and not isinstance(part, int):
+        if isinstance(part, int):
+            node = None if node is None else node[part]
+            continue
+        node = None if node is None else node.get(part)
+        if node is None:
             owner = annotation_at(model, key[:k])
             filled = owner.model_fields[part].default is not None if _is_model(owner) else k < len(key) - 1
             if not filled and ZERO_IS_NONE not in metadata_at(model, key[: k + 1]):
