@@ -118,7 +118,7 @@ def _apart(place: NDArray[np.intp], reach: int) -> NDArray[np.intp]:
 
 
 LARGEST_REACH = 200
-# Half-width of the main lobe, px: from there a peak is one among 5 x 5 pixels.
+# Half-width of the main lobe, px: other peaks count from there.
 _LOBE = 3
 # Standard deviation below which a patch is even, relative to its largest grey value: float32 sees no more.
 _EVEN = 1e-6
@@ -131,7 +131,8 @@ class Peaks:
     Attributes:
         place: (n, 2) row and column of the templates' middles; NaN where nothing was searched.
         value: (n,) coefficient of the best peak, -1 to 1; NaN likewise.
-        ratio: (n,) second best local maximum over the best; 0 without one, 1 if the best is not positive.
+        ratio: (n,) second best local maximum, more than three pixels from the best, over the best; 0 without one,
+            1 if the best is not positive.
         reason: (n,) codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, FLAT or BORDER. BORDER also where the
             image's edge cuts the window.
     """
@@ -201,13 +202,9 @@ def _best(image: NDArray[np.generic], template: Array, middle: Array, reach: int
 
 
 def _second(field: NDArray[np.float32], row: int, column: int) -> float:
-    """Highest local maximum of 5 x 5 outside of the main lobe, whose slope is none, and of 3 x 3 within: where structure
-    runs along one direction, the lobe is a ridge with several.
-    """
-    peak, near = (field >= cv2.dilate(field, np.ones((side, side), np.uint8)) for side in (5, 3))
-    lobe = np.s_[max(row - _LOBE, 0) : row + _LOBE + 1, max(column - _LOBE, 0) : column + _LOBE + 1]
-    peak[lobe] = near[lobe]
-    peak[row, column] = False
+    """Highest local maximum (of 5 x 5) outside of the main lobe; the slope of a wide lobe is none."""
+    peak = field >= cv2.dilate(field, np.ones((5, 5), np.uint8))
+    peak[max(row - _LOBE, 0) : row + _LOBE + 1, max(column - _LOBE, 0) : column + _LOBE + 1] = False
     return max(float(field[peak].max(initial=0.0)), 0.0)
 
 
