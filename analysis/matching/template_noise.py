@@ -49,6 +49,9 @@ _OPEN = 1e-11
 _QUANTILE = 0.9
 # Share of the curvature from which the noise's energy counts as what holds a place.
 _HELD = 0.3
+# Share of the best known direction's curvature below which structure runs along one direction: sharp across it, it
+# keeps a low pass from being chosen, which otherwise leaves little of the noise's energy.
+_ONE_WAY = 0.1
 # Least share for that: template and image have the same noise, of which interpolation passes two thirds.
 _EQUAL = 0.6
 # Half width of the impulse's answer and phases of a pixel at which it is taken.
@@ -87,11 +90,12 @@ class TemplateNoise:
         out = np.full_like(self.inverse[:, :2, :2], np.nan)
         # without the curvature of the noise's energy, which holds a place that is locked
         left = np.linalg.inv(self.inverse[known, :2, :2])
-        least = np.linalg.eigvalsh(left)[:, 0]
+        least, most = np.linalg.eigvalsh(left).T
         left = left - own[known]
         left[least <= own[known, 0, 0]] = np.nan
         lock = np.linalg.inv(left) @ own[known] / (2.0 * np.pi)
-        out[known] = np.where((own[known, 0, 0] < _HELD * least)[:, None, None], 0.0, lock)
+        free = (own[known, 0, 0] < _HELD * least) | (least > _ONE_WAY * most)
+        out[known] = np.where(free[:, None, None], 0.0, lock)
         return out
 
 

@@ -37,6 +37,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from types import EllipsisType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -237,9 +238,12 @@ def residual_correlation(
     return ResidualCorrelation(variance, white, influence, correlation, *size)
 
 
-def _overlap(side: int, row: int, column: int) -> tuple[tuple[object, ...], tuple[object, ...]]:
+_Cut = tuple[EllipsisType, slice, slice]
+
+
+def _overlap(side: int, row: int, column: int) -> tuple[_Cut, _Cut]:
     """Pixels of a window that have a neighbour in it at a lag, and these neighbours."""
-    here = (..., slice(0, side - row), slice(max(-column, 0), side - max(column, 0)))
+    here: _Cut = (..., slice(0, side - row), slice(max(-column, 0), side - max(column, 0)))
     return here, (..., slice(row, side), slice(max(column, 0), side - max(-column, 0)))
 
 
