@@ -6,17 +6,20 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from itertools import chain
 from pathlib import Path
 
 from optics.numerics.backend import load_backend
 from tests.hunt.hunt import hunt
+from tests.hunt.lives import lives
 
 
 def main(cases: int = 60, first: int = 0, dense: int = 6) -> int:
     """Print defects as they come, and what became of all cases; how many defects there are."""
     began, counts, checked, defects = time.monotonic(), Counter(), 0, 0
     with tempfile.TemporaryDirectory() as folder:
-        for outcome in hunt(first, cases, Path(folder), load_backend("llvm"), dense):
+        jobs = hunt(first, cases, Path(folder), load_backend("llvm"), dense)
+        for outcome in chain(jobs, lives(first, cases)):
             counts[outcome.kind] += 1
             checked += outcome.checked
             if outcome.defect:
@@ -24,7 +27,8 @@ def main(cases: int = 60, first: int = 0, dense: int = 6) -> int:
                 print(f"{outcome.case}: {outcome.kind}: {outcome.text}", flush=True)
             elif outcome.kind == "refused":
                 print(f"{outcome.case}: refused: " + outcome.text.splitlines()[-1][:220], flush=True)
-    print(f"{cases} cases in {time.monotonic() - began:.0f} s, {checked} with dense images: {dict(counts)}")
+    spent = time.monotonic() - began
+    print(f"{cases} jobs and as many lives in {spent:.0f} s, {checked} with dense images: {dict(counts)}")
     return defects
 
 
