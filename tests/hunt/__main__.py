@@ -11,6 +11,7 @@ from pathlib import Path
 
 from optics.numerics.backend import load_backend
 from tests.hunt.hunt import hunt
+from tests.hunt.lives import lives
 from tests.hunt.stops import stops
 
 
@@ -19,7 +20,8 @@ def main(cases: int = 60, first: int = 0, dense: int = 6) -> int:
     began, counts, checked, defects = time.monotonic(), Counter(), 0, 0
     with tempfile.TemporaryDirectory() as folder:
         backend = load_backend("llvm")
-        for outcome in chain(hunt(first, cases, Path(folder), backend, dense), stops(first, cases, backend)):
+        jobs = hunt(first, cases, Path(folder), backend, dense)
+        for outcome in chain(jobs, stops(first, cases, backend), lives(first, cases)):
             counts[outcome.kind] += 1
             checked += outcome.checked
             if outcome.defect:
@@ -28,7 +30,7 @@ def main(cases: int = 60, first: int = 0, dense: int = 6) -> int:
             elif outcome.kind == "refused":
                 print(f"{outcome.case}: refused: " + outcome.text.splitlines()[-1][:220], flush=True)
     spent = time.monotonic() - began
-    print(f"{cases} jobs and {cases} stops in {spent:.0f} s, {checked} with dense images: {dict(counts)}")
+    print(f"{cases} jobs, stops and lives each in {spent:.0f} s, {checked} with dense images: {dict(counts)}")
     return defects
 
 

@@ -19,6 +19,8 @@ from twin.operate.record.entries import utc_text
 __all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "SensorState", "beyond", "widening"]
 
 Array = NDArray[np.float64]
+MOST_BAD = 2
+"""Readings taken for bad ones, above which it is said: 3 of 200 come by chance once in a thousand times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +229,9 @@ class Following:
             out.append(f"{len(self.jumps)} jumps are more than is stated: something else moves, or more of it")
         if self.undecided:
             out.append(f"the newest reading may be bad: {self.bad_readings[-1][1]}; until then sigmas count with both")
+        if len(self.bad_readings) > MOST_BAD:
+            text = "either the readings are worse than usual, or the prior is too small"
+            out.append(f"{len(self.bad_readings)} readings were taken for bad ones: {text}")
         if self.too_small:
             text = "they are stated too small, or of another course in time, and their sigmas do not hold"
             out.append(f"sensors of several bodies together disagree with {', '.join(self.too_small)}: {text}")

@@ -6,7 +6,6 @@ import io
 import json
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -21,14 +20,9 @@ from analysis.monitor.state_space import HeatInputs
 
 __all__ = ["packed", "unpacked"]
 
-_VALUES = (Aside, BadReading, Belief, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
+_FILTER = (Aside, BadReading, Belief, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
+_CLASSES = (*_FILTER, SeriesFilter, TimeLaw, Track)
 _PARAMETERS = {one.key: one for one in (*CAMERA_PARAMETERS, ANGLE, *GROUND)}
-_CLASSES = {one.__name__: one for one in (*_VALUES, SeriesFilter, TimeLaw, Track)}
-
-
-@cache
-def _names(kind: type) -> tuple[str, ...]:
-    return tuple(one.name for one in fields(kind) if one.init)
 
 
 def packed(value: Any) -> bytes:
@@ -42,7 +36,8 @@ def packed(value: Any) -> bytes:
         if isinstance(one, Parameter):
             return {"parameter": one.key}
         if is_dataclass(one) and not isinstance(one, type):
-            return {"class": type(one).__name__, "of": [plain(getattr(one, name)) for name in _names(type(one))]}
+            own = {each.name: plain(getattr(one, each.name)) for each in fields(one) if each.init}
+            return {"class": type(one).__name__, "of": own}
         if isinstance(one, Mapping):
             return {"mapping": [[plain(key), plain(each)] for key, each in one.items()]}
         return [plain(each) for each in one] if isinstance(one, tuple | list) else one
@@ -59,7 +54,7 @@ def unpacked(content: bytes, *classes: type) -> Any:
         content: the bytes.
         classes: data classes that are in it, beside those of the filter.
     """
-    known = _CLASSES | {one.__name__: one for one in classes}
+    known: dict[str, Any] = {one.__name__: one for one in (*_CLASSES, *classes)}
 
     def value(one: Any) -> Any:
         if isinstance(one, list):
@@ -67,8 +62,7 @@ def unpacked(content: bytes, *classes: type) -> Any:
         if not isinstance(one, dict):
             return one
         if "class" in one:
-            kind = known[one["class"]]
-            return kind(**dict(zip(_names(kind), map(value, one["of"]), strict=True)))
+            return known[one["class"]](**{name: value(each) for name, each in one["of"].items()})
         if "mapping" in one:
             return {value(key): value(each) for key, each in one["mapping"]}
         return arrays[one["array"]] if "array" in one else _PARAMETERS[one["parameter"]]

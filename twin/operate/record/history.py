@@ -142,12 +142,16 @@ class History:
             if before and before[-1]["included"] == included:
                 text = f"entry {number} is {'included' if included else 'excluded'} already"
                 raise Problem(text, None, f"another decision; the reason then: {before[-1]['why']}")
-            content = {"entry": number, "sha256": row["sha256"], "included": included, "why": why}
-            content["number"] = len(before) + 1
+            content = {
+                "entry": number,
+                "sha256": row["sha256"],
+                "included": included,
+                "why": why,
+                "number": len(before),
+            }
             one = Entry(DECISION, str(number), int(row["time_us"]), content)
             given = Given("twin.operate exclude", digest_of_data(content), one.digest, [one], {})
-            taking = digest_of_data([given.sha256, given.meaning])
-            Taking(connection, self.simulated, True).write(given, taking, None, [(one, one.digest)], {})
+            Taking(connection, self.simulated, True).write(given, one.digest, None, [(one, one.digest)], {})
         keys = {key: row[key] for key in ("kind", "subject", "time_utc")}
         return {"entry": number, **keys, "included": included, "why": why}
 
