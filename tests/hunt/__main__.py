@@ -11,6 +11,8 @@ from pathlib import Path
 
 from optics.numerics.backend import load_backend
 from tests.hunt.hunt import hunt
+from tests.hunt.legal_spans import span_hunt
+from tests.hunt.legal_telescopes import telescopes
 from tests.hunt.lives import lives
 from tests.hunt.stops import stops
 
@@ -21,7 +23,8 @@ def main(cases: int = 60, first: int = 0, dense: int = 6) -> int:
     with tempfile.TemporaryDirectory() as folder:
         backend = load_backend("llvm")
         jobs = hunt(first, cases, Path(folder), backend, dense)
-        for outcome in chain(jobs, stops(first, cases, backend), lives(first, cases)):
+        others = (stops(first, cases, backend), lives(first, cases), span_hunt(first, cases))
+        for outcome in chain(jobs, *others, telescopes(first, cases, Path(folder), backend)):
             counts[outcome.kind] += 1
             checked += outcome.checked
             if outcome.defect:
@@ -30,7 +33,7 @@ def main(cases: int = 60, first: int = 0, dense: int = 6) -> int:
             elif outcome.kind == "refused":
                 print(f"{outcome.case}: refused: " + outcome.text.splitlines()[-1][:220], flush=True)
     spent = time.monotonic() - began
-    print(f"{cases} jobs, stops and lives each in {spent:.0f} s, {checked} with dense images: {dict(counts)}")
+    print(f"{cases} jobs, stops, lives, spans and telescopes each in {spent:.0f} s, {checked} with dense images: {dict(counts)}")
     return defects
 
 
