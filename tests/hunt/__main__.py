@@ -33,7 +33,7 @@ def main(cases: int = 60, first: int = 0, dense: int = 6) -> int:
             elif outcome.kind == "refused":
                 print(f"{outcome.case}: refused: " + outcome.text.splitlines()[-1][:220], flush=True)
     spent = time.monotonic() - began
-    print(f"{cases} jobs, stops, lives, spans and telescopes each in {spent:.0f} s, {checked} with dense images: {dict(counts)}")
+    print(f"{cases} cases of each kind in {spent:.0f} s, {checked} with dense images: {dict(counts)}")
     return defects
 
 
