@@ -883,7 +883,7 @@ def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     # heat: a free plate in a gradient across it becomes a sphere of curvature alpha times the gradient
     plate = "base/forward/monitor/left/prism_180/mirror"
     warm = experiment.thermal.state({plate: Temperature(0.0, (0.0, 0.0, 2.0))})[plate]
-    disk = 0.03 * np.hypot(1.0, np.sqrt(2.0))
+    disk = 0.03 * np.sqrt(2.0)  # the smallest circle round the ellipse that the beam leaves on the tilted face
     bent = -2.0 * material("fused silica").expansion * disk**2 / (4.0 * np.sqrt(3.0))
     assert warm.figure[4] == pytest.approx(bent, rel=1e-6)
 

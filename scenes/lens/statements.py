@@ -213,8 +213,8 @@ MAKERS = ("SCHOTT", "OHARA", "HOYA", "CDGM")
 def of_makers(glasses: Glasses, makers: Sequence[str]) -> Glasses:
     """Return glasses without common ones of other makers than those that a file names, if it names any."""
     others = set(MAKERS).difference(makers) if set(MAKERS).intersection(makers) else set()
-    known = glasses.items()
-    return FrozenMap({k: g for k, g in known if getattr(g, "source", "").partition("'")[0].upper() not in others})
+    dropped = {k for k, g in glasses.items() if getattr(g, "source", "").partition("'")[0].upper() in others}
+    return FrozenMap({k: g for k, g in glasses.items() if k not in dropped}) if dropped else glasses
 
 
 def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, line: int) -> float:

@@ -87,7 +87,7 @@ def test_a_class_shows_its_fields() -> None:
 
 def test_views_of_a_camera(gf7_view: CameraView) -> None:
     shown = {
-        repr(gf7_view): ["CameraView: name gf7; mirrors M1, M2, M3; line focal length 5.51 m; entrance pupil 600 mm"],
+        repr(gf7_view): ["CameraView: name gf7; mirrors M1, M2, M3; focal length 5.422 m; entrance pupil 595.8 mm"],
         repr(gf7_view.wavefront()): [
             "WavefrontView: field (0, 0); rms 0.0159",
             "waves; strehl 0.99",

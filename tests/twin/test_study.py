@@ -62,7 +62,8 @@ def done(tmp_path_factory):
     process = start(path, "--out", folder / "run", "--workers", 1, "--json")
     out, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
-    assert errors == ""
+    assert errors.startswith("warning: 1 of 110 runs failed and are in no statistic.")
+    assert errors.count("\n") == 1
     return folder / "run", path, json.loads(out)
 
 
@@ -70,7 +71,8 @@ def done(tmp_path_factory):
 def test_files(done) -> None:
     folder, _, numbers = done
     assert {"study.nc", "study.csv", "study.json", "config.yaml", "report.html", "manifest.json"} <= files(folder)
-    assert json.loads((folder / "study.json").read_text("utf-8")) == numbers
+    written = json.loads((folder / "study.json").read_text("utf-8"))
+    assert written == {key: value for key, value in numbers.items() if key not in ("verdict", "warnings")}
     manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
     for name, checksum in manifest["sha256"].items():
         assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == checksum

@@ -195,7 +195,11 @@ def test_a_figure_that_cannot_be_drawn_costs_nothing_else(monkeypatch) -> None:
     assert made.contents["artefacts/histograms.txt"].decode() == f"{told}\n"
     others = {name for name in whole.contents if name not in ("report.html", "artefacts/histograms.svg")}
     assert "statistics.json" in others
+    others.remove("statistics.json")  # it has the warning
     assert all(made.contents[name] == whole.contents[name] for name in others)
+    before, after = (json.loads(one.contents["statistics.json"]) for one in (whole, made))
+    assert after.pop("warnings") == [*before.pop("warnings"), told]
+    assert after == before
     page_text = html.unescape(made.contents["report.html"].decode())
     assert told in page_text  # among the warnings
     assert f"T{told[1:]}." in page_text  # where it would stand

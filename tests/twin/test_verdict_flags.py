@@ -32,6 +32,7 @@ from twin.run.quantity import Quantity, Record
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 WARNED_ELSEWHERE = {
     # verdicts without a warning in their record -> where it is made, or why there is none
+    ("Sensitivity to a factor", "rbd_fast_agrees"): "twin.study.report.study_analysis",
     ("block.json", "agrees"): "twin.orbit.block.block_report",
     ("loop.json", "stable"): "that of margins_hold",
     ("course.json", "sigma_holds"): "twin.monitor.time_series, and twin.main_job.assumptions for single times",
@@ -48,7 +49,7 @@ FACTS = frozenset(
     # keys of truth values that describe a result and judge none of its numbers; a new one is added here by whoever
     # has seen that nothing rests on it, or is called as VERDICT says
     "alpha before best beta blind controlled corrected drawn enough_runs fast found gradient held high_resolution "
-    "improved kept light_corrected line_axis local_optimum mesh_prints_through multispectral near_vertical open "
+    "improved in_search kept light_corrected line_axis local_optimum mesh_prints_through multispectral near_vertical open "
     "possible principal_point_observable relinearised same schemes stated told truth value".split()
 )
 PER_SI = {

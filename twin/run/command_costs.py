@@ -25,7 +25,18 @@ BRIEF: Mapping[str, Brief] = {
     "orbit export": Brief("Models are fitted at some ten thousand points of each line, however long its images are."),
     **{
         f"operate {name}": Brief(_RECORD)
-        for name in ("init", "ingest", "status", "export", "forecast", "alarms", "products", "report", "serve")
+        for name in (
+            "init",
+            "ingest",
+            "status",
+            "export",
+            "forecast",
+            "alarms",
+            "products",
+            "report",
+            "serve",
+            "exclude",
+        )
     },
     "camera": Brief("Fields, rays and frequencies are the same for every camera: some 12 s and 0.4 GB."),
     "lens read": Brief("A prescription has 2000 surfaces at most."),

@@ -30,7 +30,7 @@ PROGRAMS = {
     "asbuilt": ("twin.asbuilt", "one instrument as built: its state by all that was measured"),
     "operate": (
         "twin.operate",
-        "init, ingest, status, forecast, alarms, products, report, serve, export, simulate, judge",
+        "init, ingest, status, forecast, alarms, exclude, products, report, serve, export, simulate, judge",
     ),
     "camera": ("twin.camera", "wavefront, spots, MTF, distortion of a camera; refocus it"),
     "lens": ("scenes.lens", "read and write prescriptions of Zemax, CODE V and batoid"),
@@ -118,7 +118,7 @@ def main() -> None:
         module, _ = PROGRAMS[sys.argv.pop(1)]
         runpy.run_module(_BEFORE + module, run_name="__main__", alter_sys=True)
     else:
-        from scenes.yaml.interrupt import end_quietly
-
-        end_quietly()
-        _application()(prog_name="camtwin")
+        try:
+            _application()(prog_name="camtwin")
+        except OSError as error:  # help is written by a library, which has no word for a full disk
+            sys.exit(f"error: cannot write to the standard output: {error.strerror}")
