@@ -49,8 +49,8 @@ FACTS = frozenset(
     # keys of truth values that describe a result and judge none of its numbers; a new one is added here by whoever
     # has seen that nothing rests on it, or is called as VERDICT says
     "alpha before best beta blind controlled corrected drawn enough_runs fast found gradient held high_resolution "
-    "improved in_search kept light_corrected line_axis local_optimum mesh_prints_through multispectral near_vertical open "
-    "possible principal_point_observable relinearised same schemes stated told truth value".split()
+    "improved in_search kept light_corrected line_axis local_optimum mesh_prints_through multispectral near_vertical "
+    "open possible principal_point_observable relinearised same schemes stated told truth value".split()
 )
 PER_SI = {
     "mas": 206264806.24709636,
