@@ -95,7 +95,8 @@ def crosstalk_section(run: RenderRun) -> Section:
 def _crosstalk(run: RenderRun, camera: int) -> Table:
     name, table = list(run.crosstalk.items())[camera]
     columns = [_columns(run, table, p) for p in range(len(parameters.CAMERA_PARAMETERS))]
-    floors = [max(SAME, UNSEEN * row.noise) for row in run.reading.table.of(run.judged) if row.camera == name]
+    own = [row for row in run.reading.table.rows if row.estimator == run.judged and row.camera == name]
+    floors = [max(SAME, UNSEEN * row.noise) for row in own]  # SAME where the estimator has no value
     bodies = [motion.body for motion in table.motions]
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
