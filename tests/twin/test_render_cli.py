@@ -629,7 +629,6 @@ def test_a_prior_that_moves_one_change_alone_has_a_posterior_of_it_alone(tmp_pat
     result = run(job, "--out", tmp_path / "run")
     assert result.exit_code == 0, result.stderr
     camera = json.loads((tmp_path / "run" / "recovered.json").read_text())["cameras"]["backward"]["posterior"]
-    assert {key for key, value in camera.items() if isinstance(value, float) and not key.endswith("sigma")} >= {"d_f_um"}
     assert camera["d_alpha_arcsec"] is None
     assert camera["d_alpha_arcsec_sigma"] is None
     assert camera["d_f_um_sigma"] > 0.0
