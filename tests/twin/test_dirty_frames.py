@@ -1,14 +1,16 @@
 """What real frames hold beside the spot is found and corrected, and sigmas hold; clean frames are left as they are."""
 
 import re
+from contextlib import suppress
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from analysis.spots import static_defects
 from analysis.spots.frame_screening import noise_ratio, screen_frames
 from analysis.spots.photon_transfer import pixel_correction
-from analysis.spots.screened_fit import one_shape
+from analysis.spots.screened_fit import fit_screened, one_shape
 from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.spots.static_defects import examine, lone_pixels
 from optics.numerics.threads import one_blas_thread
@@ -198,6 +200,32 @@ def test_findings_tell_places_on_the_ccd(bench):
         assert "(30, 21)" in texts["bad pixels"]
         assert texts["bad columns"].startswith("62 ")
         assert "at row 60.3, column 37.6" in texts["second light"]
+
+
+class Gaussian:
+    """A spot of another shape than the calibrated one, with as much light."""
+
+    def __init__(self, template, width: float) -> None:
+        self.shape, self.width = template.shape, width
+        self.light = float(np.sum(template.evaluate(47.0, 48.0)[0][0]))
+
+    def evaluate(self, row: float, column: float):
+        r, c = np.indices(self.shape)
+        peak = self.light / (2.0 * np.pi * self.width**2)
+        return [[peak * np.exp(-((r - row) ** 2 + (c - column) ** 2) / (2.0 * self.width**2))]]
+
+
+@pytest.mark.parametrize("width", [0.9, 4.0, 12.0])
+def test_the_search_ends_where_the_spot_has_another_shape(bench, width, monkeypatch):
+    """A Gaussian in place of the diffraction image takes some dozen fits, not one for each place along the edges."""
+    template, detector, noise = bench
+    fits, rng = [], np.random.default_rng(8)
+    monkeypatch.setattr(static_defects, "fit_screened", lambda *a, **k: fits.append(1) or fit_screened(*a, **k))
+    pattern = detector.fixed_pattern(template.shape, 3)
+    frames = record(clean_scene((47.0, 48.0), template.shape), Gaussian(template, width), detector, pattern, rng)
+    with suppress(SpotError), one_blas_thread():
+        examine(screen_frames(frames, noise), noise, template)
+    assert 0 < len(fits) <= 150
 
 
 @pytest.mark.parametrize("seed", [18, 139, 154])
