@@ -1,4 +1,4 @@
-"""What a filter of a series knows: readings, what they were against what was expected of them, and the states."""
+"""State of the filter of a series: its readings, their innovations, and the estimate with its covariance."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Observed:
 
     @property
     def spots(self) -> bool:
-        """Whether it is one of the spots."""
+        """Return whether the reading is one of the spots."""
         return not self.sensors and self.parameters is None
 
 
 @dataclass(frozen=True)
 class BadReading:
-    """What speaks for a reading being bad.
+    """Evidence that a reading is bad.
 
     Attributes:
         log_ratio: logarithm of the likelihood if it is bad, chance beforehand included, over that if it is not.
@@ -77,7 +77,7 @@ class Innovation:
 
     @property
     def chi_square(self) -> float:
-        """Of as many degrees of freedom as numbers were read."""
+        """Return chi-square, of as many degrees of freedom as numbers were read."""
         return float(self.white @ self.white)
 
 

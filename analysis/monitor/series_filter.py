@@ -296,7 +296,7 @@ class SeriesFilter:
         return now, replace(own.innovation, jump=jump)
 
     def _look(self, belief: Belief, observed: Observed, weighed: bool) -> _Look:
-        """What is known of spots before a reading and with it, and what speaks for it being bad.
+        """Return the estimate of the spots before a reading and with it, and the evidence that it is bad.
 
         Args:
             belief: before, nothing set aside.

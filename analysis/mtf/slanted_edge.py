@@ -216,7 +216,7 @@ def _check_one_edge(residual: Array, contrast: float, line: EdgeLine) -> None:
 
 @dataclass(frozen=True)
 class Structure:
-    """What the means of blocks of pixels differ by from the fit.
+    """Differences between the means of blocks of pixels and the fit.
 
     rms: beyond the noise, grey values. chance: probability of such differences by independent noise of the pixels.
     """

@@ -356,7 +356,7 @@ def _chief(
 
 
 def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
-    """What `derive_camera` says. Raises AimError, BeamMissedError, AfocalError."""
+    """Return the model as `derive_camera` does. Raises AimError, BeamMissedError, AfocalError."""
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     bare = _bare(spec, surfaces, {})

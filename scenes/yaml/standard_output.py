@@ -18,8 +18,7 @@ from scenes.yaml.errors import printable
 
 BAD_INPUT, FAILURE = 2, 1
 _OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
-"""What an operating system answers where the machine, and not what a user named, is at fault: a full disk for instance.
-"""
+"""Error numbers of failures of the machine, such as a full disk, and not of what a user named."""
 PIPE_CLOSED = 128 + signal.SIGPIPE
 """Exit code with which a shell tells of a program that the signal has ended."""
 

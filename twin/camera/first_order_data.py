@@ -242,7 +242,7 @@ _RIM = 48
 @shows("paraxial.focal_length [m]", "entrance_pupil [m]", "aperture", "obscuration.shares", "obscuration.holes")
 @dataclass(frozen=True, eq=False)
 class FirstOrderData:
-    """What was traced for `FIRST_ORDER` of a camera in one state; lengths in metres, angles in radians.
+    """First-order data of a camera in one state, traced; lengths in metres, angles in radians.
 
     Attributes:
         spec: the camera.

@@ -32,7 +32,7 @@ LEFT_OUT = frozenset(
 )
 """Keys of results that say how the run was done, not what it gave."""
 NOISE = "noise"
-"""What a sigma is of that more frames lower."""
+"""Name of a sigma that more frames lower."""
 TOLD = frozenset(("verdict", "warnings"))
 """Sentences at the top of a result that follow from its numbers, which are compared themselves."""
 NAMES = ("name", "motion", "label", "field", "path", "time_s")

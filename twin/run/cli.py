@@ -23,7 +23,7 @@ from scenes.yaml.standard_output import BAD_INPUT, FAILURE, code_of, print_error
 
 DOUBTFUL, INTERRUPTED = 3, 128 + signal.SIGINT
 NO_NAME = (errno.ENAMETOOLONG, errno.ELOOP)
-"""What an operating system answers to a name that no file can have."""
+"""Error numbers of names that no file can have."""
 LARGEST_SEED = 2**63 - 1
 BACKEND_HELP = f"Where to trace: {' or '.join(NAMES)}."
 OUT_HELP = "Run folder to make. Default: runs/NAME-001, -002, ... (the first that is free), NAME that of the file."

@@ -1,4 +1,4 @@
-"""What a command keeps beside its run folder while it runs, so that ``--resume`` can go on with it."""
+"""Work that a command keeps beside its run folder while it runs, so that ``--resume`` can go on with it."""
 
 from __future__ import annotations
 

@@ -336,8 +336,8 @@ class Operation:
         return float(widening(squares, [len(squares)], False, self._lasting(told))[0])
 
     def _lasting(self, told: Sequence[int]) -> list[tuple[int, Array]]:
-        """What is not forgotten: what contradicts the first readings, and what bodies of jumps do not explain; and
-        the number of readings of these times before it.
+        """Return contradictions that widen sigma for good: of the first readings, and of what bodies of jumps do not
+        explain; and the number of readings before each.
         """
         out = [(0, self._unexplained(self._standing.first))]
         jumps = [] if self.too_many_jumps else self._standing.jumps

@@ -1,4 +1,4 @@
-"""What an estimate rests on and where it stands as bytes, always the same for the same, and back to the bit."""
+"""Serialisation of an estimate and of its model: the same bytes for the same numbers, and back to the bit."""
 
 from __future__ import annotations
 
