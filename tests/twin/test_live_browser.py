@@ -297,6 +297,17 @@ def test_every_width(browser, command, width):
     assert page.wrong == []
 
 
+def test_a_camera_by_itself_fits_a_phone(browser):
+    """The names of its numbers are longer than those of a pair's readings."""
+    with running("gf7", "--port", "0", "--stay") as one:
+        page = Page(browser, one.address, 360, 800)
+        page.ready()
+        over = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+        assert page.page.evaluate(over) == 0
+        page.close()
+        assert page.wrong == []
+
+
 def test_two_pages_have_knobs_of_their_own(browser, command, page):
     other = Page(browser, command.address)
     other.ready()
