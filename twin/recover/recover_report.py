@@ -21,6 +21,10 @@ from twin.run.report import Report, Section, answer
 __all__ = ["KIND", "recover_numbers", "recover_report"]
 
 KIND = "recovered"
+_IN_NO_SIGMA = (
+    "σ contains no charge that a CCD leaves behind when it is read out (tails away from the read-out), no reflection "
+    "so near the spot that it is not told from it, and no error of the stated geometry."
+)
 
 
 def recover_numbers(run: RecoverRun) -> dict[str, Any]:
@@ -257,7 +261,7 @@ def _estimators(run: RecoverRun) -> Section:
         rows.append(row)
     notes = [f"{one.title}: {one.note}." for one in reading.estimators.values()]
     table = Table("estimators", "All estimators", " ".join(notes), heads, rows, digits=5)
-    return Section("Estimators", (), (table,), 1)
+    return Section("Estimators", (_IN_NO_SIGMA,), (table,), 1)
 
 
 def _series(run: RecoverRun) -> Section:
