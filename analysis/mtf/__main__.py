@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 if __name__ == "__main__":
+    import os
     import sys
 
     def _interrupted(kind: Any, error: Any, trace: Any) -> None:
@@ -11,6 +12,8 @@ if __name__ == "__main__":
             sys.stderr.write("interrupted\n")
         elif isinstance(error, OSError) and error.strerror and error.filename is None:
             sys.stderr.write(f"error: cannot write to the standard output: {error.strerror}\n")
+            # the interpreter's end would try again to write what is left in the buffers
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         else:
             sys.__excepthook__(kind, error, trace)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +23,8 @@ COMMANDS = [
 
 
 def run(*words: str, **how: object) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, stderr=subprocess.PIPE, text=True, **how)
+    own = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, env=own, stderr=subprocess.PIPE, text=True, **how)
     assert "Traceback" not in done.stderr
     return done
 
