@@ -20,14 +20,13 @@ import typer
 from rich.console import Console
 
 from scenes.yaml.errors import InputError, Issue, Problem, printable
-from scenes.yaml.standard_output import FAILURE, print_error, to_stdout
+from scenes.yaml.standard_output import BAD_INPUT, FAILURE, print_error, to_stdout
 from scenes.yaml.units import ANGLE, LENGTH, Kind, parse_quantity
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.lens.prescription import Prescription
 
-BAD_INPUT = 2
 READS = {".zmx": "Zemax", ".seq": "CODE V", ".yaml": "batoid", ".yml": "batoid"}
 WRITES = (".zmx", ".yaml", ".yml")
 

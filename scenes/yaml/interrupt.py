@@ -31,8 +31,9 @@ def _told(kind: type[BaseException], error: BaseException, trace: TracebackType 
         sys.stderr.write("interrupted\n")
     elif isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
         # help is written by a library, which has no word for it
+        from scenes.yaml.standard_output import leave_stdout
+
         sys.stderr.write(f"error: cannot write to the standard output: {error.strerror}\n")
-        # the interpreter's end would try again to write what is left in the buffers
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        leave_stdout()
     else:
         sys.__excepthook__(kind, error, trace)

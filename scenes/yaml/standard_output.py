@@ -51,16 +51,16 @@ def to_stdout(errors: Console, kept: str = "") -> Iterator[None]:
         yield
         sys.stdout.flush()
     except BrokenPipeError:
-        _leave_stdout()
+        leave_stdout()
         raise typer.Exit(PIPE_CLOSED) from None
     except OSError as error:
-        _leave_stdout()
+        leave_stdout()
         reason = os.strerror(error.errno) if error.errno else str(error)
         print_error(errors, f"cannot write to the standard output: {reason}" + (f"; {kept}" if kept else ""))
         raise typer.Exit(FAILURE) from None
 
 
-def _leave_stdout() -> None:
+def leave_stdout() -> None:
     """Let nobody try again to write what is left in the buffers: the interpreter does at its end."""
     try:
         place = sys.stdout.fileno()

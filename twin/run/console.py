@@ -121,6 +121,7 @@ def main() -> None:
         try:
             _application()(prog_name="camtwin")
         except OSError as error:  # help is written by a library, which has no word for a full disk
-            # the interpreter's end would try again to write what is left in the buffers
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            from scenes.yaml.standard_output import leave_stdout
+
+            leave_stdout()
             sys.exit(f"error: cannot write to the standard output: {error.strerror}")
