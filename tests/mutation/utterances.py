@@ -79,4 +79,6 @@ def _said(node: ast.AST, function: str) -> str | None:
             WARNING.search(function) or WARNING.search(ast.unparse(call.func))
         ):
             return ast.unparse(first)[:80]
+        case ast.Return(value=ast.JoinedStr() as value) if WARNING.search(function):
+            return ast.unparse(value)[:80]
     return None
