@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+import pytest
 import typer
 
 from tests.mutation.coverage_map import CoverageMap
@@ -25,7 +26,7 @@ from tests.mutation.fork_server import ForkServer
 from tests.mutation.mutants import Mutant
 
 Fate = Literal["killed", "survived", "uncovered"]
-STAGES = ((6.0, 2), (30.0, 6), (60.0, 10_000))
+STAGES = ((6.0, 2), (30.0, 8))
 """For each round of tests its seconds at the most (without any fault) and how many cases of one test function."""
 _STARTING = 40
 """Processor seconds that starting and compiling kernels may take, beside five times what the tests take.
@@ -73,8 +74,10 @@ def run_campaign(root: Path, chosen: list[Mutant], known: CoverageMap, results: 
     """Try every mutant and add a line to the results as soon as its fate is known."""
     with _copies(root, workers) as copies, ExitStack() as stack, ThreadPoolExecutor(workers) as pool:
         free: queue.SimpleQueue[ForkServer] = queue.SimpleQueue()
-        for copy in copies:
-            free.put(stack.enter_context(ForkServer(copy)))
+        servers = [stack.enter_context(ForkServer(copy)) for copy in copies]
+        known = known.of_tests(_collected(servers[0]).__contains__)
+        for server in servers:
+            free.put(server)
 
         def work(mutant: Mutant) -> Verdict:
             server = free.get()
@@ -150,8 +153,18 @@ def _killers(server: ForkServer, path: str, tests: list[str], seconds: float) ->
         return ["time"]
     if ended == 0:
         return []
+    if ended in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED):
+        # A fault that hinders the import of a test's file ends as an error of collection, which is another code.
+        raise RuntimeError(f"pytest found no such tests: {told.read_text(errors='replace')[-500:]}")
     failed = [line for line in told.read_text(errors="replace").splitlines() if line.startswith(("FAILED ", "ERROR "))]
     return [line.split(" ", 1)[1].split(" - ")[0] for line in failed] or [f"exit {ended}"]
+
+
+def _collected(server: ForkServer) -> set[str]:
+    """The names of all tests that there are now."""
+    told = server.tree / ".told"
+    server.run(["--collect-only", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", ""], told, 600)
+    return {line for line in told.read_text(errors="replace").splitlines() if "::" in line}
 
 
 @contextmanager
