@@ -1,7 +1,5 @@
 """Disturbances as files say them: what they come to on an instrument, what a job says instead, and what is refused."""
 
-import re
-
 import numpy as np
 import pytest
 import yaml
@@ -248,149 +246,6 @@ def test_none_states_nothing_and_a_name_stands_for_a_file(tmp_path) -> None:
 
 # --- what is refused --------------------------------------------------------------------------------------------------
 
-JOB = "instrument: gf7_pair\n\ndisturbances: ./own.yaml\n"
-M2 = "bodies: base/forward/M2"
-CORRELATED = f"  a: {{{M2}, shift: 1 um, reason: r, correlations: [{{between: [base/forward/M2 shift x, BETWEEN]"
-OF_FILE = {
-    "negative": (f"  a: {{{M2}, shift: -1 um, reason: r}}", "shift", "outside the limits; found '-1 um'"),
-    "negative term": (f"  a: {{{M2}, figure: {{Z5: -1 nm}}, reason: r}}", "figure.Z5", "at least 0 um"),
-    "missing": (f"  a: {{{M2}, reason: r}}", "a: a cause without any standard deviation", "at least one of shift"),
-    "empty": (f"  a: {{{M2}, shift: , rotate: 1 arcsec, reason: r}}", "a.shift: nothing stands here", "leave the key"),
-    "empty term": (f"  a: {{{M2}, figure: {{Z5: }}, reason: r}}", "figure.Z5", "nm"),
-    "one of three": (f"  a: {{{M2}, shift: [1 um, 2 um], reason: r}}", "shift", "3 times"),
-    "no reason": (f"  a: {{{M2}, shift: 1 um}}", "a.reason", "'reason' is missing"),
-    "unit": (f"  a: {{{M2}, shift: 1 arcsec, reason: r}}", "a.shift", "um"),
-    "no unit": (f"  a: {{{M2}, scale: 1, reason: r}}", "a.scale", "ppm"),
-    "not finite": (f"  a: {{{M2}, shift: .nan um, reason: r}}", "a.shift", "um"),
-    "key": (f"  a: {{{M2}, shifts: 1 um, reason: r}}", "a.shifts: unknown key", "did you mean 'shift'"),
-    "term": (f"  a: {{{M2}, figure: {{Z99: 1 nm}}, reason: r}}", "Z99", "not a Zernike term"),
-    "body": ("  a: {bodies: base/forwrd/M2, shift: 1 um, reason: r}", "a.bodies[0]", "mean 'base/forward/M2'"),
-    "pattern": ("  a: {bodies: [base/*/M2, base/*/mirror?], shift: 1 um, reason: r}", "a.bodies[1]", "has no body"),
-    "no bodies": ("  a: {bodies: [], shift: 1 um, reason: r}", "a.bodies", "at least 1 item"),
-    "prism": ("  a: {bodies: base/*/monitor/*/prism_90, rotate: 1 arcsec, reason: r}", "a.bodies[0]", "prism_"),
-    "motion": ("  a: {bodies: base/*/M?, scale: 1 ppm, reason: r}", "a.scale", "M1, as 5 more, does not allow scale"),
-    "heat of a face": (
-        "  a: {bodies: base/*/monitor/*/prism_0/exit, temperature: {gradient: 1 mK/m}, reason: r}",
-        "a.temperature",
-        "does not allow temperature; allowed: figure, rotate, shift",
-    ),
-    "index of a mirror": (f"  a: {{{M2}, index_gradient: 1e-9 1/m, reason: r}}", "a.index_gradient", "does not allow"),
-    "pivot": (f"  a: {{{M2}, pivot: center, rotate: 1 arcsec, reason: r}}", "a.pivot", "did you mean 'centre'"),
-    "together": ("  a: {bodies: base/*/M?, shift: 1 um, together: -0.5, reason: r}", "a.together", "at least -0.2 "),
-    "together too much": ("  a: {bodies: base/*/M?, shift: 1 um, together: 1.5, reason: r}", "a.together", "at most 1"),
-    "component": (
-        CORRELATED.replace("BETWEEN", "base/forward/M2 shft y") + ", correlation: 0.1}]}",
-        "a.correlations[0].between[1]: no component of a",
-        "did you mean 'base/forward/M2 shift y'",
-    ),
-    "component twice": (
-        CORRELATED.replace("BETWEEN", "base/forward/M2 shift x") + ", correlation: 0.1}]}",
-        "a.correlations[0].between",
-        "named twice",
-    ),
-    "neither": (CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + "}]}", "correlations[0]", "one of"),
-    "not symmetric": (
-        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + ", matrix: [[1, 0.2], [0.3, 1]]}]}",
-        "a.correlations[0].matrix[1][0]",
-        "symmetric; found 0.3 and 0.2",
-    ),
-    "not ones": (
-        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + ", matrix: [[1, 0.2], [0.2, 0.9]]}]}",
-        "a.correlations[0].matrix[1][1]",
-        "ones on its diagonal",
-    ),
-    "size": (
-        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + ", matrix: [[1, 0.2, 0], [0.2, 1, 0]]}]}",
-        "a.correlations[0].matrix",
-        "2 rows of 2 numbers",
-    ),
-    "indefinite": (
-        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y, base/forward/M2 shift z") + ", correlation: -0.6}]}",
-        "a.correlations[0]",
-        "not positive definite, an eigenvalue is -0.2",
-    ),
-    "said twice": (
-        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + ", correlation: 0.1}, {between: "
-        "[base/forward/M2 shift y, base/forward/M2 shift x], correlation: 0.2}]}",
-        "a.correlations[1]",
-        "have a correlation already, 0.1; found 0.2",
-    ),
-    "law": (f"  a: {{{M2}, shift: 1 um, time: pink, reason: r}}", "a.time.kind", "white, constant"),
-    "two laws": (f"  a: {{{M2}, shift: 1 um, time: {{kind: white, drift: 1 h}}, reason: r}}", "a.time", "no law of"),
-    "no law": (f"  a: {{{M2}, shift: 1 um, time: {{}}, reason: r}}", "a.time", "{drift: 6 h}"),
-    "no product": (f"  a: {{{M2}, shift: 1 um, time: {{trend: 1 d, drift: 1 h}}, reason: r}}", "a.time", "trend alone"),
-    "no start": (f"  a: {{{M2}, shift: 1 um, time: {{drift: 1 d, since: 1 h}}, reason: r}}", "a.time.since", "beside"),
-    "no time": (f"  a: {{{M2}, shift: 1 um, time: {{drift: 0 h}}, reason: r}}", "a.time.drift", "greater than zero"),
-    "wrong time": (f"  a: {{{M2}, shift: 1 um, time: {{period: 3 K}}, reason: r}}", "a.time.period", "min"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", quick(12, OF_FILE))
-def test_what_a_file_says_wrong(tmp_path, case) -> None:
-    """One message with the file's own line, and nothing is written."""
-    cause, key, told = OF_FILE[case]
-    code, text = command(tmp_path, JOB, f"name: own\n\n\ncauses:\n{cause}\n")
-    assert code == 2
-    assert "own.yaml:5: causes" in text, text
-    assert text.count("own.yaml:") == 1, text
-    assert key in text
-    assert told in text
-    assert not (tmp_path / "out").exists()
-
-
-OF_JOB = {
-    "no such file": ("orbitt", "no such name in disturbances", "did you mean 'orbit'"),
-    "no such file at all": ("nowhere/at_all.yaml", "no such file", "in_service, launch, orbit, paper_001, none"),
-    "no cause left out": ("{file: orbit, without: [mirror_heat]}", "disturbances.without[0]: no such cause", "mirror_"),
-    "left out twice": ("{without: [base_heat, base_heat]}", "disturbances.without[1]", "left out twice"),
-    "changed and left out": (
-        "{without: [base_heat], causes: {base_heat: {time: white}}}",
-        "disturbances.without[0]",
-        "both changed and left out",
-    ),
-    "unknown cause": ("{causes: {mirror_mount: {shift: 1 um}}}", "causes.mirror_mount", "did you mean 'mirror_mounts'"),
-    "nothing to change": ("{file: none, without: [base_heat]}", "no disturbances file that could be", "name of"),
-    "key": ("{cause: {mirror_mounts: {shift: 1 um}}}", "disturbances.cause: unknown key", "did you mean 'causes'"),
-    "change of body": (
-        "{causes: {mirror_mounts: {bodies: base/*/M9}}}",
-        "disturbances.causes.mirror_mounts.bodies[0]: gf7_pair has no body",
-        "did you mean 'base/*/M3'? Found 'base/*/M9'",
-    ),
-    "other body, same motions": (
-        "{causes: {mirror_figure: {bodies: base/*/focal_plane}}}",
-        "disturbances.causes.mirror_figure.bodies: figure of mirror_figure: base/forward/focal_plane, as 1 more,",
-        "does not allow figure",
-    ),
-    "negative": ("{causes: {mirror_mounts: {shift: -1 um}}}", "causes.mirror_mounts.shift", "outside the limits"),
-    "empty": ("{causes: {mirror_mounts: {shift: }}}", "mirror_mounts.shift: nothing stands here", "leave the key out"),
-    "motion": ("{causes: {mirror_mounts: {scale: 1 ppm}}}", "causes.mirror_mounts.scale", "does not allow scale"),
-    "together": ("{causes: {mirror_mounts: {together: -0.9}}}", "causes.mirror_mounts.together", "at least -0.2"),
-    "correlations": (
-        "{causes: {mirror_mounts: {correlations: [{between: [a, b], correlation: 0.1}]}}}",
-        "causes.mirror_mounts.correlations[0].between[0]",
-        "no component of mirror_mounts",
-    ),
-    "of a new one": (
-        "{causes: {new: {bodies: base/*/M?, scale: 1 ppm, reason: r}}}",
-        "disturbances.causes.new.scale",
-        "does not allow scale",
-    ),
-    "not a mapping": ("[orbit]", "disturbances", "not a mapping"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", quick(6, OF_JOB))
-def test_what_a_job_says_wrong(tmp_path, case) -> None:
-    """Told at the job's line, also where it changes what a file says."""
-    value, key, told = OF_JOB[case]
-    code, text = command(tmp_path, f"instrument: gf7_pair\n\ndisturbances: {value}\n")
-    assert code == 2
-    assert "job.yaml:3: disturbances" in text, text
-    assert key in text, text
-    assert told in text, text
-    assert not re.search(r"/(orbit|own)\.yaml:\d", text)
-    assert not (tmp_path / "out").exists()
-
 
 @pytest.mark.second
 def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(tmp_path) -> None:
@@ -416,14 +271,6 @@ def test_heat_of_a_glass_without_known_index_is_refused(tmp_path) -> None:
     assert "orbit.yaml:" in text
     assert "temperature" in text
     assert "a glass with known dn/dT" in text
-
-
-def test_a_name_that_no_file_can_have(tmp_path) -> None:
-    name = "n" * 300
-    code, text = command(tmp_path, f"instrument: gf7_pair\n\ndisturbances: ./{name}.yaml\n")
-    assert code == 2
-    assert "job.yaml:3: disturbances" in text
-    assert "File name too long" in text
 
 
 def test_a_camera_of_any_name(backend):

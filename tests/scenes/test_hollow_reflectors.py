@@ -25,7 +25,6 @@ from scenes.models.clearance import LEAST_GAP, find_overlaps, separation
 from scenes.models.obstruction import find_obstructions, rays_taken
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.load import load_instrument
-from scenes.yaml.errors import InputError
 from tests.scenes import monitor_layouts
 from tests.scenes.prism_errors import reflection
 
@@ -193,27 +192,6 @@ def test_what_stands_in_which_beam(model, gf7_pair, backend) -> None:
     glass = {o.body: o.share for o in find_obstructions(gf7_pair, backend)}
     for path, share in glass.items():
         assert sum(o.share for o in found if o.body == path or o.body.startswith(f"{path}/")) < share
-
-
-@pytest.mark.parametrize(
-    ("prism", "change", "said"),
-    [
-        ("prism_180", {"kind": "lateral_transfer"}, "prism_180.material: no such glass: light goes through this kind"),
-        ("prism_0", {"kind": "rhomboid"}, "prism_0.material: no such glass: light goes through this kind"),
-        ("prism_180", {"material": "CFPR"}, "prism_180.material: no such material; did you mean 'CFRP'?"),
-        ("prism_0", {"material": 5}, "prism_0.material"),
-        ("prism_0", {"shift": "70 mm"}, "prism_0.shift: base/forward/monitor/left/prism_0: mirrors of width 60 mm"),
-        ("prism_180", {"angle_errors": {"window": ["0 rad", "0 rad"]}}, "angle_errors.window: no such face"),
-        ("prism_180", {"kind": "periscope"}, "prism_180.kind: not one of the choices"),
-    ],
-)
-def test_wrong_ones_are_refused(prism, change, said, backend, tmp_path) -> None:
-    data = monitor_layouts.hollow_pair()
-    data["monitor"][prism] = {**data["monitor"][prism], **change}
-    with pytest.raises(InputError) as caught:
-        monitor_layouts.built(data, tmp_path, backend)
-    assert said in str(caught.value)
-    assert re.search(r"own\.yaml:\d+", str(caught.value))
 
 
 def test_the_material_is_spelt_as_in_the_catalogue(tmp_path) -> None:

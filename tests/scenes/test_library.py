@@ -109,40 +109,6 @@ def test_unknown_names(load: object, wrong: str, right: str) -> None:
         load(wrong)  # type: ignore[operator]
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("stop: M2", "stop: M4", ["the stop is not one of the mirrors", "M1, M2, M3"]),
-        ("radius: -2.65226629663464 m", "radius: 0 m", ["radius of curvature cannot be zero"]),
-        ("conic: -1.78965940473169", "conic: high", ["conic: not a number"]),
-        ("conic: -1.78965940473169", "conic: .inf", ["conic: not a finite number"]),
-        ("A4: -0.000664476944265854 1/m^3", "A4: -0.000664476944265854", ["aspheric.A4: a number without a unit"]),
-        ("A4: -0.000664476944265854 1/m^3", "A5: 1 1/m^3", ["A5: unknown key", "A4, A6, A8"]),
-        ("focal_length: 5.52 m", "focal_length: -5.52 m", ["greater than zero"]),
-        ("focal_length: 5.52 m", "", ["'focal_length' is missing", "focal_length: 5.5 m"]),
-        ("entrance_pupil: 0.60 m", "", ["'entrance_pupil' is missing", "entrance_pupil: 0.6 m"]),
-        ("entrance_pupil: 0.60 m", "entrance_pupil: 0.6", ["a number without a unit", "e.g. '0.6 m'"]),
-        ("focal_length: 5.52 m", "focal_length: 5,52 m", ["a number with a decimal comma", "write 5.52 m"]),
-        ("conic: -1.78965940473169", "conic: -1,79", ["conic: a number with a decimal comma", "write -1.79"]),
-        ("wavelength: 650 nm", "wavelength: 650 um", ["at most 100 um"]),
-        ("name: gf7", "name: a b", ["name: not a name"]),
-    ],
-)
-def test_mistakes_in_a_camera(old: str, new: str, words: list[str], tmp_path: Path) -> None:
-    text = (LIBRARY / CAMERAS / "gf7.yaml").read_text("utf-8")
-    assert text.count(old) == 1
-    path = tmp_path / "own.yaml"
-    path.write_text(text.replace(old, new), "utf-8")
-    # What is missing is told at the first line of where it belongs.
-    line = text[: text.index(old if new else "name:")].count("\n") + 1
-    with pytest.raises(InputError) as caught:
-        load_camera(path)
-    message = str(caught.value)
-    for word in words:
-        assert word in message
-    assert caught.value.line == line
-
-
 def own_instrument(folder: Path, camera: str = "own_camera.yaml", detector: str = "monitor_ccd") -> Path:
     """An instrument, its camera and a job in a folder of the user's; returns the job's path."""
     text = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")

@@ -1,14 +1,16 @@
 """Every refusal of a file of scenes: a good file is read, and each change of it is refused at its line and key.
 
-The cases stand in ``refusals/*.txt``. A section begins with ``## name | reader | file``, followed by the text of the good
-file (``@path`` for a file of scenes) and ``--``. Every row below is
+The cases stand in ``refusals/*.txt``. A section begins with ``## name | reader | file`` (and ``| second`` for the second
+tier), followed by the text of the good file (``@path`` for a file of scenes, ``=name`` for a layout of monitors) and
+``--``. Every row below is
 
     OLD => NEW :: LINE KEY :: word ; word
 
-OLD stands once in the good file; an empty OLD is the whole file, ``^OLD`` the first of several, ``~`` the OLD of the row above, ``@a.b.0`` a key of its YAML
-tree whose value is replaced (or lost, if NEW is empty). Two changes are joined by `` && ``, a line break is written ``\\n``. LINE is preceded by the
-name of another file if that is blamed, and is ``?`` for none; ``+1`` behind KEY counts further messages. In place of LINE and KEY ``ok`` says that the changed file is
-read as well: the value is just within its limits.
+OLD stands once in the good file; an empty OLD is the whole file, ``^OLD`` the first of several, ``~`` the OLD of the row
+above, ``@a.b.0`` a key of its YAML tree whose value is replaced (or lost, if NEW is empty). Two changes are joined by
+`` && ``, a line break is written ``\\n``. LINE is preceded by the name of another file if that is blamed, and is ``?`` for
+none; ``+1`` behind KEY counts further messages. In place of LINE and KEY ``ok`` says that the changed file is read as
+well: the value is just within its limits.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import yaml
 
 from scenes.specs.load import SCENES
 from scenes.yaml.errors import InputError, key_text
+from tests.scenes import monitor_layouts
 from tests.scenes.refusals import readers
 
 FOLDER = Path(__file__).parent / "refusals"
@@ -36,6 +39,7 @@ class Section(NamedTuple):
     file: str
     text: str
     rows: list[str]
+    second: bool
 
 
 def sections() -> list[Section]:
@@ -47,11 +51,11 @@ def sections() -> list[Section]:
             text, _, rows = rest.partition("--\n")
             if text.startswith("@"):
                 text = (SCENES / text[1:].strip()).read_text("utf-8")
-            found.append(Section(*(one.strip() for one in head.split("|")), text, [r for r in rows.split("\n") if r]))
+            elif text.startswith("="):
+                text = monitor_layouts.text_of(getattr(monitor_layouts, text[1:].strip())())
+            name, reader, file, *second = (one.strip() for one in head.split("|"))
+            found.append(Section(name, reader, file, text, [r for r in rows.split("\n") if r], bool(second)))
     return found
-
-
-SECTIONS = sections()
 
 
 def changed(text: str, changes: str) -> str:
@@ -106,7 +110,9 @@ def judged(read: Callable[[Path], object], path: Path, text: str, row: str) -> s
     return "" if where == "ok" else "not refused"
 
 
-@pytest.mark.parametrize("section", SECTIONS, ids=[one.name for one in SECTIONS])
+@pytest.mark.parametrize(
+    "section", [pytest.param(one, id=one.name, marks=[pytest.mark.second] * one.second) for one in sections()]
+)
 def test_faults_are_told_where_they_stand(section: Section, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """Also, a good file is read: what refuses everything would pass all else."""
     read = getattr(readers, section.reader)(tmp_path, request.getfixturevalue)

@@ -438,27 +438,6 @@ def test_no_change_is_a_temperature_of_its_own(own: str, one_material, tmp_path)
     assert resolve(tmp_path / "config.yaml").job.fields() == fields
 
 
-@pytest.mark.parametrize(
-    ("node", "words"),
-    [
-        ("{temperature: 2}", ("temperature.change", "a number without a unit")),
-        ("{temperature: 2 degC}", ("temperature.change", "a temperature, not of a temperature difference")),
-        ("{temperature: {chnge: 2 K}}", ("temperature.chnge", "unknown key", "did you mean 'change'?")),
-        ("{temperature: {gradient: [1 K, 0 K/m, 0 K/m]}}", ("temperature.gradient[0]", "temperature gradient")),
-        ("{temperature: {gradient: [0 K/m, 0 K/m]}}", ("temperature.gradient", "not a list of 3")),
-        ("{temperature: 2000 K}", ("temperature.change", "outside the limits", "1000 K")),
-    ],
-)
-def test_mistakes_in_temperatures(node: str, words, tmp_path) -> None:
-    path = written(tmp_path, HEAD + "  base/forward/M1: " + node)
-    with pytest.raises(InputError) as caught:
-        load_job(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}:3: perturb.base/forward/M1.temperature")
-    for word in words:
-        assert word in message
-
-
 @pytest.mark.parametrize("face", ["mirror", "window", "window/entry"])
 def test_a_face_of_a_prism_has_no_temperature_of_its_own(face: str, gf7_pair, tmp_path) -> None:
     job = load_job(written(tmp_path, HEAD + f"  {PRISM}/{face}: {{temperature: 1 K}}"))

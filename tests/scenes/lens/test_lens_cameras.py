@@ -174,37 +174,6 @@ def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> No
         assert again.index_behind("L1", wavelength) == pytest.approx(index, abs=1e-5)
 
 
-FACE = "{z: 1 mm, radius: 30 mm, light: refracts, index: %s}"
-
-
-@pytest.mark.parametrize(
-    ("mirrors", "problem"),
-    [
-        (f"A: {FACE % 1.5}, B: {FACE % 1.6}", "nothing cemented to it"),
-        (f"A: {FACE % 1.5}, M: {{z: 0 m, radius: -1 m}}", "light enters glass and does not leave it"),
-        (f"A: {FACE % 1.0}", "a lens has a face into glass"),
-        ("A: {z: 0 m, radius: 1 m, light: refracts}", "a face of a lens has an index behind it"),
-        ("A: {z: 0 m, radius: 1 m, index: 1.5}", "a face of a lens has an index behind it"),
-        ("A: {z: 0 m, radius: round}", "radius"),
-    ],
-)
-def test_lenses_that_a_camera_cannot_have(mirrors: str, problem: str) -> None:
-    text = f"""
-name: c
-focal_length: 1 m
-entrance_pupil: 10 mm
-field_bias: 0 deg
-field: {{x: 1 deg, y: 1 deg}}
-wavelength: 650 nm
-stop: A
-mirrors: {{{mirrors}}}
-image: {{z: 1 m}}
-line: {{pixels: 10, pitch: 7 um}}
-"""
-    with pytest.raises(InputError, match=problem):
-        validate(CameraSpec, parse_yaml(text))
-
-
 def test_an_instrument_takes_no_lenses(tmp_path: Path, backend) -> None:
     path = tmp_path / "singlet.zmx"
     path.write_text(SINGLET, "utf-8")

@@ -1,10 +1,14 @@
-"""What reads the files of the tables of refusals: each gives, from a folder and pytest's fixtures, a function of a path."""
+"""What reads the files of the tables of refusals: each gives, from a folder and pytest's fixtures, a function."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import meshlane
+import numpy as np
 
 from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.codev_reader import read_codev
@@ -37,6 +41,8 @@ from scenes.yaml.node_table import read_nodes, read_temperatures
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.units import ANGLE, LENGTH
 from scenes.yaml.yaml_file import read_yaml
+from tests.scenes.lens.colour_cameras import colour_camera
+from tests.scenes.test_finish_tables import bsdf_text
 
 Fixture = Callable[[str], Any]
 Read = Callable[[Path], object]
@@ -117,7 +123,9 @@ def disturbances(folder: Path, fixture: Fixture) -> Read:
 
 def correlations(folder: Path, fixture: Fixture) -> Read:
     """A table of correlations of the disturbances that name it."""
-    components = "forward/M2 shift z: 3.1 um, base/forward/M2 rotate x about origin: 4 arcsec, base/forward/M1 conic: 2.0e-5"
+    components = (
+        "forward/M2 shift z: 3.1 um, base/forward/M2 rotate x about origin: 4 arcsec, base/forward/M1 conic: 2.0e-5"
+    )
     text = f"name: own\njoint: {{reason: r, components: {{{components}}}, correlation_file: corr.csv}}\n"
     (folder / "own.yaml").write_text(text, "utf-8")
     return lambda path: load_disturbances(folder / "own.yaml")
@@ -133,11 +141,53 @@ def stated_job(folder: Path, fixture: Fixture) -> Read:
     return read
 
 
+def payload(folder: Path, fixture: Fixture) -> Read:
+    """A three-line camera of a simulated pass."""
+    orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
+    (folder / "test.yaml").write_text(
+        f"name: small\ncamera: own.yaml\norbit: {orbit}\npatch: {{pixel: 6000}}\n", "utf-8"
+    )
+    return lambda path: resolve_simulate(folder / "test.yaml")
+
+
+def payload_angle(folder: Path, fixture: Fixture) -> Read:
+    """A three-line camera of an angle test."""
+    orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
+    strips = "{points: 3, first: 0, last: 11999}"
+    (folder / "test.yaml").write_text(f"name: small\ncamera: own.yaml\norbit: {orbit}\nstrips: {strips}\n", "utf-8")
+    return lambda path: resolve_angle(folder / "test.yaml")
+
+
+def filter_table(folder: Path, fixture: Fixture) -> Read:
+    """A table of a filter that a camera of lenses names."""
+    text = colour_camera("achromat", "{table: filter.csv}").file_text("")
+    (folder / "c.yaml").write_text(text, "utf-8")
+    return lambda path: load_camera(folder / "c.yaml")
+
+
+def heated(folder: Path, fixture: Fixture) -> Read:
+    """A job on tables and meshes of nodes that lie beside it."""
+    numbers = np.arange(48.0).reshape(16, 3) % [5.0, 7.0, 3.0]
+    rows = "".join(f"{x},{y},{z},28{x:g},0.1,0\n" for x, y, z in numbers)
+    (folder / "heat.csv").write_text("x [mm],y [mm],z [mm],T [K]\n" + re.sub(r",0.1,0$", "", rows, flags=re.M), "utf-8")
+    (folder / "m1.csv").write_text("x [mm],y [mm],z [mm],dx [um],dy [um],dz [um]\n" + rows, "utf-8")
+    cells = [("vertex", np.arange(16)[:, None])]
+    data = {"a": 280.0 + numbers[:, 0], "b": numbers[:, 1]}
+    meshlane.Mesh(numbers, cells, point_data=data).write(folder / "heat.vtu")
+    meshlane.Mesh(numbers, cells, point_data={"U": numbers}).write(folder / "m1.vtu")
+    meshlane.Mesh(numbers, cells, point_data={"U": numbers, "v": numbers}).write(folder / "two.vtu")
+    meshlane.Mesh(numbers, cells).write(folder / "none.vtu")
+    for name in ("heat.inp", "m1.bdf", "m1.xlsx"):
+        (folder / name).write_text("*NODE\n", "utf-8")
+    return load_job
+
+
 def finishes(folder: Path, fixture: Fixture) -> Read:
     """A job whose finishes are in files beside it."""
-    from tests.scenes.test_finish_tables import write_finishes
-
-    write_finishes(folder)
+    for name, wavelengths, reflectance in (
+        ("ar", (600, 700), 0.4), ("ag", (640, 660), 97), ("dim", (640, 660), 10), ("blue", (440, 460), 10)
+    ):  # fmt: skip
+        rows = "".join(f"{wavelength},0,{reflectance}\n" for wavelength in wavelengths)
+        (folder / f"{name}.csv").write_text(f"wavelength [nm],angle [deg],R [percent]\n{rows}", "utf-8")
+    (folder / "m.bsdf").write_text(bsdf_text(), "utf-8")
     return lambda path: measured_finishes(resolve(path))
-
-
