@@ -124,7 +124,7 @@ def test_a_written_state_is_read_back_to_the_last_bit(tmp_path) -> None:
         assert spec.disturbances == "launch"
 
 
-@pytest.mark.parametrize("motion", [Motion(scale=1e-6), Motion(stretch=1e-6), Motion(index_gradient=(1e-6, 0.0, 0.0))])
-def test_what_no_file_can_say_is_not_written(motion) -> None:
-    with pytest.raises(ValueError, match="base/forward: only rigid motions"):
-        as_built_file("own", "gf7_pair", {"base/forward": motion})
+def test_what_no_file_can_say_is_not_written() -> None:
+    for motion in (Motion(scale=1e-6), Motion(stretch=1e-6), Motion(index_gradient=(1e-6, 0.0, 0.0))):
+        with pytest.raises(ValueError, match="base/forward: only rigid motions"):
+            as_built_file("own", "gf7_pair", {"base/forward": motion})

@@ -14,35 +14,14 @@ from scenes.models.autocollimator_model import (
     build_bench,
     ccd_body,
     mirror_body,
-    paraxial_focus,
     pinhole_body,
 )
-from scenes.specs.load import LAB, library_names, load_autocollimator_test
+from scenes.specs.load import load_autocollimator_test
 from scenes.yaml.errors import InputError
 from twin.laboratory.autocollimator_images import AutocollimatorPath
 
 SPEC = load_autocollimator_test().spec
 ANGLES = [math.radians(15), math.radians(30)]
-
-
-def test_the_file() -> None:
-    assert "principle_experiment" in library_names(LAB)
-    setup = load_autocollimator_test()
-    assert setup.detector.name == setup.spec.autocollimator.area_ccd.detector == "autocollimator_ccd"
-    programme = setup.spec.programme
-    np.testing.assert_allclose(np.degrees([programme.small, programme.table, programme.large]), [0.01, 0.02, 0.03])
-    assert np.degrees([programme.stands.X, programme.stands.Y, programme.stands.Z]).round(9).tolist() == [15, 15, 30]
-    assert programme.steps == 10
-    # the CCD holds the beam turned by the largest series, with half a window to spare
-    ccd = setup.spec.autocollimator.area_ccd
-    reach = paraxial_focus(setup.spec.autocollimator.lens, 650e-9)[0] * math.tan(2 * 10 * programme.large)
-    assert reach + 0.5 * setup.spec.autocollimator.window * ccd.pitch < 0.5 * ccd.pitch * min(ccd.rows, ccd.columns)
-
-
-def test_a_full_well_is_just_below_saturation() -> None:
-    detector = load_autocollimator_test().detector
-    full = detector.full_well_e * detector.system_gain_dn_per_e + detector.offset_dn
-    assert 0.9 * 2**detector.bit_depth < full < 2**detector.bit_depth - 1
 
 
 @pytest.mark.parametrize(
@@ -122,8 +101,3 @@ def test_a_larger_autocollimator_has_a_longer_focal_length(backend: Backend) -> 
     column = np.einsum("n,bnk->bk", path.nodes.share, position)[:4, 0]
     assert column[1] - column[0] == pytest.approx(0.5 * math.tan(4e-3), rel=1e-3)
     assert (column[3] - column[2]) / (column[1] - column[0]) - 1 == pytest.approx(1e-3, rel=0.02)
-
-
-def test_an_unknown_name() -> None:
-    with pytest.raises(InputError, match="did you mean 'principle_experiment'"):
-        load_autocollimator_test("principle_experimnt")

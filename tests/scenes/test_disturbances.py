@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import StatedMotions, motions_of_spec, state_of, stated_motions
@@ -16,9 +15,7 @@ from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
-from tests.robustness.case import Reached, cut
 from tests.tiers import quick
-from twin.render import app
 
 MIRRORS = [f"base/{camera}/M{k}" for camera in ("forward", "backward") for k in (1, 2, 3)]
 HEAD = "name: own\ncauses:\n"
@@ -37,23 +34,6 @@ def spec(causes: str, head: str = HEAD) -> DisturbancesSpec:
 
 def stated(pair, causes: str) -> StatedMotions:
     return motions_of_spec(spec(causes), pair)
-
-
-def command(folder, job: str, own: str = "", instrument: str = "") -> tuple[int, str]:
-    """Exit code (-1: it would begin to compute) and message of the main command on files of one's own."""
-    (folder / "job.yaml").write_text(job)
-    (folder / "own.yaml").write_text(own)
-    if instrument:
-        (folder / "other.yaml").write_text(instrument)
-    with cut(soon=False):
-        try:
-            result = CliRunner().invoke(app, [str(folder / "job.yaml"), "--out", str(folder / "out")])
-        except Reached:
-            return -1, ""
-    if isinstance(result.exception, Reached):
-        return -1, ""
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, " ".join(result.output.split())
 
 
 # --- what is stated ---------------------------------------------------------------------------------------------------
@@ -95,15 +75,6 @@ def test_names_units_and_the_number_of_sigmas(pair) -> None:
     }
     assert {c.pivot for c in found.components if c.kind == "shift"} == {"centre"}
     assert [law.text for law in found.laws[-1:]] == ["drift 6 h"]
-
-
-def test_one_number_for_all_axes_and_three(pair) -> None:
-    one, three, row = (
-        stated(pair, f"  a: {{bodies: base/forward/M2, shift: {text}, reason: r}}\n")
-        for text in ("2 um", "[2 um, 2 um, 2 um]", "2 2 2 um")
-    )
-    assert one.components == three.components == row.components
-    assert len(one.components) == 3
 
 
 def test_draws_have_the_stated_covariance(pair) -> None:
@@ -180,14 +151,8 @@ disturbances:
     plain, found = load_disturbances("orbit"), resolve(tmp_path / "job.yaml").disturbances
     assert list(found.causes) == [name for name in plain.causes if name != "base_heat"] + ["settling"]
     changed = found.causes["mirror_figure"]
-    assert {t: round(v * 1e9, 9) for t, v in changed.figure.items()} == {
-        "Z4": 2.0,
-        "Z5": 9.0,
-        "Z6": 2.0,
-        "Z7": 2.0,
-        "Z8": 2.0,
-        "Z11": 1.0,
-    }
+    figure = {t: round(v * 1e9, 9) for t, v in changed.figure.items()}
+    assert figure == {**dict.fromkeys(("Z4", "Z6", "Z7", "Z8"), 2.0), "Z5": 9.0, "Z11": 1.0}
     assert changed.reason == plain.causes["mirror_figure"].reason
     heat = found.causes["central_prism_heat"]
     assert (heat.temperature.change, heat.temperature.gradient[0]) == (0.5, pytest.approx(0.04))
@@ -225,15 +190,6 @@ disturbances:
     np.testing.assert_array_equal(one.correlation, two.correlation)
 
 
-def test_a_config_without_disturbances_states_none(tmp_path) -> None:
-    """As runs before there were any have it."""
-    (tmp_path / "job.yaml").write_text("instrument: gf7_pair\n")
-    data = yaml.safe_load(resolve(tmp_path / "job.yaml").to_yaml())
-    del data["disturbances"], data["instrument"]["disturbances"]
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(data))
-    assert resolve(tmp_path / "config.yaml").disturbances is None
-
-
 def test_none_states_nothing_and_a_name_stands_for_a_file(tmp_path) -> None:
     def named(text: str):
         (tmp_path / "job.yaml").write_text(f"instrument: gf7_pair\ndisturbances: {text}\n")
@@ -247,30 +203,27 @@ def test_none_states_nothing_and_a_name_stands_for_a_file(tmp_path) -> None:
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.second
-def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(tmp_path) -> None:
+def stated_of_job(folder, instrument: str, disturbances: str, backend) -> StatedMotions | None:
+    """Return what a job states to move of an instrument of one's own."""
+    (folder / "other.yaml").write_text(instrument)
+    (folder / "job.yaml").write_text(f"instrument: ./other.yaml\n{disturbances}")
+    resolved = resolve(folder / "job.yaml")
+    return stated_motions(resolved, build_instrument(resolved.instrument, resolved.cameras, backend))
+
+
+def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(backend, tmp_path) -> None:
     """Cameras of other names: the file is of another instrument, while those of the library are of any camera."""
-    instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
-    instrument = instrument.replace("backward", "nadir")
+    instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8").replace("backward", "nadir")
     named = "{bodies: base/backward, rotate: 1 arcsec, reason: r}"
-    own = f"{HEAD}  camera_heat: {named}\n  camera_mounts: {named}\n"
-    code, text = command(tmp_path, "instrument: ./other.yaml\ndisturbances: ./own.yaml\n", own, instrument)
-    assert code == 2
-    assert text.count("own.yaml:") == 1
-    assert "gf7_pair has no body of this name, nor for camera_mounts" in text
-    assert "'base/backward'" in text
-    assert command(tmp_path, "instrument: ./other.yaml\n", "", instrument)[0] == -1
-    assert command(tmp_path, "instrument: ./other.yaml\ndisturbances: none\n", "", instrument)[0] == -1
-
-
-def test_heat_of_a_glass_without_known_index_is_refused(tmp_path) -> None:
-    instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8").replace("fused silica", "Zerodur")
-    assert "Zerodur" in instrument
-    code, text = command(tmp_path, "instrument: ./other.yaml\n", "", instrument)
-    assert code == 2
-    assert "orbit.yaml:" in text
-    assert "temperature" in text
-    assert "a glass with known dn/dT" in text
+    (tmp_path / "own.yaml").write_text(f"{HEAD}  camera_heat: {named}\n  camera_mounts: {named}\n")
+    with pytest.raises(
+        InputError, match=r"own.yaml.*gf7_pair has no body of this name, nor for camera_mounts"
+    ) as caught:
+        stated_of_job(tmp_path, instrument, "disturbances: ./own.yaml\n", backend)
+    assert len(caught.value.issues) == 1
+    assert caught.value.found == "'base/backward'"
+    assert stated_of_job(tmp_path, instrument, "", backend).components
+    assert stated_of_job(tmp_path, instrument, "disturbances: none\n", backend) is None
 
 
 def test_a_camera_of_any_name(backend):

@@ -101,21 +101,6 @@ def test_light_goes_as_plain_mirrors_send_it(backend, kind, turn, slant) -> None
             assert np.ptp(path + place @ into) < 3e-15
 
 
-def test_where_they_send_the_beam() -> None:
-    """As the prisms do: back at (-x, -y), or on, displaced along x."""
-    for hand in (1.0, -1.0):
-        parts, middle = made("hollow_transfer", hand)
-        start = beam(middle)
-        places, way, _ = by_hand(parts, {}, start, np.broadcast_to(UP, start.shape))
-        np.testing.assert_allclose(places[-1][:, :2], -start[:, :2], rtol=0, atol=1e-15)
-        np.testing.assert_allclose(way, np.broadcast_to(-UP, way.shape), rtol=0, atol=1e-15)
-    parts, middle = made("periscope")
-    start = beam(middle)
-    places, way, _ = by_hand(parts, {}, start, np.broadcast_to(UP, start.shape))
-    moved = places[-1][:, :2] - start[:, :2]
-    np.testing.assert_allclose(moved, np.broadcast_to([SHIFT, 0.0], moved.shape), rtol=0, atol=1e-15)
-
-
 @pytest.mark.parametrize("kind", ["hollow_transfer", "periscope"])
 def test_angle_errors_are_tilts_of_the_mirrors(kind) -> None:
     errors = dict(zip(REFLECTORS[kind].faces, ERRORS, strict=False))

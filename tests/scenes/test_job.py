@@ -7,16 +7,11 @@ import pytest
 from scenes.specs.course import noll
 from scenes.specs.job import checked_nodes
 from scenes.specs.load import EXAMPLES, load_job
-from scenes.specs.perturbation import NodeInfo
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
+from tests.scenes.refusals.readers import NODES
 
 ARCSEC = 4.84813681109536e-06
-NODES = {
-    "base/backward/focal_plane": NodeInfo(("origin", "rear_node"), frozenset({"rotate", "shift", "scale"})),
-    "base/forward/M1": NodeInfo(allows=frozenset({"rotate", "shift", "figure"})),
-    "base/forward/M2": NodeInfo(allows=frozenset({"rotate", "shift", "figure"})),
-}
 HEAD = "instrument: gf7_pair\nperturb:\n"
 
 
@@ -39,34 +34,27 @@ def test_the_example() -> None:
     checked_nodes(job, NODES)
 
 
-@pytest.mark.parametrize(
-    ("text", "kelvin"),
-    [
-        ("100 K", 100.0),
-        ("+250 K", 250.0),
-        (" +250 K", 250.0),
-        ("-250 K", -250.0),
-        ("250 mK", 0.25),
-        ("+1000 K", 1000.0),
-    ],
-)
-def test_changes_of_temperature(text: str, kelvin: float, tmp_path: Path) -> None:
-    path = write(tmp_path, f"{HEAD}  base: {{temperature: '{text}'}}\n")
-    job = load_job(path)
-    assert job.perturb["base"].temperature.change == kelvin
-    # what is written is read again
-    again = write(tmp_path, dump_yaml(job.plain()))
-    assert load_job(again).perturb["base"].temperature.change == kelvin
+def test_changes_of_temperature(tmp_path: Path) -> None:
+    changes = {"100 K": 100.0, "+250 K": 250.0, " +250 K": 250.0, "-250 K": -250.0, "250 mK": 0.25, "+1000 K": 1000.0}
+    for text, kelvin in changes.items():
+        path = write(tmp_path, f"{HEAD}  base: {{temperature: '{text}'}}\n")
+        job = load_job(path)
+        assert job.perturb["base"].temperature.change == kelvin
+        # what is written is read again
+        again = write(tmp_path, dump_yaml(job.plain()))
+        assert load_job(again).perturb["base"].temperature.change == kelvin
 
 
-@pytest.mark.parametrize(
-    "text", ["instrument: gf7_pair", "instrument: gf7_pair\nperturb: {}", "instrument: gf7_pair\nperturb:\nrender:\n"]
-)
-def test_nothing_perturbed(text: str, tmp_path: Path) -> None:
-    job = load_job(write(tmp_path, text))
-    assert job.perturb == {}
-    assert job.render.frames is None
-    checked_nodes(job, {})
+def test_nothing_perturbed(tmp_path: Path) -> None:
+    for text in (
+        "instrument: gf7_pair",
+        "instrument: gf7_pair\nperturb: {}",
+        "instrument: gf7_pair\nperturb:\nrender:\n",
+    ):
+        job = load_job(write(tmp_path, text))
+        assert job.perturb == {}
+        assert job.render.frames is None
+        checked_nodes(job, {})
 
 
 def test_everything_that_a_node_may_have(tmp_path: Path) -> None:

@@ -19,13 +19,11 @@ from scenes.specs.orbit.setup import (
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
-from tests.scenes.test_refusals import sections
+from tests.scenes.refusals.tables import good
 
 ARCSEC = math.pi / 648000.0
-SMALL = {one.name: one.text for one in sections()}
-"""Good files of the tables of refusals, by the name of their section."""
-PASSING, ELEMENTS, STATE = (SMALL[f"orbit by {name}"] for name in ("a passing", "elements", "a state"))
-ERRORS = SMALL["errors in orbit"]
+PASSING, ELEMENTS, STATE = (good(f"orbit by {name}") for name in ("a passing", "elements", "a state"))
+ERRORS = good("errors in orbit")
 TH1 = (LIBRARY / "payloads/th1.yaml").read_text("utf-8")
 
 
@@ -116,7 +114,7 @@ def test_an_angle_test(tmp_path: Path) -> None:
     setup = resolve_angle(SCENES / ORBIT / "angle_off_axis.yaml")
     assert setup.angles["multispectral"] == ("multispectral", "nadir")
     assert (setup.pixels["high_resolution"], setup.pixels["multispectral"], setup.usual_pixels) == (30000, 6000, 12000)
-    test = resolve_angle(write(tmp_path, SMALL["angle"])).test
+    test = resolve_angle(write(tmp_path, good("angle"))).test
     assert dict(test.perturb) == {}
     assert (test.errors.station, test.errors.points, test.errors.datum) == (0.5, 1.5, (0.0, 0.0, 0.0))
     effects = test.effects
@@ -126,7 +124,7 @@ def test_an_angle_test(tmp_path: Path) -> None:
 
 def test_lines_of_a_camera_of_ones_own(tmp_path: Path) -> None:
     """Other lines are no mistake, but then the file says which angles."""
-    small = SMALL["angle"].replace("th1", "own.yaml")
+    small = good("angle").replace("th1", "own.yaml")
     (tmp_path / "own.yaml").write_text(TH1.replace("name: th1", "name: own").replace("  backward:", "  rear:"), "utf-8")
     named = small + "angles: {all: [forward, rear]}\n"
     setup = resolve_angle(write(tmp_path, named))
@@ -149,7 +147,7 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     assert setup.test.perturb["base"].temperature.gradient[2] == pytest.approx(0.4)
     text = (LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8").replace("name: gf7_pair", "name: own")
     (tmp_path / "own.yaml").write_text(text, "utf-8")
-    own = resolve_angle(write(tmp_path, SMALL["angle"].replace("th1", "own.yaml")))
+    own = resolve_angle(write(tmp_path, good("angle").replace("th1", "own.yaml")))
     assert (own.camera_name, dict(own.angles)) == ("own", {"alpha": ("forward", "backward")})
     data = parse_yaml(setup.to_yaml()).data
     whole = data.pop("instrument")
@@ -170,7 +168,7 @@ def test_a_loop(tmp_path: Path) -> None:
     assert setup.pair == ("forward", "backward")
     assert "metering" in setup.disturbances.causes
     assert len(setup.test.readings.times) == 25
-    setup = resolve_loop(write(tmp_path, SMALL["loop"]))
+    setup = resolve_loop(write(tmp_path, good("loop")))
     test = setup.test
     assert setup.disturbances.name == "orbit"
     assert test.readings.times == (0.0, 600.0, 1200.0)
@@ -190,7 +188,7 @@ def test_a_monitored_orbit(tmp_path: Path) -> None:
     test = setup.test
     assert (test.interval, test.step, test.referred) == (600.0, 300.0, 0)
     assert test.motion["base/forward"].rotate[1] == pytest.approx(1.2 * ARCSEC, rel=1e-15)
-    test = resolve_monitor(write(tmp_path, SMALL["monitor"])).test
+    test = resolve_monitor(write(tmp_path, good("monitor"))).test
     assert test.apply == ("d_alpha", "d_beta", "d_gamma", "d_f")
     assert test.compared == (300.0, 600.0, 1200.0)
     assert test.errors.gps.noise == (0.0, 0.0, 0.0)
@@ -201,7 +199,7 @@ def test_a_monitored_orbit(tmp_path: Path) -> None:
     kept = [row for row in text.splitlines() if not row.lstrip().startswith("backward")]
     (tmp_path / "own.yaml").write_text("\n".join(kept), "utf-8")
     with pytest.raises(InputError, match=r"no stereo pair.*forward in gf7_pair.*two cameras"):
-        resolve_monitor(write(tmp_path, SMALL["monitor"].replace("gf7_pair", "own.yaml")))
+        resolve_monitor(write(tmp_path, good("monitor").replace("gf7_pair", "own.yaml")))
 
 
 def test_a_motion_is_a_step_a_ramp_or_a_swing() -> None:
@@ -226,7 +224,7 @@ def test_a_simulated_pass(tmp_path: Path) -> None:
     assert test.ground.light.elevation == pytest.approx(math.radians(38.0), rel=1e-15)
     assert test.control.shift == (0.6, -0.4)
     assert setup.camera.image_of("backward").wavefront["Z4"] == 20e-9
-    test = resolve_simulate(write(tmp_path, SMALL["simulate"])).test
+    test = resolve_simulate(write(tmp_path, good("simulate"))).test
     assert test.lines == ("forward", "nadir", "backward")
     assert (test.ground.terrain.kind, test.ground.terrain.relief) == ("real", None)
     assert (test.patch.line, test.patch.lines, test.seed) == ("nadir", 1000, 0)
@@ -240,7 +238,7 @@ def test_a_payload_of_ones_own_comes_through_config_yaml(tmp_path: Path) -> None
     text = TH1.replace("detector: th1_line", "detector: mine.yaml")
     text = text.replace("f_number: 6\n", "f_number: 6\n  obstruction: [[[-0.6, 0.6], [-0.2, 0.6], [-0.2, 1.1]]]\n")
     (tmp_path / "own.yaml").write_text(text, "utf-8")
-    setup = resolve_simulate(write(tmp_path, SMALL["simulate"].replace("th1", "own.yaml")))
+    setup = resolve_simulate(write(tmp_path, good("simulate").replace("th1", "own.yaml")))
     assert setup.detectors["mine.yaml"].name == "mine"
     image = setup.camera.image_of("nadir")
     assert image.obstruction[0][0] == (-0.6, 0.6)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.pose import Pose, rotation_matrix
-from optics.geometry.tree import Motion, compose
+from optics.geometry.tree import Motion
 from optics.materials.glass import GLASSES, glass
 from optics.materials.material import MATERIALS, material
 from optics.raytrace.system import assemble
@@ -337,17 +337,6 @@ def test_motions_act_on_top_of_heat_exactly(model, gf7_pair) -> None:
     assert both["base/forward/M2"].figure == {5: 1e-8}  # Zerodur does not bend
     untouched = placed.index["base/backward/M1"]
     np.testing.assert_array_equal(placed.translation[0, untouched], placed.translation[1, untouched])
-
-
-def test_composition_adds_figures_and_indices(model, gf7_pair) -> None:
-    bodies = {body.path: body for body in gf7_pair.assembly.tree.bodies}
-    one = {PRISM: Motion(figure={4: 1e-9, 5: 2e-9}, index=1e-6, index_gradient=(1e-6, 0.0, 0.0), stretch=1e-5)}
-    two = {PRISM: Motion(figure={4: 3e-9}, index=2e-6, index_gradient=(0.0, 1e-6, 0.0), stretch=2e-5)}
-    found = compose(one, two, bodies)[PRISM]
-    assert dict(found.figure) == pytest.approx({4: 4e-9, 5: 2e-9})
-    assert found.index == pytest.approx(3e-6)
-    assert found.index_gradient == (1e-6, 1e-6, 0.0)
-    assert found.stretch == pytest.approx(3e-5, rel=1e-4)
 
 
 # --- what cannot be ---------------------------------------------------------------------------------------------------
