@@ -50,7 +50,9 @@ def judged(read: Callable[[Path], object], path: Path, text: str, row: str) -> s
 )
 def test_faults_are_told_where_they_stand(section: Section, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """Also, a good file is read: what refuses everything would pass all else."""
-    read = getattr(readers, section.reader)(tmp_path, request.getfixturevalue)
+    name, *kind = section.reader.split()
+    reader = getattr(readers, name)
+    read = (reader(*kind) if kind else reader)(tmp_path, request.getfixturevalue)
     path = tmp_path / section.file
     path.write_text(section.text, "utf-8")
     read(path)

@@ -11,12 +11,15 @@ import meshlane
 import numpy as np
 
 from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.camera_reader import camera_of
 from scenes.lens.codev_reader import read_codev
+from scenes.lens.glass_catalogue import own_glasses, read_catalogue
 from scenes.lens.zemax_reader import read_zemax
 from scenes.models.camera_model import build_camera_under_test
 from scenes.models.disturbances import motions_of_spec, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.scenery import measured_finishes
+from scenes.schema import MODELS
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import checked_nodes
 from scenes.specs.load import (
@@ -27,9 +30,17 @@ from scenes.specs.load import (
     load_instrument,
     load_job,
 )
+from scenes.specs.measured.adjust_setup import resolve_adjust
 from scenes.specs.operation import read_operation
 from scenes.specs.orbit.flight import ErrorsSpec, OrbitSpec
-from scenes.specs.orbit.setup import resolve_angle, resolve_loop, resolve_monitor, resolve_simulate
+from scenes.specs.orbit.setup import (
+    resolve_angle,
+    resolve_calibration,
+    resolve_jitter,
+    resolve_loop,
+    resolve_monitor,
+    resolve_simulate,
+)
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import resolve, resolve_focus
 from scenes.specs.spectrum import SpectrumSpec
@@ -84,6 +95,7 @@ operation = _plain(read_operation)
 orbit, errors, study, spectrum = map(_spec, (OrbitSpec, ErrorsSpec, StudySpec, SpectrumHolder))
 camera_text = _spec(CameraSpec)
 angle, loop, monitor, simulate = map(_plain, (resolve_angle, resolve_loop, resolve_monitor, resolve_simulate))
+calibration, jitter, adjust = map(_plain, (resolve_calibration, resolve_jitter, resolve_adjust))
 zemax, codev = _plain(read_zemax), _plain(read_codev)
 batoid = _plain(lambda path: read_batoid(path, 650e-9))
 
@@ -191,3 +203,22 @@ def finishes(folder: Path, fixture: Fixture) -> Read:
         (folder / f"{name}.csv").write_text(f"wavelength [nm],angle [deg],R [percent]\n{rows}", "utf-8")
     (folder / "m.bsdf").write_text(bsdf_text(), "utf-8")
     return lambda path: measured_finishes(resolve(path))
+
+
+def agf(folder: Path, fixture: Fixture) -> Read:
+    """A glass catalogue."""
+    return read_catalogue
+
+
+def _lens_camera(read: Read) -> Callable[[Path, Fixture], Read]:
+    """A camera made of a prescription."""
+    return lambda folder, fixture: lambda path: camera_of(read(path), "c", fixture("backend"))
+
+
+zemax_camera = _lens_camera(lambda path: read_zemax(path, own_glasses()))
+codev_camera = _lens_camera(read_codev)
+
+
+def model(name: str) -> Callable[[Path, Fixture], Read]:
+    """A kind of file by the name of its schema."""
+    return _spec(MODELS[name])

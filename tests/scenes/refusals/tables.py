@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from scenes.specs.load import SCENES
+from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes import monitor_layouts
 
 FOLDER = Path(__file__).parent
@@ -62,7 +63,7 @@ def changed(text: str, changes: str) -> str:
 
 def with_key(text: str, key: list[str], new: str) -> str:
     """Return a YAML text with another value of one key."""
-    tree = yaml.safe_load(text)
+    tree = parse_yaml(text).data
     place: Any = tree
     for part in key[:-1]:
         place = place[int(part) if isinstance(place, list) else part]
