@@ -293,7 +293,7 @@ def test_clear_apertures_that_stop_nothing_are_left_out(backend, tmp_path: Path)
     assert any("2 of them stop no light of the field" in str(note) for note in made.notes)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_field_with_dark_corners_is_taken_to_be_round(backend, tmp_path: Path) -> None:
     """Fields on both axes, and an edge near the image that lets through no more than the circle of them."""
     spec = camera(CAMERA.replace("field: {x: 0.1 deg, y: 0.1 deg}", "field: {x: 0.7 deg, y: 0.7 deg}"))

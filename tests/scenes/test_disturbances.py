@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
-import yaml
 
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import StatedMotions, motions_of_spec, state_of, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.load import DISTURBANCES, INSTRUMENTS, LIBRARY, library_names, load_camera, load_disturbances
+from scenes.specs.load import DISTURBANCES, INSTRUMENTS, LIBRARY, library_names, load_disturbances
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
@@ -224,19 +222,3 @@ def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(bac
     assert caught.value.found == "'base/backward'"
     assert stated_of_job(tmp_path, instrument, "", backend).components
     assert stated_of_job(tmp_path, instrument, "disturbances: none\n", backend) is None
-
-
-def test_a_camera_of_any_name(backend):
-    """The shipped files are of cameras, whatever they are called."""
-    plain = yaml.safe_load((LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8"))
-    plain["cameras"] = {"one": plain["cameras"]["forward"]}
-    del plain["baffles"]
-    spec = validate(InstrumentSpec, parse_yaml(yaml.safe_dump(plain)))
-    instrument = build_instrument(spec, {"gf7": load_camera("gf7")}, backend)
-    for name in ("orbit", "launch"):
-        found = motions_of_spec(load_disturbances(name), instrument)
-        whole = {c.body for c in found.components if c.cause == "camera_mounts"}
-        assert whole == {"base/one"}
-    # half of the central prism's facets: its middle is not in the middle of the box around it
-    bent = ThermalModel(instrument).state({"base/central_prism": Temperature(0.0, (0.0, 0.0, 1.0))})
-    assert any(bent["base/central_prism/one_left"].rotate)

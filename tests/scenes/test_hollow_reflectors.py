@@ -247,19 +247,6 @@ def test_a_gradient_deforms_frame_and_mirrors_as_one_free_body(model, heat, fram
         np.testing.assert_allclose(found, rotation_matrix(turn), rtol=0, atol=4.0 * (size * reach) ** 2 + 2e-15)
 
 
-def test_zerodur_takes_no_notice(backend, tmp_path) -> None:
-    data = monitor_layouts.hollow_pair()
-    for prism in ("prism_180", "prism_0"):
-        data["monitor"][prism] = {**data["monitor"][prism], "material": "Zerodur"}
-    own = monitor_layouts.built(data, tmp_path, backend)
-    field = Temperature(5.0, (1.0, 2.0, -3.0))
-    state = ThermalModel(own).state({c.prism_body(p): field for c in own.channels for p in ("prism_180", "prism_0")})
-    placed = own.assembly.place([{}, state])
-    for what in (placed.rotation, placed.translation, placed.scale):
-        np.testing.assert_array_equal(what[0], what[1])
-    assert not any(motion.figure for motion in state.values())
-
-
 def test_mirrors_have_the_temperature_of_their_frame(model, heat) -> None:
     frame = FRAMES[0]
     assert "temperature" in model.nodes[frame].allows

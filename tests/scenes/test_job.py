@@ -6,12 +6,11 @@ import pytest
 
 from scenes.specs.course import noll
 from scenes.specs.job import checked_nodes
-from scenes.specs.load import EXAMPLES, load_job
+from scenes.specs.load import load_job
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.scenes.refusals.readers import NODES
 
-ARCSEC = 4.84813681109536e-06
 HEAD = "instrument: gf7_pair\nperturb:\n"
 
 
@@ -19,19 +18,6 @@ def write(folder: Path, text: str) -> Path:
     path = folder / "perturb.yaml"
     path.write_text(text, "utf-8")
     return path
-
-
-def test_the_example() -> None:
-    job = load_job(EXAMPLES / "perturb.yaml")
-    assert job.instrument == "gf7_pair"
-    assert job.perturb["base/backward/focal_plane"].rotate == pytest.approx(
-        (2 * ARCSEC, -1.5 * ARCSEC, 10 * ARCSEC), rel=1e-15
-    )
-    assert job.perturb["base/backward/focal_plane"].pivot == "rear_node"
-    assert job.perturb["base/forward/M2"].shift == (0.0, 0.0, 3e-6)
-    assert (job.render.images, job.render.frames, job.render.seed) == (("spots",), 9, 1)
-    assert job.analysis.centroid == "ml"
-    checked_nodes(job, NODES)
 
 
 def test_changes_of_temperature(tmp_path: Path) -> None:
@@ -43,18 +29,6 @@ def test_changes_of_temperature(tmp_path: Path) -> None:
         # what is written is read again
         again = write(tmp_path, dump_yaml(job.plain()))
         assert load_job(again).perturb["base"].temperature.change == kelvin
-
-
-def test_nothing_perturbed(tmp_path: Path) -> None:
-    for text in (
-        "instrument: gf7_pair",
-        "instrument: gf7_pair\nperturb: {}",
-        "instrument: gf7_pair\nperturb:\nrender:\n",
-    ):
-        job = load_job(write(tmp_path, text))
-        assert job.perturb == {}
-        assert job.render.frames is None
-        checked_nodes(job, {})
 
 
 def test_everything_that_a_node_may_have(tmp_path: Path) -> None:
@@ -81,8 +55,3 @@ def test_all_nodes_are_told_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         checked_nodes(job, NODES)
     assert [issue.line for issue in caught.value.issues] == [3, 4, 5]
-
-
-def test_a_missing_job() -> None:
-    with pytest.raises(InputError, match=r"no_such\.yaml: no such file"):
-        load_job("no_such.yaml")

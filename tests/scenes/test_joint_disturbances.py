@@ -65,13 +65,6 @@ def test_what_does_not_move_is_left_out_with_its_correlations(pair) -> None:
     np.testing.assert_array_equal(found.correlation, np.eye(2))
 
 
-def test_draws_have_the_stated_covariance(pair) -> None:
-    found = motions_of_spec(spec(f"{HEAD}{THREE}{MATRIX}"), pair)
-    count = 100_000
-    drawn = found.draw(np.random.default_rng(4), count) / found.sigma
-    np.testing.assert_allclose(drawn.T @ drawn / count, found.correlation, atol=5.0 * np.sqrt(2.0 / count))
-
-
 def test_radii_conic_constants_and_indices_reach_states(pair) -> None:
     text = """name: own
 causes:

@@ -5,7 +5,6 @@ import pytest
 from scenes.specs.load import EXAMPLES
 from scenes.specs.study import StudySpec, unit_of
 from scenes.yaml.spec import validate
-from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml, read_yaml
 
 TEXT = """name: study
@@ -70,12 +69,3 @@ UNITS = {
 def test_units_of_results() -> None:
     for key, unit in UNITS.items():
         assert unit_of(tuple(int(part) if part.isdigit() else part for part in key.split("."))) == unit, key
-
-
-def test_quantities_are_split() -> None:
-    assert split_quantity("3 um") == (3.0, "um")
-    assert split_quantity("-1.5e-3arcsec") == (-1.5e-3, "arcsec")
-    assert split_quantity("gf7") is None
-    assert split_quantity("3 bananas") is None
-    assert split_quantity(3) is None
-    assert unit_ratio("mm", "um") == 1000.0

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import nodal_deformation
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.job_state import job_state
@@ -84,20 +83,6 @@ def test_a_linear_table_is_the_linear_temperature(silica, tmp_path, body) -> Non
         )
 
 
-@pytest.mark.parametrize("head", quick(1, ["dT [K]", "dT [mK]", "T [K]", "T [degC]"]))
-def test_an_even_table_is_the_even_temperature(silica, tmp_path, head) -> None:
-    points = lattice(silica, M1, (7, 7, 3))
-    value = {"dT [K]": 2.0, "dT [mK]": 2000.0, "T [K]": 295.15, "T [degC]": 22.0}[head]
-    place = write(tmp_path / "heat.csv", points, np.full(len(points), value), head)
-    by_table = job_state(job(tmp_path, M1, place.name), silica)
-    by_number = job_state(job(tmp_path, M1, "2 K"), silica)
-    for path, motion in by_number.items():
-        # of 2 K 1e-9, and 293.15 K have a rounding of 6e-14
-        assert by_table[path].stretch == pytest.approx(motion.stretch, rel=1e-9)
-        np.testing.assert_allclose(by_table[path].rotate, motion.rotate, rtol=0, atol=1e-18)
-        np.testing.assert_allclose(by_table[path].shift, motion.shift, rtol=0, atol=1e-17)
-
-
 def test_numbers_beside_a_table_are_added(silica, tmp_path) -> None:
     points = lattice(silica, M1, (7, 7, 3))
     write(tmp_path / "heat.csv", points, 0.5 + points @ SLOPE)
@@ -116,39 +101,27 @@ def quadratic(points: np.ndarray) -> np.ndarray:
     return 4.0 * x**2 - 2.0 * x * y + 1.0 * y * z + 30.0 * z**2
 
 
-LATTICES = [(21, 19, 9), (41, 37, 17)]
-
-
-@pytest.mark.parametrize(
-    "lattices", [*quick(0, [LATTICES[:1]]), pytest.param(LATTICES, marks=pytest.mark.slow)], ids=["one", "two"]
-)
-def test_a_quadratic_field_is_the_thermo_elastic_solution(silica, tmp_path, lattices) -> None:
+@pytest.mark.second
+def test_a_quadratic_field_is_the_thermo_elastic_solution(silica, tmp_path) -> None:
     """Solved directly on the same elements; a table of 12 mm lies h^2/8 of the curvature below the field."""
-    held = silica.elastic(M1, cells=FINE_CELLS)
-    assert held is not None
-    elastic, support = held
+    elastic, support = silica.elastic(M1, cells=FINE_CELLS)
     ((aperture, _),) = silica.faces_of(M1).values()
     surface = silica.surface(M1)
-    errors = []
-    for counts in lattices:
-        points = lattice(silica, M1, counts)
-        body = warmed(silica, tmp_path, M1, points, quadratic(points))
+    points = lattice(silica, M1, (21, 19, 9))
+    body = warmed(silica, tmp_path, M1, points, quadratic(points))
 
-        def rest(p: np.ndarray, linear: Temperature = body.linear) -> np.ndarray:
-            return quadratic(p) - linear.change - p @ np.array(linear.gradient)
+    def rest(p: np.ndarray) -> np.ndarray:
+        return quadratic(p) - body.linear.change - p @ np.array(body.linear.gradient)
 
-        (moved,) = elastic.solve_many([rest], support)
-        face = np.abs(moved.nodes[:, 2] - surface.sag(*moved.nodes[:, :2].T)) < 1e-9
-        exact = nodal_deformation(moved.nodes[face], moved.values[face], surface, aperture).figure
-        size = np.sqrt(sum(a * a for j, a in exact.items() if j > 3))
-        error = [a - body.faces[M1].motion.figure[j] for j, a in exact.items() if j > 3]
-        errors.append(np.sqrt(np.sum(np.square(error))) / size)
-        assert body.coverage is not None
-        assert body.coverage.outside == 0.0
-        assert body.warnings(M1) == ()
+    (moved,) = elastic.solve_many([rest], support)
+    face = np.abs(moved.nodes[:, 2] - surface.sag(*moved.nodes[:, :2].T)) < 1e-9
+    exact = nodal_deformation(moved.nodes[face], moved.values[face], surface, aperture).figure
+    size = np.sqrt(sum(a * a for j, a in exact.items() if j > 3))
+    error = [a - body.faces[M1].motion.figure[j] for j, a in exact.items() if j > 3]
     assert size > 1e-8
-    assert errors[0] < 0.05
-    assert errors[-1] == errors[0] or errors[1] < 0.3 * errors[0]  # of second order: a quarter
+    assert np.sqrt(np.sum(np.square(error))) < 0.05 * size
+    assert body.coverage.outside == 0.0
+    assert body.warnings(M1) == ()
 
 
 def test_zerodur_does_not_bend(gf7_pair, tmp_path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -28,8 +26,6 @@ from twin.main_job.render_job import render_job
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import image_quality
 from twin.monitor.truth import trace_truth
-from twin.study.runs.base_job import Run
-from twin.study.runs.render_base import RenderBase
 
 RC = "ritchey_chretien"
 DESPACE = "M2 shift z 20 um"
@@ -221,19 +217,6 @@ def test_what_only_a_monitor_gives_is_refused(says: dict, problem: str, backend)
     assert f"{RC} has none" in str(error.value)
 
 
-def test_half_a_monitor_is_refused() -> None:
-    spec = load_instrument("gf7_pair").plain()
-    kind = type(load_instrument("gf7_pair"))
-    for gone, said in (("monitor", "no monitor"), ("central_prism", "no central_prism")):
-        with pytest.raises(InputError, match=said):
-            validate(kind, YamlFile("", {key: value for key, value in spec.items() if key != gone}, {}))
-    bare = {key: value for key, value in spec.items() if key not in ("monitor", "central_prism")}
-    with pytest.raises(InputError, match="has no channels"):
-        validate(kind, YamlFile("", bare, {}))
-    with pytest.raises(InputError, match="has no monitor, so that no spot tells"):
-        _ = load_instrument(RC).autocollimator
-
-
 # --- where users meet it ---------------------------------------------------------------------------------
 
 
@@ -255,21 +238,6 @@ def test_a_script(backend) -> None:
     assert shot.quality.loc[RC, "after", 0.0].wfe_rms_waves > shot.quality.loc[RC, "before", 0.0].wfe_rms_waves
     assert shot.truth.d_f_um.item() == pytest.approx(-121.0, abs=2.0)
     assert shot.before.sizes["channel"] == 0
-
-
-@pytest.mark.second
-def test_runs_of_a_study(backend, run: JobRun) -> None:
-    """States together are what each is by itself; a light that is lost costs its own run alone."""
-    base = RenderBase()
-    tree = json.loads(json.dumps(resolve_job(job(perturb={"M2": {"shift": "0 0 0 um"}})).plain()))
-    key = ("job", "perturb", "M2", "shift", 2)
-    runs = [Run(0, ((key, "20 um"),), None), Run(1, ((key, "-20 um"),), None), Run(2, ((key, "4.9 mm"),), None)]
-    base.check(tree, backend)
-    first, second, _ = base.evaluate(tree, runs, backend)
-    assert first["truth"]["cameras"][RC]["d_f_um"] == pytest.approx(run.truth_dict()["cameras"][RC]["d_f_um"], rel=1e-9)
-    assert second["truth"]["cameras"][RC]["d_f_um"] == pytest.approx(-first["truth"]["cameras"][RC]["d_f_um"], rel=1e-4)
-    assert first["quality"]["cameras"][RC]["wfe_worst_waves"] > 0.0
-    assert "recovered" not in first
 
 
 def test_the_config_of_a_job_is_the_job(tmp_path) -> None:

@@ -1,7 +1,6 @@
 """Cameras made of foreign prescriptions and prescriptions made of cameras: both trace the same."""
 
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,27 +122,6 @@ def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
     there = trace(backend, assemble(bare, ["imaging"]), make_rays(backend, launch, direction), world=True)
     place, leaving, _, _ = (a[0] for a in there.numpy(there.world))
     back = trace(backend, assemble(bare, [model.mirrors[::-1]]), make_rays(backend, place, -leaving), world=True)
-    _, again, _, valid = (a[0] for a in back.numpy(back.world))
-    assert valid.all()
-    np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
-
-
-def test_two_lenses_of_two_glasses(tmp_path: Path, backend) -> None:
-    """The second is its own, forward and backward."""
-    second = "SURF 3\n  CURV 0.01\n  DISZ 3\n  GLAS SILICA 0 0\nSURF 4\n  CURV -0.005\n  DISZ 20\nSURF 5\n  DISZ 0\n"
-    text = SINGLET.replace("DISZ 47.5\nSURF 3\n  DISZ 0\n", f"DISZ 10\n{second}")
-    assert "SILICA" in text
-    path = tmp_path / "two.zmx"
-    path.write_text(text, "utf-8")
-    lens = read_zemax(path, own_glasses())
-    model = derive_camera(camera_of(lens, "two", backend, Width(pupil=1e-3)).camera, backend)
-    launch, direction = rays_of(model, backend)
-    bare = model.bare_assembly(False)
-    first = at_image(backend, lens.assembly(False), SEQUENCE, launch, direction)
-    np.testing.assert_allclose(at_image(backend, bare, "imaging", launch, direction), first, rtol=0, atol=ROUNDING)
-    place = first[:, :3] + [0.0, 0.0, model.spec.image.z]
-    rays = make_rays(backend, place, -first[:, 3:6])
-    back = trace(backend, assemble(bare, [model.mirrors[::-1]]), rays, world=True)
     _, again, _, valid = (a[0] for a in back.numpy(back.world))
     assert valid.all()
     np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
@@ -346,16 +324,3 @@ def test_fields_are_those_of_the_file(tmp_path: Path, backend) -> None:
     # a round field is asked for in words, and has the square in it
     made = camera_of(replace(lens, round_field=True), "singlet", backend)
     assert made.camera.field.x == pytest.approx(math.radians(2) / math.sqrt(2.0), rel=1e-14)
-
-
-def test_numbers_are_written_without_the_tail_of_conversions(tmp_path: Path, backend) -> None:
-    """The half field is half of 6.1 deg less 5.9 deg, in radians 1e-15 off; 15 digits are what the file has."""
-    path = tmp_path / "tma.zmx"
-    path.write_text(TMA.replace("YFLN 6 6.1 5.9", "YFLN 6 6.15 5.85"), "utf-16")
-    lens = read_zemax(path)
-    text = camera_text(camera_of(lens, "tma", backend), lens)
-    assert "y: 540 arcsec" in text
-    assert "field_bias: 6 deg" in text
-    numbers = re.findall(r"[0-9]+[.][0-9]+", text.partition("name:")[2])
-    assert numbers
-    assert not [number for number in numbers if re.search(r"9{6}[0-9]?$|0{6}[0-9]$", number)]
