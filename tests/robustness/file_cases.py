@@ -301,7 +301,7 @@ def _prescriptions() -> Iterator[Case]:
         files = {file: content, **more}
         return Case(name, kind, lens, ("read",), files, file, options, out="out/camera.yaml", whole=1, weight=0.6)
 
-    glasses, schott = ("--glasses", "{here}/glass.agf"), {"glass.agf": AGF.encode()}
+    glasses = ("--glasses", "{here}/glass.agf")
     for name, text in (("wide", TMA.encode("utf-16")), ("tma", TMA.encode()), ("singlet", SINGLET.encode())):
         yield case(f"lens-zemax-{name}", "Zemax", "a.zmx", text)
     for name, coding in (("plain", "utf-8"), ("wide", "utf-16-le")):
@@ -311,7 +311,6 @@ def _prescriptions() -> Iterator[Case]:
         own = {"a.zmx": SINGLET.encode(), "glass.agf": AGF.encode(coding)}
         more: dict[str, Any] = {"out": "out/camera.yaml", "whole": 1, "weight": 0.6}
         yield Case(f"lens-glasses-{name}", "glass catalogue", lens, ("read",), own, "glass.agf", glasses, **more)
-    del schott
     own = {"gf7.yaml": text_of("library/cameras/gf7.yaml")}
     yield Case("lens-write", "camera", lens, ("write",), own, "gf7.yaml", out="out/camera.zmx", whole=1)
 
