@@ -22,6 +22,8 @@ from scenes.lens.__main__ import app as lens
 from scenes.yaml.yaml_file import dump_yaml
 from tests.robustness.case import Case, edited, job_of, text_of
 from tests.scenes.lens.files import AGF, BATOID, CODEV, SINGLET, TMA
+from tests.scenes.monitor_layouts import hollow_pair, two_beams
+from tests.scenes.monitor_layouts import text_of as layout_text
 from tests.twin import orbit_file_bench as bench
 from twin.lab import app as lab
 from twin.orbit.__main__ import app as orbit
@@ -50,8 +52,11 @@ def _made(write: Callable[[Path], object], name: str = "file") -> bytes:
 
 
 def _job_tables() -> Iterator[Case]:
-    """Tables that jobs name."""
+    """Layouts of monitors and tables that jobs name."""
     quick: dict[str, Any] = {"options": ("--frames", "1")}
+    for name, layout in (("two-beams", two_beams()), ("hollow", hollow_pair())):
+        own = {"job.yaml": b"instrument: ./own.yaml\n", "own.yaml": layout_text(layout).encode()}
+        yield Case(f"render-{name}", "layout of monitors", render, (), own, "own.yaml", **quick)
     single = {"single.yaml": job_of("single.yaml")}
 
     def case(name: str, kind: str, job: bytes, table: str, content: bytes, **more: Any) -> Case:

@@ -160,12 +160,6 @@ def test_bodies_in_each_other(change, pairs, told, bare, tmp_path) -> None:
         assert issue.file.endswith("own.yaml")
 
 
-def test_depth_of_an_overlap(bare, tmp_path) -> None:
-    """The rhomboid's half height is 33 mm, its exit face square to the beam, as the facet: 30 mm leave 3 mm."""
-    found = find_overlaps(bare(tmp_path, ("distance: 0.5 m", "distance: 30 mm")))
-    assert [o.depth for o in found] == pytest.approx([3e-3] * 4, abs=1e-7)  # the facet leans some 10 urad
-
-
 MOVE = re.compile(r"move it by ([+-])([xyz]) ([0-9.e+]+) mm of the base")
 
 
@@ -201,16 +195,6 @@ def test_a_gap_below_the_least(bare, tmp_path) -> None:
     with pytest.raises(InputError, match=r"is only .* um from base/central_prism"):
         check_clearance(touching)
     check_clearance(bare(tmp_path, ("distance: 0.5 m", "distance: 33.1 mm")))
-
-
-@pytest.mark.second
-def test_a_wide_beam_that_only_just_passes(backend, tmp_path) -> None:
-    """The way back lies beside the way out, by which the prisms have to be wider than the face."""
-    assert built(changed(tmp_path, ("aperture: 50 mm", "aperture: 57 mm")), backend)
-    with pytest.raises(InputError, match=r"prism_180\.width: the beam .* is cut at .*: it reaches 0\.\d+ mm beyond"):
-        built(changed(tmp_path, ("aperture: 50 mm", "aperture: 60 mm")), backend)
-    with pytest.raises(InputError, match="narrower than the beam"):
-        built(changed(tmp_path, ("aperture: 50 mm", "aperture: 60.001 mm")), backend)
 
 
 @pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])

@@ -138,3 +138,8 @@ def test_an_equal_instrument_is_built_once_and_that_of_another_file_anew(backend
     turned = first.model_copy(update={"cameras": FrozenMap(reversed(first.cameras.items()))})
     assert turned == first
     assert list(build_instrument(turned, cameras, backend).cameras) == list(built.cameras)[::-1]
+
+
+def test_a_camera_by_itself_has_no_monitor() -> None:
+    with pytest.raises(InputError, match="has no monitor, so that no spot tells"):
+        _ = load_instrument("ritchey_chretien").autocollimator

@@ -107,9 +107,7 @@ def test_config_reads_back_to_the_same_values(resolve, name: str, tmp_path: Path
 def test_an_angle_test(tmp_path: Path) -> None:
     setup = resolve_angle(SCENES / ORBIT / "angle.yaml")
     assert setup.camera == load_three_line_camera("th1")
-    test = setup.test
-    assert (test.errors.station, test.errors.points, test.time) == (0.5, 1.5, 0.0)
-    assert test.perturb["forward"].rotate[1] == pytest.approx(4.0 * ARCSEC, rel=1e-15)
+    assert setup.test.perturb["forward"].rotate[1] == pytest.approx(4.0 * ARCSEC, rel=1e-15)
     assert dict(setup.angles) == {"alpha": ("forward", "nadir"), "beta": ("nadir", "backward")}
     setup = resolve_angle(SCENES / ORBIT / "angle_off_axis.yaml")
     assert setup.angles["multispectral"] == ("multispectral", "nadir")
@@ -164,10 +162,6 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
 
 
 def test_a_loop(tmp_path: Path) -> None:
-    setup = resolve_loop(SCENES / ORBIT / "loop.yaml")
-    assert setup.pair == ("forward", "backward")
-    assert "metering" in setup.disturbances.causes
-    assert len(setup.test.readings.times) == 25
     setup = resolve_loop(write(tmp_path, good("loop")))
     test = setup.test
     assert setup.disturbances.name == "orbit"
@@ -183,11 +177,7 @@ def test_a_loop(tmp_path: Path) -> None:
 
 def test_a_monitored_orbit(tmp_path: Path) -> None:
     setup = resolve_monitor(SCENES / ORBIT / "monitor.yaml")
-    assert setup.instrument == load_instrument("gf7_pair")
-    assert setup.pair == ("forward", "backward")
-    test = setup.test
-    assert (test.interval, test.step, test.referred) == (600.0, 300.0, 0)
-    assert test.motion["base/forward"].rotate[1] == pytest.approx(1.2 * ARCSEC, rel=1e-15)
+    assert (setup.pair, setup.test.step, setup.test.referred) == (("forward", "backward"), 300.0, 0)
     test = resolve_monitor(write(tmp_path, good("monitor"))).test
     assert test.apply == ("d_alpha", "d_beta", "d_gamma", "d_f")
     assert test.compared == (300.0, 600.0, 1200.0)
@@ -217,12 +207,8 @@ def test_a_motion_is_a_step_a_ramp_or_a_swing() -> None:
 
 def test_a_simulated_pass(tmp_path: Path) -> None:
     setup = resolve_simulate(SCENES / ORBIT / "simulate.yaml")
-    assert setup.camera == load_three_line_camera("th1")
     assert set(setup.detectors) == {"th1_line"}
-    test = setup.test
-    assert (test.patch.lines, test.patch.pixels, test.oversampling) == (1000, 1000, 3)
-    assert test.ground.light.elevation == pytest.approx(math.radians(38.0), rel=1e-15)
-    assert test.control.shift == (0.6, -0.4)
+    assert setup.test.ground.light.elevation == pytest.approx(math.radians(38.0), rel=1e-15)
     assert setup.camera.image_of("backward").wavefront["Z4"] == 20e-9
     test = resolve_simulate(write(tmp_path, good("simulate"))).test
     assert test.lines == ("forward", "nadir", "backward")

@@ -16,7 +16,6 @@ from scenes.specs.resolved import resolve_camera
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
-from tests.scenes.test_stated_focal_length import CASSEGRAIN
 from tests.twin.commands import invoke
 from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera.__main__ import app
@@ -108,32 +107,6 @@ def test_a_mirror_in_the_way_is_found(backend, tmp_path) -> None:
     taken = float(met @ nodes.share)
     assert 0.1 < taken < 0.9
     assert shares["M2"] == pytest.approx(taken, abs=0.05)  # 144 rays tell shares to some percent
-
-
-def test_a_mirror_that_light_goes_through_has_a_hole_there(backend, tmp_path) -> None:
-    """The first mirror of a telescope about its axis does not take all of its light."""
-    file = tmp_path / "cassegrain.yaml"
-    file.write_text(CASSEGRAIN, "utf-8")
-    data = first_order_data(CameraOptics.alone(derive_camera(load_camera(file), backend), backend))
-    # by similar triangles: 0.5 m before the image at F/8, and chief rays that come from M2's vertex 0.7 m before M1
-    slope, half = 0.25 / 4.0, 4.0 * np.tan(np.hypot(1.0, 1.0) * np.deg2rad(0.2))
-    assert dict(data.obscuration.holes) == {"M1": pytest.approx(0.5 * slope + half * 0.7 / 1.2, rel=0.1)}
-    told = FIRST_ORDER(data)
-    # M2 is 77 mm and its edge in radius: some 9 % of the beam, and the line's edge nothing more
-    assert list(told["obscuration"]) == ["M2"]
-    assert 0.07 < told["obscuration"]["M2"] < 0.15
-    assert told["hole_radius_mm"]["M1"] == pytest.approx(1e3 * data.obscuration.holes["M1"])
-    # with a hole of that size stated there is nothing to be told
-    stated = CASSEGRAIN.replace("conic: -1}", "conic: -1, edges: [{blocks: circle, radius: 60 mm}]}")
-    file.write_text(stated, "utf-8")
-    holed = obscuration(derive_camera(load_camera(file), backend), backend)
-    assert dict(holed.holes) == {}
-    assert list(holed.shares) == ["M2"]
-    # light that goes through where the mirror is used is lost, hole or not
-    file.write_text(CASSEGRAIN.replace("y: 0.2 deg", "y: 2.5 deg"))
-    wide = obscuration(derive_camera(load_camera(file), backend), backend)
-    assert wide.shares["M1"] > 0.9
-    assert dict(wide.holes) == {}
 
 
 def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:

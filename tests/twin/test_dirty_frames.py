@@ -240,23 +240,6 @@ def test_dark_rings_of_a_brighter_spot_are_not_taken_for_dead_pixels(bench, seed
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("centroid", ["gaussian", "energy"])
-def test_other_centroids_are_corrected_as_well(bench, centroid):
-    """They know no shape: what is missing is put in by the fitted one, what is beside the spot taken off."""
-    kinds = ("bad pixels", "cosmic rays", "background", "reflection", "missing frames")
-    found, told = squares(bench, kinds, range(1000, 1003), centroid)
-    assert found.sum() < chi2.isf(1e-6, 6)
-    for spots in told:
-        for spot in spots:
-            assert {"bad pixels", "cosmic rays", "uneven background", "missing light"} <= {
-                f.kind for f in spot.findings
-            }
-            # two of nine frames are gone: 13 % at most, and what is fitted beside the spot
-            assert -0.2 < spot.cost < 0.5
-            assert spot.cost != 0.0
-
-
-@pytest.mark.second
 def test_perturbed_instruments_are_not_taken_for_dirt(experiment):
     """Spots of instruments that are as far from nominal as launch leaves them have another shape, and are clean."""
     job = JobSpec.model_validate({"instrument": "gf7_pair", "disturbances": "launch"})
