@@ -174,6 +174,8 @@ def test_what_is_no_covariance(pair, change, message) -> None:
         matrix = change(matrix)
     with pytest.raises(ValueError, match=message):
         joint_disturbances("posterior", own, matrix, pair.nodes, "r")
+    with pytest.raises(ValueError, match="a component is there twice"):
+        joint_disturbances("posterior", [*own[:2], own[0]], 1e-12 * np.eye(3), pair.nodes, "r")
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------

@@ -142,6 +142,9 @@ def test_a_quadratic_field_in_glass(silica, tmp_path) -> None:
     assert set(body.faces) == set(silica.faces_of(PRISM))
     assert max(abs(a) for face in body.faces.values() for a in face.motion.figure.values()) > 1e-13
     assert 0.0 < body.index_path < 6.5e-9
+    assert [text for text in body.warnings(PRISM) if "index of glass follows the linear part" in text]
+    linear = warmed(silica, tmp_path, PRISM, points, 0.1 + points @ SLOPE)
+    assert linear.warnings(PRISM) == ()
     with pytest.raises(InputError, match="rays through its glass") as caught:
         warmed(silica, tmp_path, PRISM, points, 2.0 + 2.0 * shape)
     assert "temperature: {change: " in str(caught.value)

@@ -189,6 +189,11 @@ def heated(folder: Path, fixture: Fixture) -> Read:
     meshlane.Mesh(numbers, cells, point_data={"U": numbers}).write(folder / "m1.vtu")
     meshlane.Mesh(numbers, cells, point_data={"U": numbers, "v": numbers}).write(folder / "two.vtu")
     meshlane.Mesh(numbers, cells).write(folder / "none.vtu")
+    for name, level in (("cold", -280.0), ("hot", 2500.0)):
+        meshlane.Mesh(numbers, cells, point_data={"a": level + numbers[:, 0]}).write(folder / f"{name}.vtu")
+    few = [("vertex", np.arange(3)[:, None])]
+    meshlane.Mesh(numbers[:3], few, point_data={"a": numbers[:3, 0]}).write(folder / "few.vtu")
+    (folder / "text.vtu").write_text("no mesh\n", "utf-8")
     for name in ("heat.inp", "m1.bdf", "m1.xlsx"):
         (folder / name).write_text("*NODE\n", "utf-8")
     return load_job
