@@ -19,7 +19,6 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera, load_instrument
 from scenes.specs.resolved import ResolvedJob, resolve_job
-from tests.daily import first_of_today
 from tests.tiers import longest_first
 from twin.monitor import monitor_experiment
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -61,11 +60,6 @@ def pytest_configure(config: pytest.Config) -> None:
     if getattr(config.option, "numprocesses", None):
         for library in ("OPENBLAS", "OMP", "MKL"):
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")
-
-
-def pytest_report_header() -> str:
-    """Say which random cases are run today."""
-    return f"random cases begin with {first_of_today()} (RANDOM_CASES=NUMBER repeats those of another day)"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -204,3 +198,10 @@ def experiment(backend):
         return MonitorExperiment(resolve_job(JobSpec(instrument=name)), backend)
 
     return prepare
+
+
+def pytest_report_header() -> str:
+    """Say which random cases are run today."""
+    from tests.daily import first_of_today
+
+    return f"random cases begin with {first_of_today()} (RANDOM_CASES=NUMBER repeats those of another day)"
