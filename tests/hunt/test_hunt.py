@@ -69,6 +69,7 @@ def test_cases_are_the_same_every_time_and_differ(experiment) -> None:
     assert len({legal_instrument(k).text for k in range(50)}) > 40
 
 
+@pytest.mark.second
 def test_the_reference_agrees_where_images_are_known_to_be_right(experiment) -> None:
     path = experiment("gf7_pair").path
     state = {"base/forward/focal_plane": Motion(shift=(1e-4, 5e-5, 3e-3))}

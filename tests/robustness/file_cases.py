@@ -114,11 +114,11 @@ def _measured_laboratory() -> Iterator[Case]:
     # edges through focus at three places
     rows, images = ["file,page,band,x [mm],y [mm],edge,shift [um]"], {}
     for place, y in (("a", -100), ("b", 0), ("c", 100)):
-        pages = np.stack([_edge(1.0 + 0.25 * abs(k)) for k in range(-4, 5)])
+        pages = np.stack([_edge(1.0 + 0.03 * k * k) for k in range(-4, 5)])
         images[f"{place}.tiff"] = _made(
             lambda path, pages=pages: tifffile.imwrite(path, pages, photometric="minisblack")
         )
-        rows += [f"{place}.tiff,{k},P,0,{y},along,{10 * (k - 4)}" for k in range(9)]
+        rows += [f"{place}.tiff,{k},P,0,{y},along,{30 * (k - 4)}" for k in range(9)]
     text = edited(text_of("lab/measured/focus.yaml"), ("mtf: mtf.csv", "images: images.csv"))
     files = {"focus.yaml": text, "images.csv": "\n".join(rows).encode(), **images}
     for target, kind in (("images.csv", "table of images"), ("a.tiff", "TIFF image")):

@@ -7,6 +7,7 @@ import pytest
 
 from tests.robustness.case import cut
 from tests.robustness.spoilt_run import limited, listing
+from tests.tiers import quick
 from tests.twin.commands import invoke
 from twin.design.__main__ import app as design
 from twin.lab import app as lab
@@ -45,7 +46,7 @@ def here(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", quick(1, COMMANDS))
 def test_the_file(command, here) -> None:
     app, *words = COMMANDS[command]
     before = listing(here)
@@ -57,6 +58,7 @@ def test_the_file(command, here) -> None:
         assert listing(here) == before, ascii(file)
 
 
+@pytest.mark.second
 def test_the_run_folder(here) -> None:
     before = listing(here)
     for out in OUTS:

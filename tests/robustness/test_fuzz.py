@@ -151,6 +151,7 @@ BEHAVIOURS = [
 ]
 
 
+@pytest.mark.second
 def test_the_judge_sees(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(spoilt_run, "SECONDS", {"soon": 0.5})
     monkeypatch.setattr(spoilt_run, "PATIENCE", 2.0)

@@ -26,6 +26,7 @@ TREES = st.recursive(
 )
 
 
+@pytest.mark.second
 @settings(max_examples=30)
 @given(st.dictionaries(TEXT, TREES, min_size=1, max_size=4))
 def test_yaml(data) -> None:

@@ -78,6 +78,7 @@ def test_edges_take_the_share_of_their_area(backend, cut, bare) -> None:
         assert optics.wavefront().vignetted == pytest.approx(share, abs=2e-3), text
 
 
+@pytest.mark.second
 def test_wavefronts_and_focus_are_of_the_light_that_comes_through(backend, bare) -> None:
     """An aberration of the outer half of the pupil goes with the light there; the sharpness of both ways agrees."""
     stopped = camera(BARE.replace("entrance_pupil: 300 mm", "entrance_pupil: 150 mm"))

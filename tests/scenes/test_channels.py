@@ -13,6 +13,7 @@ def model(backend, tmp_path_factory):
     return monitor_layouts.built(monitor_layouts.two_beams(), tmp_path_factory.mktemp("two"), backend)
 
 
+@pytest.mark.second
 def test_two_beams_stand_clear(model, backend) -> None:
     assert [c.key for c in model.channels] == [f"{c}/{name}" for c in ("forward", "backward") for name in NAMES]
     check_beams(model, backend)

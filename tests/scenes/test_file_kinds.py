@@ -130,6 +130,7 @@ WRONG = [
 ]
 
 
+@pytest.mark.second
 def test_a_file_given_to_the_wrong_command(tmp_path: Path) -> None:
     for app, words, file, what, other in WRONG:
         path = SCENES / file

@@ -50,6 +50,7 @@ def test_the_pattern_of_a_kind_admits_its_units_alone() -> None:
         assert re.search(pattern(kind), kind.example)
 
 
+@pytest.mark.second
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     app = typer.Typer()
     app.command()(main)
