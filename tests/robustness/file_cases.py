@@ -118,7 +118,7 @@ def _measured_laboratory() -> Iterator[Case]:
         images[f"{place}.tiff"] = _made(
             lambda path, pages=pages: tifffile.imwrite(path, pages, photometric="minisblack")
         )
-        rows += [f"{place}.tiff,{k},P,0,{y},along,{30 * (k - 4)}" for k in range(9)]
+        rows += [f"{place}.tiff,{k},P,{5 * (y == 0)},{y},along,{30 * (k - 4)}" for k in range(9)]
     text = edited(text_of("lab/measured/focus.yaml"), ("mtf: mtf.csv", "images: images.csv"))
     files = {"focus.yaml": text, "images.csv": "\n".join(rows).encode(), **images}
     for target, kind in (("images.csv", "table of images"), ("a.tiff", "TIFF image")):
