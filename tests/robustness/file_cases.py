@@ -311,7 +311,18 @@ def _prescriptions() -> Iterator[Case]:
         yield case(f"lens-zemax-{name}", "Zemax", "a.zmx", text)
     for name, coding in (("plain", "utf-8"), ("wide", "utf-16-le")):
         yield case(f"lens-codev-{name}", "CODE V", "a.seq", CODEV.encode(coding))
-    yield case("lens-batoid", "batoid", "a.yaml", BATOID.encode(), "--wavelength", "650 nm", "--field", "0.2 deg")
+    yield case(
+        "lens-batoid",
+        "batoid",
+        "a.yaml",
+        BATOID.encode(),
+        "--wavelength",
+        "650 nm",
+        "--field",
+        "0.2 deg",
+        "--pupil",
+        "2 m",
+    )
     for name, coding in (("plain", "utf-8"), ("wide", "utf-16")):
         own = {"a.zmx": SINGLET.encode(), "glass.agf": AGF.encode(coding)}
         more: dict[str, Any] = {"out": "out/camera.yaml", "whole": 1, "weight": 0.6}
