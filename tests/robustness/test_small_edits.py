@@ -132,6 +132,7 @@ def _block_volume(experiment: MonitorExperiment) -> float:
     return float(np.mean(np.maximum(top + spec.height, 0.0)) * 16.0 * spec.spread[0] * spec.spread[1])
 
 
+@pytest.mark.second
 def test_focus_of_the_reference_is_where_its_plane_is(experiment, tmp_path, backend) -> None:
     """A plane 1 mm beside is 1 mm out of focus: pinhole and CCD go together, the image goes twice as far."""
     nominal = experiment("gf7_pair").nominal_focus

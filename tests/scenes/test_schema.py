@@ -76,6 +76,7 @@ def problems(schema, job) -> int:
     return len(list(jsonschema.Draft202012Validator(schema).iter_errors(job)))
 
 
+@pytest.mark.second
 def test_the_schema_of_jobs_knows_the_nodes_of_shipped_instruments(nodes) -> None:
     assert set(nodes) == set(library_names(INSTRUMENTS))
     schema = with_nodes(json_schema("job"), nodes)

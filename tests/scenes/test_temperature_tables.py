@@ -133,6 +133,7 @@ def test_zerodur_does_not_bend(gf7_pair, tmp_path) -> None:
     assert body.faces == {}
 
 
+@pytest.mark.second
 def test_a_quadratic_field_in_glass(silica, tmp_path) -> None:
     """A weak one bends its faces and tells what its index leaves; a strong one is refused, with the linear field."""
     points = lattice(silica, PRISM)

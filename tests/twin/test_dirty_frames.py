@@ -83,6 +83,7 @@ def test_dirt_is_found_and_corrected(bench, kind):
             assert set(TOLD[one]) <= names or (kind == "all" and one == "saturation")
 
 
+@pytest.mark.second
 def test_without_the_corrections_dirt_does_harm(bench):
     """The test above could fail: the same frames taken as they are."""
     template, detector, noise = bench
@@ -117,6 +118,7 @@ def moved_by(rms):
     return movement
 
 
+@pytest.mark.second
 def test_the_noise_of_a_subtracted_level_is_that_of_the_light(bench, monkeypatch):
     """Real numbers whose dark level was subtracted: all that is below the data sheet's level had no shot noise, which
     made sigma 30 % too small and took noise for cosmic rays and bad pixels.
