@@ -198,3 +198,10 @@ def experiment(backend):
         return MonitorExperiment(resolve_job(JobSpec(instrument=name)), backend)
 
     return prepare
+
+
+def pytest_report_header() -> str:
+    """Say which random cases are run today."""
+    from tests.daily import first_of_today
+
+    return f"random cases begin with {first_of_today()} (RANDOM_CASES=NUMBER repeats those of another day)"

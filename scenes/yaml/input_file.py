@@ -64,7 +64,9 @@ def why_unreadable(error: BaseException) -> str:
     Libraries stumble over damaged files in ways that they do not foresee. A text that speaks of the inside of the
     program, such as the shapes of its arrays, helps nobody and is left out.
     """
-    inside = isinstance(error, LookupError | AttributeError | TypeError | AssertionError | OverflowError | Warning)
+    inside = isinstance(
+        error, LookupError | AttributeError | TypeError | AssertionError | OverflowError | Warning | SystemExit
+    )
     text = re.sub(r"\s+", " ", str(error)).strip()[:200]
     inside = inside or any(word in text for word in ("broadcast", "unpack", "ufunc"))
     return "it is damaged" if inside or not text else text

@@ -308,7 +308,11 @@ def validate(model: type[SpecType], yaml: YamlFile) -> SpecType:
     try:
         spec = model.model_validate(yaml.data)
     except ValidationError as error:
-        issues = [_issue(model, detail, source) for detail in error.errors(include_url=False)]
+        details = error.errors(include_url=False)
+        # A list with wrong items is too short only because they are not counted.
+        wrong = {detail["loc"][:-1] for detail in details} | {detail["loc"][:-2] for detail in details}
+        told = [one for one in details if one["type"] != "too_short" or one["loc"] not in wrong]
+        issues = [_issue(model, detail, source) for detail in told]
         raise InputError(*sorted(issues, key=lambda issue: issue.line or 0)) from None
     spec = spec.with_source(source)
     _tell_parts(spec, source)
@@ -392,8 +396,11 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
         problem, allowed = _SAID[kind]
         if isinstance(value, str) and (comma := decimal_comma(value)) is not None:
             problem, allowed = comma.problem, comma.allowed
-    elif kind in ("too_short", "too_long"):
-        problem, found = problem[0].lower() + problem[1:], None
+    elif kind == "too_short":
+        problem, found = "too few items", str(context["actual_length"])
+        allowed = f"at least {context['min_length']}"
+    elif kind == "too_long":
+        problem, found, allowed = "too many items", str(len(value)), f"at most {context['max_length']}"
     return Issue(problem, source.file, source.line(key), (*source.prefix, *key), found, allowed, suggestion)
 
 

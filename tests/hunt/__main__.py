@@ -1,15 +1,16 @@
-"""``python -m tests.hunt [CASES] [FIRST]``: hunt for cases in which the twin misleads its user, and print them."""
+"""``python -m tests.hunt [CASES] [FIRST] [KIND]``: hunt for cases in which the twin misleads its user, and print them.
+
+CASES of each kind (60), beginning with number FIRST (0); KIND is one of jobs, stops, lives, spans and telescopes.
+"""
 
 from __future__ import annotations
 
 import sys
 import tempfile
-import time
-from collections import Counter
-from itertools import chain
 from pathlib import Path
 
 from optics.numerics.backend import load_backend
+from tests.daily import report
 from tests.hunt.hunt import hunt
 from tests.hunt.legal_spans import span_hunt
 from tests.hunt.legal_telescopes import telescopes
@@ -17,25 +18,19 @@ from tests.hunt.lives import lives
 from tests.hunt.stops import stops
 
 
-def main(cases: int = 60, first: int = 0, dense: int = 6) -> int:
-    """Print defects as they come, and what became of all cases; how many defects there are."""
-    began, counts, checked, defects = time.monotonic(), Counter(), 0, 0
+def main(cases: str = "60", first: str = "0", kind: str = "") -> int:
+    """Return how many cases mislead."""
+    count, number, backend = int(cases), int(first), load_backend("llvm")
     with tempfile.TemporaryDirectory() as folder:
-        backend = load_backend("llvm")
-        jobs = hunt(first, cases, Path(folder), backend, dense)
-        others = (stops(first, cases, backend), lives(first, cases), span_hunt(first, cases))
-        for outcome in chain(jobs, *others, telescopes(first, cases, Path(folder), backend)):
-            counts[outcome.kind] += 1
-            checked += outcome.checked
-            if outcome.defect:
-                defects += 1
-                print(f"{outcome.case}: {outcome.kind}: {outcome.text}", flush=True)
-            elif outcome.kind == "refused":
-                print(f"{outcome.case}: refused: " + outcome.text.splitlines()[-1][:220], flush=True)
-    spent = time.monotonic() - began
-    print(f"{cases} cases of each kind in {spent:.0f} s, {checked} with dense images: {dict(counts)}")
-    return defects
+        kinds = {
+            "jobs": lambda: hunt(number, count, Path(folder), backend, 6),
+            "stops": lambda: stops(number, count, backend),
+            "lives": lambda: lives(number, count),
+            "spans": lambda: span_hunt(number, count),
+            "telescopes": lambda: telescopes(number, count, Path(folder), backend),
+        }
+        return sum(report(find()) for name, find in kinds.items() if kind in ("", name))
 
 
 if __name__ == "__main__":
-    sys.exit(1 if main(*map(int, sys.argv[1:])) else 0)
+    sys.exit(1 if main(*sys.argv[1:]) else 0)

@@ -61,9 +61,17 @@ class Outcome:
     checked: bool = False
 
     @property
-    def defect(self) -> bool:
-        """Whether the twin misled its user."""
-        return self.kind in DEFECTS
+    def end(self) -> str:
+        """What became of it."""
+        return self.kind
+
+    @property
+    def wrong(self) -> str:
+        """What misled the user, if anything did."""
+        return self.text if self.kind in DEFECTS else ""
+
+    def __str__(self) -> str:
+        return f"{self.case}: {self.kind}: {self.text}"
 
 
 def hunt(first: int, cases: int, folder: Path, backend: Backend, dense: int) -> Iterator[Outcome]:

@@ -70,15 +70,30 @@ def cases(bases: Path | None = None) -> dict[str, Case]:
     from tests.robustness.run_cases import run_cases
 
     runs = run_cases(bases) if bases is not None else ()
-    every = (*_renders(), *_cameras(), *_labs(), *_orbits(), *_studies(), *_designs(), *file_cases(), *runs)
+    every = (*_listed(), *_renders(), *_labs(), *_orbits(), *_studies(), *_designs(), *file_cases(), *runs)
     return {case.name: case for case in every}
 
 
-def _of_one(name: str, kind: str, app: typer.Typer, words: str, file: str, *beside: str, **more: Any) -> Case:
-    """A case with a file of scenes, or one of the small jobs and those beside it that it names."""
-    small = "/" not in file
-    files = {Path(one).name: (job_of if small else text_of)(one) for one in (file, *beside)}
-    return Case(name, kind, app, tuple(words.split()), files, Path(file).name, **more)
+APPS = {
+    **{"render": render, "camera": camera, "lab": lab, "orbit": orbit, "study": study, "design": design, "live": live},
+    **{"uncertainty": uncertainty, "bench": bench},
+}
+
+
+def _listed() -> Iterator[Case]:
+    """Cases of one file, which cases.txt lists."""
+    for line in Path(__file__).with_name("cases.txt").read_text("utf-8").splitlines():
+        if line.startswith("#"):
+            continue
+        name, kind, command, named, *rest = (part.strip() for part in line.split("|"))
+        numbers, options = (*rest, "", "")[:2]
+        files = {Path(one).name: (text_of if "/" in one else job_of)(one) for one in named.split()}
+        app, *words = command.split()
+        more: dict[str, Any] = {"options": tuple(options.split())}
+        for number in numbers.split():
+            key, _, value = number.partition("=")
+            more[key] = {"out": str, "weight": float}.get(key, int)(value)
+        yield Case(name, kind, APPS[app], tuple(words), files, next(iter(files)), **more)
 
 
 def _config(name: str, app: typer.Typer, words: str, resolve: Callable, file: str, **more: Any) -> Case:
@@ -97,18 +112,6 @@ def _renders() -> Iterator[Case]:
     from scenes.specs.resolved import resolve
 
     quick: dict[str, Any] = {"options": ("--frames", "1")}
-    job = "job"
-    for stem, whole in (("perturb", 30), ("heated", 30)):
-        yield _of_one(f"render-{stem}", job, render, "", f"{stem}.yaml", **quick, whole=whole)
-    for stem in ("aligned", "steady", "image_quality"):
-        yield _of_one(f"render-{stem}", job, render, "", f"examples/{stem}.yaml", **quick)
-    yield _of_one("render-targets", "job with targets", render, "", "targets.yaml", "single.yaml", **quick)
-    yield _of_one("render-stray", "job with stray light", render, "", "stray.yaml", **quick, whole=40)
-    yield _of_one("render-course", "job with a course", render, "", "course.yaml", **quick, whole=40)
-    for stem, weight in (("orbit", 0.5), ("launch", 0.3), ("heat_soak", 0.2)):
-        yield _of_one(
-            f"render-{stem}", "job with a course", render, "", f"examples/{stem}.yaml", **quick, weight=weight
-        )
     own = {
         "job.yaml": edited(text_of("examples/targets.yaml"), ("instrument: gf7_pair", "instrument: ./pair.yaml")),
         "pair.yaml": edited(
@@ -134,12 +137,10 @@ def _renders() -> Iterator[Case]:
     added: {bodies: base/*/M?, shift: [1 um, 0 um, 2 um], figure: {Z5: 2 nm}, together: 0.2, time: {drift: 6 h},
       correlations: [{between: [base/forward/M1 shift x, base/forward/M1 shift z], correlation: -0.5}], reason: added}
 """
-    for stem in ("orbit", "launch", "paper_001"):
-        text = text_of(f"library/disturbances/{stem}.yaml")
-        cause = text.partition(b"causes:")[2].split(b":")[0].strip().splitlines()[-1].strip()
-        job_text = text_of("examples/aligned.yaml") + changes.replace(b"CAUSE", cause)
-        own = {"job.yaml": job_text, "own.yaml": text}
-        yield Case(f"render-disturbances-{stem}", "disturbances", render, (), own, "own.yaml", **quick, whole=50)
+    text = text_of("library/disturbances/orbit.yaml")
+    cause = text.partition(b"causes:")[2].split(b":")[0].strip().splitlines()[-1].strip()
+    own = {"job.yaml": text_of("examples/aligned.yaml") + changes.replace(b"CAUSE", cause), "own.yaml": text}
+    yield Case("render-disturbances", "disturbances", render, (), own, "own.yaml", **quick, whole=50)
     yield Case("render-disturbances-job", "job with disturbances", render, (), own, "job.yaml", **quick)
     own = {"job.yaml": AS_BUILT, "own.yaml": text_of("examples/as_built_pair.yaml")}
     yield Case("render-as-built", "instrument as built", render, (), own, "own.yaml", **quick, whole=40)
@@ -151,8 +152,6 @@ def _renders() -> Iterator[Case]:
     yield Case("render-joint", "disturbances", render, (), own, "own.yaml", **quick, whole=50)
     yield Case("render-joint-table", "table of correlations", render, (), own, "own.csv", **quick, whole=50)
     yield _config("render", render, "", resolve, "examples/targets.yaml", **quick, weight=0.5)
-    yield _of_one("uncertainty", job, uncertainty, "", "perturb.yaml", whole=40)
-    yield _of_one("live", job, live, "", "perturb.yaml", options=("--port", "0"), out="", weight=0.5)
 
 
 AS_BUILT = b"instrument: ./own.yaml\nperturb:\n  forward/M2: {shift: 0 0 1 um}\nrender: {frames: 1, seed: 1}\n"
@@ -176,23 +175,12 @@ SPOTS = (
 )
 
 
-def _cameras() -> Iterator[Case]:
-    for name in ("gf7", "gf7_conic", "monitor"):
-        file = f"library/cameras/{name}.yaml"
-        refocus = ("--refocus",) if name == "gf7_conic" else ()
-        yield _of_one(f"camera-{name}", "camera", camera, "", file, options=refocus, whole=30)
-
-
 def _labs() -> Iterator[Case]:
     from scenes.specs.resolved import resolve_distortion, resolve_focus, resolve_turntable
 
     resolvers = {"focus": resolve_focus, "distortion": resolve_distortion, "turntable": resolve_turntable}
-    beside = {"focus": ("two_bands.yaml",)}
     for stem, resolve in resolvers.items():
-        whole = {"turntable": 4, "distortion": 25, "focus": 40}[stem]
-        kind, file = f"{stem} test", f"{stem}.yaml"
-        yield _of_one(f"lab-{stem}", kind, lab, stem, file, *beside.get(stem, ()), whole=whole)
-        yield _config(f"lab-{stem}", lab, stem, resolve, file, weight=0.5)
+        yield _config(f"lab-{stem}", lab, stem, resolve, f"{stem}.yaml", weight=0.5)
     own = {
         "test.yaml": edited(
             job_of("distortion.yaml"),
@@ -203,23 +191,11 @@ def _labs() -> Iterator[Case]:
         "gf7.yaml": text_of("library/cameras/gf7.yaml"),
     }
     yield from _own({"t.yaml": "turntable test", "gf7.yaml": "camera"}, "lab-distortion-own", lab, "distortion", own)
-    yield _of_one("principle", "principle experiment", bench, "principle", "lab/principle_experiment.yaml")
-    yield _of_one("budget", "error budget", bench, "budget", "library/budgets/monitor_pair.yaml")
 
 
 def _orbits() -> Iterator[Case]:
     from scenes.specs.orbit.setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
 
-    for stem, whole in (("angle", 4), ("angle_gf7", 20), ("angle_off_axis", 20)):
-        yield _of_one(f"orbit-{stem}", "angle test", orbit, "angle", f"{stem}.yaml", whole=whole)
-    for stem, whole in (("", 15), ("_images", 0), ("_monitor", 30), ("_strip", 30)):
-        name = f"calibrate{stem}"
-        yield _of_one(f"orbit-{name}", "calibration", orbit, "calibrate", f"{name}.yaml", whole=whole)
-    yield _of_one("orbit-adjust", "block", orbit, "adjust", "adjust.yaml", weight=0.5, whole=30)
-    yield _of_one("orbit-monitor", "monitoring", orbit, "monitor", "monitor.yaml", weight=0.5, whole=40)
-    yield _of_one("orbit-loop", "monitor in a loop", orbit, "loop", "loop.yaml", weight=0.5, whole=0)
-    yield _of_one("orbit-simulate", "simulation", orbit, "simulate", "simulate.yaml", whole=30)
-    yield _of_one("orbit-export", "simulation", orbit, "export", "simulate.yaml", weight=0.5)
     configs = {
         "angle": resolve_angle,
         "calibrate": resolve_calibration,
@@ -240,14 +216,8 @@ def _studies() -> Iterator[Case]:
     from twin.study.runs.setup import resolve_study
 
     one: dict[str, Any] = {"options": ("--workers", "1"), "starts": True}
-    for stem in ("smoke", "alignment", "aperture", "interval", "prism_heat"):
-        yield _of_one(f"study-{stem}", "study", study, "", f"examples/study_{stem}.yaml", **one, weight=0.7)
-    # the small ones are of cheap tests: two numbers of a laboratory, eight passes
-    yield _of_one("study-lab", "study", study, "", "study_lab.yaml", "turntable.yaml", **one, weight=0.7, whole=30)
-    yield _of_one("study-orbit", "study", study, "", "study_orbit.yaml", "angle.yaml", **one, weight=0.7, whole=30)
     smoke = "examples/study_smoke.yaml"
     yield _config("study", study, "", resolve_study, smoke, **one, weight=0.5)
-    yield _of_one("study-gradient", "study", study, "", smoke, options=("--gradient",), weight=0.7)
     text = edited(
         text_of(smoke),
         ("file: perturb}", "file: ./base.yaml}"),
@@ -263,13 +233,11 @@ def _studies() -> Iterator[Case]:
 
 
 def _designs() -> Iterator[Case]:
-    yield _of_one("design", "camera design", design, "", "design.yaml", whole=30)
     own = {
         "design.yaml": edited(job_of("design.yaml"), ("camera: gf7\n", "camera: ./gf7.yaml\n")),
         "gf7.yaml": text_of("library/cameras/gf7.yaml"),
     }
     yield from _own({"gf7.yaml": "camera"}, "design-own", design, "", own, whole=40)
-    yield _of_one("layouts", "layout search", design, "monitor", "design_monitor.yaml", options=("--workers", "0"))
     with tempfile.TemporaryDirectory() as folder:
         kept = Path(folder) / "kept.search"
         with suppress(KeyboardInterrupt), Journal(kept, "fuzzed") as journal_:

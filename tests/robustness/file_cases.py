@@ -22,6 +22,8 @@ from scenes.lens.__main__ import app as lens
 from scenes.yaml.yaml_file import dump_yaml
 from tests.robustness.case import Case, edited, job_of, text_of
 from tests.scenes.lens.files import AGF, BATOID, CODEV, SINGLET, TMA
+from tests.scenes.monitor_layouts import hollow_pair, two_beams
+from tests.scenes.monitor_layouts import text_of as layout_text
 from tests.twin import orbit_file_bench as bench
 from twin.lab import app as lab
 from twin.orbit.__main__ import app as orbit
@@ -50,8 +52,11 @@ def _made(write: Callable[[Path], object], name: str = "file") -> bytes:
 
 
 def _job_tables() -> Iterator[Case]:
-    """Tables that jobs name."""
+    """Layouts of monitors and tables that jobs name."""
     quick: dict[str, Any] = {"options": ("--frames", "1")}
+    for name, layout in (("two-beams", two_beams()), ("hollow", hollow_pair())):
+        own = {"job.yaml": b"instrument: ./own.yaml\n", "own.yaml": layout_text(layout).encode()}
+        yield Case(f"render-{name}", "layout of monitors", render, (), own, "own.yaml", **quick)
     single = {"single.yaml": job_of("single.yaml")}
 
     def case(name: str, kind: str, job: bytes, table: str, content: bytes, **more: Any) -> Case:
@@ -109,11 +114,11 @@ def _measured_laboratory() -> Iterator[Case]:
     # edges through focus at three places
     rows, images = ["file,page,band,x [mm],y [mm],edge,shift [um]"], {}
     for place, y in (("a", -100), ("b", 0), ("c", 100)):
-        pages = np.stack([_edge(1.0 + 0.25 * abs(k)) for k in range(-4, 5)])
+        pages = np.stack([_edge(1.0 + 0.03 * k * k) for k in range(-4, 5)])
         images[f"{place}.tiff"] = _made(
             lambda path, pages=pages: tifffile.imwrite(path, pages, photometric="minisblack")
         )
-        rows += [f"{place}.tiff,{k},P,0,{y},along,{30 * (k - 4)}" for k in range(9)]
+        rows += [f"{place}.tiff,{k},P,{5 * (y == 0)},{y},along,{30 * (k - 4)}" for k in range(9)]
     text = edited(text_of("lab/measured/focus.yaml"), ("mtf: mtf.csv", "images: images.csv"))
     files = {"focus.yaml": text, "images.csv": "\n".join(rows).encode(), **images}
     for target, kind in (("images.csv", "table of images"), ("a.tiff", "TIFF image")):
@@ -301,17 +306,27 @@ def _prescriptions() -> Iterator[Case]:
         files = {file: content, **more}
         return Case(name, kind, lens, ("read",), files, file, options, out="out/camera.yaml", whole=1, weight=0.6)
 
-    glasses, schott = ("--glasses", "{here}/glass.agf"), {"glass.agf": AGF.encode()}
+    glasses = ("--glasses", "{here}/glass.agf")
     for name, text in (("wide", TMA.encode("utf-16")), ("tma", TMA.encode()), ("singlet", SINGLET.encode())):
         yield case(f"lens-zemax-{name}", "Zemax", "a.zmx", text)
     for name, coding in (("plain", "utf-8"), ("wide", "utf-16-le")):
         yield case(f"lens-codev-{name}", "CODE V", "a.seq", CODEV.encode(coding))
-    yield case("lens-batoid", "batoid", "a.yaml", BATOID.encode(), "--wavelength", "650 nm", "--field", "0.2 deg")
+    yield case(
+        "lens-batoid",
+        "batoid",
+        "a.yaml",
+        BATOID.encode(),
+        "--wavelength",
+        "650 nm",
+        "--field",
+        "0.2 deg",
+        "--pupil",
+        "2 m",
+    )
     for name, coding in (("plain", "utf-8"), ("wide", "utf-16")):
         own = {"a.zmx": SINGLET.encode(), "glass.agf": AGF.encode(coding)}
         more: dict[str, Any] = {"out": "out/camera.yaml", "whole": 1, "weight": 0.6}
         yield Case(f"lens-glasses-{name}", "glass catalogue", lens, ("read",), own, "glass.agf", glasses, **more)
-    del schott
     own = {"gf7.yaml": text_of("library/cameras/gf7.yaml")}
     yield Case("lens-write", "camera", lens, ("write",), own, "gf7.yaml", out="out/camera.zmx", whole=1)
 

@@ -19,7 +19,7 @@ from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.robustness.mutate_data import DATA_SETS, IMAGES
 from tests.robustness.mutate_table import TABLES
 from tests.robustness.mutate_tree import TREES, YAMLS, paths
-from tests.robustness.nasty import NUMBERS, TEXTS, UNITS
+from tests.robustness.nasty import LINE_ENDS, MARKS, NUMBERS, TEXTS, UNITS, WORDS
 
 Mutator = Callable[[bytes, random.Random], bytes]
 
@@ -101,9 +101,7 @@ def insert(content: bytes, chance: random.Random) -> bytes:
     if sort == 0:
         extra = chance.randbytes(chance.randint(1, 40))
     elif sort == 1:
-        extra = chance.choice(
-            (b"\0", b"\t", b"\r", b"\x85", b"\xff\xfe", b"\xed\xa0\x80", b"\xc0\x80", b"\xf4\x90\x80\x80")
-        )
+        extra = chance.choice(MARKS)
     elif sort == 2:
         extra = bytes(chance.choices(b"{}[],:#&*!|>'\"%@`-?\n \\", k=chance.randint(1, 6)))
     else:
@@ -145,9 +143,7 @@ def recode(content: bytes, chance: random.Random) -> bytes:
 
 
 def line_ends(content: bytes, chance: random.Random) -> bytes:
-    return content.replace(
-        b"\n", chance.choice((b"\r\n", b"\r", b"\n\n", b"\n\r", b"\xe2\x80\xa8", b"", b"\n \n", b"\n\t"))
-    )
+    return content.replace(b"\n", chance.choice(LINE_ENDS))
 
 
 def huge(content: bytes, chance: random.Random) -> bytes:
@@ -224,36 +220,7 @@ def indent(text: str, chance: random.Random) -> str:
 
 
 TOKENS: tuple[Callable[[str, random.Random], str], ...] = (
-    number,
-    number,
-    scale,
-    scale,
-    scale,
-    unit,
-    unit,
-    no_unit,
-    word,
-    words,
-    indent,
-)
-
-
-NASTY = (
-    "1e400",
-    "-1e308",
-    "nan",
-    "0",
-    "1e-320",
-    "S" * 300,
-    "\u202e",
-    "&",
-    "!",
-    ";",
-    "'",
-    '"',
-    "INFINITY",
-    "SURF 1",
-    "SI 0 0",
+    *(number, number, scale, scale, scale, unit, unit, no_unit, word, words, indent),
 )
 
 
@@ -262,7 +229,7 @@ def lines(text: str, chance: random.Random) -> str:
     found = text.split("\n")
     for _ in range(chance.randint(1, 4)):
         at = chance.randrange(len(found))
-        found[at : at + 1] = chance.choice(([], [found[at]] * 2, [chance.choice(found)], [chance.choice(NASTY)]))
+        found[at : at + 1] = chance.choice(([], [found[at]] * 2, [chance.choice(found)], [chance.choice(WORDS)]))
         found = found or [""]
     return "\n".join(found)
 
@@ -270,7 +237,7 @@ def lines(text: str, chance: random.Random) -> str:
 def nasty_words(text: str, chance: random.Random) -> str:
     found = text.split(" ")
     for _ in range(chance.randint(1, 4)):
-        found[chance.randrange(len(found))] = chance.choice(NASTY)
+        found[chance.randrange(len(found))] = chance.choice(WORDS)
     return " ".join(found)
 
 

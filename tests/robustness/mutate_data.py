@@ -156,10 +156,7 @@ def card(content: bytes, chance: random.Random) -> bytes:
     return bytes(out)
 
 
-IMAGES = (
-    *(_image(one) for one in (level, patched, noise, cut, turned, kind, depth)),
-    *(packed, number, number, card),
-)
+IMAGES = (*(_image(one) for one in (level, patched, noise, cut, turned, kind, depth)), *(packed, number, number, card))
 
 
 # --- data sets (netCDF-4, which is HDF5)

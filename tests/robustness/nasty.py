@@ -47,4 +47,28 @@ VALUES: tuple[Any, ...] = (
     "1 nm", "1e6 km", "0 deg", "90 deg", "-90 deg", "180 deg", "1e9 deg", "0 s", "-1 s", "1e-12 s", "1e6 h", "0 K",
     "-300 K", "1e9 K", "0 percent", "100 percent", "1e6 percent", "1 1/m^3", "1e-30 m", "0 1/m",
 )
+TAGS = (
+    "!!python/object/apply:os.system ", "!!python/name:os.system ", "!!python/object:scenes.specs.job.JobSpec ", "!x ",
+    "! ", "!!float ", "!!set ", "!!omap ", "!!binary ", "!!timestamp ", "!<tag:yaml.org,2002:str> ", "!<> ", "!%zz ",
+    "!!",
+)
+BLOCKS = tuple(f"{style}\n{' ' * n}" for style in ("|", ">", "|-", ">+", "|2", "|9", ">0", "|x") for n in (2, 8, 30))
+MERGES = ("{}\n<<: {a: 1}\n", "{}\n<<: *x\n", "{}\n'<<': {a: 1}\n", "{}\nx:\n  <<: [{a: 1}]\n")
+DOCUMENTS = ("{}\n---\n{}", "---\n{}", "{}\n...\n", "{}\n...\nx: 1\n", "--- \n---\n", "...", "")
+DIRECTIVES = (
+    "%YAML 1.1\n---\n{}", "%YAML 9.9\n---\n{}", "%TAG ! x:\n---\n{}", "%FOO bar\n---\n{}", "%YAML 1.2\n{}", "%{}",
+    "%YAML 1.1\n%YAML 1.1\n---\n{}",
+)
+NOTHING = ("# nothing\n", "\n\n", "~\n", "''\n", "3\n", "text\n", "[]\n", "- 1\n", "? \n", "null: null\n", ".nan\n")
+KEYS = (
+    "? [1, 2]\n: 3\n", "? {a: b}\n: 3\n", "? |\n  a\n  b\n: 3\n", "1: 2\n", "true: 2\n", "~: 2\n", "'': 2\n", "? x\n",
+    "[a]: 1\n", ": 1\n",
+)
+WORDS = (
+    "1e400", "-1e308", "nan", "0", "1e-320", "S" * 300, "\u202e", "&", "!", ";", "'", '"', "INFINITY", "SURF 1",
+    "SI 0 0",
+)
+"""In place of words and lines of other programs' files."""
+MARKS = (b"\0", b"\t", b"\r", b"\x85", b"\xff\xfe", b"\xed\xa0\x80", b"\xc0\x80", b"\xf4\x90\x80\x80")
+LINE_ENDS = (b"\r\n", b"\r", b"\n\n", b"\n\r", b"\xe2\x80\xa8", b"", b"\n \n", b"\n\t")
 # fmt: on

@@ -86,7 +86,7 @@ class Outcome:
         return {REACHED: "built", 0: "ran", 2: "refused"}.get(self.code if self.code is not None else 1, "told")
 
     def __str__(self) -> str:
-        again = f"python -m tests.robustness --case {self.case} --number {self.number} --keep /tmp/mutant"
+        again = f"python -m tests.robustness 1 {self.number} {self.case} --keep /tmp/mutant"
         head = f"{self.case} {self.number} ({self.how}), {self.depth}, {self.seconds:.1f} s: {self.wrong}"
         return f"{head}\n{self.text[-3000:]}\nagain: {again}"
 

@@ -65,9 +65,14 @@ def two_beams() -> dict[str, Any]:
     return data
 
 
+def text_of(data: dict[str, Any]) -> str:
+    """Plain data as the text of a file."""
+    return str(yaml.dump(data, Dumper=_Plain, sort_keys=False))
+
+
 def write(data: dict[str, Any], place: Path) -> Path:
     """Plain data as a file."""
-    place.write_text(yaml.dump(data, Dumper=_Plain, sort_keys=False), "utf-8")
+    place.write_text(text_of(data), "utf-8")
     return place
 
 

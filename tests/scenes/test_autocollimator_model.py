@@ -1,7 +1,6 @@
 """The file of the test with two autocollimators, and the bench that is built from it."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,45 +14,14 @@ from scenes.models.autocollimator_model import (
     build_bench,
     ccd_body,
     mirror_body,
-    paraxial_focus,
     pinhole_body,
 )
-from scenes.specs.autocollimators import AutocollimatorTestSpec
-from scenes.specs.load import LAB, SCENES, library_names, load_autocollimator_test
+from scenes.specs.load import load_autocollimator_test
 from scenes.yaml.errors import InputError
-from scenes.yaml.spec import Spec, validate
-from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from twin.laboratory.autocollimator_images import AutocollimatorPath
 
-FILE = SCENES / LAB / "principle_experiment.yaml"
 SPEC = load_autocollimator_test().spec
 ANGLES = [math.radians(15), math.radians(30)]
-
-
-def test_the_file() -> None:
-    assert "principle_experiment" in library_names(LAB)
-    setup = load_autocollimator_test()
-    assert setup.detector.name == setup.spec.autocollimator.area_ccd.detector == "autocollimator_ccd"
-    programme = setup.spec.programme
-    np.testing.assert_allclose(np.degrees([programme.small, programme.table, programme.large]), [0.01, 0.02, 0.03])
-    assert np.degrees([programme.stands.X, programme.stands.Y, programme.stands.Z]).round(9).tolist() == [15, 15, 30]
-    assert programme.steps == 10
-    # the CCD holds the beam turned by the largest series, with half a window to spare
-    ccd = setup.spec.autocollimator.area_ccd
-    reach = paraxial_focus(setup.spec.autocollimator.lens, 650e-9)[0] * math.tan(2 * 10 * programme.large)
-    assert reach + 0.5 * setup.spec.autocollimator.window * ccd.pitch < 0.5 * ccd.pitch * min(ccd.rows, ccd.columns)
-
-
-def test_a_full_well_is_just_below_saturation() -> None:
-    detector = load_autocollimator_test().detector
-    full = detector.full_well_e * detector.system_gain_dn_per_e + detector.offset_dn
-    assert 0.9 * 2**detector.bit_depth < full < 2**detector.bit_depth - 1
-
-
-def test_the_specification_reads_back() -> None:
-    again: Spec = validate(AutocollimatorTestSpec, parse_yaml(dump_yaml(SPEC.plain())))
-    assert again == SPEC
-    assert hash(again) == hash(SPEC)
 
 
 @pytest.mark.parametrize(
@@ -133,71 +101,3 @@ def test_a_larger_autocollimator_has_a_longer_focal_length(backend: Backend) -> 
     column = np.einsum("n,bnk->bk", path.nodes.share, position)[:4, 0]
     assert column[1] - column[0] == pytest.approx(0.5 * math.tan(4e-3), rel=1e-3)
     assert (column[3] - column[2]) / (column[1] - column[0]) - 1 == pytest.approx(1e-3, rel=0.02)
-
-
-def broken(tmp_path: Path, old: str, new: str) -> tuple[Path, int]:
-    """A copy of the file with one place changed, and the line of that place."""
-    text = FILE.read_text("utf-8")
-    assert text.count(old) == 1
-    path = tmp_path / "own.yaml"
-    path.write_text(text.replace(old, new), "utf-8")
-    return path, text[: text.index(old)].count("\n") + 1
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "key", "words"),
-    [
-        ("small: 0.01 deg", "small: 0.01", "programme.small", ["without a unit"]),
-        ("thickness: 12 mm", "thickness: 12 deg", "autocollimator.lens.thickness", ["is a unit of an angle"]),
-        ("glass: N-BK7", "glass: N-BK8", "autocollimator.lens.glass", ["no such glass", "did you mean"]),
-        ("window: 64 ", "window: 3.5 ", "autocollimator.window", []),
-        ("window: 64 ", "window: 400 ", None, []),
-        (
-            "offset: [0 mm, 7.5 mm]",
-            "offset: [0 mm, 1 mm]",
-            "autocollimator.area_ccd.offset",
-            ["stands on the area CCD"],
-        ),
-        ("aperture: 40 mm, radius", "aperture: 90 mm, radius", "mirrors.aperture", ["run into each other", "80.3"]),
-        ("radius: 150 mm", "radius: 460 mm", "mirrors.radius", ["behind the autocollimator's lens"]),
-        ("focal_length: 670 ppm", "focal_length: -1 ppm", "errors.focal_length", ["outside the limits"]),
-        ("steps: 10 ", "steps: 0 ", "programme.steps", []),
-        (
-            "detector: autocollimator_ccd",
-            "detector: autocolimator_ccd",
-            "autocollimator.area_ccd.detector",
-            ["did you"],
-        ),
-        ("front_radius: 283.19552 mm", "front_radius: 30 mm", "autocollimator.lens.front_radius", ["too strongly"]),
-    ],
-)
-def test_mistakes(old: str, new: str, key: str | None, words: list[str], tmp_path: Path) -> None:
-    path, line = broken(tmp_path, old, new)
-    if key is None:  # a right file, so that the test's way of breaking it does not break it by itself
-        assert load_autocollimator_test(path).spec != SPEC
-        return
-    with pytest.raises(InputError) as caught:
-        load_autocollimator_test(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}:{line}: {key}: ")
-    for word in words:
-        assert word in message
-
-
-def test_a_misspelt_key_is_told(tmp_path: Path) -> None:
-    path, line = broken(tmp_path, "narrow: 15 deg", "narow: 15 deg")
-    with pytest.raises(InputError) as caught:
-        load_autocollimator_test(path)
-    unknown = next(issue for issue in caught.value.issues if issue.key == ("programme", "narow"))
-    assert (unknown.line, unknown.suggestion) == (line, "narrow")
-
-
-def test_a_missing_key_is_told(tmp_path: Path) -> None:
-    path, _ = broken(tmp_path, "  axis_tilt: 10 arcsec", "  # gone")
-    with pytest.raises(InputError, match="'axis_tilt' is missing"):
-        load_autocollimator_test(path)
-
-
-def test_an_unknown_name() -> None:
-    with pytest.raises(InputError, match="did you mean 'principle_experiment'"):
-        load_autocollimator_test("principle_experimnt")

@@ -1,6 +1,5 @@
 """Edges in a camera's file: what they may say, what they take of the light, where they may not stand, round trips."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-import twin.camera.__main__
 from optics.geometry.aperture import Circle, Edge
 from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
@@ -31,7 +29,6 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.tiers import quick
-from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.cut_wavefront import RAYS_ACCURACY
@@ -81,6 +78,7 @@ def test_edges_take_the_share_of_their_area(backend, cut, bare) -> None:
         assert optics.wavefront().vignetted == pytest.approx(share, abs=2e-3), text
 
 
+@pytest.mark.second
 def test_wavefronts_and_focus_are_of_the_light_that_comes_through(backend, bare) -> None:
     """An aberration of the outer half of the pupil goes with the light there; the sharpness of both ways agrees."""
     stopped = camera(BARE.replace("entrance_pupil: 300 mm", "entrance_pupil: 150 mm"))
@@ -245,37 +243,6 @@ def test_light_of_a_cut_pupil_is_that_of_traced_rays(cut, monkeypatch) -> None:
         cut.pupils([(1.0, 0.0)])
 
 
-@pytest.mark.slow
-def test_a_report_has_the_mtf_of_a_cut_pupil(tmp_path: Path) -> None:
-    (tmp_path / "two.yaml").write_text(CAMERA)
-    invoke(twin.camera.__main__.app, tmp_path / "two.yaml", "--out", tmp_path / "run", "--quiet")
-    numbers = json.loads((tmp_path / "run/optics.json").read_text())
-    assert len(numbers["mtf_at_nyquist"]) > 2
-    assert "MTF at Nyquist" in (tmp_path / "run/report.html").read_text()
-
-
-@pytest.mark.parametrize(
-    ("edge", "said"),
-    [
-        ("{radius: 1 m}", "an edge is clear or blocks"),
-        ("{clear: circle, blocks: circle, radius: 1 m}", "an edge is clear or blocks"),
-        ("{clear: circle}", "a circle needs its radius"),
-        ("{clear: circle, radius: 1 m, half: [1 m, 1 m]}", "a circle has no half"),
-        ("{clear: circle, radius: 1 m, inner: 2 m}", "the hole is not within the circle"),
-        ("{clear: circel, radius: 1 m}", "did you mean 'circle'"),
-        ("{clear: circle, radius: 1}", "unit"),
-        ("{blocks: polygon, corners: [[0 m, 0 m], [1 m, 0 m]]}", "corners"),
-        ("{blocks: polygon, corners: [[0 m, 0 m], [1 m, 0 m], [0 m, 1 m]], centre: [1 m, 0 m]}", "has no centre"),
-        ("{blocks: ray, turn: 30 deg}", "a ray needs its width"),
-    ],
-)
-def test_wrong_edges_are_refused_where_they_stand(edge, said) -> None:
-    with pytest.raises(InputError) as caught:
-        with_edges(edge)
-    assert said in str(caught.value)
-    assert "mirrors.M1.edges" in str(caught.value)
-
-
 def test_instruments_take_no_camera_with_edges() -> None:
     spec = camera(CAMERA)
     with pytest.raises(InputError, match=r"mirrors\.P1\.edges: a camera of an instrument has no edges"):
@@ -327,21 +294,7 @@ def test_clear_apertures_that_stop_nothing_are_left_out(backend, tmp_path: Path)
     assert any("2 of them stop no light of the field" in str(note) for note in made.notes)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "edge", ["{blocks: circle, radius: 1 m}", "{clear: circle, radius: 2 mm, centre: [149 mm, 0 mm]}"]
-)
-def test_a_field_that_edges_leave_dark_is_refused_by_name(edge, tmp_path: Path) -> None:
-    file = tmp_path / "dark.yaml"
-    file.write_text(BARE.replace("  M1: {", f"  M1: {{edges: [{edge}], "), "utf-8")
-    done = invoke(twin.camera.__main__.app, file, "--out", tmp_path / "run")
-    assert done.exit_code == 2
-    assert "dark.yaml:" in done.stderr
-    assert "mirrors.M1.edges: edges leave no light" in " ".join(done.stderr.split())
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_field_with_dark_corners_is_taken_to_be_round(backend, tmp_path: Path) -> None:
     """Fields on both axes, and an edge near the image that lets through no more than the circle of them."""
     spec = camera(CAMERA.replace("field: {x: 0.1 deg, y: 0.1 deg}", "field: {x: 0.7 deg, y: 0.7 deg}"))

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import ConvexHull, Delaunay
-from typer.testing import CliRunner
 
-import twin.render as command
 from optics.geometry.pose import rotation_matrix
 from scenes.models import obstruction
 from scenes.models.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, remedy, separation
@@ -17,14 +15,10 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.obstruction import RAYS, find_obstructions
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_camera, load_instrument
 from scenes.yaml.errors import InputError
-from tests.tiers import quick
 
 PAIR = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
 PAIR = re.sub(r", tilt: \[[^]]*\]", "", PAIR)  # prisms square to the beam, for round numbers
 PAIR = re.sub(r" +#.*", "", PAIR)
-ONLY_180 = "prism_180: {material: fused silica, distance: 2.4 m, width: 60 mm"
-AT_FORWARD = "pupil_offset: [-220 mm, 0 mm]"
-ONLY_0 = "shift: 100 mm, width: 60 mm"
 
 
 def changed(folder: Path, *changes: tuple[str, str]) -> Path:
@@ -166,12 +160,6 @@ def test_bodies_in_each_other(change, pairs, told, bare, tmp_path) -> None:
         assert issue.file.endswith("own.yaml")
 
 
-def test_depth_of_an_overlap(bare, tmp_path) -> None:
-    """The rhomboid's half height is 33 mm, its exit face square to the beam, as the facet: 30 mm leave 3 mm."""
-    found = find_overlaps(bare(tmp_path, ("distance: 0.5 m", "distance: 30 mm")))
-    assert [o.depth for o in found] == pytest.approx([3e-3] * 4, abs=1e-7)  # the facet leans some 10 urad
-
-
 MOVE = re.compile(r"move it by ([+-])([xyz]) ([0-9.e+]+) mm of the base")
 
 
@@ -207,99 +195,6 @@ def test_a_gap_below_the_least(bare, tmp_path) -> None:
     with pytest.raises(InputError, match=r"is only .* um from base/central_prism"):
         check_clearance(touching)
     check_clearance(bare(tmp_path, ("distance: 0.5 m", "distance: 33.1 mm")))
-
-
-REFUSED = [
-    (
-        [("distance: 0.5 m", "distance: 30 mm")],
-        13,
-        ["monitor.prism_0.distance", "prism_0 reaches 3 mm into base/central"],
-    ),
-    (
-        [(ONLY_180, f"{ONLY_180}, angle_errors: {{roof_a: [-1 deg, 1 deg], roof_b: [1 deg, 1 deg]}}")],
-        12,
-        [
-            "monitor.prism_180: the middle of the beam forward/left misses forward/left/prism_180/",
-            "base/forward/monitor",
-        ],
-    ),
-    (
-        [("width: 60 mm}\n  prism_0", "width: 30 mm}\n  prism_0")],
-        12,
-        ["monitor.prism_180.width: the prism is narrower than the beam: 30 mm for", "50 mm", "at least 50 mm"],
-    ),
-    (
-        [(AT_FORWARD, AT_FORWARD.replace("220", "900"))],
-        4,
-        ["cameras.forward.pupil_offset: the middle of the beam", "M3"],
-    ),
-    ([(ONLY_0, "shift: 100 mm, width: 40 mm")], 13, ["monitor.prism_0.width", "narrower", "40 mm"]),
-    ([(ONLY_0, "shift: 50 mm, width: 60 mm")], 13, ["monitor.prism_0.shift", "prism_0", "at least 63 mm"]),
-    (
-        [("aperture: 50 mm", "aperture: 59 mm"), ("spread: [60 mm, 50 mm]", "spread: [20 mm, 20 mm]")],
-        14,
-        ["monitor.return_face.aperture: base/central_prism", "return_face reaches", "over the edge of its face"],
-    ),
-    ([("height: 60 mm", "height: 1 mm")], 6, ["central_prism.height: base/central_prism", "over the edge", "bottom"]),
-    ([("field: 1.22 deg", "field: 40 deg")], 9, ["monitor.field", "forward/left"]),
-    (
-        [("wavelength: 650 nm", "wavelength: 250 nm"), (ONLY_180, ONLY_180.replace("fused silica", "N-BK7"))],
-        12,
-        ["monitor.prism_180.material", "N-BK7", "250 nm", "300 to 2500 nm"],
-    ),
-    ([("wavelength: 650 nm", "wavelength: 4 um")], 12, ["monitor.prism_180.material", "4000 nm", "210 to 3710 nm"]),
-    (
-        [(ONLY_180, ONLY_180.replace("fused silica", "fused silca"))],
-        12,
-        ["monitor.prism_180.material: no such glass", "did you mean 'fused silica'?"],
-    ),
-    (
-        [("[0.15 m, 0 m, 0.5 m], material: fused silica", "[0.15 m, 0 m, 0.5 m], material: Invar")],
-        6,
-        ["central_prism.material: no such glass", "Zerodur"],
-    ),
-    (
-        [(ONLY_180, f"{ONLY_180}, angle_errors: {{roof: [1 arcsec, 0 arcsec]}}")],
-        12,
-        ["monitor.prism_180.angle_errors.roof: no such face", "roof_a, roof_b"],
-    ),
-    (
-        [(ONLY_0, f"{ONLY_0}, angle_errors: {{mirror: [1 arcsec, 0 arcsec]}}")],
-        13,
-        ["monitor.prism_0.angle_errors.mirror: no such face", "did you mean 'mirror_"],
-    ),
-    ([(ONLY_0, f"{ONLY_0}, angle_errors: {{exit: [1 arcsec, 2]}}")], 13, ["angle_errors.exit[1]", "without a unit"]),
-]
-
-
-@pytest.mark.parametrize(
-    ("changes", "line", "words"), quick(6, REFUSED), ids=[words[0].split(":")[0] for _, _, words in REFUSED]
-)
-def test_what_cannot_be_built_is_bad_input(changes, line, words, tmp_path) -> None:
-    """Exit code 2, the file with its line and key, and nothing written."""
-    changed(tmp_path, *changes)
-    job = tmp_path / "job.yaml"
-    job.write_text("instrument: own.yaml\n", "utf-8")
-    result = CliRunner().invoke(command.app, [str(job), "--out", str(tmp_path / "run"), "--quiet"])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == 2
-    assert f"own.yaml:{line}: " in result.stderr
-    for word in words:
-        assert word in result.stderr
-    assert "llowed: " in result.stderr  # a remedy, for a person and for a program
-    assert "Traceback" not in result.stderr
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.second
-def test_a_wide_beam_that_only_just_passes(backend, tmp_path) -> None:
-    """The way back lies beside the way out, by which the prisms have to be wider than the face."""
-    assert built(changed(tmp_path, ("aperture: 50 mm", "aperture: 57 mm")), backend)
-    with pytest.raises(InputError, match=r"prism_180\.width: the beam .* is cut at .*: it reaches 0\.\d+ mm beyond"):
-        built(changed(tmp_path, ("aperture: 50 mm", "aperture: 60 mm")), backend)
-    with pytest.raises(InputError, match="narrower than the beam"):
-        built(changed(tmp_path, ("aperture: 50 mm", "aperture: 60.001 mm")), backend)
 
 
 @pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])

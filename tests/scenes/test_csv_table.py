@@ -55,43 +55,6 @@ def test_rows_in_pieces_are_the_same_table(tmp_path: Path, monkeypatch: pytest.M
         _read(tmp_path, f"point,x [mm]\n{rows}q,much\n")
 
 
-@pytest.mark.parametrize(
-    ("text", "line", "parts"),
-    [
-        ("", 1, ["empty table", "x [um]"]),
-        ("point,x [mm]\n", 1, ["0 rows"]),
-        ("point,y [mm]\na,1\n", 1, ["no such column", "y [mm]"]),
-        ("point,turns [arcsec]\na,1\n", 1, ["did you mean 'turn [arcsec]'"]),
-        ("point,x\na,1\n", 1, ["without a unit", "x [um]"]),
-        ("point,x [arcsec]\na,1\n", 1, ["unit of an angle"]),
-        ("point,x [mmm]\na,1\n", 1, ["unknown unit"]),
-        ("point,x [m],x [mm]\na,1,1\n", 1, ["another column"]),
-        ("point,x [m],count [m]\na,1,1\n", 1, ["has no unit"]),
-        ("x [m],count\n1,1\n", 1, ["no column 'point'"]),
-        ("point,x [m]\na,1\nb\n", 3, ["1 cells under 2 heads"]),
-        ("point,x [m]\na,1\nb,1,5\n", 3, ["3 cells under 2 heads", "point in decimal"]),
-        ('point;x [m]\na;1\nb;"1,5"\n', 3, ["not a number", "not a comma"]),
-        ("point,x [m]\na,1\nb,one\n", 3, ["x [m]", "'one'", "not a number"]),
-        ("point,x [m]\na,\n", 2, ["not a number"]),
-        ("point,x [m]\na,1_0\n", 2, ["not a number"]),
-        ("point,x [m]\na,nan\n", 2, ["finite"]),
-        ("point,x [m]\na,1e999\n", 2, ["finite"]),
-        ("point,x [m]\n ,1\n", 2, ["empty cell"]),
-        ("point,x [m],count\na,1,10\n", 2, ["out of range", "0 to 9"]),
-        ("point,x [m],count\na,1,1.5\n", 2, ["whole"]),
-        ('point,x [m]\n"a,1\n', 2, ["not a CSV file"]),
-        (b"point,x [m]\na,\xff\n", 2, ["UTF-8"]),
-    ],
-)
-def test_errors_name_file_line_and_column(tmp_path: Path, text: str | bytes, line: int, parts: list[str]) -> None:
-    with pytest.raises(InputError) as error:
-        _read(tmp_path, text)
-    assert error.value.line == line
-    assert error.value.file.endswith("table.csv")
-    for part in parts:
-        assert part in str(error.value)
-
-
 def test_missing_file_names_the_one_that_was_meant(tmp_path: Path) -> None:
     (tmp_path / "angles.csv").write_text("x")
     with pytest.raises(InputError, match=r"angles\.csv"):

@@ -23,14 +23,8 @@ def test_message() -> None:
 
 def test_error_gives_the_first_issue_and_all_of_them() -> None:
     error = InputError(Issue("one", "a.yaml", 1, ("x",), "f", "g", "h"), Issue("two", "a.yaml", 2))
-    assert (error.file, error.line, error.key, error.found, error.allowed, error.suggestion) == (
-        "a.yaml",
-        1,
-        ("x",),
-        "f",
-        "g",
-        "h",
-    )
+    first = (error.file, error.line, error.key, error.found, error.allowed, error.suggestion)
+    assert first == ("a.yaml", 1, ("x",), "f", "g", "h")
     assert str(error).splitlines() == ["a.yaml:1: x: one; did you mean 'h'? Found f, allowed: g", "a.yaml:2: two"]
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
     with pytest.raises(ValueError, match="at least one issue"):

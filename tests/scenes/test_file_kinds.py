@@ -17,71 +17,67 @@ from twin.orbit.__main__ import app as orbit
 from twin.render import app as render
 from twin.study.__main__ import app as study
 
-FOLDERS = {
-    "examples/study": "study",
-    "examples/measured": "measurement",
-    "examples/design_monitor": "monitor_design",
-    "examples/design": "camera_design",
-    "examples/tolerance": "tolerance",
-    "examples/asbuilt": "asbuilt",
-    "examples/telemetry": "telemetry",
-    "examples/operation": "operation",
-    "examples/as_built": "as_built_instrument",
-    "examples/cassegrain": "camera",
-    "examples/": "job",
-    "lab/focus": "focus_test",
-    "lab/distortion": "distortion_test",
-    "lab/turntable": "turntable_test",
-    "lab/principle": "principle_experiment",
-    "lab/measured/focus": "measured_focus",
-    "lab/measured/distortion": "measured_distortion",
-    "lab/measured/turntable": "measured_turntable",
-    "library/budgets": "error_budget",
-    "library/cameras": "camera",
-    "library/detectors": "detector",
-    "library/disturbances": "disturbances",
-    "library/instruments": "instrument",
-    "library/payloads": "three_line_camera",
-    "orbit/adjust": "orbit_adjust",
-    "orbit/angle": "orbit_angle",
-    "orbit/measured/adjust": "measured_adjust",
-    "orbit/measured/angle": "measured_angle",
-    "orbit/measured/calibrate": "measured_calibration",
-    "orbit/measured/data": "orbit_data",
-    "orbit/measured/check": "orbit_check",
-    "orbit/measured/match": "orbit_match",
-    "orbit/measured/jitter": "measured_jitter",
-    "orbit/calibrate": "orbit_calibration",
-    "orbit/jitter": "orbit_jitter",
-    "orbit/loop": "orbit_loop",
-    "orbit/monitor": "orbit_monitor",
-    "orbit/simulate": "orbit_simulate",
-}
-"""Beginning of a shipped file's place -> its kind."""
+# the beginning of a shipped file's place -> its kind
+FOLDERS = dict(
+    line.split()
+    for line in """
+examples/study study
+examples/measured measurement
+examples/design_monitor monitor_design
+examples/design camera_design
+examples/tolerance tolerance
+examples/asbuilt asbuilt
+examples/telemetry telemetry
+examples/operation operation
+examples/as_built as_built_instrument
+examples/cassegrain camera
+examples/ job
+lab/focus focus_test
+lab/distortion distortion_test
+lab/turntable turntable_test
+lab/principle principle_experiment
+lab/measured/focus measured_focus
+lab/measured/distortion measured_distortion
+lab/measured/turntable measured_turntable
+library/budgets error_budget
+library/cameras camera
+library/detectors detector
+library/disturbances disturbances
+library/instruments instrument
+library/payloads three_line_camera
+orbit/measured/adjust measured_adjust
+orbit/measured/angle measured_angle
+orbit/measured/calibrate measured_calibration
+orbit/measured/data orbit_data
+orbit/measured/check orbit_check
+orbit/measured/match orbit_match
+orbit/measured/jitter measured_jitter
+orbit/adjust orbit_adjust
+orbit/angle orbit_angle
+orbit/calibrate orbit_calibration
+orbit/jitter orbit_jitter
+orbit/loop orbit_loop
+orbit/monitor orbit_monitor
+orbit/simulate orbit_simulate
+""".strip().splitlines()
+)
 FILES = sorted(path.relative_to(SCENES).as_posix() for path in SCENES.rglob("*.yaml"))
 
 
-def test_files_of_every_kind_are_shipped() -> None:
+def test_every_shipped_file_is_recognised() -> None:
     assert {kind.name for kind in FILE_KINDS} == set(FOLDERS.values())
+    for file in FILES:
+        expected = next(name for start, name in FOLDERS.items() if file.startswith(start))
+        data = read_yaml(SCENES / file).data
+        assert kind_of(data).name == expected, file
+        # a typing error does not make it another one
+        again = kind_of({**data, "no_such_key": 1})
+        assert again is None or again.name == expected, file
 
 
-@pytest.mark.parametrize("file", FILES)
-def test_every_shipped_file_is_recognised(file: str) -> None:
-    expected = next(name for start, name in FOLDERS.items() if file.startswith(start))
-    data = read_yaml(SCENES / file).data
-    kind = kind_of(data)
-    assert kind is not None
-    assert kind.name == expected
-    # a typing error does not make it another one
-    again = kind_of({**data, "no_such_key": 1})
-    assert again is None or again.name == expected
-
-
-@pytest.mark.parametrize(
-    "data", [None, 3, [], {}, {"name": "x"}, {"a": 1, "b": 2}, {"instrument": "x", "a": 1, "b": 2}]
-)
-def test_what_could_be_anything_is_nothing(data: object) -> None:
-    assert kind_of(data) is None
+def test_what_could_be_anything_is_nothing() -> None:
+    for data in (None, 3, [], {}, {"name": "x"}, {"a": 1, "b": 2}, {"instrument": "x", "a": 1, "b": 2}):
+        assert kind_of(data) is None, data
 
 
 def test_a_file_of_either_of_two_kinds_is_told_as_either(tmp_path) -> None:
@@ -106,64 +102,43 @@ def test_configs_of_runs_are_told_as_well() -> None:
     assert [kind and kind.name for kind in found] == ["job", "study", "focus_test"]
 
 
-@pytest.mark.parametrize("kind", [kind for kind in FILE_KINDS if kind.command], ids=lambda kind: kind.name)
-def test_the_commands_are_there(kind) -> None:
-    program, *sub = kind.command.split()
-    try:
-        app = importlib.import_module(f"{program}.__main__").app
-    except ModuleNotFoundError:
-        app = importlib.import_module(program).app
-    assert {command.name for command in app.registered_commands} >= set(sub)
+def test_the_commands_are_there() -> None:
+    for kind in FILE_KINDS:
+        if kind.command:
+            program, *sub = kind.command.split()
+            try:
+                app = importlib.import_module(f"{program}.__main__").app
+            except ModuleNotFoundError:
+                app = importlib.import_module(program).app
+            assert {command.name for command in app.registered_commands} >= set(sub), kind.name
 
 
-@pytest.mark.parametrize(
-    ("app", "words", "file", "said"),
-    [
-        (
-            render,
-            (),
-            "examples/study_smoke.yaml",
-            "a study, which twin.render does not read; python -m twin.study {} does",
-        ),
-        (
-            study,
-            (),
-            "examples/perturb.yaml",
-            "a job of the monitor, which twin.study does not read; python -m twin.render {} d",
-        ),
-        (
-            study,
-            ("--gradient",),
-            "lab/focus.yaml",
-            "a focus test, which twin.study does not read; python -m twin.lab focus {} d",
-        ),
-        (
-            lab,
-            ("focus",),
-            "lab/distortion.yaml",
-            "which twin.lab focus does not read; python -m twin.lab distortion {} does",
-        ),
-        (
-            orbit,
-            ("angle",),
-            "library/cameras/gf7.yaml",
-            "a camera's prescription, which twin.orbit angle does not read; python -m twin.camera {} does, or its na",
-        ),
-        (
-            design,
-            (),
-            "orbit/simulate.yaml",
-            "images of the ground, which twin.design camera does not read; python -m twin.orbit simu",
-        ),
-    ],
-)
-def test_a_file_given_to_the_wrong_command(app, words, file, said, tmp_path: Path) -> None:
-    path = SCENES / file
-    done = invoke(app, *words, path, "--out", tmp_path / "run")
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"error: {path}: this is ")
-    assert said.format(path) in done.stderr
-    assert not (tmp_path / "run").exists()
+# what is given to a command, what is said of it, and which command reads it
+WRONG = [
+    (render, "", "examples/study_smoke.yaml", "a study, which twin.render", "twin.study {} does"),
+    (study, "", "examples/perturb.yaml", "a job of the monitor, which twin.study", "twin.render {} does"),
+    (study, "--gradient", "lab/focus.yaml", "a focus test, which twin.study", "twin.lab focus {} does"),
+    (lab, "focus", "lab/distortion.yaml", "which twin.lab focus", "twin.lab distortion {} does"),
+    (orbit, "angle", "library/cameras/gf7.yaml", "a camera's prescription, which twin.orbit angle", "twin.camera {} d"),
+    (
+        design,
+        "",
+        "orbit/simulate.yaml",
+        "images of the ground, which twin.design camera",
+        "twin.orbit simulate {} does",
+    ),
+]
+
+
+@pytest.mark.second
+def test_a_file_given_to_the_wrong_command(tmp_path: Path) -> None:
+    for app, words, file, what, other in WRONG:
+        path = SCENES / file
+        done = invoke(app, *words.split(), path, "--out", tmp_path / "run")
+        assert (done.exit_code, done.stdout) == (2, "")
+        assert done.stderr.startswith(f"error: {path}: this is ")
+        assert f"{what} does not read; python -m {other.format(path)}" in done.stderr
+        assert not (tmp_path / "run").exists()
 
 
 def test_an_own_file_with_faults_is_told_its_faults(tmp_path: Path) -> None:

@@ -25,7 +25,6 @@ from scenes.models.clearance import LEAST_GAP, find_overlaps, separation
 from scenes.models.obstruction import find_obstructions, rays_taken
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.load import load_instrument
-from scenes.yaml.errors import InputError
 from tests.scenes import monitor_layouts
 from tests.scenes.prism_errors import reflection
 
@@ -100,21 +99,6 @@ def test_light_goes_as_plain_mirrors_send_it(backend, kind, turn, slant) -> None
             miss = np.cross(place - (2.0 * np.array(parts.apex) - start), into)
             assert np.abs(miss).max() < 3e-15
             assert np.ptp(path + place @ into) < 3e-15
-
-
-def test_where_they_send_the_beam() -> None:
-    """As the prisms do: back at (-x, -y), or on, displaced along x."""
-    for hand in (1.0, -1.0):
-        parts, middle = made("hollow_transfer", hand)
-        start = beam(middle)
-        places, way, _ = by_hand(parts, {}, start, np.broadcast_to(UP, start.shape))
-        np.testing.assert_allclose(places[-1][:, :2], -start[:, :2], rtol=0, atol=1e-15)
-        np.testing.assert_allclose(way, np.broadcast_to(-UP, way.shape), rtol=0, atol=1e-15)
-    parts, middle = made("periscope")
-    start = beam(middle)
-    places, way, _ = by_hand(parts, {}, start, np.broadcast_to(UP, start.shape))
-    moved = places[-1][:, :2] - start[:, :2]
-    np.testing.assert_allclose(moved, np.broadcast_to([SHIFT, 0.0], moved.shape), rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", ["hollow_transfer", "periscope"])
@@ -195,27 +179,6 @@ def test_what_stands_in_which_beam(model, gf7_pair, backend) -> None:
         assert sum(o.share for o in found if o.body == path or o.body.startswith(f"{path}/")) < share
 
 
-@pytest.mark.parametrize(
-    ("prism", "change", "said"),
-    [
-        ("prism_180", {"kind": "lateral_transfer"}, "prism_180.material: no such glass: light goes through this kind"),
-        ("prism_0", {"kind": "rhomboid"}, "prism_0.material: no such glass: light goes through this kind"),
-        ("prism_180", {"material": "CFPR"}, "prism_180.material: no such material; did you mean 'CFRP'?"),
-        ("prism_0", {"material": 5}, "prism_0.material"),
-        ("prism_0", {"shift": "70 mm"}, "prism_0.shift: base/forward/monitor/left/prism_0: mirrors of width 60 mm"),
-        ("prism_180", {"angle_errors": {"window": ["0 rad", "0 rad"]}}, "angle_errors.window: no such face"),
-        ("prism_180", {"kind": "periscope"}, "prism_180.kind: not one of the choices"),
-    ],
-)
-def test_wrong_ones_are_refused(prism, change, said, backend, tmp_path) -> None:
-    data = monitor_layouts.hollow_pair()
-    data["monitor"][prism] = {**data["monitor"][prism], **change}
-    with pytest.raises(InputError) as caught:
-        monitor_layouts.built(data, tmp_path, backend)
-    assert said in str(caught.value)
-    assert re.search(r"own\.yaml:\d+", str(caught.value))
-
-
 def test_the_material_is_spelt_as_in_the_catalogue(tmp_path) -> None:
     data = monitor_layouts.hollow_pair()
     data["monitor"]["prism_180"] = {**data["monitor"]["prism_180"], "material": "zerodur"}
@@ -282,19 +245,6 @@ def test_a_gradient_deforms_frame_and_mirrors_as_one_free_body(model, heat, fram
         turn = own.rotation @ (stuff.expansion * np.cross(gradient, at))
         found = placed.pose(element.body, 1).rotation @ placed.pose(element.body).rotation.T
         np.testing.assert_allclose(found, rotation_matrix(turn), rtol=0, atol=4.0 * (size * reach) ** 2 + 2e-15)
-
-
-def test_zerodur_takes_no_notice(backend, tmp_path) -> None:
-    data = monitor_layouts.hollow_pair()
-    for prism in ("prism_180", "prism_0"):
-        data["monitor"][prism] = {**data["monitor"][prism], "material": "Zerodur"}
-    own = monitor_layouts.built(data, tmp_path, backend)
-    field = Temperature(5.0, (1.0, 2.0, -3.0))
-    state = ThermalModel(own).state({c.prism_body(p): field for c in own.channels for p in ("prism_180", "prism_0")})
-    placed = own.assembly.place([{}, state])
-    for what in (placed.rotation, placed.translation, placed.scale):
-        np.testing.assert_array_equal(what[0], what[1])
-    assert not any(motion.figure for motion in state.values())
 
 
 def test_mirrors_have_the_temperature_of_their_frame(model, heat) -> None:

@@ -51,35 +51,27 @@ def test_what_is_no_file(kind: str, tmp_path: Path) -> None:
     assert "cannot be read" in str(refused(read, tmp_path / "\0"))
 
 
-@pytest.mark.parametrize("name", ["/dev/zero", "pipe", "folder"])
-@pytest.mark.parametrize(
-    ("text", "key"),
-    [
-        ("instrument: {}.yaml", "instrument"),
-        ("instrument: gf7_pair\ncourse: {{table: {}}}", "course.table"),
-        (
-            "instrument: gf7_pair\nperturb: {{base/forward/M2: {{deformation: {{table: {}}}}}}}",
-            "perturb.base/forward/M2.deformation.table",
-        ),
-    ],
-    ids=["instrument", "course", "deformation"],
-)
-def test_what_a_file_names_is_no_file(text: str, key: str, name: str, tmp_path: Path) -> None:
+NAMED = {
+    "instrument": "instrument: {}.yaml",
+    "course.table": "instrument: gf7_pair\ncourse: {{table: {}}}",
+    "perturb.base/forward/M2.deformation.table": "instrument: gf7_pair\n"
+    "perturb: {{base/forward/M2: {{deformation: {{table: {}}}}}}}",
+}
+"""Key of a job -> a job that names a file there."""
+
+
+@pytest.mark.parametrize("kind", ["a device", "a pipe", "a directory"])
+def test_what_a_file_names_is_no_file(kind: str, tmp_path: Path) -> None:
     """It is said what stands there, at the key, and nothing of it is read."""
     place = tmp_path / "what.yaml"
-    if name == "/dev/zero":
-        place.symlink_to(name)
-    elif name == "pipe":
-        os.mkfifo(place)
-    else:
-        place.mkdir()
-    given = str(place.with_suffix("")) if ".yaml" in text else str(place)
-    job = tmp_path / "job.yaml"
-    job.write_text(text.format(given), "utf-8")
-    kind = {"/dev/zero": "a device", "pipe": "a pipe", "folder": "a directory"}[name]
-    error = refused(resolve, job)
-    assert f"{place} is {kind}, not a regular file" in str(error)
-    assert ".".join(map(str, error.key)) == key
+    make = {"a device": lambda: place.symlink_to("/dev/zero"), "a pipe": lambda: os.mkfifo(place)}
+    make.get(kind, place.mkdir)()
+    for key, text in NAMED.items():
+        job = tmp_path / "job.yaml"
+        job.write_text(text.format(place.with_suffix("") if ".yaml" in text else place), "utf-8")
+        error = refused(resolve, job)
+        assert f"{place} is {kind}, not a regular file" in str(error)
+        assert ".".join(map(str, error.key)) == key
 
 
 @pytest.mark.parametrize("kind", [kind for kind in READERS if kind != "csv"])

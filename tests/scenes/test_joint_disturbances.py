@@ -1,7 +1,5 @@
 """Components that go together in a file of disturbances: read, drawn from, written, refused; radii and conics."""
 
-import re
-
 import numpy as np
 import pytest
 
@@ -65,13 +63,6 @@ def test_what_does_not_move_is_left_out_with_its_correlations(pair) -> None:
     found = motions_of_spec(spec(f"{HEAD}{THREE}{MATRIX}".replace("4 arcsec", "0 arcsec")), pair)
     assert [c.what for c in found.components] == ["shift z", "conic"]
     np.testing.assert_array_equal(found.correlation, np.eye(2))
-
-
-def test_draws_have_the_stated_covariance(pair) -> None:
-    found = motions_of_spec(spec(f"{HEAD}{THREE}{MATRIX}"), pair)
-    count = 100_000
-    drawn = found.draw(np.random.default_rng(4), count) / found.sigma
-    np.testing.assert_allclose(drawn.T @ drawn / count, found.correlation, atol=5.0 * np.sqrt(2.0 / count))
 
 
 def test_radii_conic_constants_and_indices_reach_states(pair) -> None:
@@ -183,126 +174,11 @@ def test_what_is_no_covariance(pair, change, message) -> None:
         matrix = change(matrix)
     with pytest.raises(ValueError, match=message):
         joint_disturbances("posterior", own, matrix, pair.nodes, "r")
+    with pytest.raises(ValueError, match="a component is there twice"):
+        joint_disturbances("posterior", [*own[:2], own[0]], 1e-12 * np.eye(3), pair.nodes, "r")
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
-
-FAULTS = {
-    "no components": ("  components: {}\n", "own.yaml:4: joint.components: no components", "shift z"),
-    "no kind": (
-        "  components: {forward/M2 shft z: 3 um}\n",
-        "joint.components.forward/M2 shft z: no such kind",
-        "shift",
-    ),
-    "no axis": (
-        "  components: {forward/M2 shift: 3 um}\n",
-        "joint.components.forward/M2 shift: not a motion",
-        "shift x",
-    ),
-    "no body": (
-        "  components: {forward/M9 shift z: 3 um}\n",
-        "own.yaml:4: joint.components.forward/M9 shift z: no such node",
-        "",
-    ),
-    "several bodies": (
-        "  components: {M2 shift z: 3 um}\n",
-        "joint.components.M2 shift z: several nodes",
-        "forward/M2",
-    ),
-    "not of it": ("  components: {forward/focal_plane radius: 3 ppm}\n", "does not allow radius", "rotate"),
-    "pivot": ("  components: {forward/M2 rotate x about top: 3 arcsec}\n", "has no such pivot", "centre"),
-    "pivot of a figure": (
-        "  components: {forward/M2 figure Z5 about centre: 3 nm}\n",
-        "a figure has no pivot",
-        "rotate",
-    ),
-    "twice": (
-        "  components: {forward/M2 shift z: 3 um, forward/M2 shift z about origin: 2 um}\n",
-        "named twice",
-        "once",
-    ),
-    "twice by names": (
-        "  components: {forward/M2 shift z: 3 um, base/forward/M2 shift z: 2 um}\n",
-        "named twice",
-        "once",
-    ),
-    "unit": (
-        "  components: {forward/M2 shift z: 3 arcsec}\n",
-        "joint.components.forward/M2 shift z: 'arcsec' is a unit",
-        "um",
-    ),
-    "no unit": (
-        "  components: {forward/M2 shift z: 3}\n",
-        "joint.components.forward/M2 shift z: a number without",
-        "um",
-    ),
-    "negative": ("  components: {forward/M2 shift z: -3 um}\n", "shift z: outside the limits", "at least 0"),
-    "too large": ("  components: {forward/M2 shift z: 3 m}\n", "shift z: outside the limits", "10 mm"),
-    "conic with a unit": (
-        "  components: {forward/M2 conic: 3 ppm}\n",
-        "not a standard deviation of a change of the conic",
-        "plain",
-    ),
-    "amount in its name": (
-        "  components: {forward/M2 shift z 3 um: 3 um}\n",
-        "has no amount in its name",
-        "forward/M2 shift z",
-    ),
-    "not a matrix": (
-        THREE + "  correlation: [[1, 0], [0, 1]]\n",
-        "own.yaml:8: joint.correlation: not a matrix",
-        "3 rows",
-    ),
-    "not symmetric": (
-        THREE + MATRIX.replace("[0.8, 1", "[0.7, 1"),
-        r"joint.correlation[1][0]: a correlation matrix is symm",
-        "",
-    ),
-    "diagonal": (THREE + MATRIX.replace("[[1,", "[[2,"), "joint.correlation[0][0]: outside the limits", "at most 1"),
-    "not of real quantities": (
-        THREE + "  correlation: [[1, 0.9, 0.9], [0.9, 1, -0.9], [0.9, -0.9, 1]]\n",
-        "own.yaml:8: joint.correlation: these correlations cannot be: the matrix is not positive definite",
-        "real quantities",
-    ),
-    "two matrices": (
-        THREE + MATRIX + "  correlation_file: a.csv\n",
-        "joint: two matrices of correlations",
-        "one of them",
-    ),
-    "no such file": (
-        THREE + "  correlation_file: a.csv\n",
-        "own.yaml:8: joint.correlation_file: no such file",
-        "a CSV file",
-    ),
-    "law": (THREE + "  time: pink\n", "own.yaml:8: joint.time", "white"),
-}
-
-
-@pytest.mark.parametrize("case", FAULTS)
-def test_what_cannot_go_together(pair, case) -> None:
-    text, message, remedy = FAULTS[case]
-    with pytest.raises(InputError) as caught:
-        motions_of_spec(spec(HEAD + text), pair)
-    told = str(caught.value)
-    assert message in told, told
-    assert remedy in told
-    assert told.count("\n") == 0
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("name: own\n", "own.yaml:1: causes: nothing is stated to move"),
-        (
-            HEAD + THREE + "causes:\n  joint: {bodies: base/*/M?, shift: 1 um, reason: r}\n",
-            "causes.joint: the components of the file's own `joint` are called so",
-        ),
-        ("name: own\njoint:\n" + THREE, "'reason' is missing"),
-    ],
-)
-def test_what_no_file_may_say(text, message) -> None:
-    with pytest.raises(InputError, match=re.escape(message)):
-        spec(text)
 
 
 TABLE = [
@@ -330,28 +206,6 @@ def test_a_table_may_have_its_columns_in_any_order(pair, tmp_path) -> None:
     (tmp_path / "corr.csv").unlink()
     again = motions_of_spec(resolve(tmp_path / "config.yaml").disturbances, pair)
     np.testing.assert_array_equal(again.covariance, found.covariance)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda rows: [rows[0].replace("conic", "radius"), *rows[1:]], r"corr.csv:1: not the components of .*own.yaml"),
-        (lambda rows: [rows[0] + ",base/forward/M3 conic", *rows[1:]], r"corr.csv:1: .*base/forward/M3 conic among"),
-        (lambda rows: [rows[0].rpartition(",")[0], *rows[1:]], r"corr.csv:\d+: "),
-        (lambda rows: rows[:-1], r"corr.csv: not a matrix of this size; found 2 rows"),
-        (lambda rows: [*rows[:2], "0,1", rows[3]], r"corr.csv:3: not a row of this table; found 2 cells"),
-        (lambda rows: [*rows[:2], "0,1,minus", rows[3]], r"corr.csv:3: not a correlation; found 'minus'"),
-        (lambda rows: [*rows[:2], "0,1,-1.3", rows[3]], r"corr.csv:3: not a correlation; found '-1.3'"),
-        (lambda rows: [*rows[:2], "0,1,nan", rows[3]], r"corr.csv:3: not a correlation; found 'nan'"),
-        (lambda rows: [*rows[:3], "0.8,-0.2,1"], r"corr.csv:\d: .*a correlation matrix is symmetric"),
-        (lambda rows: [*rows[:3], "0.8,-0.3,0.9"], r"corr.csv:4: .*ones on its diagonal"),
-        (lambda rows: [], r"corr.csv"),
-    ],
-)
-def test_a_table_that_is_none(tmp_path, change, message) -> None:
-    with pytest.raises(InputError, match=message) as caught:
-        table_of(tmp_path, change(TABLE))
-    assert str(caught.value).count("\n") == 0
 
 
 def test_a_job_cannot_change_what_goes_together(tmp_path) -> None:

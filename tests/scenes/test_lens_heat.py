@@ -178,6 +178,11 @@ def test_what_nothing_says_is_refused(changed: dict, node: str, said: str, backe
     data = {"instrument": "ritchey_chretien", "perturb": {node: {"temperature": "1 K"}}}
     with pytest.raises(InputError, match=f"does not allow temperature: .*{said}"):
         checked_nodes(validate(JobSpec, YamlFile("", data, {})), built.nodes)
+    if node in ("L1", "L3"):
+        with pytest.raises(TemperatureError, match=said.partition(".*")[0]) as caught:
+            ThermalModel(built).check({f"base/achromat/{node}": Temperature(1.0)})
+        assert caught.value.origin == f"base/achromat/{node}"
+        ThermalModel(built).check({f"base/achromat/{node}": Temperature()})
 
 
 def test_a_lens_beyond_what_is_known_is_refused(singlet) -> None:

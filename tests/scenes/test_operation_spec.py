@@ -9,7 +9,6 @@ from scenes.models.disturbances import stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import EXAMPLES
 from scenes.specs.operation import ENDINGS, OperationSpec, read_operation, resolve_operation
-from scenes.yaml.errors import InputError
 from scenes.yaml.units import parse_quantity
 from tests.tiers import quick
 
@@ -59,56 +58,6 @@ def test_own_files_are_found_from_the_plans_folder(tmp_path: Path) -> None:
     setup = read_operation(written(tmp_path, SHORT.replace("in_service", "own.yaml")))
     assert setup.operation.disturbances == str(tmp_path / "own.yaml")
     assert list(setup.disturbances.causes) == ["mount"]
-
-
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        (
-            "events: {safemode: [settling]}",
-            ["plan.yaml:3: events.safemode: no such event", "did you mean 'safe_mode'?"],
-        ),
-        (
-            "events:\n  safe_mode: [settlin]",
-            ["plan.yaml:4: events.safe_mode[0]: no such cause in in_service", "did you mean 'settling'?"],
-        ),
-        ("events: {refocus: []}", ["plan.yaml:3: events.refocus"]),
-        ("events: {refocus: [refocus, refocus]}", ["a cause is named twice"]),
-        ("coefficients: 30", ["plan.yaml:3: coefficients: a number without a unit"]),
-        ("window: 1", ["plan.yaml:3: window"]),
-        ("horizon: 0 h", ["plan.yaml:3: horizon: outside the limits"]),
-        ("requirements: [{quantity: forward d_f_um, limit: 20}]", ["requirements[0].limit"]),
-        ("requirements: [{quantity: forward d_f_um, limit: 20 arcsec}]", ["requirements[0].limit"]),
-        ("requirements: [{quantity: forward d_f_um, limit: 0 um}]", ["not greater than zero"]),
-        ("requirements: [{quantity: d_f_um, limit: 20 um}]", ["not a quantity"]),
-        ("requirements: [{quantity: forward d_f, limit: 20 um}]", ["a quantity without a unit"]),
-        ("requirements: [{quantity: forward d_f_um, limit: 20 um, probability: 1}]", ["requirements[0].probability"]),
-        (
-            "requirements: [{quantity: forward d_f_um, limit: 2 um}, {quantity: forward  d_f_um, limit: 3 um}]",
-            ["requirements[1].quantity: a quantity has two requirements"],
-        ),
-        ("horizont: 3 h", ["unknown key", "did you mean 'horizon'?"]),
-    ],
-)
-def test_a_mistake_is_told_where_it_stands(more: str, said: list[str], tmp_path: Path) -> None:
-    with pytest.raises(InputError) as caught:
-        read_operation(written(tmp_path, f"{SHORT}{more}\n"))
-    for one in said:
-        assert one in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("in_service", "in_servce", "plan.yaml:2: disturbances: no such name"),
-        ("in_service", "none", "plan.yaml:2: disturbances: a plan needs what is expected to move"),
-        ("gf7_pair", "gf7_pare", "plan.yaml:1: instrument: no such name"),
-    ],
-)
-def test_files_that_are_not_there(old: str, new: str, said: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError) as caught:
-        read_operation(written(tmp_path, SHORT.replace(old, new)))
-    assert said in str(caught.value)
 
 
 def test_every_ending_measures_one_of_its_unit() -> None:

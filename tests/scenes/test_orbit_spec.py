@@ -1,40 +1,40 @@
-"""Orbits, attitudes and their errors in files: units, limits, and what is said of mistakes."""
+"""Files of tests in orbit: units and defaults, the way to cameras and instruments, and configurations read back."""
 
 import math
+from pathlib import Path
 
 import pytest
 from pydantic import TypeAdapter
 
+from scenes.specs.load import LIBRARY, ORBIT, SCENES, load_camera, load_instrument
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, UtcTime, parse_utc
+from scenes.specs.orbit.monitor import MotionSpec
+from scenes.specs.orbit.setup import (
+    load_three_line_camera,
+    resolve_angle,
+    resolve_loop,
+    resolve_monitor,
+    resolve_simulate,
+)
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from tests.scenes.refusals.tables import good
 
-PASSING = """
-epoch: 2011-03-05T03:05:00Z
-before: 5 min
-after: 90 s
-passing: {longitude: 116 deg, latitude: 40 deg, altitude: 500 km, direction: ascending, inclination: 97.4 deg}
-"""
-ELEMENTS = """
-epoch: 2011-03-05T03:05Z
-elements: {altitude: 500 km, eccentricity: 0.001, node_local_time: 10.5 h, perigee: 90 deg, argument: 140 deg}
-"""
-STATE = """
-epoch: 2011-03-05T03:05:00.125Z
-state: {position: [6878 km, 0 km, 1 m], velocity: [0 m/s, -960.5 m/s, 7.5 km/s]}
-"""
-ERRORS = """
-gps: {interval: 1 s, noise: [1 m, 1 m, 2 m], drift: [10 cm, 0 m, 0 m], correlation_time: 30 min}
-star_tracker:
-  noise: [2 arcsec, 2 arcsec, 15 arcsec]
-  bias: [10 arcsec, -0.1 deg, 0 arcsec]
-  thermal: {amplitude: [1 arcsec, 2 arcsec, 0 arcsec], reference: 40 deg}
-"""
+ARCSEC = math.pi / 648000.0
+PASSING, ELEMENTS, STATE = (good(f"orbit by {name}") for name in ("a passing", "elements", "a state"))
+ERRORS = good("errors in orbit")
+TH1 = (LIBRARY / "payloads/th1.yaml").read_text("utf-8")
 
 
 def read(model: type[Spec], text: str) -> Spec:
     return validate(model, parse_yaml(text))
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "test.yaml"
+    path.write_text(text, "utf-8")
+    return path
 
 
 def test_values_are_si() -> None:
@@ -42,12 +42,13 @@ def test_values_are_si() -> None:
     assert (spec.epoch, spec.before, spec.after) == ("2011-03-05T03:05:00Z", 300.0, 90.0)
     assert spec.passing.longitude == pytest.approx(math.radians(116), rel=1e-15)
     assert (spec.passing.altitude, spec.passing.direction) == (500e3, "ascending")
+    assert spec.plain()["passing"]["altitude"] == "500 km"
     assert read(OrbitSpec, ELEMENTS).elements.node_local_time == 37800.0
     state = read(OrbitSpec, STATE).state
     assert (state.position, state.velocity) == ((6878e3, 0.0, 1.0), (0.0, -960.5, 7500.0))
     earth = read(EarthSpec, "{ut1_utc: -150 ms, polar_motion: [0.1 arcsec, -200 mas]}")
     assert earth.ut1_utc == -0.15
-    assert earth.polar_motion == pytest.approx([math.radians(0.1 / 3600), -math.radians(0.2 / 3600)], rel=1e-15)
+    assert earth.polar_motion == pytest.approx([0.1 * ARCSEC, -0.2 * ARCSEC], rel=1e-15)
     errors = read(ErrorsSpec, ERRORS)
     assert (errors.gps.drift, errors.gps.correlation_time) == ((0.1, 0.0, 0.0), 1800.0)
     assert errors.star_tracker.bias[1] == pytest.approx(-math.radians(0.1), rel=1e-15)
@@ -64,92 +65,168 @@ def test_what_is_not_written() -> None:
     assert (EarthSpec().ut1_utc, EarthSpec().polar_motion) == (0.0, (0.0, 0.0))
 
 
-@pytest.mark.parametrize(
-    ("model", "text"),
-    [
-        (OrbitSpec, PASSING),
-        (OrbitSpec, ELEMENTS),
-        (OrbitSpec, STATE),
-        (ErrorsSpec, ERRORS),
-        (AttitudeSpec, "{nadir: geocentric, steering: yaw, offset: [0.1 deg, 0 deg, -2 arcsec]}"),
-        (EarthSpec, "{ut1_utc: -150 ms, polar_motion: [0.1 arcsec, -200 mas]}"),
-    ],
-)
-def test_it_reads_back(model: type[Spec], text: str) -> None:
-    spec = read(model, text)
-    again = read(model, dump_yaml(spec.plain()))
-    assert again == spec
-    assert hash(again) == hash(spec)
-    assert model.model_json_schema()["additionalProperties"] is False
-
-
-def test_distances_are_written_in_kilometres() -> None:
-    assert read(OrbitSpec, PASSING).plain()["passing"]["altitude"] == "500 km"
-
-
-@pytest.mark.parametrize(
-    ("model", "text", "old", "new", "words"),
-    [
-        (OrbitSpec, PASSING, "altitude: 500 km", "altitude: 500", ["passing.altitude", "without a unit", "500 km"]),
-        (OrbitSpec, PASSING, "altitude: 500 km", "altitude: 500 m", ["passing.altitude", "at least 150 km"]),
-        (OrbitSpec, PASSING, "latitude: 40 deg", "latitude: 91 deg", ["passing.latitude", "at most 90 deg"]),
-        (OrbitSpec, PASSING, "ascending", "upward", ["passing.direction"]),
-        (OrbitSpec, PASSING, "2011-03-05T03:05:00Z", "2011-03-05T03:05:00", ["epoch", "without its zone"]),
-        (OrbitSpec, PASSING, "2011-03-05T03:05:00Z", "2011-02-30T03:05:00Z", ["epoch", "no such date"]),
-        (OrbitSpec, PASSING, "5 min", "-5 min", ["before", "outside the limits"]),
-        (OrbitSpec, PASSING, "passing:", "pasing:", ["pasing", "did you mean 'passing'"]),
-        (OrbitSpec, ELEMENTS, "argument: 140 deg", "perige: 1 deg", ["elements.argument", "missing"]),
-        (OrbitSpec, ELEMENTS, "perigee: 90 deg", "node: 90 deg", ["elements", "either node or node_local_time"]),
-        (OrbitSpec, ELEMENTS, "node_local_time: 10.5 h, ", "", ["elements", "either node or node_local_time"]),
-        (OrbitSpec, ELEMENTS, "0.001", "0.2", ["elements.eccentricity", "from 0 to 0.1"]),
-        (OrbitSpec, ELEMENTS, "10.5 h", "25 h", ["elements.node_local_time", "24 h"]),
-        (OrbitSpec, STATE, "0 m/s, -960", "0 m, -960", ["velocity", "is a unit of a length, not of a speed"]),
-        (OrbitSpec, STATE, "[6878 km, 0 km, 1 m]", "[6878 km, 0 km]", ["position", "not a list of 3"]),
-        (ErrorsSpec, ERRORS, "[1 m, 1 m, 2 m]", "[1 m, 1 m, -2 m]", ["gps.noise", "at least 0 m"]),
-        (ErrorsSpec, ERRORS, "interval: 1 s", "interval: 0 s", ["gps.interval", "greater than zero"]),
-        (ErrorsSpec, ERRORS, "amplitude: [1 arcsec", "amplitude: [1 m", ["thermal.amplitude", "unit of a length"]),
-    ],
-)
-def test_mistakes(model: type[Spec], text: str, old: str, new: str, words: list[str]) -> None:
-    assert text.count(old) == 1
-    with pytest.raises(InputError) as caught:
-        read(model, text.replace(old, new))
-    for word in words:
-        assert word in str(caught.value)
-
-
-def test_an_orbit_is_given_once() -> None:
-    with pytest.raises(InputError, match=r"the orbit is not given once; found none of them"):
-        read(OrbitSpec, "epoch: 2011-03-05T03:05:00Z")
-    both = ELEMENTS + "passing: {longitude: 116 deg, latitude: 40 deg}"
-    with pytest.raises(InputError, match="passing and elements"):
-        read(OrbitSpec, both)
-    with pytest.raises(InputError, match="no length"):
-        read(OrbitSpec, ELEMENTS + "before: 0 s\nafter: 0 s")
-
-
-@pytest.mark.parametrize(
-    ("found", "problem"),
-    [
-        (20110305, "not a date and time"),
-        (None, "not a date and time"),
-        ("5 March 2011", "not a date and time"),
-        ("2011-03-05", "not a date and time"),
-        ("2011-03-05T03:05:00+08:00", "not a date and time"),
-        ("2011-03-05T03:05:00", "without its zone"),
-        ("2016-12-31T23:59:60Z", "no such date or time"),
-        ("2011-13-05T03:05:00Z", "no such date or time"),
-        ("1960-03-05T03:05:00Z", "outside the years"),
-        ("2100-03-05T03:05:00Z", "outside the years"),
-    ],
-)
-def test_times_that_are_refused(found: object, problem: str) -> None:
-    with pytest.raises(Problem, match=problem) as caught:
-        parse_utc(found)
-    assert "2011-03-05T03:05:00Z" in str(caught.value.allowed)
+def test_it_reads_back() -> None:
+    attitude = "{nadir: geocentric, steering: yaw, offset: [0.1 deg, 0 deg, -2 arcsec]}"
+    earth = "{ut1_utc: -150 ms, polar_motion: [0.1 arcsec, -200 mas]}"
+    cases = [*((OrbitSpec, text) for text in (PASSING, ELEMENTS, STATE)), (ErrorsSpec, ERRORS)]
+    for model, text in (*cases, (AttitudeSpec, attitude), (EarthSpec, earth)):
+        spec = read(model, text)
+        again = read(model, dump_yaml(spec.plain()))
+        assert again == spec
+        assert hash(again) == hash(spec)
 
 
 def test_times_that_are_read() -> None:
     for text in ("2011-03-05T03:05Z", "2011-03-05T03:05:00Z", " 2011-03-05T03:05:00.123456Z "):
         assert parse_utc(text) == text.strip()
     assert TypeAdapter(UtcTime).json_schema()["examples"] == ["2011-03-05T03:05:00Z"]
+    for none in (20110305, None):
+        with pytest.raises(Problem, match="not a date and time"):
+            parse_utc(none)
+
+
+@pytest.mark.parametrize(
+    ("resolve", "name"),
+    [
+        *((resolve_angle, name) for name in ("angle", "angle_gf7", "angle_off_axis")),
+        *((resolve_loop, "loop"), (resolve_monitor, "monitor"), (resolve_simulate, "simulate")),
+    ],
+)
+def test_config_reads_back_to_the_same_values(resolve, name: str, tmp_path: Path) -> None:
+    setup = resolve(SCENES / ORBIT / f"{name}.yaml").with_seed(7)
+    again = resolve(write(tmp_path, setup.to_yaml()))
+    assert type(again) is type(setup)
+    assert again == setup
+    assert again.test.seed == 7
+    assert again.to_yaml() == setup.to_yaml()
+
+
+# --- the intersection angle
+
+
+def test_an_angle_test(tmp_path: Path) -> None:
+    setup = resolve_angle(SCENES / ORBIT / "angle.yaml")
+    assert setup.camera == load_three_line_camera("th1")
+    assert setup.test.perturb["forward"].rotate[1] == pytest.approx(4.0 * ARCSEC, rel=1e-15)
+    assert dict(setup.angles) == {"alpha": ("forward", "nadir"), "beta": ("nadir", "backward")}
+    setup = resolve_angle(SCENES / ORBIT / "angle_off_axis.yaml")
+    assert setup.angles["multispectral"] == ("multispectral", "nadir")
+    assert (setup.pixels["high_resolution"], setup.pixels["multispectral"], setup.usual_pixels) == (30000, 6000, 12000)
+    test = resolve_angle(write(tmp_path, good("angle"))).test
+    assert dict(test.perturb) == {}
+    assert (test.errors.station, test.errors.points, test.errors.datum) == (0.5, 1.5, (0.0, 0.0, 0.0))
+    effects = test.effects
+    assert (effects.light_time, effects.aberration, effects.refraction, effects.corrected) == (True,) * 4
+    assert (test.passes, test.seed, test.terrain.relief, test.orbit.passing.direction) == (200, 0, 0.0, "descending")
+
+
+def test_lines_of_a_camera_of_ones_own(tmp_path: Path) -> None:
+    """Other lines are no mistake, but then the file says which angles."""
+    small = good("angle").replace("th1", "own.yaml")
+    (tmp_path / "own.yaml").write_text(TH1.replace("name: th1", "name: own").replace("  backward:", "  rear:"), "utf-8")
+    named = small + "angles: {all: [forward, rear]}\n"
+    setup = resolve_angle(write(tmp_path, named))
+    assert (setup.camera.name, dict(setup.angles)) == ("own", {"all": ("forward", "rear")})
+    with pytest.raises(InputError, match=r"perturb.backward.*no such line"):
+        resolve_angle(write(tmp_path, named + "perturb: {backward: [0 deg, 0 deg, 0 deg]}"))
+    plain = load_three_line_camera("th1").plain()
+    two = {**plain, "lines": {name: plain["lines"][name] for name in ("backward", "nadir")}}
+    (tmp_path / "own.yaml").write_text(dump_yaml(two), "utf-8")
+    assert dict(resolve_angle(write(tmp_path, small)).angles) == {"alpha": ("backward", "nadir")}
+
+
+def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
+    """By name or path; a configuration without its camera is refused."""
+    setup = resolve_angle(SCENES / ORBIT / "angle_gf7.yaml")
+    assert setup.camera is None
+    assert setup.instrument == load_instrument("gf7_pair")
+    assert dict(setup.cameras) == {"gf7": load_camera("gf7")}
+    assert dict(setup.pixels) == {"forward": 32768, "backward": 32768}
+    assert setup.test.perturb["base"].temperature.gradient[2] == pytest.approx(0.4)
+    text = (LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8").replace("name: gf7_pair", "name: own")
+    (tmp_path / "own.yaml").write_text(text, "utf-8")
+    own = resolve_angle(write(tmp_path, good("angle").replace("th1", "own.yaml")))
+    assert (own.camera_name, dict(own.angles)) == ("own", {"alpha": ("forward", "backward")})
+    data = parse_yaml(setup.to_yaml()).data
+    whole = data.pop("instrument")
+    for change, words in (
+        ({}, "one camera is tested; found 'neither'"),
+        ({"camera": whole}, "camera"),
+        ({"instrument": whole, "cameras": {"gf8": data["cameras"]["gf7"]}}, "camera 'gf7' of the instrument's forward"),
+    ):
+        with pytest.raises(InputError, match=words):
+            resolve_angle(write(tmp_path, dump_yaml({**data, **change})))
+
+
+# --- monitors in orbit
+
+
+def test_a_loop(tmp_path: Path) -> None:
+    setup = resolve_loop(write(tmp_path, good("loop")))
+    test = setup.test
+    assert setup.disturbances.name == "orbit"
+    assert test.readings.times == (0.0, 600.0, 1200.0)
+    pointing, roll, focus = (test.corrections[name] for name in ("pointing", "roll", "focus"))
+    assert pointing.smallest == pytest.approx(0.05 * ARCSEC, rel=1e-12)
+    # whole steps alone: 40 of them
+    assert pointing.largest == pytest.approx(2.0 * ARCSEC, rel=1e-12)
+    assert (roll.mechanism, roll.smallest, roll.largest, roll.band, roll.delay) == (None, None, None, 0.0, 0)
+    assert focus.motion == ("forward/focal_plane", "shift", "z", "")
+    assert focus.band == pytest.approx(2e-6, rel=1e-12)
+
+
+def test_a_monitored_orbit(tmp_path: Path) -> None:
+    setup = resolve_monitor(SCENES / ORBIT / "monitor.yaml")
+    assert (setup.pair, setup.test.step, setup.test.referred) == (("forward", "backward"), 300.0, 0)
+    test = resolve_monitor(write(tmp_path, good("monitor"))).test
+    assert test.apply == ("d_alpha", "d_beta", "d_gamma", "d_f")
+    assert test.compared == (300.0, 600.0, 1200.0)
+    assert test.errors.gps.noise == (0.0, 0.0, 0.0)
+    assert (test.errors.star_tracker.bias, test.errors.image) == ((0.0, 0.0, 0.0), 0.3)
+    # from the reference to both sides
+    assert [test.measured(step) for step in (600.0, 300.0, 1200.0)] == [[1, 3], [0, 1, 2, 3, 4], [1]]
+    text = (LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8")
+    kept = [row for row in text.splitlines() if not row.lstrip().startswith("backward")]
+    (tmp_path / "own.yaml").write_text("\n".join(kept), "utf-8")
+    with pytest.raises(InputError, match=r"no stereo pair.*forward in gf7_pair.*two cameras"):
+        resolve_monitor(write(tmp_path, good("monitor").replace("gf7_pair", "own.yaml")))
+
+
+def test_a_motion_is_a_step_a_ramp_or_a_swing() -> None:
+    def shares(times: tuple[float, ...], duration: float = 0.0, period: float | None = None) -> list[float]:
+        motion = MotionSpec.model_construct(rotate=(0.0, 1e-6, 0.0), begin=10.0, duration=duration, period=period)
+        return [motion.share(time) for time in times]
+
+    assert shares((9.9, 10.0, 1e4)) == [0.0, 1.0, 1.0]
+    assert shares((0.0, 15.0, 40.0), duration=20.0) == [0.0, 0.25, 1.0]
+    assert shares((10.0, 20.0, 40.0), period=40.0) == pytest.approx([0.0, 1.0, -1.0])
+
+
+# --- simulated images
+
+
+def test_a_simulated_pass(tmp_path: Path) -> None:
+    setup = resolve_simulate(SCENES / ORBIT / "simulate.yaml")
+    assert set(setup.detectors) == {"th1_line"}
+    assert setup.test.ground.light.elevation == pytest.approx(math.radians(38.0), rel=1e-15)
+    assert setup.camera.image_of("backward").wavefront["Z4"] == 20e-9
+    test = resolve_simulate(write(tmp_path, good("simulate"))).test
+    assert test.lines == ("forward", "nadir", "backward")
+    assert (test.ground.terrain.kind, test.ground.terrain.relief) == ("real", None)
+    assert (test.patch.line, test.patch.lines, test.seed) == ("nadir", 1000, 0)
+    assert math.degrees(test.control.light.elevation) == pytest.approx(60.0)
+
+
+def test_a_payload_of_ones_own_comes_through_config_yaml(tmp_path: Path) -> None:
+    """Its detector is found beside it; an outline before the lens is kept."""
+    sheet = (LIBRARY / "detectors/th1_line.yaml").read_text("utf-8").replace("name: th1_line", "name: mine")
+    (tmp_path / "mine.yaml").write_text(sheet, "utf-8")
+    text = TH1.replace("detector: th1_line", "detector: mine.yaml")
+    text = text.replace("f_number: 6\n", "f_number: 6\n  obstruction: [[[-0.6, 0.6], [-0.2, 0.6], [-0.2, 1.1]]]\n")
+    (tmp_path / "own.yaml").write_text(text, "utf-8")
+    setup = resolve_simulate(write(tmp_path, good("simulate").replace("th1", "own.yaml")))
+    assert setup.detectors["mine.yaml"].name == "mine"
+    image = setup.camera.image_of("nadir")
+    assert image.obstruction[0][0] == (-0.6, 0.6)
+    again = resolve_simulate(write(tmp_path, setup.to_yaml())).camera.image_of("nadir")
+    assert again.obstruction == image.obstruction

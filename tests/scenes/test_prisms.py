@@ -17,8 +17,6 @@ from optics.raytrace.assembly import Assembly, Interaction
 from optics.raytrace.reflectors import EDGE, Mount, prism_0, prism_180, roof_offset
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.instrument_model import key_of
-from scenes.specs.instrument import CENTRAL_KEY, CENTRAL_PRISM, PRISMS, prism_of
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
 
 N = 1.4565
@@ -138,27 +136,6 @@ def test_angle_errors_of_the_180_deg_prism(backend, hand, face, axis) -> None:
     assert left[0] == pytest.approx(4.0 * left[1], abs=50.0 * 1e-3**3)  # and it is of second order
     turn = np.linalg.norm(first_order_180(hand, {face: frames(nominal)[face] @ np.eye(3)[axis]}))
     assert 0.3 * N < turn < 2.0 * N + 1e-12
-
-
-def test_both_axes_of_some_face_turn_the_beam_by_2n() -> None:
-    """A mirror turned about an axis square to the beam that leaves it turns the beam by twice the angle, n times so in
-    air: the last face, about the axis square to both its normal and the beam that leaves.
-    """
-    normal = np.array([0.5, -np.sqrt(0.5), 0.5])
-    axis = np.cross(normal, UP) / np.linalg.norm(np.cross(normal, UP))
-    change = first_order_180(1.0, {"roof_b": axis})
-    assert np.linalg.norm(change) == pytest.approx(2.0 * N, rel=1e-15)
-
-
-def test_errors_of_faces_add_up(backend) -> None:
-    """To first order; one arcsecond each leaves 1e-10, the products of the errors."""
-    errors = dict.fromkeys(FACES_180, (ARCSEC, -2.0 * ARCSEC))
-    nominal = parts_180()
-    turns = {face: frames(nominal)[face] @ np.array([*tilt, 0.0]) for face, tilt in errors.items()}
-    _, direction, _, _ = send(backend, parts_180(errors=errors), beam(entry(), 1), np.broadcast_to(UP, (2, 3)))
-    first = first_order_180(1.0, turns)
-    assert direction[0] + UP == pytest.approx(first, abs=100.0 * ARCSEC**2)
-    assert np.linalg.norm(first) > 2.0 * ARCSEC
 
 
 @pytest.mark.parametrize("tilt", [(1e-3, 0.0), (0.0, 1e-3), (-0.01, 0.02)])
@@ -289,18 +266,3 @@ def test_what_cannot_be_made() -> None:
         prism_0(Mount("glass", Pose(), "p", "fused silica", 0.05, 0.06))
     with pytest.raises(ValueError, match="glass/entry"):
         RigidTree((Body("glass/entry"), *parts_0().bodies))
-
-
-def test_names_of_prisms_are_keys_of_the_file(gf7_pair) -> None:
-    """Whoever tells a prism by its body's path finds the key that describes it."""
-    assert tuple(gf7_pair.spec.monitor.prisms) == PRISMS
-    for channel in gf7_pair.channels:
-        for prism in PRISMS:
-            body = channel.prism_body(prism)
-            assert body in gf7_pair.assembly.media
-            assert prism_of(body) == prism_of(f"{body}/window") == prism
-            assert key_of(body) == ("monitor", prism)
-            assert hasattr(gf7_pair.spec.monitor, prism)
-    assert CENTRAL_KEY in type(gf7_pair.spec).model_fields
-    assert key_of(f"{CENTRAL_PRISM}/wall_front") == (CENTRAL_KEY,)
-    assert prism_of(CENTRAL_PRISM) is None

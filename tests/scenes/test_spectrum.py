@@ -14,10 +14,9 @@ from scenes.models.camera_model import coloured, glass_indices
 from scenes.specs.camera import BandSpec, CameraSpec
 from scenes.specs.load import load_camera
 from scenes.specs.spectrum import SpectrumSpec
-from scenes.yaml.errors import InputError
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import parse_yaml
-from tests.scenes.lens.colour_cameras import ACHROMAT, F2, colour_camera
+from tests.scenes.lens.colour_cameras import colour_camera
 
 TABLE = "wavelength [um],response\n0.45,0\n0.5,0.8\n0.6,1\n0.64,0.2\n0.7,0\n0.9,0\n"
 
@@ -102,40 +101,6 @@ def test_lines_are_all_taken() -> None:
     assert spectrum("{wavelengths: [500 nm]}").rule(5)[1].tolist() == [1.0]
 
 
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("{between: [500 nm, 600 nm], wavelengths: [500 nm]}", "a spectrum is given in one way"),
-        ("{weights: [1]}", "a spectrum is given in one way"),
-        ("{between: [600 nm, 500 nm]}", "in the wrong order"),
-        ("{wavelengths: [600 nm, 500 nm]}", "do not ascend"),
-        ("{wavelengths: [500 nm], weights: [1, 2]}", "one weight for each"),
-        ("{wavelengths: [500 nm], weights: [0]}", "all weights are zero"),
-        ("{wavelengths: [500 nm], black_body: 5800 K}", "the weights of lines"),
-        ("{curve: [[500 nm, 0], [600 nm, 0]]}", "a response below zero, or none at all"),
-    ],
-)
-def test_spectra_that_cannot_be(text: str, problem: str) -> None:
-    with pytest.raises(InputError, match=problem):
-        spectrum(text)
-
-
-@pytest.mark.parametrize(
-    ("table", "problem"),
-    [
-        ("wavelength [nm],response\n500,1\n400,1\n", "do not ascend"),
-        ("wavelength [nm],response\n500,0\n600,0\n", "no response"),
-        ("wavelength [nm],response\n500,1\n", "1 rows"),
-        ("wavelength [nm],response\n500,1\n5000,1\n", "outside the range of its dispersion formula"),
-    ],
-)
-def test_tables_that_cannot_be(tmp_path: Path, table: str, problem: str) -> None:
-    (tmp_path / "filter.csv").write_text(table, "utf-8")
-    (tmp_path / "c.yaml").write_text(colour_camera("achromat", "{table: filter.csv}").file_text(""), "utf-8")
-    with pytest.raises(InputError, match=problem):
-        load_camera(tmp_path / "c.yaml")
-
-
 def test_the_index_of_a_named_glass() -> None:
     """Against air as makers state it, in vacuum times that of air; both at the design wavelength and others."""
     for medium, index in (("air", N_BK7.index), ("vacuum", N_BK7.vacuum_index)):
@@ -153,23 +118,6 @@ def test_the_index_of_a_named_glass() -> None:
     again = validate(CameraSpec, parse_yaml(spec.file_text("")))
     assert again == spec
     assert spec.plain()["mirrors"]["L1"]["glass"] == "N-BK7"
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "problem"),
-    [
-        ("glass: N-BK7", "index: 1.5", "an index alone says nothing of other wavelengths"),
-        ("glass: N-BK7", "glass: N-BK8", "no such glass"),
-        ("glass: N-BK7", "glass: N-BK7, index: 1.5", "follows from its dispersion"),
-        ("glass: N-BK7", "glass: {name: own, formula: 2}", "a glass of one's own has all of these"),
-        (F2, F2.replace("320 nm", "500 nm"), "outside the range"),
-        ("index: 1}", "glass: N-BK7}", "nothing cemented to it"),
-    ],
-)
-def test_glasses_that_a_camera_cannot_have(old: str, new: str, problem: str) -> None:
-    assert old in ACHROMAT
-    with pytest.raises(InputError, match=problem):
-        colour_camera("achromat", mirrors=ACHROMAT.replace(old, new, 1))
 
 
 def test_bands_of_a_camera_of_lenses() -> None:

@@ -9,6 +9,7 @@ import pytest
 from scenes.models.camera_model import derive_camera
 from scenes.specs.load import load_camera
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 
 GF7 = (Path(__file__).parents[2] / "scenes/library/cameras/gf7.yaml").read_text("utf-8")
 
@@ -33,7 +34,7 @@ WRONG = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("old", "new", "traced", "cause", "line"), WRONG)
+@pytest.mark.parametrize(("old", "new", "traced", "cause", "line"), quick(1, WRONG))
 def test_wrong_number_is_named(tmp_path: Path, backend, old: str, new: str, traced: str, cause: str, line: str) -> None:
     path = changed(tmp_path, old, new)
     with pytest.raises(InputError) as error:

@@ -26,86 +26,67 @@ from scenes.yaml.units import (
     parse_quantity,
 )
 
-
-@pytest.mark.parametrize(
-    ("text", "kind", "value"),
-    [
-        ("20 um", LENGTH, 20e-6),
-        ("20um", LENGTH, 20e-6),
-        (" 20  µm ", LENGTH, 20e-6),
-        ("650 nm", LENGTH, 650e-9),
-        ("-11851.78535 mm", LENGTH, -11.85178535),
-        ("+.5 m", LENGTH, 0.5),
-        ("3e-2 m", LENGTH, 0.03),
-        ("0 m", LENGTH, 0.0),
-        ("10 ppm", SCALE, 10e-6),
-        ("1 %", SCALE, 0.01),
-        ("2 um/m", SCALE, 2e-6),
-        ("10 ms", TIME, 0.01),
-        ("7.6 km/s", SPEED, 7600.0),
-        ("36 km/hour", SPEED, 10.0),
-        ("2 mW", POWER, 0.002),
-        ("20 degC", TEMPERATURE, 293.15),
-        ("20 °C", TEMPERATURE, 293.15),
-        ("0.1 K", TEMPERATURE_DIFFERENCE, 0.1),
-        ("1e-3 1/m^3", PER_LENGTH3, 1e-3),
-        ("1 1/mm^3", PER_LENGTH3, 1e9),
-        ("2 m^-5", PER_LENGTH5, 2.0),
-        ("180 deg", ANGLE, math.pi),
-        ("1 rad", ANGLE, 1.0),
-    ],
+EXACT = {
+    LENGTH: {"20 um": 20e-6, "20um": 20e-6, " 20  µm ": 20e-6, "650 nm": 650e-9, "-11851.78535 mm": -11.85178535,
+             "+.5 m": 0.5, "3e-2 m": 0.03, "0 m": 0.0},
+    SCALE: {"10 ppm": 10e-6, "1 %": 0.01, "2 um/m": 2e-6},
+    TIME: {"10 ms": 0.01},
+    SPEED: {"7.6 km/s": 7600.0, "36 km/hour": 10.0},
+    POWER: {"2 mW": 0.002},
+    TEMPERATURE: {"20 degC": 293.15, "20 °C": 293.15},
+    TEMPERATURE_DIFFERENCE: {"0.1 K": 0.1},
+    PER_LENGTH3: {"1e-3 1/m^3": 1e-3, "1 1/mm^3": 1e9},
+    PER_LENGTH5: {"2 m^-5": 2.0},
+    ANGLE: {"180 deg": math.pi, "1 rad": 1.0},
+}  # fmt: skip
+NOT_FINITE = (float("nan"), float("inf"), "nan m", "-inf m", "1e999 m")
+NO_QUANTITY = (
+    *("9**9**9 m", "__import__('os') m", "1 m^99999999", "1 " + "m*" * 500 + "m", "9" * 10_000 + " m", "٣ m"),
+    *("two um", ""),
 )
-def test_exact_values(text: str, kind: Kind, value: float) -> None:
-    assert parse_quantity(text, kind) == value
+REFUSED = [
+    *((found, LENGTH, "a number without a unit", None) for found in (2, "2", 0, "0")),
+    *((found, LENGTH, "not a quantity", None) for found in (True, None, ["1 m"])),
+    *((found, LENGTH, "not a finite number", None) for found in NOT_FINITE),
+    *((found, LENGTH, "not a number with a unit", None) for found in NO_QUANTITY),
+    ("21/m^3", PER_LENGTH3, "not a number with a unit", None),
+    ("2 arcsek", ANGLE, "unknown unit 'arcsek'", "arcsec"),
+    ("2 Um", LENGTH, "unknown unit 'Um'", "um"),
+    ("3 dB", SCALE, "unknown unit", None),
+    ("2 um", ANGLE, "'um' is a unit of a length, not of an angle", None),
+    ("2 ppm", ANGLE, "'ppm' is a unit of a relative change, not of an angle", None),
+    ("1 rad", SCALE, "'rad' is a unit of an angle, not of a relative change", None),
+    ("2 sec", ANGLE, "'sec' is a unit of a time, not of an angle", "arcsec"),
+    ("2 m", SPEED, "'m' is a unit of a length, not of a speed", None),
+    ("2 km/s", LENGTH, "'km/s' is a unit of a speed, not of a length", None),
+    ("2 degC", TEMPERATURE_DIFFERENCE, "not of a temperature difference", None),
+]
+KEPT = {
+    ANGLE: ("2 arcsec", "-1.5 arcsec", "26 deg"),
+    LENGTH: ("20 um", "650 nm", "-6.74535927468851 m"),
+    SPEED: ("7.61 km/s",),
+    DISTANCE: ("500 km",),
+    SCALE: ("10 ppm",),
+    TEMPERATURE: ("20 degC",),
+}
+
+
+def test_exact_values() -> None:
+    for kind, texts in EXACT.items():
+        assert {text: parse_quantity(text, kind) for text in texts} == texts
 
 
 def test_arcseconds() -> None:
     assert parse_quantity("2 arcsec", ANGLE) == pytest.approx(2 * math.pi / 648000, rel=4e-16)
 
 
-@pytest.mark.parametrize(
-    ("text", "kind", "problem", "suggestion"),
-    [
-        (2, ANGLE, "a number without a unit", None),
-        ("2", ANGLE, "a number without a unit", None),
-        (0, LENGTH, "a number without a unit", None),
-        ("0", LENGTH, "a number without a unit", None),
-        (True, LENGTH, "not a quantity", None),
-        (None, LENGTH, "not a quantity", None),
-        (["1 m"], LENGTH, "not a quantity", None),
-        (float("nan"), ANGLE, "not a finite number", None),
-        (float("inf"), ANGLE, "not a finite number", None),
-        ("nan arcsec", ANGLE, "not a finite number", None),
-        ("-inf m", LENGTH, "not a finite number", None),
-        ("1e999 m", LENGTH, "not a finite number", None),
-        ("2 arcsek", ANGLE, "unknown unit 'arcsek'", "arcsec"),
-        ("2 Um", LENGTH, "unknown unit 'Um'", "um"),
-        ("3 dB", SCALE, "unknown unit", None),
-        ("2 um", ANGLE, "'um' is a unit of a length, not of an angle", None),
-        ("2 ppm", ANGLE, "'ppm' is a unit of a relative change, not of an angle", None),
-        ("1 rad", SCALE, "'rad' is a unit of an angle, not of a relative change", None),
-        ("2 sec", ANGLE, "'sec' is a unit of a time, not of an angle", "arcsec"),
-        ("2 m", SPEED, "'m' is a unit of a length, not of a speed", None),
-        ("2 km/s", LENGTH, "'km/s' is a unit of a speed, not of a length", None),
-        ("2 degC", TEMPERATURE_DIFFERENCE, "not of a temperature difference", None),
-        ("21/m^3", PER_LENGTH3, "not a number with a unit", None),
-        ("9**9**9 m", LENGTH, "not a number with a unit", None),
-        ("__import__('os') m", LENGTH, "not a number with a unit", None),
-        ("1 m^99999999", LENGTH, "not a number with a unit", None),
-        ("1 " + "m*" * 500 + "m", LENGTH, "not a number with a unit", None),
-        ("9" * 10_000 + " m", LENGTH, "not a number with a unit", None),
-        ("٣ m", LENGTH, "not a number with a unit", None),
-        ("two um", LENGTH, "not a number with a unit", None),
-        ("", LENGTH, "not a number with a unit", None),
-    ],
-)
-def test_refused(text: object, kind: Kind, problem: str, suggestion: str | None) -> None:
-    with pytest.raises(Problem) as caught:
-        parse_quantity(text, kind)
-    assert problem in str(caught.value)
-    assert caught.value.suggestion == suggestion
-    assert caught.value.allowed is not None
-    assert kind.example in caught.value.allowed
+def test_refused() -> None:
+    for text, kind, problem, suggestion in REFUSED:
+        with pytest.raises(Problem) as caught:
+            parse_quantity(text, kind)
+        assert problem in str(caught.value), text
+        assert caught.value.suggestion == suggestion, text
+        assert kind.example in caught.value.allowed, text
 
 
 def test_text_reads_back_to_the_same_bits() -> None:
@@ -120,29 +101,15 @@ def test_text_reads_back_to_the_same_bits() -> None:
     assert math.copysign(1.0, parse_quantity(format_quantity(-0.0, LENGTH), LENGTH)) == -1.0
 
 
-@pytest.mark.parametrize(
-    ("text", "kind"),
-    [
-        ("2 arcsec", ANGLE),
-        ("-1.5 arcsec", ANGLE),
-        ("26 deg", ANGLE),
-        ("20 um", LENGTH),
-        ("650 nm", LENGTH),
-        ("7.61 km/s", SPEED),
-        ("500 km", DISTANCE),
-        ("-6.74535927468851 m", LENGTH),
-        ("10 ppm", SCALE),
-        ("20 degC", TEMPERATURE),
-    ],
-)
-def test_text_comes_out_as_it_went_in(text: str, kind: Kind) -> None:
-    assert format_quantity(parse_quantity(text, kind), kind) == text
+def test_text_comes_out_as_it_went_in() -> None:
+    for kind, texts in KEPT.items():
+        assert tuple(format_quantity(parse_quantity(text, kind), kind) for text in texts) == texts
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_no_text_for_what_is_not_finite(value: float) -> None:
-    with pytest.raises(ValueError, match="has no text"):
-        format_quantity(value, LENGTH)
+def test_no_text_for_what_is_not_finite() -> None:
+    for value in (math.nan, math.inf, -math.inf):
+        with pytest.raises(ValueError, match="has no text"):
+            format_quantity(value, LENGTH)
 
 
 def test_the_units_that_are_suggested_are_those_of_pint() -> None:
@@ -161,32 +128,25 @@ def test_the_units_that_are_suggested_are_those_of_pint() -> None:
         assert abs(asked[0] / factor - 1) < 1e-26
 
 
-@pytest.mark.parametrize("sign", units.OTHER_MINUS)
-def test_a_minus_that_is_none_is_named(sign: str) -> None:
-    with pytest.raises(Problem, match=f"U\\+{ord(sign):04X}") as caught:
-        parse_quantity(f"{sign} 3 um", LENGTH)
-    assert caught.value.allowed is not None
-    assert caught.value.allowed.endswith(": -3 um")
+def test_a_minus_that_is_none_is_named() -> None:
+    for sign in units.OTHER_MINUS:
+        with pytest.raises(Problem, match=f"U\\+{ord(sign):04X}") as caught:
+            parse_quantity(f"{sign} 3 um", LENGTH)
+        assert caught.value.allowed.endswith(": -3 um")
 
 
-@pytest.mark.parametrize(
-    ("text", "kind", "write"),
-    [
+def test_a_decimal_comma_is_told() -> None:
+    for text, kind, write in (
         ("3,5 um", LENGTH, "write 3.5 um"),
         ("-0,25um", LENGTH, "write -0.25um"),
         ("1,5e-3 1/m^3", PER_LENGTH3, "write 1.5e-3 1/m^3"),
         ("1,500 m", LENGTH, "write 1.500 m, or 1500 m if thousands are meant"),
         ("3,5", LENGTH, "write 3.5"),
-    ],
-)
-def test_a_decimal_comma_is_told(text: str, kind: Kind, write: str) -> None:
-    with pytest.raises(Problem, match="a number with a decimal comma") as caught:
-        parse_quantity(text, kind)
-    assert caught.value.allowed == write
-
-
-@pytest.mark.parametrize("text", ["1,2,3 um", "M1,2", "a,b", "," + "1" * 200])
-def test_no_decimal_comma_is_seen_elsewhere(text: str) -> None:
-    with pytest.raises(Problem) as caught:
-        parse_quantity(text, LENGTH)
-    assert "decimal comma" not in str(caught.value)
+    ):
+        with pytest.raises(Problem, match="a number with a decimal comma") as caught:
+            parse_quantity(text, kind)
+        assert caught.value.allowed == write
+    for text in ("1,2,3 um", "M1,2", "a,b", "," + "1" * 200):
+        with pytest.raises(Problem) as caught:
+            parse_quantity(text, LENGTH)
+        assert "decimal comma" not in str(caught.value)

@@ -7,81 +7,12 @@ import pytest
 
 from scenes.yaml import yaml_file
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
-
-BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "line", "words"),
-    [
-        (BOMB, 1, "anchors are not allowed, found &a"),
-        ("x: 1\ny: *x\n", 2, "aliases are not allowed, found *x"),
-        ("a: {b: 1}\nc:\n  <<: {d: 2}\n", 3, "merge keys are not allowed"),
-        ("x: 1\ny: !!python/object/apply:os.system [ls]\n", 2, "tags are not allowed"),
-        ("x: !foo 1\n", 1, "tags are not allowed, found !foo"),
-        ("x: !!int '3'\n", 1, "tags are not allowed"),
-        ("! x: 1\n", 1, "tags are not allowed"),
-        ("%TAG ! tag:example.com,2000:\n---\nx: 1\n", 2, "%TAG"),
-        ("x: 1\ny: 2\nx: 3\n", 3, "duplicate key 'x', first on line 1"),
-        ("x:\n  y: 1\n  'y': 3\n", 3, "duplicate key 'y', first on line 2"),
-        ("x: 1\n---\ny: 2\n", 2, "a second document"),
-        ("x: 1\n? [1, 2]\n: 3\n", 2, "a key must be a plain name"),
-        ("x: [1, 2\ny: 3\n", 2, "not valid YAML"),
-        ("x: 1\n\ty: 3\n", 2, "a TAB character, which YAML does not take here; allowed: spaces"),
-        ("x:\n\ty: 3\n", 2, "a TAB character"),
-        ("x:\t1\ny: [\n", 1, "a TAB character"),
-        ("x:\n  - y: 1\n\t  z: 2\n", 3, "a TAB character"),
-        ("x: [1 # a\tcomment\ny: 2\n", 2, "not valid YAML"),
-        ("a: 1\nx: \u22123\n", 2, "x: a number with the sign U+2212 (minus sign); found"),
-        ("a: 1\nx: [1, \u20132.5e-3]\n", 2, "x[1]: a number with the sign U+2013 (en dash)"),
-        ("\u22123\n", 1, "minus sign of the keyboard, '-': -3"),
-        ("x: \x01\n", None, "not valid YAML"),
-        ("", 1, "the file is empty"),
-        ("# only a comment\n", 1, "the file is empty"),
-        ("---\n...\n", 1, "the file is empty"),
-        ("[" * 40 + "]" * 40, 1, "nested too deeply"),
-        ("[" * 500_000, 1, "nested too deeply"),
-    ],
-)
-def test_refused(text: str, line: int | None, words: str, tmp_path: Path) -> None:
-    path = tmp_path / "input.yaml"
-    path.write_text(text, "utf-8")
-    with pytest.raises(InputError) as caught:
-        read_yaml(path)
-    assert caught.value.line == line
-    assert words in str(caught.value)
-    assert str(caught.value).startswith(str(path) + (f":{line}: " if line else ": "))
-    assert len(str(caught.value).splitlines()) == 1
+from scenes.yaml.yaml_file import YamlFile, dump_yaml, parse_yaml, read_yaml
 
 
 def test_text_with_tabs_and_minus_signs_is_text() -> None:
     text = "name: '3\tum'\nsaid: \u22123 K and more\nquoted: '\u22123'\n# a\tcomment\n"
     assert parse_yaml(text).data == {"name": "3\tum", "said": "\u22123 K and more", "quoted": "\u22123"}
-
-
-def test_a_file_that_is_not_there_names_the_nearest(tmp_path: Path) -> None:
-    (tmp_path / "perturb.yaml").touch()
-    with pytest.raises(InputError) as caught:
-        read_yaml(tmp_path / "pertub.yaml")
-    assert caught.value.suggestion == str(tmp_path / "perturb.yaml")
-    with pytest.raises(InputError) as caught:
-        read_yaml(tmp_path / "none" / "perturb.yaml")
-    assert caught.value.suggestion is None
-
-
-def test_unreadable_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        read_yaml(tmp_path / "missing.yaml")
-    with pytest.raises(InputError, match="is a directory"):
-        read_yaml(tmp_path)
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="Not a directory"):
-        read_yaml(tmp_path / "file" / "input.yaml")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_yaml("a\0b.yaml")
-    with pytest.raises(InputError, match="not a regular file"):
-        read_yaml("/dev/zero")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
@@ -97,13 +28,6 @@ def test_not_utf8_gives_the_line(tmp_path: Path) -> None:
     path = tmp_path / "input.yaml"
     path.write_bytes(b"x: 1\ny: \xff\n")
     with pytest.raises(InputError, match=r"input\.yaml:2: not UTF-8 text: byte 0xff"):
-        read_yaml(path)
-
-
-def test_too_large(tmp_path: Path) -> None:
-    path = tmp_path / "input.yaml"
-    path.write_bytes(b"#" * (LARGEST_BYTES + 1))
-    with pytest.raises(InputError, match="too large; allowed: at most 1 MB"):
         read_yaml(path)
 
 
@@ -140,9 +64,8 @@ def test_a_byte_order_mark_is_fine(tmp_path: Path) -> None:
     assert read_yaml(path).data == {"x": 1}
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
+AWKWARD = (
+    *(
         "",
         "null",
         "1",
@@ -160,19 +83,18 @@ def test_a_byte_order_mark_is_fine(tmp_path: Path) -> None:
         "a\nb",
         "ü µm",
         "[",
-        "<<",
-        "-",
-    ],
+    ),
+    *("<<", "-"),
 )
-def test_awkward_text_survives_a_round_trip(value: str) -> None:
-    data = {"key": value, "list": [value, 1], value or "k": {"x": [[value]]}}
-    assert parse_yaml(dump_yaml(data)).data == data
+NUMBERS = (0.1, 1e-300, 1.7976931348623157e308, -0.0, 3, 10**20, 1e16, True, None, 5e-324)
 
 
-@pytest.mark.parametrize("value", [0.1, 1e-300, 1.7976931348623157e308, -0.0, 3, 10**20, 1e16, True, None, 5e-324])
-def test_numbers_survive_a_round_trip(value: object) -> None:
-    found = parse_yaml(dump_yaml({"x": value})).data["x"]
-    assert repr(found) == repr(value)
+def test_awkward_text_and_numbers_survive_a_round_trip() -> None:
+    for value in AWKWARD:
+        data = {"key": value, "list": [value, 1], value or "k": {"x": [[value]]}}
+        assert parse_yaml(dump_yaml(data)).data == data
+    for value in NUMBERS:
+        assert repr(parse_yaml(dump_yaml({"x": value})).data["x"]) == repr(value)
 
 
 def test_too_many_values_are_refused_where_they_begin(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,12 +106,14 @@ def test_too_many_values_are_refused_where_they_begin(monkeypatch: pytest.Monkey
     assert caught.value.key == ("b", 7)
 
 
-@pytest.mark.parametrize(
-    "text", [r'unit: "a\0b"', r'unit: "\x1b[2J"', r'unit: "\ud800"', r'"un\0it": um', r'unit: ["\uffff"]']
-)
-def test_texts_that_no_file_can_hold(text: str) -> None:
+def test_texts_that_no_file_can_hold() -> None:
     """They would end in HDF5, Matplotlib or the encoder, after all that is computed."""
-    with pytest.raises(InputError, match=r"a control character, or half a character, in a text") as caught:
-        parse_yaml(f"name: x\n{text}\n", "study.yaml")
-    assert (caught.value.file, caught.value.line) == ("study.yaml", 2)
+    for text in (r'unit: "a\0b"', r'unit: "\x1b[2J"', r'unit: "\ud800"', r'"un\0it": um', r'unit: ["\uffff"]'):
+        with pytest.raises(InputError, match=r"a control character, or half a character, in a text") as caught:
+            parse_yaml(f"name: x\n{text}\n", "study.yaml")
+        assert (caught.value.file, caught.value.line) == ("study.yaml", 2)
     assert parse_yaml('note: "a\\tb\\nc µ ″"').data == {"note": "a\tb\nc µ ″"}
+    with pytest.raises(InputError, match="not valid YAML"):
+        parse_yaml("x: \x01\n")
+    with pytest.raises(InputError, match="nested too deeply"):
+        parse_yaml("[" * 500_000)

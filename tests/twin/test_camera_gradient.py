@@ -1,17 +1,10 @@
 """Derivatives of a camera's numbers by motions of its parts, without a monitor: against formulas of the first order."""
 
-import numpy as np
 import pytest
 
-from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera
-from scenes.specs.resolved import resolve_job
-from scenes.yaml.spec import validate
-from scenes.yaml.yaml_file import YamlFile
 from tests.scenes.lens.colour_cameras import colour_camera
-from twin.main_job.render_job import render_job
 from twin.study.gradient.study_gradient import AD, TRACED, Gradient, study_gradient
-from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 
 RC = "ritchey_chretien"
@@ -26,10 +19,6 @@ design: {{kind: monte_carlo, runs: 4, seed: 3}}
 responses:
   da: {{key: [truth, cameras, {RC}, d_alpha_arcsec]}}
   df: {{key: [truth, cameras, {RC}, d_f_um]}}
-"""
-IMAGES = f"""  focus: {{key: [quality, cameras, {RC}, defocus_um, centre]}}
-  wfe: {{key: [quality, cameras, {RC}, wfe_rms_waves]}}
-  mtf: {{key: [quality, cameras, {RC}, mtf_along_line, centre]}}
 """
 
 
@@ -69,20 +58,6 @@ def test_motions_of_a_telescope_by_hand(tmp_path, backend) -> None:
     assert set(found.method[:, 2]) == {TRACED}
 
 
-@pytest.mark.slow
-def test_images_of_a_telescope(tmp_path, backend) -> None:
-    """A despace of M2 moves the focus by m^2 + 1, less what it adds of spherical aberration to a ring's best focus."""
-    job = JOB + "perturb: [M2 shift z 5 um]\n"
-    found = jacobian(tmp_path, backend, STUDY.replace("  warmth", "  #") + IMAGES, job)
-    spec, (*_, focal) = load_camera(RC), first_order()
-    magnification = focal / (0.5 * abs(spec.mirrors["M1"].radius))
-    assert entry(found, "focus", "m2z") == pytest.approx(magnification**2 + 1.0, rel=0.01)
-    assert np.all(np.isnan(found.ad[2:]))
-    assert set(found.method[2:].ravel()) == {TRACED}
-    # beyond focus by a despace: more of it blurs
-    assert entry(found, "wfe", "m2z") > 0.0 > entry(found, "mtf", "m2z")
-
-
 @pytest.mark.second
 def test_lenses_have_derivatives_too(tmp_path, backend) -> None:
     """A face of a lens moves by itself; what turns the line of sight is known by two methods."""
@@ -106,29 +81,3 @@ def test_lenses_have_derivatives_too(tmp_path, backend) -> None:
 
     by_hand = (scale(step) - scale(-step)) / (2.0 * step)
     assert entry(found, "df", "m2z") == pytest.approx(by_hand, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_a_table_of_states_is_a_course(tmp_path, backend) -> None:
-    """What a job without a monitor is told to write in place of a course: every row is one state."""
-    (tmp_path / "course.csv").write_text("time_s,despace,heat\n0,0 um,0 K\n60,5 um,1 K\n120,9 um,1.5 K\n", "utf-8")
-    (tmp_path / "job.yaml").write_text(JOB, "utf-8")
-    (tmp_path / "study.yaml").write_text(
-        STUDY[: STUDY.index("  m2z")]
-        + "  despace: {motion: M2 shift z, table: {file: course.csv, column: despace}}\n"
-        + "  heat: {motion: base temperature, table: {file: course.csv, column: heat}}\n"
-        + "design: {kind: grid}\n"
-        + STUDY[STUDY.index("responses") :],
-        "utf-8",
-    )
-    setup = resolve_study(tmp_path / "study.yaml")
-    plan = Plan.of(setup)
-    assert plan.runs == 3
-    found = setup.job.evaluate(setup.tree, [plan.run(k) for k in range(3)], backend)
-    for k, texts in enumerate(
-        ([], ["M2 shift z 5 um", "base temperature 1 K"], ["M2 shift z 9 um", "base temperature 1.5 K"])
-    ):
-        data = {"instrument": RC, "perturb": texts, "render": {"seed": 1}}
-        alone = render_job(resolve_job(validate(JobSpec, YamlFile("", data, {}))), backend)
-        told = alone.truth_dict()["cameras"][RC]["d_f_um"]
-        assert found[k]["truth"]["cameras"][RC]["d_f_um"] == pytest.approx(told, abs=1e-9)

@@ -9,10 +9,8 @@ from optics.waves.pupil_stack import circular_pupil
 from optics.waves.transfer import transfer
 from scenes.models.camera_model import field_direction
 from scenes.models.camera_sharpness import FieldBeams
-from scenes.specs.load import load_camera
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.camera_view import CameraView
 from twin.camera.cut_wavefront import RAYS_ACCURACY
 from twin.camera.field_maps import through_focus
 from twin.monitor.image_quality import image_quality
@@ -134,17 +132,3 @@ def test_fields_are_shares_of_the_half_field(gf7, gf7_alone) -> None:
         gf7_alone.wavefront((1.2, 0.0))
     with pytest.raises(ValueError, match="pairs"):
         gf7_alone.wavefronts([0.0, 1.0])  # type: ignore[list-item]
-
-
-def test_views_can_be_drawn_and_put_into_tables(backend) -> None:
-    camera = CameraView.alone(load_camera("gf7"), backend)
-    wave, spot, mtf = camera.wavefront(field=(0, 0)), camera.spot(), camera.in_state({}).mtf((1, 0))
-    for shown in (wave, spot, mtf):
-        (axes, *_) = shown.plot().axes
-        assert axes.get_xlabel()
-    table = wave.to_xarray()
-    assert float(np.sqrt(np.sum(table["zernike"] ** 2))) == pytest.approx(wave.rms, rel=1e-6)
-    assert str(table["term"][3].values) == "defocus"
-    assert table["wavefront"].attrs["units"] == "waves"
-    assert mtf.to_xarray().sel(direction="along line")["mtf"][0] == pytest.approx(1.0)
-    assert spot.to_xarray().attrs["rms_m"] == spot.rms

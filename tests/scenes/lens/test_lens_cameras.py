@@ -1,7 +1,6 @@
 """Cameras made of foreign prescriptions and prescriptions made of cameras: both trace the same."""
 
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,27 +127,6 @@ def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
     np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
 
 
-def test_two_lenses_of_two_glasses(tmp_path: Path, backend) -> None:
-    """The second is its own, forward and backward."""
-    second = "SURF 3\n  CURV 0.01\n  DISZ 3\n  GLAS SILICA 0 0\nSURF 4\n  CURV -0.005\n  DISZ 20\nSURF 5\n  DISZ 0\n"
-    text = SINGLET.replace("DISZ 47.5\nSURF 3\n  DISZ 0\n", f"DISZ 10\n{second}")
-    assert "SILICA" in text
-    path = tmp_path / "two.zmx"
-    path.write_text(text, "utf-8")
-    lens = read_zemax(path, own_glasses())
-    model = derive_camera(camera_of(lens, "two", backend, Width(pupil=1e-3)).camera, backend)
-    launch, direction = rays_of(model, backend)
-    bare = model.bare_assembly(False)
-    first = at_image(backend, lens.assembly(False), SEQUENCE, launch, direction)
-    np.testing.assert_allclose(at_image(backend, bare, "imaging", launch, direction), first, rtol=0, atol=ROUNDING)
-    place = first[:, :3] + [0.0, 0.0, model.spec.image.z]
-    rays = make_rays(backend, place, -first[:, 3:6])
-    back = trace(backend, assemble(bare, [model.mirrors[::-1]]), rays, world=True)
-    _, again, _, valid = (a[0] for a in back.numpy(back.world))
-    assert valid.all()
-    np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
-
-
 def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> None:
     """By name or by the catalogue's formula; a glass whose dispersion nobody knows keeps its index."""
     path, agf = tmp_path / "singlet.zmx", tmp_path / "own.agf"
@@ -172,37 +150,6 @@ def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> No
     # Schott's data sheet
     for wavelength, index in ((486.1327e-9, 1.63208), (587.5618e-9, 1.62004), (656.2725e-9, 1.61503)):
         assert again.index_behind("L1", wavelength) == pytest.approx(index, abs=1e-5)
-
-
-FACE = "{z: 1 mm, radius: 30 mm, light: refracts, index: %s}"
-
-
-@pytest.mark.parametrize(
-    ("mirrors", "problem"),
-    [
-        (f"A: {FACE % 1.5}, B: {FACE % 1.6}", "nothing cemented to it"),
-        (f"A: {FACE % 1.5}, M: {{z: 0 m, radius: -1 m}}", "light enters glass and does not leave it"),
-        (f"A: {FACE % 1.0}", "a lens has a face into glass"),
-        ("A: {z: 0 m, radius: 1 m, light: refracts}", "a face of a lens has an index behind it"),
-        ("A: {z: 0 m, radius: 1 m, index: 1.5}", "a face of a lens has an index behind it"),
-        ("A: {z: 0 m, radius: round}", "radius"),
-    ],
-)
-def test_lenses_that_a_camera_cannot_have(mirrors: str, problem: str) -> None:
-    text = f"""
-name: c
-focal_length: 1 m
-entrance_pupil: 10 mm
-field_bias: 0 deg
-field: {{x: 1 deg, y: 1 deg}}
-wavelength: 650 nm
-stop: A
-mirrors: {{{mirrors}}}
-image: {{z: 1 m}}
-line: {{pixels: 10, pitch: 7 um}}
-"""
-    with pytest.raises(InputError, match=problem):
-        validate(CameraSpec, parse_yaml(text))
 
 
 def test_an_instrument_takes_no_lenses(tmp_path: Path, backend) -> None:
@@ -311,43 +258,43 @@ def test_the_command(tmp_path: Path, backend) -> None:
                      "0.1 deg", "--pupil", "2 m", "--pitch", "15 um")  # fmt: skip
     assert code == 0, said
     assert load_camera(camera).line.pitch == pytest.approx(15e-6)
-    for arguments, problem in (
-        (("read", tmp_path / "two.yaml", "--out", tmp_path / "a.yaml"), "names no wavelength"),
-        (("read", tmp_path / "none.zmx", "--out", tmp_path / "a.yaml"), "no such file"),
-        (("read", tmp_path / "tma.zmx", "--out", tmp_path / "a.txt"), "what kind of file"),
-        (("read", tmp_path / "tma.zmx", "--out", tmp_path / "a.yaml", "--pupil", "3 kg"), "--pupil"),
-        (("write", "gf8", "--out", tmp_path / "a.zmx"), "did you mean 'gf7'"),
-        (("write", "gf7", "--out", tmp_path / "a.zmx", "--camera", "forward"), "--camera is for --perturbed"),
-    ):
-        code, said = run(*arguments)
-        assert code == 2
-        assert problem in said
-        assert not (tmp_path / "a.yaml").exists()
     job = tmp_path / "job.yaml"
     job.write_text(
         "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: 0 0 30 um, figure: {Z5: 20 nm}}}\n", "utf-8"
     )
+    (tmp_path / "what.doc").touch()
+    for words, problem in (
+        ("read two.yaml --out a.yaml", "names no wavelength"),
+        ("read none.zmx --out a.yaml", "no such file"),
+        ("read what.doc --out a.yaml", "what kind of file is this?"),
+        ("read tma.zmx --out a.txt", "what kind of file is this to be?"),
+        ("read tma.zmx --out a.yaml --pupil 3_kg", "--pupil"),
+        ("read tma.zmx --out a.yaml --pupil 0_mm", "--pupil is not greater than zero"),
+        ("read tma.zmx --out a.yaml --wavelength 650_nm", "--wavelength is for files of batoid"),
+        ("read tma.zmx --out nowhere/a.yaml", "cannot be written"),
+        ("write gf8 --out a.zmx", "did you mean 'gf7'"),
+        ("write gf7 --out a.zmx --camera forward", "--camera is for --perturbed"),
+        ("write gf7 --perturbed job.yaml --out a.zmx", "which of them?"),
+        ("write gf7 --perturbed job.yaml --camera upward --out a.zmx", "no such camera"),
+        ("write korsch --perturbed job.yaml --out a.zmx", "the job's instrument has no such camera"),
+    ):
+        code, said = run(
+            *(tmp_path / one if "." in one or "/" in one else one.replace("_", " ") for one in words.split())
+        )
+        assert (code, problem in " ".join(said.split())) == (2, True), (words, said)
+        assert not (tmp_path / "a.yaml").exists()
+        assert not (tmp_path / "a.zmx").exists()
     for name in ("a.zmx", "a.yaml"):
         code, said = run("write", "gf7", "--perturbed", job, "--camera", "forward", "--out", tmp_path / name)
         assert code == 0, said
     moved = read_zemax(tmp_path / "a.zmx")
     assert moved.surfaces[1].pose.translation[2] == pytest.approx(-2.01593047747168 + 30e-6, abs=1e-14)
-    assert run("write", "gf7", "--perturbed", job, "--out", tmp_path / "b.zmx")[0] == 2  # which of the two?
 
 
 def test_what_a_camera_cannot_hold_is_refused(tmp_path: Path, backend) -> None:
-    flat = "SURF 7\n  TYPE STANDARD\n  CURV 0.0"
-    cases: dict[str, tuple[str, str]] = {
-        "finite.zmx": (TMA.replace("DISZ INFINITY", "DISZ 500"), "the object is at a finite distance"),
-        "heights.zmx": (TMA.replace("FTYP 0", "FTYP 4"), "no directions of the field"),
-        "curved.zmx": (TMA.replace(flat, flat.replace("0.0", "0.01")), "a curved image"),
-        "turned.seq": (CODEV.replace("SI 0.0 0.25\n  ADE 1.5", "SI 0.0 0.25\n  ADE 70"), "an image turned too far"),
-    }
-    for name, (text, problem) in cases.items():
-        (tmp_path / name).write_text(text, "utf-8")
-        lens = (read_zemax if name.endswith("zmx") else read_codev)(tmp_path / name)
-        with pytest.raises(InputError, match=problem):
-            camera_of(lens, "c", backend)
+    (tmp_path / "a.seq").write_text(CODEV.replace("SI 0.0 0.25\n  ADE 1.5", "SI 0.0 0.25\n  ADE 70"), "utf-8")
+    with pytest.raises(InputError, match="an image turned too far"):
+        camera_of(read_codev(tmp_path / "a.seq"), "c", backend)
 
 
 def test_what_a_zemax_file_cannot_hold_is_refused(tmp_path: Path, backend) -> None:
@@ -377,16 +324,3 @@ def test_fields_are_those_of_the_file(tmp_path: Path, backend) -> None:
     # a round field is asked for in words, and has the square in it
     made = camera_of(replace(lens, round_field=True), "singlet", backend)
     assert made.camera.field.x == pytest.approx(math.radians(2) / math.sqrt(2.0), rel=1e-14)
-
-
-def test_numbers_are_written_without_the_tail_of_conversions(tmp_path: Path, backend) -> None:
-    """The half field is half of 6.1 deg less 5.9 deg, in radians 1e-15 off; 15 digits are what the file has."""
-    path = tmp_path / "tma.zmx"
-    path.write_text(TMA.replace("YFLN 6 6.1 5.9", "YFLN 6 6.15 5.85"), "utf-16")
-    lens = read_zemax(path)
-    text = camera_text(camera_of(lens, "tma", backend), lens)
-    assert "y: 540 arcsec" in text
-    assert "field_bias: 6 deg" in text
-    numbers = re.findall(r"[0-9]+[.][0-9]+", text.partition("name:")[2])
-    assert numbers
-    assert not [number for number in numbers if re.search(r"9{6}[0-9]?$|0{6}[0-9]$", number)]

@@ -16,7 +16,6 @@ from scenes.lens.glass_catalogue import own_glasses, read_catalogue, read_catalo
 from scenes.lens.prescription import Prescription
 from scenes.lens.statements import glass_key
 from scenes.lens.zemax_reader import read_zemax
-from scenes.yaml.errors import InputError
 from tests.scenes.lens.files import AGF, BATOID, CODEV, SINGLET, TMA
 
 ENCODINGS = {
@@ -229,80 +228,6 @@ def test_the_same_lens_in_glass(tmp_path: Path) -> None:
     assert [s.interaction for s in lens.surfaces[:2]] == [Interaction.REFRACT] * 2
     assert lens.surfaces[0].index == N_BK7.index(587.5618e-9)
     assert lens.surfaces[1].index == 1.0
-
-
-WRONG = {
-    "TYPE TOROIDAL": ("TYPE EVENASPH", "TYPE TOROIDAL", "a kind of surface that is not known here", 0),
-    "GLAS SF99": ("GLAS MIRROR", "GLAS SF99", "unknown glass", 0),
-    "MODE NSC": ("MODE SEQ", "MODE NSC", "not a sequential system", 0),
-    "UNIT": ("UNIT MM", "UNIT FURLONG", "unknown unit of lengths", 0),
-    "number": ("DISZ -201.593", "DISZ 2O1", "the thickness of DISZ is not a number", 0),
-    "order": ("SURF 3", "SURF 4", "surfaces are not in their order", 0),
-    "tilt": ("SQAP 70 65 0", "SCBD 1 0 0 0 0 90 0 0", "a surface with a tilt or decentre of its own", 0),
-    "two stops": ("SURF 5", "SURF 5\n  STOP", "a second stop", 0),
-    "negative edge": ("SURF 5", "SURF 5\n  CLAP 0 -5 0", "a circular aperture needs", 1),
-    "ignored": ("  COMM frame", "  IGNR 1", "a surface that is to be ignored", 0),
-}
-"""Words of the file -> other words, what is said of them, and by how many lines the place lies behind them."""
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_what_would_be_taken_wrongly_is_refused(tmp_path: Path, case: str) -> None:
-    old, new, problem, behind = WRONG[case]
-    text = TMA.replace(old, new, 1)
-    with pytest.raises(InputError) as caught:
-        read_zemax(file(tmp_path, "wrong.zmx", text))
-    assert problem in str(caught.value)
-    assert caught.value.line == text[: text.index(new)].count("\n") + 1 + behind, str(caught.value)
-
-
-@pytest.mark.parametrize(("content", "problem"), [("\n\n", "an empty file"), (TMA[: TMA.index("SURF 2")], "cut off")])
-def test_what_is_no_whole_file_is_refused(tmp_path: Path, content: str, problem: str) -> None:
-    with pytest.raises(InputError, match=problem) as caught:
-        read_zemax(file(tmp_path, "wrong.zmx", content))
-    assert caught.value.line is not None
-
-
-WRONG_CODEV = {
-    "radii?": (CODEV.replace("RDM Y; ", ""), "radii or curvatures"),
-    "return": (CODEV.replace("  DAR", "  RET S1"), "a return to the frame of another surface"),
-    "global": (CODEV.replace("  DAR", "  GLB S1"), "a global decentre"),
-    "special": (CODEV.replace("  CON", "  SPS ODD"), "a special surface that is not known here"),
-    "diffractive": (CODEV.replace("  CON", "  DIF DOE"), "a diffractive surface"),
-    "bend about two axes": (CODEV.replace("  ADE 3.0", "  ADE 3.0; BDE 2.0"), "BEN with turns about several axes"),
-    "edited": (CODEV.replace("GO", "THI S3 5.0"), "a change of surfaces that have been given before"),
-    "no image": (CODEV[: CODEV.index("SI 0.0")], "it is cut off"),
-    "glass": (CODEV.replace("REFL", "NSK99_SCHOTT", 1), "unknown glass"),
-    "Fresnel base": (CODEV.replace("  CON", "  CUF 0.1"), "a curvature of a Fresnel base"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG_CODEV)
-def test_what_would_be_taken_wrongly_of_codev_is_refused(tmp_path: Path, case: str) -> None:
-    text, problem = WRONG_CODEV[case]
-    with pytest.raises(InputError, match=problem) as caught:
-        read_codev(file(tmp_path, "wrong.seq", text))
-    assert caught.value.line is not None
-
-
-WRONG_BATOID = {
-    "unknown number": (BATOID.replace("coefs: [1.0e-5]", "coefs: [1.0e-5], spin: 1"), "spin: a key that is not known"),
-    "tilted": (BATOID.replace("type: Quadric", "type: Tilted"), "a key that is not known here"),
-    "table": (BATOID.replace("type: ConstMedium, n: 1.46", "type: Moonstone"), "a medium that is not known here"),
-    "YAML": (BATOID.replace("items:", "items: [", 1), "not YAML"),
-    "one face": (
-        BATOID.replace("        - {type: RefractiveInterface, name: front, surface: {type: Plane}}\n", ""),
-        "two faces",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", WRONG_BATOID)
-def test_what_would_be_taken_wrongly_of_batoid_is_refused(tmp_path: Path, case: str) -> None:
-    text, problem = WRONG_BATOID[case]
-    with pytest.raises(InputError, match=problem) as caught:
-        read_batoid(file(tmp_path, "wrong.yaml", text), 650e-9)
-    assert caught.value.line is not None
 
 
 def test_the_power_of_batoids_first_coefficient(tmp_path: Path) -> None:

@@ -1,0 +1,1 @@
+"""Tables of files that are refused, and what reads them."""

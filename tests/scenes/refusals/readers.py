@@ -1,0 +1,229 @@
+"""What reads the files of the tables of refusals: each gives, from a folder and pytest's fixtures, a function."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import meshlane
+import numpy as np
+
+from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.camera_reader import camera_of
+from scenes.lens.codev_reader import read_codev
+from scenes.lens.glass_catalogue import own_glasses, read_catalogue
+from scenes.lens.zemax_reader import read_zemax
+from scenes.models.camera_model import build_camera_under_test
+from scenes.models.disturbances import motions_of_spec, stated_motions
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.scenery import measured_finishes
+from scenes.schema import MODELS
+from scenes.specs.camera import CameraSpec
+from scenes.specs.job import checked_nodes
+from scenes.specs.load import (
+    load_autocollimator_test,
+    load_camera,
+    load_cameras,
+    load_disturbances,
+    load_instrument,
+    load_job,
+)
+from scenes.specs.measured.adjust_setup import resolve_adjust
+from scenes.specs.operation import read_operation
+from scenes.specs.orbit.flight import ErrorsSpec, OrbitSpec
+from scenes.specs.orbit.setup import (
+    resolve_angle,
+    resolve_calibration,
+    resolve_jitter,
+    resolve_loop,
+    resolve_monitor,
+    resolve_simulate,
+)
+from scenes.specs.perturbation import NodeInfo
+from scenes.specs.resolved import resolve, resolve_focus
+from scenes.specs.spectrum import SpectrumSpec
+from scenes.specs.study import StudySpec
+from scenes.yaml.csv_table import Column, read_table
+from scenes.yaml.finish_files import read_bsdf, read_coating
+from scenes.yaml.json_file import read_json
+from scenes.yaml.node_table import read_nodes, read_temperatures
+from scenes.yaml.spec import Spec, validate
+from scenes.yaml.units import ANGLE, LENGTH
+from scenes.yaml.yaml_file import read_yaml
+from tests.scenes.lens.colour_cameras import colour_camera
+from tests.scenes.test_finish_tables import bsdf_text
+
+Fixture = Callable[[str], Any]
+Read = Callable[[Path], object]
+
+COLUMNS = (
+    Column("point", text=True),
+    Column("x", LENGTH),
+    Column("turn", ANGLE, needed=False),
+    Column("count", needed=False, least=0.0, most=9.0, whole=True),
+)
+NODES = {
+    "base/backward/focal_plane": NodeInfo(("origin", "rear_node"), frozenset({"rotate", "shift", "scale"})),
+    "base/forward/M1": NodeInfo(allows=frozenset({"rotate", "shift", "figure"})),
+    "base/forward/M2": NodeInfo(allows=frozenset({"rotate", "shift", "figure"})),
+}
+
+
+class SpectrumHolder(Spec):
+    """A file of a spectrum alone."""
+
+    spectrum: SpectrumSpec
+
+
+def _plain(read: Read) -> Callable[[Path, Fixture], Read]:
+    return lambda folder, fixture: read
+
+
+def _spec(model: type[Spec]) -> Callable[[Path, Fixture], Read]:
+    return _plain(lambda path: validate(model, read_yaml(path)))
+
+
+yaml_file, json_file = _plain(read_yaml), _plain(read_json)
+table = _plain(lambda path: read_table(path, COLUMNS))
+nodes, temperatures = _plain(read_nodes), _plain(read_temperatures)
+bsdf, coating = _plain(read_bsdf), _plain(read_coating)
+camera, job = _plain(load_camera), _plain(load_job)
+autocollimators = _plain(load_autocollimator_test)
+operation = _plain(read_operation)
+orbit, errors, study, spectrum = map(_spec, (OrbitSpec, ErrorsSpec, StudySpec, SpectrumHolder))
+camera_text = _spec(CameraSpec)
+angle, loop, monitor, simulate = map(_plain, (resolve_angle, resolve_loop, resolve_monitor, resolve_simulate))
+calibration, jitter, adjust = map(_plain, (resolve_calibration, resolve_jitter, resolve_adjust))
+zemax, codev = _plain(read_zemax), _plain(read_codev)
+batoid = _plain(lambda path: read_batoid(path, 650e-9))
+
+
+def job_nodes(folder: Path, fixture: Fixture) -> Read:
+    """A job on an instrument of three nodes."""
+    return lambda path: checked_nodes(load_job(path), NODES)
+
+
+def instrument(folder: Path, fixture: Fixture) -> Read:
+    """An instrument, also one as built, with all that stands in it."""
+    backend = fixture("backend")
+
+    def read(path: Path) -> object:
+        spec = load_instrument(path)
+        return build_instrument(spec, load_cameras(spec), backend)
+
+    return read
+
+
+def focus(folder: Path, fixture: Fixture) -> Read:
+    """A focus test with its camera."""
+    backend = fixture("backend")
+
+    def read(path: Path) -> object:
+        setup = resolve_focus(path)
+        return build_camera_under_test(setup.test, setup.camera, backend)
+
+    return read
+
+
+def disturbances(folder: Path, fixture: Fixture) -> Read:
+    """Disturbances of the pair gf7; a table of correlations beside them."""
+    pair = fixture("gf7_pair")
+    return lambda path: motions_of_spec(load_disturbances(path), pair)
+
+
+def correlations(folder: Path, fixture: Fixture) -> Read:
+    """A table of correlations of the disturbances that name it."""
+    components = (
+        "forward/M2 shift z: 3.1 um, base/forward/M2 rotate x about origin: 4 arcsec, base/forward/M1 conic: 2.0e-5"
+    )
+    text = f"name: own\njoint: {{reason: r, components: {{{components}}}, correlation_file: corr.csv}}\n"
+    (folder / "own.yaml").write_text(text, "utf-8")
+    return lambda path: load_disturbances(folder / "own.yaml")
+
+
+def stated_job(folder: Path, fixture: Fixture) -> Read:
+    """A job on the pair gf7 and what it states to move."""
+    pair = fixture("gf7_pair")
+
+    def read(path: Path) -> object:
+        return stated_motions(resolve(path), pair)
+
+    return read
+
+
+def payload(folder: Path, fixture: Fixture) -> Read:
+    """A three-line camera of a simulated pass."""
+    orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
+    (folder / "test.yaml").write_text(
+        f"name: small\ncamera: own.yaml\norbit: {orbit}\npatch: {{pixel: 6000}}\n", "utf-8"
+    )
+    return lambda path: resolve_simulate(folder / "test.yaml")
+
+
+def payload_angle(folder: Path, fixture: Fixture) -> Read:
+    """A three-line camera of an angle test."""
+    orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
+    strips = "{points: 3, first: 0, last: 11999}"
+    (folder / "test.yaml").write_text(f"name: small\ncamera: own.yaml\norbit: {orbit}\nstrips: {strips}\n", "utf-8")
+    return lambda path: resolve_angle(folder / "test.yaml")
+
+
+def filter_table(folder: Path, fixture: Fixture) -> Read:
+    """A table of a filter that a camera of lenses names."""
+    text = colour_camera("achromat", "{table: filter.csv}").file_text("")
+    (folder / "c.yaml").write_text(text, "utf-8")
+    return lambda path: load_camera(folder / "c.yaml")
+
+
+def heated(folder: Path, fixture: Fixture) -> Read:
+    """A job on tables and meshes of nodes that lie beside it."""
+    numbers = np.arange(48.0).reshape(16, 3) % [5.0, 7.0, 3.0]
+    rows = "".join(f"{x},{y},{z},28{x:g},0.1,0\n" for x, y, z in numbers)
+    (folder / "heat.csv").write_text("x [mm],y [mm],z [mm],T [K]\n" + re.sub(r",0.1,0$", "", rows, flags=re.M), "utf-8")
+    (folder / "m1.csv").write_text("x [mm],y [mm],z [mm],dx [um],dy [um],dz [um]\n" + rows, "utf-8")
+    cells = [("vertex", np.arange(16)[:, None])]
+    data = {"a": 280.0 + numbers[:, 0], "b": numbers[:, 1]}
+    meshlane.Mesh(numbers, cells, point_data=data).write(folder / "heat.vtu")
+    meshlane.Mesh(numbers, cells, point_data={"U": numbers}).write(folder / "m1.vtu")
+    meshlane.Mesh(numbers, cells, point_data={"U": numbers, "v": numbers}).write(folder / "two.vtu")
+    meshlane.Mesh(numbers, cells).write(folder / "none.vtu")
+    for name, level in (("cold", -280.0), ("hot", 2500.0)):
+        meshlane.Mesh(numbers, cells, point_data={"a": level + numbers[:, 0]}).write(folder / f"{name}.vtu")
+    few = [("vertex", np.arange(3)[:, None])]
+    meshlane.Mesh(numbers[:3], few, point_data={"a": numbers[:3, 0]}).write(folder / "few.vtu")
+    (folder / "text.vtu").write_text("no mesh\n", "utf-8")
+    for name in ("heat.inp", "m1.bdf", "m1.xlsx"):
+        (folder / name).write_text("*NODE\n", "utf-8")
+    return load_job
+
+
+def finishes(folder: Path, fixture: Fixture) -> Read:
+    """A job whose finishes are in files beside it."""
+    for name, wavelengths, reflectance in (
+        ("ar", (600, 700), 0.4), ("ag", (640, 660), 97), ("dim", (640, 660), 10), ("blue", (440, 460), 10)
+    ):  # fmt: skip
+        rows = "".join(f"{wavelength},0,{reflectance}\n" for wavelength in wavelengths)
+        (folder / f"{name}.csv").write_text(f"wavelength [nm],angle [deg],R [percent]\n{rows}", "utf-8")
+    (folder / "m.bsdf").write_text(bsdf_text(), "utf-8")
+    return lambda path: measured_finishes(resolve(path))
+
+
+def agf(folder: Path, fixture: Fixture) -> Read:
+    """A glass catalogue."""
+    return read_catalogue
+
+
+def _lens_camera(read: Read) -> Callable[[Path, Fixture], Read]:
+    """A camera made of a prescription."""
+    return lambda folder, fixture: lambda path: camera_of(read(path), "c", fixture("backend"))
+
+
+zemax_camera = _lens_camera(lambda path: read_zemax(path, own_glasses()))
+codev_camera = _lens_camera(read_codev)
+
+
+def model(name: str) -> Callable[[Path, Fixture], Read]:
+    """A kind of file by the name of its schema."""
+    return _spec(MODELS[name])

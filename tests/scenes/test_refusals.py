@@ -1,0 +1,65 @@
+"""Every refusal of a file of scenes: a good file is read, and each change of it is refused at its line and key.
+
+The cases stand in ``refusals/*.txt``. A section begins with ``## name | reader | file`` (and ``| second`` for the
+second tier), followed by the text of the good file (``@path`` for a file of scenes, ``=name`` for a layout of
+monitors) and ``--``. Every row below is
+
+    OLD => NEW :: LINE KEY :: word ; word
+
+OLD stands once in the good file; an empty OLD is the whole file, ``^OLD`` the first of several, ``~`` the OLD of the
+row above, ``@a.b.0`` a key of its YAML tree whose value is replaced (or lost, if NEW is empty). Two changes are joined
+by `` && ``, a line break is written ``\\n``. The name of another file that is blamed precedes LINE, which is ``?`` for
+none; ``+1`` behind KEY counts further messages. In place of LINE and KEY ``ok`` says that the changed file is read as
+well: the value is just within its limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from scenes.yaml.errors import InputError, key_text
+from tests.scenes.refusals import readers
+from tests.scenes.refusals.tables import Section, changed, sections
+
+
+def judged(read: Callable[[Path], object], path: Path, text: str, row: str) -> str:
+    """Return what is wrong with how a row's file is taken, nothing if all is well."""
+    change, _, rest = row.partition(" :: ")
+    where, _, words = rest.partition(" :: ")
+    path.write_text(changed(text, change), "utf-8")
+    try:
+        read(path)
+    except InputError as error:
+        (issue, *more), told = error.issues, str(error)
+        line = "?" if issue.line is None else str(issue.line)
+        name = Path(issue.file).name
+        found = f"{'' if name == path.name else name + ' '}{line} {key_text(issue.key)}".strip()
+        found += f" +{len(more)}" if more else ""
+        if found != where:
+            return f"told at {found!r}: {told}"
+        missing = [word for word in words.split(" ; ") if word.replace("\\n", "\n") not in told]
+        return f"{missing} not in: {told}" if missing else ""
+    return "" if where == "ok" else "not refused"
+
+
+@pytest.mark.parametrize(
+    "section", [pytest.param(one, id=one.name, marks=[pytest.mark.second] * one.second) for one in sections()]
+)
+def test_faults_are_told_where_they_stand(section: Section, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """Also, a good file is read: what refuses everything would pass all else."""
+    name, *kind = section.reader.split()
+    reader = getattr(readers, name)
+    read = (reader(*kind) if kind else reader)(tmp_path, request.getfixturevalue)
+    path = tmp_path / section.file
+    path.write_text(section.text, "utf-8")
+    read(path)
+    wrong, old = [], ""
+    for row in section.rows:
+        first, arrow, rest = (" " + row).partition(" => ")
+        old = old if first == " ~" else first[1:]
+        if text := judged(read, path, section.text, old + arrow + rest):
+            wrong.append(f"{row}\n    {text}")
+    assert not wrong, "\n" + "\n".join(wrong)
