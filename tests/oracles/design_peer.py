@@ -6,23 +6,16 @@ prescription, the fields, the quadrature of the pupil and which beams pass which
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import batoid
 import numpy as np
-from scipy.optimize import least_squares
 
-from optics.design.design_variables import Prescription, Variable
+from optics.design.design_variables import Prescription
 from optics.design.merit_function import MeritFunction
 from tests.oracles.peers import batoid_rays
 
 LAUNCH = 9.0
-PENALTY = 10.0
-"""Residual per metre of violation. At an optimum a constraint is worth some 1e-3 waves^2/m: it is broken by 1e-5 m. A
-penalty of 300 stops least squares at twice the error."""
-LOST = 1e3
-"""Residual of everything where light is lost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,44 +112,3 @@ def judge(merit: MeritFunction, prescription: Prescription) -> Judged | None:
         violated.append(max(operands.clearance - room.min(), 0.0))
     errors = np.linalg.norm(rest, axis=1)
     return Judged(rest.ravel() / np.sqrt(fields), errors, np.array(violated), float(envelope))
-
-
-def optimised(
-    merit: MeritFunction,
-    start: Prescription,
-    variables: Sequence[Variable],
-    sizes: np.ndarray,
-    steps: int,
-    iterations: tuple[int, int],
-) -> Prescription:
-    """What scipy's least squares reach with penalties for the constraints, the envelope shortened in steps.
-
-    Differences are central ones: with one-sided ones of 1e-8 the rounding of paths hides the valley's slope.
-
-    Args:
-        merit: what to minimise.
-        start: where to begin.
-        variables: what varies.
-        sizes: of the variables, by which they are made dimensionless.
-        steps: of the envelope.
-        iterations: at each step on the way, and at the last.
-    """
-    from dataclasses import replace
-
-    x = start.values(variables) / sizes
-    found = judge(merit, start)
-    assert found is not None
-    first, size = found.envelope, len(found.residuals) + len(found.violations)
-    for step in range(1, steps + 1):
-        goal = first + step / steps * (merit.operands.envelope - first)
-        own = replace(merit, operands=replace(merit.operands, envelope=goal))
-
-        def residuals(x: np.ndarray, own: MeritFunction = own) -> np.ndarray:
-            found = judge(own, start.with_values(variables, x * sizes))
-            if found is None:
-                return np.full(size, LOST)
-            return np.concatenate([found.residuals, PENALTY * found.violations])
-
-        most = iterations[0] if step < steps else iterations[1]
-        x = least_squares(residuals, x, "3-point", x_scale="jac", max_nfev=most, ftol=1e-7, xtol=1e-12, gtol=1e-14).x
-    return start.with_values(variables, x * sizes)

@@ -47,8 +47,6 @@ def traced(model: CameraModel, peer: Any, field: tuple[float, float], stop: np.n
 
 CASES = sorted(product(KINDS, LENSES), key=lambda case: case not in list(zip(KINDS, LENSES, strict=False)))
 """Every lens by every program, those first that have each once."""
-LONG = [*map(pytest.param, CASES[:3]), *(pytest.param(case, marks=pytest.mark.slow) for case in CASES[3:])]
-"""Of tests of a second and more: the third tier has all others."""
 
 
 @pytest.fixture(scope="module", params=quick(3, [pytest.param(case) for case in CASES]), ids="-".join)
@@ -107,7 +105,7 @@ def test_the_glass_of_batoids_lsst_comes_along() -> None:
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("case", LONG, indirect=True, ids="-".join)
+@pytest.mark.parametrize("case", CASES[:3], indirect=True, ids="-".join)
 def test_mtf_over_the_light_of_batoids_wavefronts(case, backend) -> None:
     """Each wavelength's pupil on a grid of direction cosines with its true edge, shifted against itself and summed."""
     optics, peer = case

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.stats import ks_2samp, truncnorm
 
 from optics.numerics.backend import Backend
 from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
@@ -129,18 +128,3 @@ def test_cameras_are_as_in_batoid_one_by_one(drawn: Samples, peer: BatoidCamera)
     same = np.array([one.worst for one in peer.tried_all(ERRORS, drawn.x[:100] * LIMITS)])
     assert spread > 0.01
     np.testing.assert_allclose(ours[:100], same, rtol=0, atol=CLOSE * spread)
-
-
-@pytest.mark.slow
-def test_cameras_are_distributed_as_those_that_the_oracle_draws(drawn: Samples, peer: BatoidCamera) -> None:
-    """1000 of each, with the oracle's own random numbers; the laws are said anew."""
-    rng = np.random.default_rng(20)
-    size = len(drawn.x)
-    columns = [
-        rng.uniform(-1.0, 1.0, size)
-        if law == UNIFORM
-        else truncnorm.rvs(-2.0, 2.0, scale=0.5, size=size, random_state=rng)
-        for _, _, _, law in BUDGET.values()
-    ]
-    own = np.array([one.worst for one in peer.tried_all(ERRORS, np.stack(columns, axis=-1) * LIMITS)])
-    assert ks_2samp(drawn.values[:, 0], own).pvalue > 1e-3
