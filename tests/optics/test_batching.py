@@ -202,36 +202,6 @@ def test_aim_reaches_its_points_and_says_when_it_cannot(backend, gf7) -> None:
         aim(backend, to_stop, fan, np.full((1, 2), np.inf))
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_few_rays_are_traced_as_many_are(backend, gf7, monkeypatch, count) -> None:
-    """Element by element in kernels of their own, or many elements in one: no number differs."""
-    bare = gf7.bare_assembly()
-    systems = assemble(bare, ["imaging"], some_states(count, 1, ("M1", "M2", "M3", "image")))
-    position, direction = launch(gf7)
-    found = []
-    for few in (trace_module.FEW, 0):
-        monkeypatch.setattr(trace_module, "FEW", few)
-        traced = trace(backend, systems, make_rays(backend, position, direction), keep=(0, 2), world=True)
-        found.append((*traced.numpy(), *traced.numpy(traced.world), traced.hit(0), traced.hit(2)))
-    assert 0 < found[0][3].mean() < 1
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_elements_of_one_structure_share_a_kernel(backend, gf7_pair) -> None:
-    """Wherever they stand: a channel of 25 elements takes some ten kernels."""
-    name = next(name for name in gf7_pair.assembly.sequences if name.endswith("/monitor"))
-    systems = assemble(gf7_pair.assembly, [name], some_states(2, 1, ("base/backward/M2",)))
-    rays = make_rays(backend, np.zeros((2, 8, 3)), np.broadcast_to([0.0, 0.0, 1.0], (2, 8, 3)))
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        trace(backend, systems, rays)
-        hashes = [k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-    assert len(hashes) >= len(systems.structure)
-    # beside the elements' kernels the one that says which system a ray belongs to
-    assert len(set(hashes)) <= len(set(systems.structure)) + 1 < len(systems.structure) / 2
-
-
 def new_kernels(work) -> tuple[int, int]:
     """Kernels launched and kernels compiled while ``work`` runs."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):

@@ -91,24 +91,6 @@ def test_shadows_that_overlap_count_once() -> None:
     np.testing.assert_allclose(area(pieces).sum(axis=-1)[::2], area(OTHERS)[::2], atol=1e-12)
 
 
-def test_a_disk_in_a_disk_by_its_parts() -> None:
-    """What shadows take of a circle's overlap with itself: a shadow as large as half of it leaves the other half's own
-    overlap, a lens cut by chords, known from circular segments.
-    """
-    half = np.array([[[[-2.0, -2.0], [2.0, -2.0], [2.0, 0.0], [-2.0, 0.0]]]])
-    shadow = PupilShadow.within(half, CIRCLE)
-    assert shadow.area[0] == pytest.approx(0.5 * np.pi, rel=1e-5)
-    for s in (0.3, 0.9, 1.6):
-        # shifted along the cut the upper half disk overlaps itself in half the lens, square to it in less
-        lens = 2.0 * np.arccos(0.5 * s) - 0.5 * s * np.sqrt(4.0 - s * s)
-        _, weights = shadow.overlap(np.array([[s, -1j * s]]), 3)
-        # up to the polygon of the rim, which has the circle's area as a whole
-        assert lens + weights[0, 0].sum() == pytest.approx(0.5 * lens, abs=1e-4)
-        # moved up by s: the segment of the lower circle above y = s/2 + s/2 ...
-        segment = np.arccos(min(s, 1.0)) - s * np.sqrt(max(1.0 - s * s, 0.0))
-        assert lens + weights[0, 1].sum() == pytest.approx(segment if s < 1.0 else 0.0, abs=2e-4)
-
-
 def test_rounding_in_corners_cuts_nothing_off() -> None:
     """Corners 1e-17 apart have a side of no direction."""
     square = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])

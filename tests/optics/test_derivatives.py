@@ -105,44 +105,6 @@ def test_forward_mode_for_the_shape(backend, bare, rays, mirror: int, name: str)
     np.testing.assert_allclose(exact_path, (sides[0][2][0] - sides[1][2][0]) / (2 * h), rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.second
-def test_reverse_mode_is_the_transpose_of_forward_mode(backend, bare, rays) -> None:
-    """d(sum w . out)/d(parameters) of all four elements in one backward sweep."""
-    systems = assemble(bare, ["imaging"], [BASE])
-    weight = np.random.default_rng(1).normal(size=(len(rays[0]), 4))
-    uploaded = replace(systems.upload(backend, own=True), differentiable=True)
-    wanted: list[Path] = [
-        (0, *NUMBERS["c"]),
-        (0, "surface", "even", 1),
-        (1, "frame", "y", "shift"),
-        (1, *NUMBERS["k"]),
-        (2, *NUMBERS["c"]),
-        (2, "frame", "y", "turn", 2),
-    ]
-    numbers = leaves(uploaded.values)
-    for path in wanted:
-        dr.enable_grad(numbers[path])
-
-    def loss(local):
-        terms = [c * backend.opaque(weight[:, j]) for j, c in enumerate((*local.position, local.path))]
-        return dr.sum(terms[0] + terms[1] + terms[2] + terms[3])
-
-    dr.backward(loss(trace(backend, uploaded, make_rays(backend, *rays), evaluate=False).local))
-    reverse = np.array([dr.grad(numbers[path])[0] for path in wanted])
-    forward = []
-    for path in wanted:
-        fresh = replace(systems.upload(backend, own=True), differentiable=True)
-        number = leaves(fresh.values)[path]
-        dr.enable_grad(number)
-        dr.set_grad(number, backend.opaque([1.0]))
-        value = loss(trace(backend, fresh, make_rays(backend, *rays), evaluate=False).local)
-        dr.forward_to(value)
-        forward.append(dr.grad(value)[0])
-    assert np.all(np.isfinite(reverse))
-    assert np.all(np.abs(reverse) > 0.0)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-10)
-
-
 def test_ray_matrix_against_neighbouring_rays(backend, gf7, bare) -> None:
     systems = assemble(bare, ["imaging"])
     direction = field_direction(gf7.spec, 0.0, 0.0)

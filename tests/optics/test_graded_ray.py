@@ -83,13 +83,6 @@ def test_truncation_bound(backend, strength, way) -> None:
     assert path < 30.0 * short + rounding
 
 
-def test_in_space_the_cut_is_far_below_a_wave() -> None:
-    """A prism of 1.4 m with 20 K/m at dn/dT = 1e-5 /K."""
-    position, path = truncation_bound(2e-4, 1.4)
-    assert position < 1e-20
-    assert path < 1e-20
-
-
 def slab(length: float, index: float = N0, tilt: float = 0.0) -> Assembly:
     """A plate along z, its entry in the plane z = 0, with a screen 0.1 m behind."""
     tree = RigidTree(

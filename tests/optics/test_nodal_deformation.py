@@ -76,35 +76,6 @@ def test_a_large_turn_and_a_growth_are_exact_too() -> None:
     assert face.rms(face.change) < 1e-14
 
 
-@pytest.mark.slow
-def test_figure_and_ripple_on_20000_nodes_come_back_within_the_sampling_error() -> None:
-    points = mesh(DISK, 160)
-    assert len(points) > 20_000
-    x, y = (points[:, :2] - DISK.centre).T
-
-    def bump(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        smooth = 100e-9 * zernike.zernike(5, x / 0.3, y / 0.3) - 40e-9 * zernike.zernike(9, x / 0.3, y / 0.3)
-        return smooth + 20e-9 * np.cos(2.0 * np.pi * x / 0.05) * np.cos(2.0 * np.pi * y / 0.07)
-
-    lifted = points + np.stack([0.0 * x, 0.0 * x, bump(x, y)], axis=-1)
-    face = nodal_deformation(points, lifted @ _turned().T + SHIFT - points, BOWL, DISK)
-    # the bump's own nearest rigid motion is at most its rms over the radius
-    np.testing.assert_allclose(face.rotate, TURN, rtol=0, atol=1e-9)
-    assert face.figure[5] == pytest.approx(100e-9, rel=0.01)
-    assert face.figure[9] == pytest.approx(-40e-9, rel=0.02)
-    assert face.rms(face.residual) == pytest.approx(10e-9, rel=0.03)  # half of the ripple's amplitude
-    assert not face.printed_through
-    # the surface itself, at places between the nodes; the mesh says how well it knows them
-    rng = np.random.default_rng(7)
-    r, t = 0.3 * np.sqrt(rng.uniform(0.0, 1.0, 3000)), rng.uniform(0.0, 2.0 * np.pi, 3000)
-    at = np.stack([r * np.cos(t), r * np.sin(t)], axis=-1) + DISK.centre
-    true = np.stack([*at.T, BOWL.sag(*at.T) + bump(*(at - DISK.centre).T)], axis=-1) @ _turned().T + SHIFT
-    error = whole(face, BOWL, DISK, true) - true[:, 2]
-    assert face.between < 0.2e-9
-    assert np.sqrt(np.mean(error**2)) < face.between
-    assert face.rms(face.lost) < 1e-12
-
-
 def lifted_by(points: np.ndarray, height: float) -> np.ndarray:
     """Points elsewhere along z."""
     return np.asarray(points + np.array([0.0, 0.0, height]))

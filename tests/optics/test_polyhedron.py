@@ -105,11 +105,6 @@ def test_random_bodies() -> None:
     assert random_bodies(60, 1) > 40
 
 
-@pytest.mark.slow
-def test_thousands_of_random_bodies() -> None:
-    assert random_bodies(1000, 2) > 700
-
-
 @pytest.mark.parametrize("size", [0.0, 1e-17, 1e-15, 1e-12, 3e-10, 1e-9, 7e-9, 2e-8, 1.1e-7, 4e-6, 1e-3])
 def test_planes_that_nearly_meet_in_a_point(size) -> None:
     """A pyramid whose four sides miss their apex by that much: V = (2a)^2 h / 3 and at most that much of skin."""

@@ -21,17 +21,6 @@ def test_a_conic_is_a_quadric(curvature, conic) -> None:
     assert np.all((1.0 + conic) * curvature * z < 1.0)
 
 
-@given(CURVATURE, CONIC, st.floats(-1e-2, 1e-2), st.floats(0.1, 10.0), st.floats(0.0, 6.3))
-def test_surfaces_scale_and_turn(curvature, conic, fourth, scale, turn) -> None:
-    x, y = PLACES
-    surface = Surface(curvature, conic, (fourth, 0.1 * fourth))
-    z = surface.sag(x, y)
-    grown = Surface(curvature / scale, conic, (fourth / scale**3, 0.1 * fourth / scale**5))
-    np.testing.assert_allclose(grown.sag(scale * x, scale * y), scale * z, rtol=1e-13, atol=1e-16 * scale)
-    c, s = np.cos(turn), np.sin(turn)
-    np.testing.assert_allclose(surface.sag(c * x - s * y, s * x + c * y), z, rtol=1e-13, atol=1e-16)
-
-
 def _apertures() -> st.SearchStrategy[Aperture]:
     size, place = st.floats(0.05, 2.0), st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
     return st.one_of(

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.raytrace.trace import BeamMissedError, require_some
@@ -171,15 +170,6 @@ def test_a_ray_that_misses_is_invalid(backend) -> None:
     for surface in (Surface(-0.5), Surface(-0.5, 0.0, (1e-5,))):
         _, _, _, valid = run(backend, build(Stage(surface)), position, direction)
         np.testing.assert_array_equal(valid, [True, True, False, False])
-
-
-def test_apertures_stop_what_is_outside(backend) -> None:
-    points = np.array([[0.0, 0.0], [0.15, 0.0], [0.25, 0.0], [0.0, 0.45], [0.0, 0.55]])
-    position, direction = beam(points, -1.0, Z)
-    for aperture in (Circle(0.5, (0.0, 0.0), inner=0.2), Circle(0.2, (0.1, 0.0)), Rectangle(0.2, 0.5)):
-        valid = run(backend, build(Stage(plane(), aperture=aperture)), position, direction)[3]
-        np.testing.assert_array_equal(valid, aperture.contains(*points.T))
-        assert 0 < valid.sum() < len(points)
 
 
 def test_a_scaled_camera_scales_its_paths(backend) -> None:

@@ -262,17 +262,6 @@ def test_rule_for_the_nodes(span: float) -> None:
     assert np.sum(weight * np.cos(span * node)) == pytest.approx(2.0 * np.sin(span) / span, abs=1e-8)
 
 
-@pytest.mark.parametrize("reach", [0.0, 1e-3, 2e-3])
-def test_independent_of_the_number_of_nodes(traced: PupilFunction, monkeypatch, reach: float) -> None:
-    """+-1 mm at F/9.2 and 450 nm are 3.3 waves of defocus at the edge."""
-    f = random_frequencies(traced, 60, BAND[0])
-    dz = np.linspace(-reach, reach, 5)
-    got = transfer.transfer(traced, f, BAND[0], dz)
-    rule = transfer.nodes_for
-    monkeypatch.setattr(transfer, "nodes_for", lambda span, least: 2 * rule(span, least))
-    assert np.max(np.abs(transfer.transfer(traced, f, BAND[0], dz) - got)) < 1e-7
-
-
 def test_polychromatic_mean(traced: PupilFunction) -> None:
     f = random_frequencies(traced, 30, 550e-9)
     dz = np.array([-1e-4, 2e-4])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.monitoring import PER_SI
 from analysis.monitor.recovery import measure_spots
 from analysis.units import ARCSEC
 from tests.tiers import quick
@@ -101,12 +101,3 @@ def test_reference_rotation_cannot_be_told_from_the_cameras(table):
         assert any(
             s.startswith("central prism about Y") and "not separable" in s for s in found.observability.statements
         )
-
-
-def test_table_as_plain_data(table):
-    _, cameras = table
-    for found in cameras.values():
-        plain = found.to_dict()
-        assert len(plain["motions"]) == 49
-        assert set(plain["motions"][0]["model"]) == set(PARAMETERS)
-        assert len(plain["factors"]) == 8

@@ -131,17 +131,6 @@ def test_a_map_of_the_accuracy(folder: Path, tmp_path: Path) -> None:
     assert len(table) == 1 + 13 * 13
 
 
-@pytest.mark.second
-def test_what_control_determines_is_not_what_the_camera_leaves_open(folder: Path, tmp_path: Path) -> None:
-    arguments = ("--control", folder / "points.gcp", "--attitude-sigma", "2 arcsec", "--image-sigma", "0.5")
-    result = run("export", folder / "DIM_SCENE.XML", *arguments, "--out", tmp_path / "out", "--quiet")
-    assert result.exit_code == 0
-    numbers = json.loads((tmp_path / "out" / "export.json").read_text())
-    found = read_rpc(tmp_path / "out" / "models" / "SCENE_P_RPC.TXT")
-    assert found.bias_m == pytest.approx(numbers["control"]["SCENE_P"]["err_bias_m"])
-    assert numbers["accuracy"]["SCENE_P"]["common_m"] > 10.0 * found.bias_m
-
-
 REFUSED = {
     "no control": (("--control", "none.gcp"), "no such file"),
     "another ending": (("--control", "RPC_SCENE.XML"), "not a .gcp file"),

@@ -1,15 +1,12 @@
 """Shadows of bodies in pupils: against rays that meet triangles, rasters of the pupil, and one way against another."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 
-import twin.render as command
 from optics.geometry import zernike
-from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.aperture import Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.solid import solid_mesh
 from optics.geometry.tree import Motion
@@ -21,7 +18,6 @@ from optics.waves.wavefront import path_to_sphere
 from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams
 from scenes.specs.baffle import Plate
 from scenes.specs.load import load_band_detectors
-from tests.twin.commands import invoke
 from twin.monitor.image_quality import _CameraBench, image_quality
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
@@ -270,33 +266,6 @@ def with_plate(instrument, plate: Plate):
     return replace(instrument, baffles=(*instrument.baffles, plate))
 
 
-@pytest.mark.second
-def test_a_round_plate_before_the_first_mirror(gf7_pair, backend) -> None:
-    """A disk square to the beam takes its share of the beam's cross-section, by each of two parts, or as a ring."""
-    path = path_of(gf7_pair, backend)
-    directions = path.directions(places_of(gf7_pair)[1:2])
-    _, _, rays = rays_of(path, {}, directions, path.nodes)
-    middle = rays.launched[0].mean(axis=0) + 0.0 * directions[0]
-    z = directions[0]
-    x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    turn = np.stack([x, np.cross(z, x), z], axis=-1)
-    cross_section = float(np.sum(rays.launch_area))
-    base = np.sum(shadows_of(path, {}, directions).areas[0]) / np.pi
-
-    def light(outline) -> float:
-        own = path_of(with_plate(gf7_pair, Plate("disk", "base", Pose(turn, middle), outline)), backend)
-        return own.pupils({}, directions, own.places({}, directions))[0].light
-
-    clear = light(Circle(1e-4))
-    assert clear == pytest.approx(1.0 - base, abs=1e-3)
-    # 48 corners of a circle have 0.3 % less than its area
-    polygon = 24.0 * np.sin(np.pi / 24.0)
-    assert clear - light(Circle(0.05)) == pytest.approx(polygon * 0.05**2 / cross_section, rel=2e-3)
-    ring = polygon * (0.05**2 - 0.03**2) / cross_section
-    assert clear - light(Circle(0.05, inner=0.03)) == pytest.approx(ring, rel=2e-3)
-
-
 def test_a_plate_between_two_mirrors(gf7_pair, backend) -> None:
     """Against the rays themselves: which of them go through the plate on their way from the first to the second."""
     path = path_of(gf7_pair, backend)
@@ -328,32 +297,3 @@ def test_a_plate_between_two_mirrors(gf7_pair, backend) -> None:
         taken = outline.contains(at[:, 0], at[:, 1]) & (share > 0.0) & (share < 1.0)
         assert 0.005 < taken.mean() < 0.2
         assert shares["plate"][k] == pytest.approx(taken.mean(), abs=2e-4)
-
-
-@pytest.mark.slow
-def test_ignored_obstruction_is_told_everywhere_and_leaves_the_monitor_alone(tmp_path) -> None:
-    """The same frames of the spots, since their way through prisms is no obstruction; another image quality, another
-    target; terminal, JSON and report say it.
-    """
-    found = {}
-    for mode in ("traced", "ignore"):
-        render = {"images": ["spots", "pinhole"], "quality": True, "frames": 2, "obstruction": mode}
-        job = tmp_path / f"{mode}.yaml"
-        job.write_text(yaml.safe_dump({"instrument": "gf7_pair", "render": render}))
-        result = invoke(command.app, job, "--out", tmp_path / mode)
-        assert result.exit_code == 0
-        quality, mtf = (json.loads((tmp_path / mode / name).read_text()) for name in ("quality.json", "mtf.json"))
-        assert quality["obstruction"] == mtf["obstruction"] == mode
-        report = (tmp_path / mode / "report.html").read_text()
-        assert ("free" in result.output) == (mode == "ignore") == ("<code>obstruction: ignore</code>" in report)
-        spots = {file.name: file.read_bytes() for file in (tmp_path / mode / "images").glob("*_after.tiff")}
-        found[mode] = quality, mtf, {name: data for name, data in spots.items() if "pinhole" not in name}
-    traced, ignored = found["traced"], found["ignore"]
-    assert traced[2]
-    assert traced[2] == ignored[2]
-    lost = traced[0]["cameras"][CAMERA]["light_lost"]["centre"]
-    place = traced[1]["truth"]["cameras"][CAMERA]["places"]["centre"]
-    assert lost == pytest.approx(place["light_lost"]["after"], abs=1e-3)
-    assert lost > 0.07
-    assert ignored[0]["cameras"][CAMERA]["light_lost"]["centre"] == 0.0
-    assert ignored[1]["truth"]["cameras"][CAMERA]["places"]["centre"]["light_lost"]["after"] == 0.0

@@ -82,14 +82,6 @@ def test_ghosts_of_a_plane_parallel_plate(backend, angle: float, coated: Finish)
         assert abs(found - total) < Z_LIMIT * error
 
 
-def test_a_plate_is_found_with_another_index(backend) -> None:
-    """The test above can fail: an index of 1.52 is not 1.5."""
-    source = DiskSource.along(np.array([0.0, 0.0, -0.2]), np.array([0.0, 0.0, 1.0]), 1e-3)
-    result = PathTracer(backend, glass_scene(slab(0.3, THICKNESS), 1.52), sampling=FLOOR).run(source, PATHS, 3)
-    family = find(result, "front", way("entry"))
-    assert abs(family.energy - 0.04) > Z_LIMIT * family.error
-
-
 def hand_made_prism(backend, coated: Finish) -> tuple[Assembly, Scenery, str]:
     """A turned right-angle prism whose faces carry elements, a screen behind it, and the sequence's name."""
     solid = right_angle_prism(0.03)
@@ -210,24 +202,6 @@ def test_what_the_step_limit_cuts_off_is_under_way(backend) -> None:
         balance = tracer.run(source, 1000).balance
         assert balance.under_way == pytest.approx(expected, abs=1e-12)
         assert abs(balance.error) < 1e-12
-
-
-@pytest.mark.second
-def test_a_screen_sees_the_plate_move_the_beam(backend) -> None:
-    """Refraction shifts a beam sideways by d sin(a - b) / cos(b)."""
-    angle = 0.6
-    direction = unit(0.0, np.sin(angle), np.cos(angle))
-    centre = -0.2 * direction / direction[2]
-    scenery = glass_scene(slab(0.3, THICKNESS), INDEX, Finish(transmission=1.0))
-    with_glass = PathTracer(backend, scenery).run(DiskSource.along(centre, direction, 0.0), 10, keep=True).detections
-    surface, grid = screen("behind", facing(0.5), 1.0)
-    bare = PathTracer(backend, Scenery((surface,), (grid,)))
-    without = bare.run(DiskSource.along(centre, direction, 0.0), 10, keep=True).detections
-    bent = np.arcsin(np.sin(angle) / INDEX)
-    aside = THICKNESS * np.sin(angle - bent) / np.cos(bent) / np.cos(angle)
-    np.testing.assert_allclose(without.place[:, 1] - with_glass.place[:, 1], aside, rtol=0, atol=1e-15)
-    longer = THICKNESS * (INDEX / np.cos(bent) - 1.0 / np.cos(angle))
-    np.testing.assert_allclose(with_glass.length - without.length, longer, rtol=0, atol=1e-14)
 
 
 def test_more_detections_than_expected_are_all_kept(backend) -> None:

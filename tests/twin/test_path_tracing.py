@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -21,20 +20,17 @@ from scenes.models.scenery_parts import Detector, detector_surface
 from tests.optics.bench import disk_points
 from tests.twin.path_bench import IDEAL, scene_beam
 from twin.monitor.monitor_path import MonitorPath
-from twin.path_tracing.families import nominal_codes, signature
+from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, trace_stray
 from twin.path_tracing.tracer import (
     BALANCED,
-    FAINT,
-    NAME,
     VARIANTS,
     PathTracer,
     Sampling,
     VariantUnavailable,
     load_mitsuba,
-    make_integrator,
 )
 
 INSTRUMENTS = ["gf7_pair", "monitor_pair"]
@@ -198,51 +194,12 @@ def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, nam
     np.testing.assert_allclose(nominal.rms, 5e-6, rtol=0.02)
 
 
-@pytest.mark.second
-def test_one_kernel_for_all_states_and_seeds(backend, gf7_pair) -> None:
-    def run(state: dict, seed: int) -> None:
-        trace_stray(gf7_pair, backend, state, 20_000, seed, channels=gf7_pair.channels[:1])
-
-    run({}, 0)
-    run(STATE, 9)
-    flag = dr.flag(dr.JitFlag.KernelHistory)
-    dr.set_flag(dr.JitFlag.KernelHistory, True)
-    try:
-        dr.kernel_history_clear()
-        for seed in range(3):
-            run(STATE, seed)
-        history = dr.kernel_history([dr.KernelType.JIT])
-    finally:
-        dr.set_flag(dr.JitFlag.KernelHistory, flag)
-    large = [k for k in history if k["size"] == 20_000 and k["operation_count"] > 500]
-    assert len(large) >= 3
-    # what other tests left in the process may be worked out with the first of them, in a kernel of its own
-    assert len({k["hash"] for k in large}) <= 2
-    assert all(k["cache_hit"] for k in large)
-
-
-def test_the_integrator_is_mitsubas(backend) -> None:
-    integrator = make_integrator(backend, FAINT)
-    mi = load_mitsuba(backend)
-    assert isinstance(integrator, mi.SamplingIntegrator)
-    assert integrator.sampling == FAINT
-    assert NAME in str(integrator)
-    with pytest.raises(NotImplementedError):
-        integrator.sample()
-
-
 def test_another_variant_is_not_taken_silently(backend, monkeypatch) -> None:
     mi = load_mitsuba(backend)
     monkeypatch.setitem(VARIANTS, "llvm", "llvm_ad_double")
     with pytest.raises(VariantUnavailable, match="cannot run its variant llvm_ad_double"):
         load_mitsuba(backend)
     assert mi.variant() == "llvm_ad_mono"
-
-
-def test_signatures_differ(gf7_pair) -> None:
-    scenery = build_scenery(gf7_pair, {})
-    names = [n for n in gf7_pair.assembly.sequences if n.endswith(("monitor", "imaging"))]
-    assert len({signature(nominal_codes(scenery, gf7_pair.assembly, name)) for name in names}) == len(names) == 6
 
 
 def test_impossible_sampling_and_sources() -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from analysis.monitor.recovery import measure_spots
 from optics.geometry.tree import Motion
 from optics.materials.glass import glass
 from optics.raytrace.system import assemble
@@ -200,47 +199,6 @@ def test_an_imperfect_prism_that_turns(imperfect, instrument, backend, prism, ax
     want = (turned[:, 1] - turned[:, 0]) / 1e3
     assert np.abs(got - want).max() < 5e-6
     assert np.abs(want).max() > 1e-3
-
-
-@pytest.fixture(scope="module")
-def measured(experiment):
-    """Shifts of the monitor pair's spots (row, column), px, rendered without noise and measured, per state."""
-    setup = experiment("monitor_pair")
-    path = setup.path
-    kinds = [*((p, "", 10.0 * e) for p in PRISMS for e in np.eye(3)), ("prism_180", "mirror", np.eye(3)[0])]
-    kinds += [("prism_180", "roof_a", np.eye(3)[1]), ("prism_180", "roof_b", np.eye(3)[0])]
-    kinds += [("prism_0", "mirror_b", np.eye(3)[0]), ("prism_0", "entry", np.eye(3)[1])]
-    states = [{}, *(on_prisms(path, p, v, face) for p, face, v in kinds)]
-    photons = path.expected_photons(states)
-    images = setup.expected_frames(photons).reshape(-1, *photons.shape[2:])
-    place = measure_spots(images, 9, setup.calibration).position.reshape(len(states), -1, 2)
-    return path, dict(zip([(p, f, int(np.argmax(v))) for p, f, v in kinds], place[1:] - place[0], strict=True))
-
-
-def test_perfect_prisms_may_turn_in_images(measured) -> None:
-    _, moved = measured
-    still = {kind: np.abs(change).max() for kind, change in moved.items() if not kind[1]}
-    assert len(still) == 6
-    assert max(still.values()) < STILL
-
-
-@pytest.mark.second
-def test_angle_errors_in_images(measured) -> None:
-    """Rows are y, columns x; the facet's turn is traced. Images and beams differ by the shape of coma, which
-    changes over the up to 19 px: 0.02 px.
-    """
-    path, moved = measured
-    checked = 0
-    for (prism, face, axis), change in moved.items():
-        if not face:
-            continue
-        vectors = [-seen_turn(path, c, prism, face, ARCSEC * np.eye(3)[axis]) for c in path.channels]
-        beams = spots(path, [{}, facets_turned(path, vectors)])
-        want = (beams[:, 1] - beams[:, 0])[:, ::-1]
-        assert np.abs(change - want).max() < 0.02
-        assert np.abs(want).max() > 2.0
-        checked += 1
-    assert checked == 5
 
 
 def test_a_beam_that_misses_its_prism_is_told_by_name(tmp_path):

@@ -1,14 +1,11 @@
 """Ghosts and stray light in the render job: what is added to the images, and what the prisms' tilt is good for."""
 
-import json
 import re
 
 import numpy as np
 import pytest
-import xarray as xr
 from typer.testing import CliRunner
 
-from optics.materials.finish import COATED, MIRROR
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.job import JobSpec
@@ -65,57 +62,11 @@ def test_the_tilt_keeps_ghosts_off_the_spot(experiment, square_prisms):
         assert np.abs(place).max() < 0.05 * setup.path.pitch
 
 
-@pytest.mark.second
-def test_a_ghost_has_the_energy_of_its_reflections(square_prisms):
-    """The reflection off the 180-deg prism's window, over the spot: the coating's R over the way through all faces."""
-    light = stray_light(square_prisms, {}, PATHS, 2)
-    run = light.traced.runs["forward/left"]
-    window = [f for f in run.families if [str(t).rpartition("/")[2] for t in f.touches].count("window") == 1]
-    inside = [f for f in window if f.detector == "forward/left/area_ccd" and not any("!" in str(t) for t in f.touches)]
-    ghost = max(inside, key=lambda f: f.energy)
-    assert [str(t).rpartition("/")[2] for t in ghost.touches] == ["M3", "M2", "M1", "window", "M1", "M2", "M3"]
-    nominal = run.nominal("forward/left/area_ccd")
-    touches = [str(t) for t in nominal.touches]
-    assert sum(t.endswith(">") for t in touches) == 8
-    assert sum(t.endswith("/mirror") for t in touches) == 2
-    # nominal: 8 passes of T = 1 - R, two silvered reflections and the facet's; the window's clear aperture is wider
-    # than the facet's by (60/50)^2
-    reflectance, metal, wider = COATED.reflectance, MIRROR.reflectance, (60.0 / 50.0) ** 2
-    expected = reflectance * wider / ((1.0 - reflectance) ** 8 * metal**3)
-    ratio = ghost.energy / nominal.energy
-    error = ratio * np.hypot(ghost.error / ghost.energy, nominal.error / nominal.energy)
-    assert abs(ratio - expected) < 4.0 * error + 0.02 * expected  # 4 sigma; 2 %: light scattered out of the families
-
-
 def test_the_spread_keeps_the_light(experiment):
     spots = diffraction_spots(experiment("gf7_pair"))
     assert spots.shape[1:] == (2 * REACH + 1, 2 * REACH + 1)
     np.testing.assert_allclose(spots.sum(axis=(1, 2)), 1.0, rtol=1e-12)
     assert np.unravel_index(np.argmax(spots[0]), spots[0].shape) == (REACH, REACH)
-
-
-@pytest.mark.slow
-def test_the_job_adds_it_to_the_images(tmp_path):
-    job = tmp_path / "job.yaml"
-    job.write_text(f"instrument: gf7_pair\nrender: {{frames: 2, stray: {{paths: {PATHS}}}}}\n")
-    done = CliRunner().invoke(app, [str(job), "--out", str(tmp_path / "run")])
-    assert done.exit_code == 0, done.output
-    stray = json.loads((tmp_path / "run" / "stray.json").read_text())
-    assert {o["beam"] for o in stray["obstructions"]} == {"forward/imaging", "backward/imaging"}
-    assert all(0.02 < o["share"] < 0.1 and o["used"] > 0.0 for o in stray["obstructions"])
-    found = stray["after"]
-    assert found["paths_per_source"] == PATHS
-    for source in found["sources"].values():
-        for one in source["families"]:
-            # of few paths alike the share is known to about one over the root of their number
-            assert 0.5 < one["relative_to_nominal_sigma"] / one["relative_to_nominal"] * np.sqrt(one["paths"]) < 10.0
-    assert set(found["sources"]) == {"forward/left", "forward/right", "backward/left", "backward/right"}
-    with xr.open_dataset(tmp_path / "run" / "irradiance.nc") as images:
-        stray, photons = images["stray_photons"].values, images["photons"].values
-    assert np.all(stray >= 0.0)
-    assert np.all(stray.sum(axis=(-2, -1)) > 0.0)
-    assert np.all(photons > stray)
-    assert "Ghosts and stray light" in (tmp_path / "run" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

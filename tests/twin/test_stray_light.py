@@ -102,21 +102,6 @@ def test_neither_chunks_nor_threads_change_a_run(backend, gf7_pair) -> None:
     assert other.balance.escaped != whole.balance.escaped
 
 
-def test_progress_is_told(backend, gf7_pair) -> None:
-    told = []
-    trace_stray(
-        gf7_pair,
-        backend,
-        {},
-        30_000,
-        0,
-        channels=gf7_pair.channels[:2],
-        chunk=20_000,
-        progress=lambda *n: told.append(n),
-    )
-    assert told == [(20_000, 60_000), (30_000, 60_000), (50_000, 60_000), (60_000, 60_000)]
-
-
 def share_of(family: Family, finishes: Finishes) -> float:
     """What reflections and transmissions leave of a family that no edge cuts."""
     assert finishes.mirror.scatter is not None
