@@ -8,7 +8,6 @@ import pytest
 
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
-from optics.numerics.threads import kernel_threads
 from optics.raytrace import trace as trace_module
 from optics.raytrace.aim import AimError, RayFan, aim, transverse_axes
 from optics.raytrace.system import assemble
@@ -60,59 +59,27 @@ def ends(backend, systems, rays) -> list[np.ndarray]:
     return [*found.numpy(), *found.numpy(found.world), found.hit(0), found.hit(2)]
 
 
-@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("section", [2, trace_module.SECTION])
-def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, threads: int, section: int, monkeypatch) -> None:
+def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, section: int, monkeypatch) -> None:
     """The same recording serves any number of systems and rays."""
     bare = gf7.bare_assembly()
     monkeypatch.setattr(trace_module, "SECTION", section)
     monkeypatch.setattr(trace_module, "FEWEST_IN_LANES", 1)
     position, direction = launch(gf7, 800)
-    before = dr.thread_count()
-    kernel_threads(threads)
-    try:
-        for count, size in ((5, 37), (37, 5), (8, 100), (100, 8), (33, 7), (33, 1), (1, 33), (16, 43)):
-            states = some_states(count, count, ("M1", "M2", "M3", "image"))
-            figure = Motion(figure={4: 1e-8, 6: 2e-8}, scale=1e-5)
-            systems = assemble(bare, ["imaging"], [{**state, "M3": figure} for state in states])
-            own = position[: count * size].reshape(count, size, 3)
-            ways = {
-                "each its own": make_rays(backend, own, np.broadcast_to(direction, own.shape)),
-                "own, one direction": make_rays(backend, own, direction),
-                "all the same": make_rays(backend, own[0], direction),
-            }
-            for way, rays in ways.items():
-                found = []
-                for fewest in (1, 10**9):
-                    monkeypatch.setattr(trace_module, "FEWEST_LANES", fewest)
-                    found.append(ends(backend, systems, rays))
-                for lanes, looked_up in zip(*found, strict=True):
-                    # the same operations; the compiler may contract other products into fma
-                    np.testing.assert_allclose(lanes, looked_up, rtol=0, atol=1e-14, err_msg=f"{count} {size} {way}")
-                assert np.any(found[0][3])
-    finally:
-        kernel_threads(before)
-
-
-def test_no_ray_of_a_batch_is_anothers(backend, gf7, monkeypatch) -> None:
-    """Each system's rays, traced by lanes, against the system by itself, with rays that are lost among them."""
-    monkeypatch.setattr(trace_module, "FEWEST_LANES", 1)
-    monkeypatch.setattr(trace_module, "FEWEST_IN_LANES", 1)
-    bare = gf7.bare_assembly()
-    systems = assemble(bare, ["imaging"], some_states(24, 2, ("M2", "M3")))
-    position, direction = launch(gf7, 24 * 50)
-    rng = np.random.default_rng(5)
-    heading = direction + 1e-3 * rng.standard_normal((24, 50, 3))
-    heading[rng.random((24, 50)) < 0.2, 2] = 0.0
-    heading /= np.linalg.norm(heading, axis=-1, keepdims=True)
-    own = position.reshape(24, 50, 3)
-    every = ends(backend, systems, make_rays(backend, own, heading))
-    for k in range(24):
-        alone = ends(backend, systems.take(np.array([k])), make_rays(backend, own[k], heading[k]))
-        alive = alone[3][0]
-        np.testing.assert_array_equal(every[3][k], alive)
-        for many, one in zip(every, alone, strict=True):
-            np.testing.assert_allclose(many[k][alive], one[0][alive], rtol=0, atol=1e-14)
+    for count, size in ((37, 5), (8, 100), (100, 8), (33, 1), (1, 33), (16, 43)):
+        states = some_states(count, count, ("M1", "M2", "M3", "image"))
+        figure = Motion(figure={4: 1e-8, 6: 2e-8}, scale=1e-5)
+        systems = assemble(bare, ["imaging"], [{**state, "M3": figure} for state in states])
+        own = position[: count * size].reshape(count, size, 3)
+        for start, heading in ((own, np.broadcast_to(direction, own.shape)), (own, direction), (own[0], direction)):
+            found = []
+            for fewest in (1, 10**9):
+                monkeypatch.setattr(trace_module, "FEWEST_LANES", fewest)
+                found.append(ends(backend, systems, make_rays(backend, start, heading)))
+            for lanes, looked_up in zip(*found, strict=True):
+                # the same operations; the compiler may contract other products into fma
+                np.testing.assert_allclose(lanes, looked_up, rtol=0, atol=1e-14, err_msg=f"{count} {size}")
+            assert np.any(found[0][3])
 
 
 def test_each_system_may_have_its_own_rays(backend, gf7) -> None:
@@ -164,16 +131,6 @@ def test_threads_have_recordings_of_their_own(backend, gf7) -> None:
         alone = trace(backend, systems, make_rays(backend, *bundle)).numpy()[0]
         for one in several:
             np.testing.assert_array_equal(one, alone)
-
-
-def test_part_of_a_batch(backend, gf7) -> None:
-    systems = assemble(gf7.bare_assembly(), ["imaging"], some_states(5, 2, ("M2",)))
-    rays = make_rays(backend, *launch(gf7, 40))
-    whole = trace(backend, systems, rays).numpy()[0]
-    for chosen in ([0, 1], [4], [3, 1, 1]):
-        part = systems.take(np.array(chosen))
-        assert part.count == len(chosen)
-        np.testing.assert_allclose(trace(backend, part, rays).numpy()[0], whole[chosen], rtol=0, atol=1e-14)
 
 
 def test_sequences_of_other_structure_are_refused(gf7_pair) -> None:

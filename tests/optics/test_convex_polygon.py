@@ -26,7 +26,6 @@ from tests.tiers import quick
 
 RNG = np.random.default_rng(7)
 SOME, OTHERS = (hull(RNG.normal(size=(60, count, 2))) for count in (7, 6))
-CIRCLE = np.array([[0.0], [0.0], [1.0]], complex)
 
 
 def test_hulls_have_the_area_of_qhull() -> None:
@@ -169,24 +168,3 @@ def test_random_shadows_in_a_pupil_take_what_a_dense_raster_of_it_says(count) ->
         assert all(-1e-6 < float(share[0]) < 1.0 + 1e-6 for share in shares.values())
         # squares of wavefronts are sums of these weights, which alternate where a sliver lies in a corner of its box
         assert np.sum(np.abs(shadows.weights)) < 100.0 * np.sum(shadows.areas) + 1e-3
-
-
-@pytest.mark.parametrize("height", [1e-9, 1e-14, 3e-17, 0.0])
-def test_slivers_have_the_weight_of_their_area(height: float) -> None:
-    """Two shadows that touch leave one: rounding of its corners is many times its height."""
-    rng = np.random.default_rng(7)
-    x = np.sort(rng.uniform(-0.6, 0.6, (200, 4)), axis=1)
-    y = 0.192 + height * rng.uniform(-1.0, 1.0, (200, 4)) + np.spacing(0.192) * rng.integers(-1, 2, (200, 4))
-    slivers = np.stack([x, y], axis=-1)
-    _, weights = quadrature(slivers, 58)
-    wide = np.ptp(x, axis=1) * np.ptp(y, axis=1)
-    assert np.all(np.abs(weights).sum(axis=1) < 10.0 * wide + 1e-15)
-
-
-def test_corners_that_repeat_one_but_for_rounding_cover_what_the_polygon_does() -> None:
-    """Polygons of a batch have as many corners as the largest; those that only fill up may lie a rounding aside."""
-    rng = np.random.default_rng(5)
-    points = rng.uniform(-2.5, 2.5, (300, 2))
-    doubled = np.repeat(SOME, 2, axis=1) * (1.0 + 2e-16 * rng.integers(-1, 2, (*SOME.shape[:1], 2 * SOME.shape[1], 1)))
-    np.testing.assert_array_equal(covered(doubled[:, None], points), covered(SOME[:, None], points))
-    assert covered(SOME[:, None], points).any()

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, State
-from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
@@ -20,7 +19,6 @@ MOTIONS = [
     for kind, axes in (("rotate", 3), ("shift", 3), ("scale", 1))
     for axis in range(axes)
 ]
-NUMBERS: dict[str, Path] = {"c": ("surface", "curvature"), "k": ("surface", "conic"), "A0": ("surface", "even", 0)}
 STEP = {"rotate": 1e-5, "shift": 1e-5, "scale": 1e-5}
 BASE: State = {
     "M2": Motion(rotate=(1e-4, -5e-5, 2e-4), shift=(5e-5, -2e-5, 3e-5)),
@@ -80,29 +78,6 @@ def test_forward_mode_for_every_motion(backend, bare, rays) -> None:
         np.testing.assert_allclose(exact, difference, rtol=1e-7, atol=1e-8)
     moves = np.max(np.abs(forward[0]), axis=(1, 2)) > 0.0
     assert [m for m, moved in zip(MOTIONS, moves, strict=True) if not moved] == [(IMAGE, "scale", 0)]  # a plane
-
-
-@pytest.mark.parametrize("mirror", [0, 1, 2])
-@pytest.mark.parametrize("name", ["c", "k", "A0"])
-def test_forward_mode_for_the_shape(backend, bare, rays, mirror: int, name: str) -> None:
-    systems = assemble(bare, ["imaging"], [BASE])
-    uploaded = replace(systems.upload(backend, own=True), differentiable=True)
-    parameter = leaves(uploaded.values[mirror])[NUMBERS[name]]
-    dr.enable_grad(parameter)
-    dr.set_grad(parameter, backend.opaque([1.0]))
-    out = trace(backend, uploaded, make_rays(backend, *rays), evaluate=False).local
-    dr.forward_to(out.position, out.path, flags=dr.ADFlag.ClearEdges)
-    exact = np.stack([c.numpy() for c in dr.grad(out.position)], axis=-1)
-    exact_path = dr.grad(out.path).numpy()
-    h = {"c": 1e-6, "k": 1e-5, "A0": 1e-6}[name]
-    sides = []
-    for sign in (1, -1):
-        path = (mirror, *NUMBERS[name])
-        numbers = systems.numbers.copy()
-        numbers[leaves(systems.form[0])[path]] += sign * h
-        sides.append(columns(trace(backend, replace(systems, numbers=numbers), make_rays(backend, *rays))))
-    np.testing.assert_allclose(exact, (sides[0][0][0] - sides[1][0][0]) / (2 * h), rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(exact_path, (sides[0][2][0] - sides[1][2][0]) / (2 * h), rtol=1e-6, atol=1e-8)
 
 
 def test_ray_matrix_against_neighbouring_rays(backend, gf7, bare) -> None:

@@ -19,15 +19,6 @@ def wavy_grid(amplitude: float) -> tuple[GridFigure, float]:
     return GridFigure(amplitude * np.outer(np.cos(k * y), np.cos(k * x)), (-0.5, 0.5, -0.5, 0.5)), k
 
 
-def test_piston_figure_shifts_a_plane(backend) -> None:
-    figure = ZernikeFigure(1.0, terms={1: 1e-4})
-    position, direction = beam(disk_points(20, 0.5), -1.0, SLANTED)
-    hit, _, path, valid = run(backend, build(Stage(Surface(figure=figure))), position, direction)
-    assert valid.all()
-    np.testing.assert_allclose(hit[:, 2], 1e-4, atol=1e-18)
-    np.testing.assert_allclose(path, (1.0 + 1e-4) / SLANTED[2], rtol=1e-15)
-
-
 def test_tilt_figure_is_a_tilted_plane(backend) -> None:
     slope = 1e-3  # Z2 = 2 x, so an amplitude of slope / 2
     figure = ZernikeFigure(1.0, terms={2: slope / 2})

@@ -145,26 +145,6 @@ def test_against_huygens(backend, gf7, dz: float, where: str) -> None:
     assert np.sum(want) * (3e-6) ** 2 == pytest.approx(0.977, abs=0.005)
 
 
-@pytest.mark.parametrize("dz", [0.0, 100e-6])
-def test_independent_of_the_pupil_sampling(backend, gf7, dz: float) -> None:
-    camera = Camera(backend, gf7, focal_plane_at(dz))
-    images = [
-        image(camera.field(nodes), AXIS, AXIS)[0] for nodes in (quadrature.disk(14, 48), FINE, quadrature.disk(30, 96))
-    ]
-    peak = images[-1].max()
-    assert np.max(np.abs(images[1] - images[2])) < 1e-8 * peak
-    assert np.max(np.abs(images[0] - images[2])) < 1e-6 * peak
-
-
-def test_power_is_that_of_the_stop(backend, gf7) -> None:
-    """Plancherel over a wide detector: all but the far wings of the light, 1 - 2 / (pi^2 r / (lambda F))."""
-    camera = Camera(backend, gf7, PERTURBED)
-    n, step = 120, 2.5e-6
-    axis = Grid(-0.5 * (n - 1) * step, step, n)
-    total = np.sum(image(camera.field(quadrature.disk(40, 160)), axis, axis)) * step**2
-    assert 1.0 - total == pytest.approx(2 * WAVELENGTH * 9.2 / np.pi**2 / (0.5 * n * step) * 0.9, rel=0.2)
-
-
 def moved_by(reference: PupilField, other: PupilField, x: Grid, y: Grid, start: np.ndarray) -> np.ndarray:
     """(x, y) by which the image of ``other`` lies beside that of ``reference``: least squares from a near start."""
     got = image(other, x, y)[0]

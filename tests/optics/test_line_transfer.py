@@ -104,12 +104,6 @@ def test_edges_that_share_a_cell_count_together() -> None:
     np.testing.assert_allclose(coarse.perfect, fine.perfect[::8], rtol=0, atol=1e-12)
 
 
-def test_long_steps_are_several_cells() -> None:
-    cut = CutPupil(aberrated(0.12), (), (disk(0.3),))
-    few = by_lines(cut, step=8.0 * STEP, count=9, lines=(400,))
-    np.testing.assert_allclose(few.values, by_lines(cut, lines=(400,)).values[::8], rtol=0, atol=2e-6)
-
-
 def test_too_few_lines_are_refused() -> None:
     with pytest.raises(UnphysicalError, match=r"still changes by .* with further lines"):
         by_lines(CutPupil(circular_pupil(F_NUMBER), (), (disk(0.35), vane(0.7), vane(2.3))), lines=(12,))

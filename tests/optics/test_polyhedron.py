@@ -162,25 +162,3 @@ def test_corners_are_exact() -> None:
 def test_what_is_no_body(normals, offsets, error) -> None:
     with pytest.raises(error):
         enclosed(normals, offsets)
-
-
-def test_thin_but_enough() -> None:
-    assert checked(CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5 + 2.0 * MERGED]))[1] == pytest.approx(2.0 * MERGED)
-
-
-@pytest.mark.parametrize("size", [1e-9, 1e-8, 3e-8])
-def test_a_needle_on_a_ridge(size) -> None:
-    """A ridge cut down to three long thin faces, whose short end cannot be drawn together: it would leave two faces
-    back to back.
-    """
-    u, v, w, x = np.array([[0, -size, -size], [0, size, -size], [1, 0, 0], [0.5, 0, -0.25 * size]])
-    ridge = unit([[0, -1, 1], [0, 1, 1]])
-    planes = [(n, 0.0) for n in ridge] + [(np.array(n, float), d) for n, d in (((-1, 0, 0), 0), ((0, 0, -1), 0.5))]
-    planes.append((np.array([1.0, 0, 0]), 1.0))
-    for a, b, c in ((u, w, x), (v, x, w), (u, x, v)):
-        normal = unit(np.cross(b - a, c - a))
-        normal = normal if normal[2] > 0.0 else -normal
-        planes.append((normal, float(normal @ a)))
-    normals, offsets = (np.array(p) for p in zip(*planes, strict=True))
-    _, volume = checked(normals, offsets)
-    assert volume == pytest.approx(0.25, abs=10.0 * MERGED)

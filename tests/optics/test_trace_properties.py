@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import Surface, plane
-from optics.geometry.tree import Body, RigidTree, compose
+from optics.geometry.tree import Body, RigidTree
 from optics.raytrace.assembly import Assembly, Element
 from tests.optics.bench import PASS, REFLECT, REFRACT, Stage, at, build, disk_points, run
-from tests.optics.test_motion_properties import motions, poses, undone, vectors
+from tests.optics.test_motion_properties import motions, poses, vectors
 
 POINTS = disk_points(30, 0.1)
 WAY = np.array([0.02, -0.03, 1.0]) / np.linalg.norm([0.02, -0.03, 1.0])
@@ -135,15 +135,3 @@ def test_moving_everything_is_moving_the_rays(backend, lens, motion, base) -> No
     np.testing.assert_allclose(there, moved.apply(growth * local), rtol=0, atol=4e-13)
     np.testing.assert_allclose(away, leaving @ base.rotation @ moved.rotation.T, rtol=0, atol=4e-13)
     np.testing.assert_allclose(way, growth * path, rtol=0, atol=4e-14)
-
-
-@given(lens=lenses(), first=motions(), second=motions())
-def test_a_motion_and_its_inverse_give_the_nominal_trace(backend, lens, first, second) -> None:
-    assembly = on_a_base(lens.stages(), Pose())
-    bodies = {body.path: body for body in assembly.tree.bodies}
-    there = {"base": first, "base/e2": second}
-    state = compose(there, {name: undone(motion) for name, motion in there.items()}, bodies)
-    nominal = run(backend, assembly, START, HEADING)
-    assert nominal[3].all()
-    for got, expected in zip(run(backend, assembly, START, HEADING, state)[:3], nominal[:3], strict=True):
-        np.testing.assert_allclose(got, expected, rtol=0, atol=4e-13)

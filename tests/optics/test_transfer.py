@@ -7,7 +7,6 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from optics.geometry import zernike
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.numerics.quadrature import PupilNodes
@@ -177,34 +176,6 @@ def test_symmetry_energy_and_shift(backend, gf7, traced: PupilFunction) -> None:
     np.testing.assert_allclose(transfer.transfer(moved, f, WAVELENGTH, dz), want, rtol=0, atol=1e-9)
 
 
-def test_cutoffs_of_an_anamorphic_pupil(backend, gf7, traced: PupilFunction) -> None:
-    """Longest chords of the polygon of traced rim rays; its 2000 corners are 1e-6 of the radius inside the edge."""
-    angle = 2.0 * np.pi * np.arange(2000) / 2000
-    rim = PupilNodes(np.cos(angle), np.sin(angle), np.ones(2000))
-    field = Camera(backend, gf7, PERTURBED).field(rim)
-    edge = np.stack([field.u[0], field.v[0]], axis=-1)
-    checked = []
-    for along in (0, 1):
-        across = edge[:, 1 - along]
-        first, last = sorted((int(np.argmin(across)), int(np.argmax(across))))
-        sides = [np.arange(first, last + 1), np.r_[np.arange(last, 2000), np.arange(first + 1)]]
-        offsets = np.linspace(across.min(), across.max(), 4001)[1500:2500]
-        ends = []
-        for side in sides:
-            ordered = side[np.argsort(across[side])]
-            ends.append(np.interp(offsets, across[ordered], edge[ordered, along]))
-        longest = np.max(np.abs(ends[0] - ends[1]))
-        cutoff = float(traced.cutoff(np.eye(2)[along : along + 1], WAVELENGTH)[0])
-        assert cutoff == pytest.approx(longest / WAVELENGTH, rel=5e-6)
-        below, above = np.outer([0.999, 1.0 + 1e-9], np.eye(2)[along]) * cutoff
-        got = transfer.transfer(traced, np.stack([below, above]), WAVELENGTH, FOCUS)[0]
-        assert 1e-6 < np.abs(got[0]) < 1e-4
-        assert got[1] == 0.0
-        checked.append(1.0 / (WAVELENGTH * cutoff))
-    # paper design: F/9.2 along the line; the field bias lengthens the focal ratio across it
-    assert checked == pytest.approx([9.22, 9.45], abs=0.02)
-
-
 def test_overlap_of_a_distorted_edge() -> None:
     """Area of the overlap against the intersection of polygons, for an edge as far from a circle as is allowed.
 
@@ -234,26 +205,6 @@ def test_overlap_of_a_distorted_edge() -> None:
         right, left, inside = edge.corners(beyond * longest)
         assert not inside.any()
         assert np.isfinite([right, left]).all()
-
-
-@pytest.mark.parametrize("terms", [(7,), (8,), (5,), (6,), (7, 5, 11)])
-def test_aberrations_of_007_waves(terms: tuple[int, ...]) -> None:
-    """They lower the MTF and never raise it; the area under the transfer function is the Strehl ratio of the pupil."""
-    coefficients = np.zeros(11)
-    coefficients[np.array(terms) - 1] = 0.07 * WAVELENGTH / np.sqrt(len(terms))
-    wavefront = zernike.basis(11, NODES.x, NODES.y) @ coefficients
-    (pupil,) = fit_pupils(circle(wavefront), NODES)
-    node, weight = np.polynomial.legendre.leggauss(20)
-    t = 0.25 * np.pi * (node + 1.0)
-    ratio, angle = np.cos(t), 2.0 * np.pi * np.arange(24) / 24
-    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1) / (WAVELENGTH * F_NUMBER)
-    got = transfer.transfer(pupil, (ratio[:, None, None] * unit).reshape(-1, 2), WAVELENGTH, FOCUS).reshape(20, 24)
-    ideal = perfect(ratio)[:, None]
-    assert np.all(np.abs(got) <= ideal + 1e-9)
-    assert np.max(ideal - np.abs(got)) > 0.05
-    area = weight * np.sin(t) * np.cos(t)
-    strehl = np.abs(np.sum(NODES.share * np.exp(2j * np.pi * wavefront / WAVELENGTH))) ** 2
-    assert np.sum(area @ got) / (24 * area @ perfect(ratio)) == pytest.approx(strehl, abs=1e-8)
 
 
 @pytest.mark.parametrize("span", [0.1, 1.0, 3.0, 10.0, 30.0, 100.0])

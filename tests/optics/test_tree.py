@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from optics.geometry.pose import Pose, about_axis, rotation_matrix
+from optics.geometry.pose import Pose, about_axis
 from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, State, compose
 
 PIVOT = (0.0, 0.2, -0.1)
@@ -18,14 +18,6 @@ def tree() -> RigidTree:
             Body("c"),
         )
     )
-
-
-def test_nominal_poses_are_products_down_the_tree(tree: RigidTree) -> None:
-    placed = tree.place()
-    assert placed.pose("a") == tree["a"].pose
-    want = tree["a"].pose @ tree["a/b"].pose
-    np.testing.assert_allclose(placed.pose("a/b").rotation, want.rotation, atol=1e-15)
-    np.testing.assert_allclose(placed.pose("a/b").translation, want.translation, atol=1e-15)
 
 
 def test_the_pivot_stays_in_place(tree: RigidTree) -> None:
@@ -87,21 +79,6 @@ def test_complex_step_against_differences(tree: RigidTree, kind: str, axis: int)
         difference = (values[0] - values[1]) / (2 * h)
         np.testing.assert_allclose(getattr(exact, name)[0].imag / COMPLEX_STEP, difference, atol=1e-9)
     assert exact.rotation.dtype == np.complex128
-
-
-def test_states_are_independent(tree: RigidTree) -> None:
-    states: list[State] = [{"a": Motion(rotate=(0.1, 0, 0))}, {}, {"a/b": Motion(shift=(0, 0, 1.0))}]
-    together = tree.place(states)
-    for s, state in enumerate(states):
-        alone = tree.place([state])
-        np.testing.assert_array_equal(together.rotation[s], alone.rotation[0])
-        np.testing.assert_array_equal(together.translation[s], alone.translation[0])
-
-
-def test_rotations_about_two_axes_are_one_rotation_vector(tree: RigidTree) -> None:
-    vector = (0.2, 0.3, 0.0)
-    got = tree.place([{"c": Motion(rotate=vector)}]).pose("c").rotation
-    np.testing.assert_allclose(got, rotation_matrix(vector), atol=1e-15)
 
 
 def test_bad_trees_and_states_are_refused(tree: RigidTree) -> None:

@@ -41,11 +41,6 @@ def _budget() -> dict[str, tuple[str, str, float, str, int, str | None]]:
 
 BUDGET = _budget()
 """Twenty, so large that every one changes the refocused wavefront by more than ``LEAST``."""
-LEAST = 1e-3
-"""Waves: a hundred times ``SETTLED``."""
-
-SETTLED = 1e-5
-"""Waves. The twin ends its adjustments where the next step would change less; optiland's search ends as near."""
 
 
 def twin_budget(folder: Path) -> ToleranceSetup:

@@ -153,17 +153,12 @@ def spot_statistic(counts: np.ndarray, shares: np.ndarray, paths: int) -> tuple[
     return float(np.sum((found - expected) ** 2 / expected)), len(found) - 1
 
 
-@pytest.mark.parametrize(
-    ("paths", "fine"),
-    [pytest.param(400_000, 1000, marks=pytest.mark.second), pytest.param(10_000_000, 5000, marks=pytest.mark.slow)],
-    ids=["fast", "1e7"],
-)
-@pytest.mark.parametrize("name", INSTRUMENTS)
-def test_spot_has_the_shape_of_the_sequential_trace(backend, instrument, name: str, paths: int, fine: int) -> None:
+@pytest.mark.second
+def test_spot_has_the_shape_of_the_sequential_trace(backend, gf7_pair) -> None:
     """Chi-square over the cells of a defocused spot with a sharp pupil edge; false alarm 1e-3 at most: neighbouring
     paths start alike and fill the beam more evenly than independent ones.
     """
-    chosen = instrument(name)
+    chosen, paths, fine = gf7_pair, 400_000, 1000
     counts, source, centre, state = spot_counts(backend, chosen, paths)
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
     shares = expected_shares(backend, chosen, source, centre, state, fine)
@@ -174,15 +169,11 @@ def test_spot_has_the_shape_of_the_sequential_trace(backend, instrument, name: s
     assert spot_statistic(counts, wrong, paths)[0] > chi2.ppf(0.999, freedom)
 
 
-@pytest.mark.parametrize(
-    "paths",
-    [pytest.param(200_000, marks=pytest.mark.second), pytest.param(10_000_000, marks=pytest.mark.slow)],
-    ids=["fast", "1e7"],
-)
+@pytest.mark.second
 @pytest.mark.parametrize("name", INSTRUMENTS)
-def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, name: str, paths: int) -> None:
+def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, name: str) -> None:
     """Within three standard errors in x and y (false alarm 0.5 %)."""
-    chosen = instrument(name)
+    chosen, paths = instrument(name), 200_000
     stray = trace_stray(chosen, backend, {}, paths, 3, channels=chosen.channels[:1], finishes=IDEAL, sampling=BALANCED)
     nominal = stray.runs["forward/left"].nominal(CCD)
     path = MonitorPath(chosen, backend)

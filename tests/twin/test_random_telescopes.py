@@ -14,7 +14,7 @@ from tests.own_trace import OwnCamera
 from tests.random_telescopes import KINDS, telescope
 from twin.camera.camera_optics import CameraOptics
 
-FEW, MANY = len(KINDS), 200
+FEW = len(KINDS)
 CELLS = 256
 APART = 1e-3
 """What an MTF is to be right to; the raster's own error, of cells with their shares at edges, is some 2e-4."""
