@@ -13,7 +13,6 @@ from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.imaging import aim_collimated, imaging_field
 from scenes.models.camera_model import IMAGE, field_direction
-from twin.monitor.monitor_path import MonitorPath
 
 ARCSEC = np.pi / 180 / 3600
 WAVELENGTH = 650e-9
@@ -172,23 +171,6 @@ def test_the_image_moves_when_the_detector_moves(backend, gf7, pixels: tuple[flo
     window = shifted(AXIS, -dx), shifted(AXIS, -dy)
     shift = moved_by(still.field(FINE), moved.field(FINE, still.centre), *window, start) / pitch
     np.testing.assert_allclose(shift, [-pixels[0], -pixels[1]], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("camera", ["forward", "backward"])
-def test_the_spot_moves_when_the_area_ccd_moves(backend, gf7_pair, camera: str) -> None:
-    path = MonitorPath(gf7_pair, backend)
-    body = f"base/{camera}/focal_plane/left/area_ccd"
-    pixels = np.array([0.3, -0.4])
-    state: State = {body: Motion(shift=(*(pixels * path.pitch), 0.0))}
-    fields = path.fields([{}, state])
-    checked = 0
-    for i, channel in enumerate(path.channels):
-        still, moved = fields[2 * i : 2 * i + 1], fields[2 * i + 1 : 2 * i + 2]
-        shift = moved_by(still, moved, path.grid(1), path.grid(0), np.zeros(2)) / path.pitch
-        want = -pixels if channel.ccd_body == body else np.zeros(2)
-        np.testing.assert_allclose(shift, want, rtol=0, atol=1e-4)
-        checked += 1
-    assert checked == 4
 
 
 def test_a_blocked_beam_is_an_explained_error(backend, gf7) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import erf, j0, j1, struve
 
-from optics.geometry.vector_shape import HalfPlane, Polygon
+from optics.geometry.vector_shape import HalfPlane
 from optics.numerics import quadrature
 from optics.targets.target_image import EdgeProfile, target_image
 from optics.targets.target_shapes import Target, bar_group, pinhole, siemens_star, slanted_edge
@@ -32,10 +32,6 @@ def diffraction(cutoff: float = CUTOFF, pitch: float = 0.0, shift: tuple[float, 
 
 def centred(count: int, step: float) -> Grid:
     return Grid(-0.5 * (count - 1) * step, step, count)
-
-
-def box(x0: float, x1: float, y0: float, y1: float) -> Polygon:
-    return Polygon(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
 
 
 # edge profiles
@@ -123,40 +119,6 @@ def test_middle_of_a_disk_is_the_encircled_energy(radius: float) -> None:
     z = np.pi * radius * CUTOFF
     middle = target_image(pinhole(2.0 * radius), diffraction(), CUTOFF, x, x)[32, 32]
     assert middle == pytest.approx(1.0 - j0(z) ** 2 - j1(z) ** 2, abs=FAINT)
-
-
-def test_coarse_pixels_against_a_fine_raster() -> None:
-    """Boxes on a raster of 2 um, its discrete Fourier transform times the cell's sinc, H, and every 14th sample.
-
-    The raster's transform is exact for the boxes repeated with its period of 4.1 mm. The copies add their tails,
-    area/(pi^3 fc P^3) times the lattice sum 9.03 of 1/n^3.
-    """
-    count, cell, ratio = 2048, 2e-6, 14
-    assert ratio * cell == COARSE
-    raster = np.zeros((count, count))
-    parts = []
-    for i0, i1, j0_, j1_, level in (
-        (1000, 1100, 990, 1003, 0.9),
-        (940, 997, 1010, 1085, 0.5),
-        (900, 903, 880, 1180, 1.0),
-    ):
-        raster[i0:i1, j0_:j1_] = level
-        parts.append((level, box(j0_ * cell, j1_ * cell, i0 * cell, i1 * cell)))
-    fx, fy = np.meshgrid(np.fft.rfftfreq(count, cell), np.fft.fftfreq(count, cell))
-    shift = (5e-6, -3e-6)
-    transfer = diffraction(COARSE_CUTOFF, COARSE, shift)
-    spectrum = np.fft.rfft2(raster) * np.sinc(fx * cell) * np.sinc(fy * cell) * transfer(fx, fy)
-    fine = np.fft.irfft2(spectrum, s=raster.shape)
-    first = 1024 - 10 * ratio
-    want = fine[first : first + 20 * ratio : ratio, first : first + 24 * ratio : ratio]
-    start = (first + 0.5) * cell
-    got = target_image(
-        Target(0.0, tuple(parts)), transfer, COARSE_CUTOFF, Grid(start, COARSE, 24), Grid(start, COARSE, 20)
-    )
-    tails = 9.03 * np.sum(raster) * cell**2 / (np.pi**3 * COARSE_CUTOFF * (count * cell) ** 3)
-    assert tails < 2e-6
-    np.testing.assert_allclose(got, want - tails, rtol=0, atol=0.1 * tails + FAINT)
-    assert got.max() > 0.5
 
 
 @pytest.mark.parametrize("angle", quick(1, [0.0, 0.3]))

@@ -108,22 +108,6 @@ def test_total_internal_reflection_is_invalid_and_finite(backend) -> None:
     assert np.isfinite(path).all()
 
 
-def test_aplanatic_sphere(backend) -> None:
-    """From r/n inside a sphere of glass to the virtual image at r n, free of aberration."""
-    n, radius = 1.5, -2.0
-    source = np.array([0.0, 0.0, radius - abs(radius) / n])
-    directions = np.column_stack([disk_points(200, 1.0), np.ones(200)])
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    bench = build(Stage(plane(), PASS, at(source[2]), index_after=n), Stage(Surface(1 / radius), REFRACT))
-    hit, leaving, path, valid = run(backend, bench, np.broadcast_to(source, directions.shape), directions)
-    assert valid.all()
-    # the images lie on the source's side of the centre: centre + r n toward the source
-    image = np.array([0.0, 0.0, radius + np.sign(source[2] - radius) * n * abs(radius)])
-    offset = hit - image
-    np.testing.assert_allclose(np.cross(offset, leaving), 0.0, atol=2e-15)
-    np.testing.assert_allclose(path, np.linalg.norm(offset, axis=-1), atol=5e-15)
-
-
 @pytest.mark.parametrize(
     ("surface", "interaction"),
     [

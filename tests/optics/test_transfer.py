@@ -13,7 +13,7 @@ from optics.numerics.quadrature import PupilNodes
 from optics.waves import transfer
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.pupil_edge import PupilEdge
-from optics.waves.pupil_stack import PupilFunction, PupilStack, circular_pupil, fit_pupils
+from optics.waves.pupil_stack import PupilFunction, circular_pupil, fit_pupils
 from optics.waves.transfer import TransferTable, polychromatic_transfer
 from scenes.models.camera_model import IMAGE
 from tests.optics.test_imaging import PERTURBED, WAVELENGTH, Camera
@@ -55,35 +55,6 @@ def random_frequencies(pupil: PupilFunction, count: int, wavelength: float, reac
 def traced(backend, gf7) -> PupilFunction:
     (pupil,) = fit_pupils(Camera(backend, gf7, PERTURBED).field(NODES), NODES)
     return pupil
-
-
-def test_a_pupil_alone_is_what_it_is_among_others(backend, gf7) -> None:
-    """By itself, among others of other wavefronts and with shadows, by both integrals."""
-    first, second = (Camera(backend, gf7, state).field(NODES) for state in ({}, PERTURBED))
-    both = PupilField(
-        *(np.concatenate([getattr(f, n) for f in (first, second)]) for n in ("u", "v", "eikonal", "amplitude")),
-        WAVELENGTH,
-    )
-    square = 0.2 * np.array([[[[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]]])
-    for shadows, close in ((None, 2e-6), (square, 5e-5)):
-        many = None if shadows is None else np.concatenate([shadows, shadows + 0.1])
-        among = fit_pupils(both, NODES, shadows=many)
-        alone = [
-            fit_pupils(f, NODES, shadows=None if many is None else many[k : k + 1])[0]
-            for k, f in enumerate((first, second))
-        ]
-        stack = PupilStack.fit(both.u, both.v, both.eikonal, both.amplitude, NODES, shadows=many)
-        for k, (one, other) in enumerate(zip(alone, among, strict=True)):
-            frequency = random_frequencies(one, 30, WAVELENGTH)
-            apart = transfer.transfer(one, frequency, WAVELENGTH, FOCUS)
-            # rounding of a few hundred terms
-            np.testing.assert_allclose(
-                transfer.transfer(other, frequency, WAVELENGTH, FOCUS), apart, rtol=0, atol=1e-12
-            )
-            few = stack.transfer(frequency, np.array([WAVELENGTH]), np.ones(1))[k]
-            np.testing.assert_allclose(few, apart[0], rtol=0, atol=close)
-            assert one.light == pytest.approx(float(stack.light[k]), abs=close)
-        assert (min(p.light for p in among) < 0.97) == (many is not None)
 
 
 @pytest.mark.parametrize("pupil", [circular_pupil(F_NUMBER), *fit_pupils(circle(), NODES)], ids=["ideal", "fitted"])

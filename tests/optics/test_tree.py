@@ -103,24 +103,6 @@ def test_numbers_of_a_motion_by_name() -> None:
         motion.component("stretch", 0)
 
 
-@pytest.mark.parametrize("derivative", [False, True])
-def test_a_body_at_rest_is_where_it_is_when_it_is_moved_by_nothing(tree: RigidTree, derivative: bool) -> None:
-    """What nothing moves is not worked out anew: to the bit what a motion of zero gives, alone or among others."""
-    still = {path: Motion() for path in tree.paths}
-    turned: State = {"a/plate": Motion(rotate=(1e-3, 0.0, 2e-3), shift=(0.0, 1e-4, 0.0), scale=1e-3)}
-    for count in (1, 2, 9):
-        step = [("a/plate", "rotate", 1)] * count if derivative else None
-        for some in ({}, turned):
-            short, long = (tree.place([{**part, **some}] * count, step) for part in ({}, still))
-            assert short.rotation.dtype == long.rotation.dtype
-            assert np.array_equal(short.rotation, long.rotation)
-            assert np.array_equal(short.translation, long.translation)
-            assert np.array_equal(short.scale, long.scale)
-    # what a state does to one body is not kept for the next
-    assert np.array_equal(tree.place([turned]).translation, tree.place([turned]).translation)
-    assert np.array_equal(tree.place().translation[0], tree.place([still]).translation[0])
-
-
 def test_a_tree_stands_by_itself_as_another_does_in_a_state() -> None:
     """Also under states on top of it; what cannot be a place of a body is refused."""
     bodies = (

@@ -65,28 +65,6 @@ def test_thin_bar_is_sinc_times_sinc() -> None:
     np.testing.assert_allclose(Polygon(BAR).spectrum(fx, fy) / (wide * long), want / (wide * long), rtol=0, atol=1e-12)
 
 
-def test_product_grid_is_the_same_as_single_frequencies() -> None:
-    fx, fy = np.linspace(0.0, 2e5, 301), np.linspace(-2e5, 2e5, 211)  # several blocks of rows
-    u, v = np.meshgrid(fx, fy)
-    for shape in (Polygon(ARROW), Disk((1e-5, 2e-5), 2e-5)):
-        grid = shape.spectrum(fx, fy[:, None])
-        assert grid.shape == (211, 301)
-        np.testing.assert_allclose(grid.ravel(), shape.spectrum(u.ravel(), v.ravel()), rtol=0, atol=1e-14 * shape.area)
-
-
-@pytest.mark.parametrize("corners", [100, 400])
-def test_disk_is_a_polygon_of_many_corners(corners: int) -> None:
-    """Of equal area: the outline's ripple has mean 0, the spectra differ by the fourth order of the corner angle."""
-    radius, turn = 2e-5, 2.0 * np.pi / corners
-    angle = turn * np.arange(corners)
-    rim = radius * np.sqrt(turn / np.sin(turn)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    f = np.linspace(-2e5, 2e5, 41)  # up to q = 36 radians, far below the number of corners
-    disk, polygon = Disk((3e-5, -1e-5), radius), Polygon(rim + np.array([3e-5, -1e-5]))
-    difference = np.abs(disk.spectrum(f, f[:, None]) - polygon.spectrum(f, f[:, None])) / disk.area
-    assert polygon.area == pytest.approx(disk.area, rel=1e-12)
-    assert np.max(difference) < 0.1 * turn**4
-
-
 def test_ellipse_against_quadrature() -> None:
     shape = Disk((1e-5, 5e-6), 3e-5, [[1.3, 0.4], [-0.2, 0.8]])
     nodes = quadrature.disk(30, 120)

@@ -19,7 +19,7 @@ from tests.oracles.peers import LENSES
 from tests.scenes.lens.colour_cameras import KINDS, colour_camera
 from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.colour import FOCUS_RINGS, axial_colour, lateral_colour, spectral_mtfs, spectral_psfs
+from twin.camera.colour import FOCUS_RINGS, axial_colour, lateral_colour, spectral_mtfs
 
 pytestmark = pytest.mark.oracle
 FIELDS = [(0.0, 0.0), (1.0, 0.0), (0.6, -1.0)]
@@ -161,25 +161,6 @@ def _pupil(
     (x_v, x_u), (y_v, y_u) = np.gradient(x), np.gradient(y)
     light = np.where(np.hypot(x, y) <= 1.0, np.sqrt(np.abs(x_u * y_v - x_v * y_u)), 0.0)
     return np.asarray(light * np.exp(2j * np.pi / colour * path))
-
-
-@pytest.mark.second
-def test_point_images_hold_the_light_of_batoids_rays(case) -> None:
-    """Where the image's centroid is, and how much of the light its window holds."""
-    optics, peer = case
-    colours, weights = optics.model.spec.spectrum.rule(3)
-    nodes = disk(12)
-    stop = np.stack([nodes.x, nodes.y], axis=-1)
-    for field, psf in zip(FIELDS, spectral_psfs(optics, FIELDS, colours, weights), strict=True):
-        step = psf.place[1] - psf.place[0]
-        assert 0.98 < np.sum(psf.values) * step**2 < 1.0
-        start = traced(optics.model, peer, field, np.zeros((1, 2)), optics.model.spec.wavelength).r[0, :2]
-        rays = [nodes.share @ traced(optics.model, peer, field, stop, c).r[:, :2] for c in colours]
-        mean = weights @ np.array(rays) - start
-        # a diffraction pattern's tails, cut off by the window, pull its centroid to the window's middle
-        middle = [psf.place @ np.sum(psf.values, axis=axis) / np.sum(psf.values) for axis in (0, 1)]
-        spread = optics.spot().airy
-        np.testing.assert_allclose(middle, mean, rtol=0.0, atol=0.05 * spread)
 
 
 def _unit(velocity: np.ndarray) -> np.ndarray:

@@ -94,49 +94,6 @@ def test_mtf_as_by_an_fft_of_batoids_pupil(backend, folder, name, field) -> None
     assert 0.0 < mtf.accuracy < TOLD
 
 
-def test_a_paraboloid_is_written_as_one(backend, folder) -> None:
-    """batoid divides by zero where a ray runs along the axis of a quadric with conic -1: it had no light."""
-    _, peer = own_telescope(backend, "cassegrain", folder)
-    x = np.linspace(-0.19, 0.19, 39)
-    start, way = np.stack([x, 0.01 + 0.0 * x, 5.0 + 0.0 * x]), np.zeros((3, len(x)))
-    way[2] = -1.0
-    rays = batoid.RayVector(*start, *way)
-    rays.wavelength[:] = 650e-9
-    peer.trace(rays)
-    assert np.count_nonzero(~(rays.failed | rays.vignetted)) > 10
-    assert np.all(np.isfinite(rays.r))
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("name", ["ritchey_chretien", "maksutov"])
-def test_psf_as_by_an_fft_of_batoids_pupil(backend, folder, name) -> None:
-    """The transform of the transfer function over both frequencies, against that of the raster: of the peak 1e-3."""
-    optics, peer = own_telescope(backend, name, folder)
-    field = (1.0, 0.0)
-    grid = its_raster(optics, peer, field)
-    size = 2 * len(grid.share)
-    every = 24  # so many cells a step: an image 32 times as wide as it is sharp
-    shift = np.arange(0, size // 2, every)
-    both = np.array([(a, b) for a in np.concatenate([-shift[:0:-1], shift]) for b in shift])
-    frequency = both * grid.step / grid.wavelength
-    (pupil,) = optics.pupils([field])
-    ours = polychromatic_transfer(pupil, frequency, np.array([grid.wavelength]), np.ones(1), np.zeros(1))[0]
-    theirs = grid.transfer()[both[:, 1], both[:, 0]]
-    # images stand at other places: the phase of the shift is of none of them
-    low = np.abs(ours) > 0.05
-    turn = np.angle(theirs * np.conj(ours))
-    design = np.column_stack([frequency])
-    slope = np.linalg.lstsq(design[low] * np.abs(ours[low])[:, None], turn[low] * np.abs(ours[low]), rcond=None)[0]
-    moved = ours * np.exp(1j * (design @ slope))
-    place = np.linspace(-8.0, 8.0, 17) * grid.wavelength * 10.0
-    waves = np.exp(2j * np.pi * (frequency[:, :1] * place))
-    # half of the frequencies: the other half are their conjugates
-    half = np.where(both[:, 1] == 0, 0.5, 1.0)
-    images = [np.real((half * one) @ waves) for one in (moved, theirs)]
-    np.testing.assert_allclose(images[0], images[1], rtol=0, atol=1e-3 * images[1].max())
-    assert images[1].max() > 10.0 * np.median(np.abs(images[1]))
-
-
 @pytest.mark.second
 @pytest.mark.parametrize("name", ["ritchey_chretien", "maksutov"])
 def test_mtf_at_uneven_frequencies_as_by_an_fft_of_batoids_pupil(backend, folder, name) -> None:

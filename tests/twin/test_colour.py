@@ -78,21 +78,6 @@ def test_lateral_colour_is_in_the_pupils(achromat) -> None:
     assert mtf.weights.tolist() == [0.25, 0.75]
 
 
-def test_images_that_stand_apart_blur_what_they_make_together(achromat) -> None:
-    """Two images of one kind at a distance s have the transfer function of one times cos(pi f s)."""
-    light, apart = achromat.directions([(0.0, 0.0)]), 5e-6
-    places = achromat.path.places({}, light)
-    pupils = [achromat.path.pupils({}, light, np.add(places, (k * apart, 0.0)))[0] for k in (0, 1)]
-    frequency = np.array([[20e3, 0.0], [70e3, 0.0], [70e3, 40e3]])
-    colours = np.full(2, achromat.wavelength)
-    both = polychromatic_transfer(pupils, frequency, colours, np.ones(2), np.zeros(1))[0]
-    alone = polychromatic_transfer(pupils[0], frequency, colours[:1], np.ones(1), np.zeros(1))[0]
-    wanted = np.abs(alone) * np.abs(np.cos(np.pi * frequency[:, 0] * apart))
-    np.testing.assert_allclose(np.abs(both), wanted, atol=1e-7)
-    with pytest.raises(ValueError, match="zip"):
-        polychromatic_transfer(pupils, frequency, colours[:1], np.ones(1), np.zeros(1))
-
-
 @pytest.mark.second
 def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) -> None:
     light, frequency = SpectrumSpec.evenly(500e-9, 640e-9), np.array([0.0, 30e3, 70e3])

@@ -13,7 +13,7 @@ from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import imaging_rays
-from optics.waves.transfer import TransferTable, polychromatic_transfer, transfer
+from optics.waves.transfer import polychromatic_transfer, transfer
 from optics.waves.wavefront import path_to_sphere
 from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams
 from scenes.specs.baffle import Plate
@@ -100,15 +100,6 @@ def test_share_of_the_prisms_against_rays_and_triangles(gf7_pair, backend, state
     assert np.all(np.sum(shadows.areas, axis=-1) / np.pi > 0.05)
 
 
-def test_a_moved_prism_moves_its_shadow(gf7_pair, backend) -> None:
-    path = path_of(gf7_pair, backend)
-    directions = path.directions(places_of(gf7_pair))
-    still, moved = (shadows_of(path, state, directions).shares() for state in ({}, MOVED))
-    right = PRISM.replace("left", "right")
-    np.testing.assert_allclose(moved[right], still[right], atol=2e-5)  # only the beam has moved, by micrometres
-    assert np.max(np.abs(moved[PRISM] - still[PRISM])) > 1e-3
-
-
 @pytest.mark.parametrize("chord", [-0.5, 0.1, 0.62, 0.97])
 def test_shadows_on_the_stop_end_at_its_edge(chord: float) -> None:
     """A straight body that reaches over the edge takes the segment beyond its chord: area and moment about x = 0."""
@@ -182,23 +173,6 @@ def test_transfer_function_against_the_autocorrelation_of_a_raster(gf7_pair, bac
         np.testing.assert_allclose(got, want, atol=2e-4)
         clear = transfer(replace(pupil, shadow=None), frequency, wavelength, np.zeros(1))[0]
         assert np.max(np.abs(clear - want)) > 0.01
-
-
-@pytest.mark.second
-def test_light_and_table_of_a_cut_pupil(gf7_pair, backend) -> None:
-    path = path_of(gf7_pair, backend)
-    directions = path.directions(places_of(gf7_pair))
-    pupil = path.pupils({}, directions, path.places({}, directions))[1]
-    share = sum(s[1] for s in shadows_of(path, {}, directions).shares().values())
-    # the beam is evenly lit before the first mirror, the stop is not quite its picture
-    assert 1.0 - pupil.light == pytest.approx(share, rel=0.01)
-    wavelengths, weights = np.linspace(480e-9, 800e-9, 4), np.ones(4)
-    table = TransferTable.build(pupil, wavelengths, weights)
-    angle = np.radians(np.arange(0.0, 180.0, 7.5))
-    frequency = 30e3 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    frequency = np.concatenate([0.1 * frequency, frequency, 2.0 * frequency])
-    want = polychromatic_transfer(pupil, frequency, wavelengths, weights, np.zeros(1))[0]
-    np.testing.assert_allclose(table(*frequency.T), want, atol=2e-4)  # as the table says
 
 
 def test_batch_and_single_pupils_agree(gf7_pair, backend) -> None:

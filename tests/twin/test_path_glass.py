@@ -128,27 +128,6 @@ def test_a_prism_as_the_sequential_trace_has_it(backend) -> None:
     np.testing.assert_allclose(found.length[own], length[path], rtol=0, atol=1e-12)
 
 
-def test_light_through_a_bare_prism_loses_what_fresnel_says(backend) -> None:
-    assembly, scenery, name = hand_made_prism(backend, BARE)
-    entry = scenery.surfaces[scenery.of_element("entry")]
-    exit_face = scenery.surfaces[scenery.of_element("exit")]
-    direction = unit(0.0, 0.0, 1.0)
-    middle = scenery.surfaces[scenery.of_element("hypotenuse")].pose.translation
-    tracer = PathTracer(backend, scenery, {"screen": nominal_codes(scenery, assembly, name)})
-    result = tracer.run(DiskSource.along(middle - 1.0 * direction, direction, 2e-3), PATHS, 1)
-    first = abs(direction @ entry.pose.rotation[:, 2])
-    inside = np.sqrt(1.0 - (1.0 - first**2) / INDEX**2)
-    refracted = direction / INDEX - (inside - first / INDEX) * entry.pose.rotation[:, 2]
-    normal = scenery.surfaces[scenery.of_element("hypotenuse")].pose.rotation[:, 2]
-    turned = refracted - 2.0 * (refracted @ normal) * normal
-    second = turned @ exit_face.pose.rotation[:, 2]
-    expected = (1.0 - reflectance(first, 1.0, INDEX)) * (1.0 - reflectance(second, INDEX, 1.0))
-    nominal = result.nominal("screen")
-    assert abs(nominal.energy - expected) < Z_LIMIT * nominal.error
-    assert nominal.error < 1e-3
-    assert abs(result.balance.error) < 1e-12
-
-
 def near_edges(rng: np.random.Generator, half: float, n: int) -> RaySource:
     """Rays from all around to points within some nanometres of a cube's edges."""
     corner = np.sign(rng.uniform(-1, 1, (n, 3))) * half

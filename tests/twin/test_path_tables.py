@@ -101,21 +101,6 @@ def test_drawn_directions_follow_the_table(backend, kind: str, degrees: float) -
     assert statistic < chi2.ppf(1.0 - FALSE_ALARM, int(seen.sum()))
 
 
-@pytest.mark.second
-def test_between_whole_degrees_all_that_the_table_says_is_scattered(backend) -> None:
-    table, angle = lambert(0.6), np.radians(67.43)
-    specular = np.array([np.sin(angle), 0.0, np.cos(angle)])
-    direction, event, _ = scattered(backend, Finish(table=table, scattered_only=True), specular)
-    away = event == Event.SCATTER
-    assert abs(away.mean() - 0.6) < 3.3 * np.sqrt(0.24 / N) + 1e-3
-    # Lambert's law about the normal, whatever the specular direction: even in sin^2
-    sine2 = 1.0 - direction[away, 2] ** 2
-    counts = np.histogram(sine2, np.linspace(0.0, 1.0, 11))[0]
-    expected = away.sum() / 10.0
-    # 1 % for the two angles of incidence, one degree apart, at the horizon
-    assert np.all(np.abs(counts - expected) < 3.9 * np.sqrt(expected) + 0.01 * expected)
-
-
 def test_between_two_angles_of_incidence_both_have_their_part(backend) -> None:
     """A table that scatters into one ring at 30 degrees and into another at 31."""
     radial = np.radians([0.0, 1.0, 5.0, 6.0, 12.0, 13.0, 17.0, 18.0])

@@ -9,14 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
-from optics.geometry.pose import Pose
 from optics.geometry.tree import Motion
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.scenery import FACING_THE_LIGHT, Scenery, build_scenery
-from scenes.models.scenery_parts import Detector, detector_surface
+from scenes.models.scenery import Scenery, build_scenery
+from scenes.models.scenery_parts import Detector
 from tests.optics.bench import disk_points
 from tests.twin.path_bench import IDEAL, scene_beam
 from twin.monitor.monitor_path import MonitorPath
@@ -105,70 +103,6 @@ def test_out_and_back_through_all_prisms_as_the_sequential_trace_has_it(
     assert checked > 2000
 
 
-def spot_counts(backend, chosen, paths: int, chunk: int = 1 << 20) -> tuple[np.ndarray, DiskSource, Pose, dict]:
-    """Counts on a grid of 80 um over the blurred spot of a focal plane 5 mm out of focus."""
-    state = {"base/forward/focal_plane": Motion(shift=(0.0, 0.0, 0.005))}
-    middle, heading, across = scene_beam(chosen, backend)
-    source = DiskSource(middle, heading, across, 0.36)
-    systems = assemble(chosen.assembly, ["forward/imaging"], [state])
-    chief = trace(backend, systems, make_rays(backend, middle, heading)).numpy()[0][0, 0]
-    placed = chosen.assembly.place([state])
-    pose = placed.pose("base/forward/focal_plane") @ Pose(np.eye(3), chief) @ FACING_THE_LIGHT
-    grid = Detector("forward/focal_plane", 9, 9, (8e-5, 8e-5))
-    scenery = without_prisms(build_scenery(chosen, state, IDEAL, whole_focal_planes=True))
-    kept = tuple(s for s in scenery.surfaces if s.detector is None)
-    scenery = Scenery((*kept, detector_surface(grid, pose, IDEAL, (grid.name,))), (grid,))
-    tracer = PathTracer(backend, scenery, {grid.name: nominal_codes(scenery, chosen.assembly, "forward/imaging")})
-    image = tracer.run(source, paths, seed=11, chunk=chunk).images[grid.name][NOMINAL]
-    return image * paths, source, Pose(np.eye(3), chief), state
-
-
-def expected_shares(backend, chosen, source: DiskSource, centre: Pose, state: dict, fine: int) -> np.ndarray:
-    """Share of the disk's area whose rays the sequential trace brings to each cell."""
-    systems = assemble(chosen.assembly, ["forward/imaging"], [state]).upload(backend)
-    edges = (np.arange(10) - 4.5) * 8e-5
-    shares = np.zeros((9, 9))
-    angle = 2.0 * np.pi * (np.arange(fine) + 0.5) / fine
-    rings = source.radius * np.sqrt((np.arange(fine) + 0.5) / fine)
-    block = max(1, 2_000_000 // fine)
-    for first in range(0, fine, block):
-        r = rings[first : first + block, None]
-        points = np.stack([r * np.cos(angle + r * 1e3), r * np.sin(angle + r * 1e3)], axis=-1).reshape(-1, 2)
-        place, _, _, valid = (
-            a[0]
-            for a in trace(
-                backend, systems, make_rays(backend, source.centre + points @ source.across, source.axis)
-            ).numpy()
-        )
-        at = (place[valid, :2] - centre.translation[:2]) * [-1.0, 1.0]
-        shares += np.histogram2d(at[:, 1], at[:, 0], [edges, edges])[0]
-    return shares / fine**2
-
-
-def spot_statistic(counts: np.ndarray, shares: np.ndarray, paths: int) -> tuple[float, int]:
-    use = shares * paths > 50.0
-    assert use.sum() > 25
-    found = np.append(counts[use], paths - counts[use].sum())
-    expected = paths * np.append(shares[use], 1.0 - shares[use].sum())
-    return float(np.sum((found - expected) ** 2 / expected)), len(found) - 1
-
-
-@pytest.mark.second
-def test_spot_has_the_shape_of_the_sequential_trace(backend, gf7_pair) -> None:
-    """Chi-square over the cells of a defocused spot with a sharp pupil edge; false alarm 1e-3 at most: neighbouring
-    paths start alike and fill the beam more evenly than independent ones.
-    """
-    chosen, paths, fine = gf7_pair, 400_000, 1000
-    counts, source, centre, state = spot_counts(backend, chosen, paths)
-    np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
-    shares = expected_shares(backend, chosen, source, centre, state, fine)
-    statistic, freedom = spot_statistic(counts, shares, paths)
-    assert statistic < chi2.ppf(0.999, freedom)
-    # and the test can fail: the spot of a pupil 0.5 % larger is told apart
-    wrong = expected_shares(backend, chosen, replace(source, radius=1.005 * source.radius), centre, state, fine)
-    assert spot_statistic(counts, wrong, paths)[0] > chi2.ppf(0.999, freedom)
-
-
 @pytest.mark.second
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, name: str) -> None:
@@ -226,21 +160,3 @@ def test_oblique_hits_are_exact_as_well(backend, gf7_pair, degrees: float) -> No
     np.testing.assert_allclose(found.place[same], place[found.path[same], :2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(found.length[same], length[found.path[same]], rtol=0, atol=1e-12)
     assert same.mean() > 0.95
-
-
-def test_a_line_ccd_gets_its_star(backend, gf7_pair) -> None:
-    """Light of a point on the line's field falls on the pixel where the sequential trace has it."""
-    scenery = without_prisms(build_scenery(gf7_pair, {}, IDEAL))
-    tracer = PathTracer(
-        backend, scenery, {"forward/line": nominal_codes(scenery, gf7_pair.assembly, "forward/imaging")}
-    )
-    middle, heading, across = scene_beam(gf7_pair, backend, 0.0005, 0.0)
-    systems = assemble(gf7_pair.assembly, ["forward/imaging"])
-    chief = trace(backend, systems, make_rays(backend, middle, heading)).numpy()[0][0, 0]
-    line = gf7_pair.cameras["forward"].spec.line
-    assert abs(chief[0]) < 0.4 * line.pitch  # the smile of the field is small here
-    result = tracer.run(DiskSource(middle, heading, across, 0.25), 20_000)
-    image = result.images["forward/line"][NOMINAL][:, 0]
-    assert result.balance.detected["forward/line"] > 0.9
-    row = chief[1] / line.pitch + 0.5 * (line.pixels - 1)
-    assert np.sum(image * np.arange(line.pixels)) / image.sum() == pytest.approx(row, abs=0.5)

@@ -7,7 +7,6 @@ error has the effect of turning the facet by -V, and a spot moves by twice that 
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from optics.geometry.tree import Motion
 from optics.materials.glass import glass
@@ -16,6 +15,7 @@ from optics.raytrace.trace import make_rays, trace
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import load_camera
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
+from tests.twin.commands import invoke
 from twin.monitor.monitor_path import MonitorPath
 from twin.render import app
 
@@ -205,7 +205,7 @@ def test_a_beam_that_misses_its_prism_is_told_by_name(tmp_path):
     job = tmp_path / "job.yaml"
     prism = "base/forward/monitor/left/prism_180"
     job.write_text(f"instrument: gf7_pair\nperturb:\n  {prism}: {{shift: [0 mm, 60 mm, 0 mm]}}\n")
-    done = CliRunner().invoke(app, [str(job), "--out", str(tmp_path / "run")])
+    done = invoke(app, job, "--out", tmp_path / "run")
     assert done.exit_code == 2
-    assert f"misses forward/left/prism_180/entry on {prism}/window/entry" in done.output
+    assert f"misses forward/left/prism_180/entry on {prism}/window/entry" in done.stderr
     assert not (tmp_path / "run").exists()
