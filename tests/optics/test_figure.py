@@ -19,17 +19,6 @@ def wavy_grid(amplitude: float) -> tuple[GridFigure, float]:
     return GridFigure(amplitude * np.outer(np.cos(k * y), np.cos(k * x)), (-0.5, 0.5, -0.5, 0.5)), k
 
 
-def test_tilt_figure_is_a_tilted_plane(backend) -> None:
-    slope = 1e-3  # Z2 = 2 x, so an amplitude of slope / 2
-    figure = ZernikeFigure(1.0, terms={2: slope / 2})
-    position, direction = beam(disk_points(20, 0.5), -1.0, Z)
-    hit, leaving, _, valid = run(backend, build(Stage(Surface(figure=figure))), position, direction)
-    assert valid.all()
-    np.testing.assert_allclose(hit[:, 2], slope * position[:, 0], atol=1e-17)
-    angle = 2 * np.arctan(slope)
-    np.testing.assert_allclose(leaving, np.broadcast_to([np.sin(angle), 0, -np.cos(angle)], leaving.shape), atol=1e-15)
-
-
 def test_defocus_figure_is_a_paraboloid(backend) -> None:
     amplitude, radius = 1e-4, 0.6
     focal = radius**2 / (8 * np.sqrt(3) * amplitude)  # z = 2 sqrt(3) a r^2 / R^2 = r^2 / (4 f)

@@ -152,16 +152,3 @@ def test_what_an_assembly_refuses() -> None:
         Assembly(RigidTree((Body("glass"),)), {"face": face}, {})
     with pytest.raises(ValueError, match="unknown body 'prism'"):
         Assembly(RigidTree((Body("glass"),)), {}, {}, {"prism": 1.5})
-
-
-def test_glasses_of_one_batch_may_differ(backend) -> None:
-    """Two plates of different index are one structure; each ray sees its own."""
-    bodies, elements, sequences = [], {}, {}
-    for name in ("a", "b"):
-        bodies += [Body(name), Body(f"{name}/front", at(0.0, np.pi)), Body(f"{name}/back", at(0.05))]
-        for face in ("front", "back"):
-            elements[f"{name}_{face}"] = Element(f"{name}_{face}", f"{name}/{face}", plane(), REFRACT, solid=name)
-        sequences[name] = (f"{name}_front", f"{name}_back")
-    both = Assembly(RigidTree(tuple(bodies)), elements, sequences, {"a": 1.4, "b": 1.9})
-    traced = trace(backend, assemble(both, ["a", "b"]), make_rays(backend, np.zeros(3), np.array([0.0, 0.0, 1.0])))
-    assert traced.numpy()[2][:, 0] == pytest.approx([0.05 * 1.4, 0.05 * 1.9], rel=1e-15)

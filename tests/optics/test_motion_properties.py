@@ -42,13 +42,6 @@ TREE = RigidTree(
 )
 
 
-@given(vectors(1.8), vectors(1.8))
-def test_a_turned_rotation_turns_about_the_turned_vector(vector, other) -> None:
-    frame = rotation_matrix(other)
-    got = rotation_matrix(frame @ vector)
-    np.testing.assert_allclose(got, frame @ rotation_matrix(vector) @ frame.T, atol=ROUNDING)
-
-
 @given(vectors(1.0), st.floats(-1.5, 1.5), st.floats(-1.5, 1.5))
 def test_turns_about_one_axis_add(axis, first, second) -> None:
     together = rotation_matrix(first * axis) @ rotation_matrix(second * axis)
@@ -56,16 +49,6 @@ def test_turns_about_one_axis_add(axis, first, second) -> None:
     np.testing.assert_allclose(rotation_matrix(axis) @ rotation_matrix(-axis), np.eye(3), atol=ROUNDING)
     # |vector| < 1.8, so that the angle's sine tells it to some roundings
     np.testing.assert_allclose(rotation_vector(rotation_matrix(axis)), axis, atol=ROUNDING)
-
-
-@given(vectors(1.0), st.floats(-9.0, -1.0))
-def test_small_turns_are_their_series(vector, exponent) -> None:
-    small = vector * 10.0**exponent
-    cross = np.cross(np.eye(3), small)  # cross @ x is small x x
-    size = np.linalg.norm(small)
-    left = rotation_matrix(small) - np.eye(3) - cross - 0.5 * cross @ cross
-    # the next term is cross^3 / 6
-    assert np.abs(left).max() <= size**3 / 6.0 + 4e-16
 
 
 @given(poses(), poses(), poses())

@@ -93,16 +93,11 @@ class TestMeshes:
             np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0], axis=0), axis=0
         )
         assert area.sum() / 2 == pytest.approx(hull.area, rel=1e-12)
-
-    @pytest.mark.parametrize("name", list(BODIES))
-    def test_a_polyhedron_is_cut_the_same_way_anywhere(self, name: str) -> None:
-        """Its cells depend on its own shape and not on where the origin lies: 1e-16 of 10 m of rounding."""
-        corners, spacing = BODIES[name]
+        # its cells do not depend on where the origin lies: 1e-16 of 10 m of rounding
         shift = np.array([3.0, -4.0, 8.0])
-        here, there = polyhedron_mesh(corners @ TURN.T, spacing), polyhedron_mesh(corners @ TURN.T + shift, spacing)
-        assert there.t.shape == here.t.shape
-        distance, _ = cKDTree(here.p.T + shift).query(there.p.T)
-        assert distance.max() < 1e-12
+        there = polyhedron_mesh(turned + shift, spacing)
+        assert there.t.shape == mesh.t.shape
+        assert cKDTree(mesh.p.T + shift).query(there.p.T)[0].max() < 1e-12
 
     @pytest.mark.parametrize("behind", [1.0, -1.0])
     @pytest.mark.parametrize(
@@ -132,33 +127,22 @@ class TestMeshes:
         assert errors[0] < 1e-3
         assert errors[1] < errors[0] / 12.0
 
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            ((np.zeros((3, 3)), 0.1), "four or more"),
-            ((np.eye(4, 3) * np.nan, 0.1), "four or more finite"),
-            (([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], 0.1), "degenerate"),
-            (([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], 0.1), "degenerate"),
-            ((np.vstack([RHOMBOID, RHOMBOID.mean(axis=0)]), 0.1), "vertex 8 lies inside"),
-            ((RHOMBOID, 0.0), "positive spacing"),
-        ],
-    )
-    def test_what_is_no_polyhedron_is_refused(self, arguments, words: str) -> None:
-        with pytest.raises(ValueError, match=words):
-            polyhedron_mesh(*arguments)
-
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            ((plane(), Circle(1.0), 0.1, 0.5, 8), "side"),
-            ((plane(), Circle(1.0), -0.1, 1, 8), "positive thickness"),
-            ((plane(), Circle(1.0), 0.1, 1, 1), "2 cells"),
-            ((Surface(2.0), Circle(1.0), 0.1, 1, 8), "domain"),
-        ],
-    )
-    def test_what_is_no_mirror_is_refused(self, arguments, words: str) -> None:
-        with pytest.raises(ValueError, match=words):
-            mirror_mesh(*arguments)
+    def test_what_is_no_polyhedron_or_mirror_is_refused(self) -> None:
+        disk = Circle(1.0)
+        for make, arguments, words in (
+            (polyhedron_mesh, (np.zeros((3, 3)), 0.1), "four or more"),
+            (polyhedron_mesh, (np.eye(4, 3) * np.nan, 0.1), "four or more finite"),
+            (polyhedron_mesh, ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], 0.1), "degenerate"),
+            (polyhedron_mesh, ([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], 0.1), "degenerate"),
+            (polyhedron_mesh, (np.vstack([RHOMBOID, RHOMBOID.mean(axis=0)]), 0.1), "vertex 8 lies inside"),
+            (polyhedron_mesh, (RHOMBOID, 0.0), "positive spacing"),
+            (mirror_mesh, (plane(), disk, 0.1, 0.5, 8), "side"),
+            (mirror_mesh, (plane(), disk, -0.1, 1, 8), "positive thickness"),
+            (mirror_mesh, (plane(), disk, 0.1, 1, 1), "2 cells"),
+            (mirror_mesh, (Surface(2.0), disk, 0.1, 1, 8), "domain"),
+        ):
+            with pytest.raises(ValueError, match=words):
+                make(*arguments)
 
 
 class TestFree:
@@ -320,51 +304,30 @@ class TestFace:
         assert set(face_change(u, plane(), aperture, pose, terms=3).figure) == set()
 
 
-class TestErrors:
-    @pytest.mark.parametrize(
-        ("points", "words"),
-        [
-            (np.zeros((2, 3)), "three finite points"),
-            ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], "on a line"),
-            ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], "three finite"),
-        ],
-    )
-    def test_a_kinematic_support_needs_three_points(self, points, words: str) -> None:
+def test_supports_bonds_temperatures_and_points_that_cannot_be_are_refused() -> None:
+    body, support = bar()
+    for points, words in (
+        (np.zeros((2, 3)), "three finite points"),
+        ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], "on a line"),
+        ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], "three finite"),
+    ):
         with pytest.raises(ValueError, match=words):
             Kinematic(np.asarray(points))
-
-    def test_a_support_outside_of_the_body_is_refused(self) -> None:
-        body, _ = bar()
-        with pytest.raises(ValueError, match=r"\[0.5, 0.5, 0.0\] m lies outside"):
-            body.solve_many([one_kelvin], Kinematic(np.array([[0.1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.02]])))
-
-    @pytest.mark.parametrize(
-        "where",
-        [lambda nodes: nodes[:, 2] > 1.0, lambda nodes: (np.abs(nodes[:, 1]) < 1e-9) & (nodes[:, 0] > 1.2 - 1e-9)],
-        ids=["nothing", "an edge"],
-    )
-    def test_a_bond_needs_a_face(self, where) -> None:
-        body, _ = bar()
-        with pytest.raises(ValueError, match="three nodes that are not on a line"):
-            body.solve_many([one_kelvin], Bonded(where))
-
-    def test_temperatures_must_be_finite_and_one_for_each_point(self) -> None:
-        body, support = bar()
-        with pytest.raises(ValueError, match="not finite at"):
-            body.solve_many([lambda p: np.where(p[:, 0] > 0.5, np.nan, 0.0)], support)
-        with pytest.raises(ValueError, match="one value for each"):
-            body.solve_many([lambda p: p], support)
-        with pytest.raises(ValueError, match="finite expansion"):
-            Bonded(lambda nodes: nodes[:, 0] > 0, np.nan)
-
-    def test_points_and_apertures_beyond_the_body_are_refused(self) -> None:
-        body, support = bar()
-        (u,) = body.solve_many([one_kelvin], support)
-        with pytest.raises(ValueError, match="lies outside of the body"):
-            u.at([[0.5, 0.0, 0.031]])
-        with pytest.raises(ValueError, match="shape"):
-            u.at([0.5, 0.0, 0.0])
-        with pytest.raises(ValueError, match="lies outside of the body"):
-            face_change(u, plane(), Circle(0.2), Pose(np.eye(3), np.array([0.5, 0.0, 0.03])))
-        with pytest.raises(ValueError, match="between Z3 and"):
-            face_change(u, plane(), Circle(0.02), Pose(), terms=2)
+    (u,) = body.solve_many([one_kelvin], support)
+    outside = Kinematic(np.array([[0.1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.02]]))
+    edge = Bonded(lambda nodes: (np.abs(nodes[:, 1]) < 1e-9) & (nodes[:, 0] > 1.2 - 1e-9))
+    pose = Pose(np.eye(3), np.array([0.5, 0.0, 0.03]))
+    for call, words in (
+        (lambda: body.solve_many([one_kelvin], outside), r"\[0.5, 0.5, 0.0\] m lies outside"),
+        (lambda: body.solve_many([one_kelvin], Bonded(lambda nodes: nodes[:, 2] > 1.0)), "three nodes that are not on"),
+        (lambda: body.solve_many([one_kelvin], edge), "three nodes that are not on a line"),
+        (lambda: body.solve_many([lambda p: np.where(p[:, 0] > 0.5, np.nan, 0.0)], support), "not finite at"),
+        (lambda: body.solve_many([lambda p: p], support), "one value for each"),
+        (lambda: Bonded(lambda nodes: nodes[:, 0] > 0, np.nan), "finite expansion"),
+        (lambda: u.at([[0.5, 0.0, 0.031]]), "lies outside of the body"),
+        (lambda: u.at([0.5, 0.0, 0.0]), "shape"),
+        (lambda: face_change(u, plane(), Circle(0.2), pose), "lies outside of the body"),
+        (lambda: face_change(u, plane(), Circle(0.02), Pose(), terms=2), "between Z3 and"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()

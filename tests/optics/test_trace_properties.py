@@ -99,26 +99,6 @@ def test_hits_and_the_laws_of_reflection_and_refraction(backend, lens) -> None:
         before, way, index = hit, leaving, after
 
 
-@given(lens=lenses())
-def test_light_goes_back_the_way_it_came(backend, lens) -> None:
-    """Reversed at the end, it retraces its way with the same optical path."""
-    stages = lens.stages()
-    hit, leaving, path, valid = run(backend, build(*stages), START, HEADING)
-    assert valid.all()
-    front, back, mirror, _ = stages
-    reverse = [
-        mirror,
-        Stage(back.surface, REFRACT, back.pose, index_after=lens.index),
-        Stage(front.surface, REFRACT, front.pose),
-        Stage(plane(), PASS, at(-1.0)),
-    ]
-    again, returning, way_back, valid = run(backend, build(*reverse), hit, -leaving)
-    assert valid.all()
-    np.testing.assert_allclose(again, START, rtol=0, atol=2e-13)
-    np.testing.assert_allclose(returning, -HEADING, rtol=0, atol=2e-13)
-    np.testing.assert_allclose(way_back, path, rtol=0, atol=2e-14)
-
-
 @given(lens=lenses(), motion=motions(), base=poses())
 def test_moving_everything_is_moving_the_rays(backend, lens, motion, base) -> None:
     """Rigidly: paths stay. Grown by a factor: paths grow by it."""

@@ -9,11 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.special import j1
 
-from optics.numerics import quadrature
 from optics.numerics.backend import Backend
-from optics.waves.transfer import polychromatic_transfer
 from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of
@@ -109,49 +106,6 @@ def test_mtf_at_uneven_frequencies_as_by_an_fft_of_batoids_pupil(backend, folder
     assert uneven.accuracy == 0.0
     (pupil,) = optics.pupils([(1.0, 1.0)])
     assert pupil.transfer_error < TOLD
-
-
-@pytest.mark.second
-def test_a_spider_as_poppy_has_it(backend) -> None:
-    """MTF and encircled energy of the perfect wavefront behind the Ritchey-Chretien telescope's disk and four vanes."""
-    poppy = pytest.importorskip("poppy")
-    import astropy.units as u
-
-    optics = CameraOptics.alone(load_camera("ritchey_chretien"), backend)
-    wavelength = optics.model.spec.wavelength
-    cells, parts = 512, 4
-    wave = poppy.Wavefront(wavelength=wavelength * u.m, npix=cells * parts, diam=0.5 * u.m)
-    blocked = poppy.AsymmetricSecondaryObscuration(
-        secondary_radius=0.0875 * u.m, support_angle=(45, 135, 225, 315), support_width=4e-3 * u.m
-    )
-    mask = poppy.CircularAperture(radius=0.25 * u.m).get_transmission(wave) * blocked.get_transmission(wave)
-    share = mask.reshape(cells, parts, cells, parts).mean(axis=(1, 3))
-    overlap = np.abs(np.fft.ifft2(np.abs(np.fft.fft2(share, (2 * cells, 2 * cells))) ** 2)) / np.sum(share)
-    shifts = np.arange(0, cells, 16)[1:]
-    aperture = float(np.max(np.abs(optics.pupils([(0.0, 0.0)])[0].axes)))
-    frequency = shifts * (2.0 * aperture / cells) / wavelength
-    mtf = optics.mtf((0.0, 0.0), frequency)
-    np.testing.assert_allclose(mtf.limit, [overlap[0, shifts], overlap[shifts, 0]], rtol=0, atol=TOLD)
-    # encircled energy 2 pi R integral of the mean over directions of the OTF times J1(2 pi R f)
-    (pupil,) = optics.pupils([(0.0, 0.0)])
-    perfect = replace(pupil, eikonal_terms=np.zeros_like(pupil.eikonal_terms))
-    turns = np.pi * (np.arange(24) + 0.5) / 24
-    node, weight = quadrature.gauss(72)
-    end = 2.0 * aperture / wavelength
-    every, weight = 0.5 * end * (node + 1.0), 0.5 * end * weight
-    both = np.concatenate([every[:, None] * np.array([np.cos(t), np.sin(t)]) for t in turns])
-    otf = polychromatic_transfer(perfect, both, np.array([wavelength]), np.ones(1), np.zeros(1))[0].real
-    mean = otf.reshape(len(turns), -1).mean(axis=0)
-    radii = np.array([1.0, 2.0, 4.0]) * wavelength / (2.0 * aperture)
-    ours = [2 * np.pi * r * float(weight @ (mean * j1(2 * np.pi * r * every))) for r in radii]
-    u_f, v_f = np.meshgrid(*2 * [np.fft.fftfreq(2 * cells, 1.0 / (2 * cells))])
-    far = np.hypot(u_f, v_f) * (2.0 * aperture / cells) / wavelength
-    area = (2.0 * aperture / cells / wavelength) ** 2
-    with np.errstate(invalid="ignore", divide="ignore"):
-        kernel = [np.where(far > 0.0, r * j1(2 * np.pi * r * far) / far, np.pi * r**2) for r in radii]
-    theirs = [float(np.sum(overlap * one) * area) for one in kernel]
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLD)
-    assert 0.5 < theirs[0] < theirs[1] < theirs[2] < 0.97
 
 
 @pytest.mark.second

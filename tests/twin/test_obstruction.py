@@ -13,7 +13,7 @@ from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import imaging_rays
-from optics.waves.transfer import polychromatic_transfer, transfer
+from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import path_to_sphere
 from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams
 from scenes.specs.baffle import Plate
@@ -126,53 +126,6 @@ def test_a_state_with_shadows_is_the_same_alone_and_among_others(gf7_pair, backe
         alone = image_quality(gf7_pair, backend, [state]).cameras[CAMERA]
         for key in ("wfe", "wfe_refocused", "mtf_along_line", "mtf_along_track", "light_lost"):
             np.testing.assert_allclose(getattr(several, key)[k], getattr(alone, key)[0], rtol=0, atol=5e-7)
-
-
-def raster(pupil, size: int, parts: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Share of each cell of [-1, 1]^2 that is free, and cells' middles; shadows by half-planes."""
-    step = 2.0 / size
-    middle = -1.0 + step * (np.arange(size) + 0.5)
-    x, y = np.meshgrid(middle, middle)
-    free = np.zeros((size, size))
-    angle = np.linspace(-np.pi, np.pi, 2001)
-    edge = pupil.edge.boundary(angle)[0]
-    order = np.argsort(np.angle(edge))
-    for i in range(parts):
-        for j in range(parts):
-            px, py = x + ((i + 0.5) / parts - 0.5) * step, y + ((j + 0.5) / parts - 0.5) * step
-            rim = np.interp(np.arctan2(py, px), np.angle(edge)[order], np.abs(edge)[order], period=2.0 * np.pi)
-            inside = np.hypot(px, py) < rim
-            for piece in pupil.shadow.pieces[0]:
-                after = np.roll(piece, -1, axis=0)
-                left = [(q - p)[0] * (py - p[1]) - (q - p)[1] * (px - p[0]) for p, q in zip(piece, after, strict=True)]
-                if np.ptp(piece, axis=0).min() > 0.0:
-                    inside &= ~np.all(np.array(left) >= 0.0, axis=0)
-            free += inside
-    return free / parts**2, x + 1j * y
-
-
-@pytest.mark.second
-def test_transfer_function_against_the_autocorrelation_of_a_raster(gf7_pair, backend) -> None:
-    """Shifts by whole cells, so that only the edges of the raster err: 1e-3 of the diameter a cell, a sixteenth of it
-    known; some 1e-4 of the result, of which the mean over an edge leaves 3e-5.
-    """
-    path = path_of(gf7_pair, backend)
-    directions = path.directions(places_of(gf7_pair)[:2])
-    size, wavelength = 512, 650e-9
-    for pupil in path.pupils({}, directions, path.places({}, directions)):
-        free, p = raster(pupil, size)
-        path_length, amplitude = pupil.values(p)
-        field = free * amplitude * np.exp(2j * np.pi / wavelength * path_length)
-        spectrum = np.fft.fft2(field, (2 * size, 2 * size))
-        found = np.fft.ifft2(np.abs(spectrum) ** 2) / np.sum(free * amplitude**2)
-        cells = [(40, 0), (0, 40), (128, -64), (200, 90), (0, 230), (230, 0), (-150, 150), (300, 120)]
-        shift = 2.0 / size * np.array(cells)
-        frequency = shift @ pupil.axes.T / wavelength
-        got = transfer(pupil, frequency, wavelength, np.zeros(1))[0]
-        want = np.array([found[row, column] for column, row in cells])
-        np.testing.assert_allclose(got, want, atol=2e-4)
-        clear = transfer(replace(pupil, shadow=None), frequency, wavelength, np.zeros(1))[0]
-        assert np.max(np.abs(clear - want)) > 0.01
 
 
 def test_batch_and_single_pupils_agree(gf7_pair, backend) -> None:
