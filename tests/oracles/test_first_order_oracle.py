@@ -4,7 +4,6 @@ batoid near the axis.
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -162,14 +161,6 @@ def by_batoid(system: System) -> dict[str, float]:
         "stop": abs(at_stop[2]),
         "f_number": abs(height / way[0]) / system.pupil,
     }
-
-
-@cache
-def told(name: str, backend: Any) -> dict[str, float]:
-    """What the program says of a system, and the radius of its stop."""
-    model = camera(SYSTEMS[name], backend)
-    data = FIRST_ORDER(first_order_data(CameraOptics.alone(model, backend)))
-    return {key: data[name] for key, name in KEYS.items()} | {"stop": model.apertures[model.spec.stop].radius}
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
