@@ -82,16 +82,11 @@ def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, section: i
             assert np.any(found[0][3])
 
 
-def test_each_system_may_have_its_own_rays(backend, gf7) -> None:
-    bare = gf7.bare_assembly()
-    systems = assemble(bare, ["imaging"], some_states(3, 1, ("M2",)))
+def test_rays_for_another_number_of_systems_are_refused(backend, gf7) -> None:
+    systems = assemble(gf7.bare_assembly(), ["imaging"], some_states(3, 1, ("M2",)))
     position, direction = launch(gf7, 60)
-    shared = trace(backend, systems, make_rays(backend, position, direction)).numpy()
-    own = trace(backend, systems, make_rays(backend, np.tile(position, (3, 1, 1)), direction)).numpy()
     with pytest.raises(ValueError, match="rays for 2 systems cannot go through 3"):
         trace(backend, systems, make_rays(backend, np.tile(position, (2, 1, 1)), direction))
-    for a, b in zip(shared, own, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("order", [(60, 200), (200, 60)], ids=["first fewer rays", "first more rays"])

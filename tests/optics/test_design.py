@@ -12,6 +12,7 @@ from optics.design.optimiser import DesignError
 from optics.design.starts import drawn_start, search
 from scenes.models.camera_design import beams_of, camera_of, prescription_of
 from tests.tiers import quick
+from twin.camera.camera_optics import CameraOptics
 
 MIRRORS = ("M1", "M2", "M3")
 EVERY = (
@@ -62,6 +63,22 @@ def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) 
             assert np.max(np.abs(difference - slope)) < 1e-6 * np.max(np.abs(slope)) + rounding / h + 1e-8, variable
             compared += int(np.max(np.abs(slope)) > 1e3 * rounding / h)
     assert compared > 3 * len(EVERY)
+
+
+@pytest.mark.parametrize("name", ["gf7", "gf7_conic"])
+def test_errors_and_envelope_are_those_of_the_camera(backend, camera, name: str) -> None:
+    """Against wavefronts of the camera as told to users, and heights of all that its clear apertures hold."""
+    model = camera(name)
+    nominal, beams = prescription_of(model.spec), beams_of(model.spec)
+    found = MeritFunction.of(backend, nominal, beams, Operands(model.spec.wavelength)).evaluate(nominal)
+    half = np.array([model.spec.field.x, model.spec.field.y])
+    waves = CameraOptics.alone(model, backend).wavefronts([tuple(field) for field in (beams.fields / half).tolist()])
+    np.testing.assert_allclose(found.errors, [wave.rms for wave in waves], rtol=5e-3)
+    heights = [model.spec.image.z]
+    for mirror, aperture in model.apertures.items():
+        points = np.concatenate([aperture.outline(400), [aperture.centre]])
+        heights += list(model.spec.mirrors[mirror].z + model.surfaces[mirror].sag(*points.T))
+    assert found.envelope == pytest.approx(max(heights) - min(heights), abs=0.02)
 
 
 def test_axes_of_a_beam() -> None:

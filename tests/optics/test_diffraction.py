@@ -55,14 +55,6 @@ def test_encircled_energy(dark_rings: float) -> None:
     assert energy == pytest.approx(1.0 - j0(z) ** 2 - j1(z) ** 2, abs=1e-8)
 
 
-def test_plancherel() -> None:
-    """An image that fades fast enough for the detector holds exactly the pupil's power."""
-    step, n = 2e-6, 128  # below the critical sampling of lambda F / 2
-    axis = centred(n, step)
-    field = perfect(apodisation=5, nodes=quadrature.disk(40, 200))
-    assert np.sum(image(field, axis, axis)) * step**2 == pytest.approx(1.0, abs=1e-8)
-
-
 def test_images_of_a_batch() -> None:
     fields = [perfect(0.001 * i, 0.0, apodisation=i) for i in range(6)]
     together = PupilField(

@@ -144,35 +144,6 @@ def test_against_huygens(backend, gf7, dz: float, where: str) -> None:
     assert np.sum(want) * (3e-6) ** 2 == pytest.approx(0.977, abs=0.005)
 
 
-def moved_by(reference: PupilField, other: PupilField, x: Grid, y: Grid, start: np.ndarray) -> np.ndarray:
-    """(x, y) by which the image of ``other`` lies beside that of ``reference``: least squares from a near start."""
-    got = image(other, x, y)[0]
-
-    def at(shift: np.ndarray) -> np.ndarray:
-        return image(reference, shifted(x, -shift[0]), shifted(y, -shift[1]))[0]
-
-    shift = start
-    h = 1e-8
-    for _ in range(8):
-        model = at(shift)
-        matrix = np.stack([(at(shift + h * e) - model).ravel() / h for e in np.eye(2)], axis=-1)
-        shift = shift + np.linalg.lstsq(matrix, (got - model).ravel(), rcond=None)[0]
-    return shift
-
-
-@pytest.mark.parametrize("pixels", [(0.3, -0.4), (1.37, 0.0), (0.0, 12.25)])
-def test_the_image_moves_when_the_detector_moves(backend, gf7, pixels: tuple[float, float]) -> None:
-    """The focal plane of the camera, 7 um pixels: the image moves the other way on it, to 1e-4 pixel."""
-    pitch = gf7.spec.line.pitch
-    still = Camera(backend, gf7, PERTURBED)
-    dx, dy = (p * pitch for p in pixels)
-    moved = Camera(backend, gf7, {**PERTURBED, IMAGE: Motion(shift=(dx, dy, 0.0))})
-    start = np.array([1e-6 - dx, 1e-6 - dy])
-    window = shifted(AXIS, -dx), shifted(AXIS, -dy)
-    shift = moved_by(still.field(FINE), moved.field(FINE, still.centre), *window, start) / pitch
-    np.testing.assert_allclose(shift, [-pixels[0], -pixels[1]], rtol=0, atol=1e-4)
-
-
 def test_a_blocked_beam_is_an_explained_error(backend, gf7) -> None:
     camera = Camera(backend, gf7, {"M3": Motion(shift=(2.0, 0.0, 0.0))})
     with pytest.raises(BeamMissedError, match="imaging path"):

@@ -88,21 +88,6 @@ def test_draws_follow_the_bsdf(scatter: ABg | HarveyShack) -> None:
     assert statistic < chi2.ppf(1.0 - FALSE_ALARM, len(rest) - 1)
 
 
-def test_drjit_draws_as_numpy(backend) -> None:
-    u = np.linspace(0.0, 0.999999, 1000)
-    for scatter in LOBES:
-        lobe = scatter.lobe
-        exact = sample_distance(u, lobe.scale, lobe.exponent)
-        got = sample_distance(backend.opaque(u), backend.opaque(lobe.scale), backend.opaque(lobe.exponent)).numpy()
-        np.testing.assert_allclose(got, exact, rtol=0, atol=1e-9)
-        keep = acceptance(
-            backend.opaque(exact), lobe.scale, backend.opaque(lobe.exponent), backend.opaque(lobe.abg)
-        ).numpy()
-        np.testing.assert_allclose(keep, acceptance(exact, lobe.scale, lobe.exponent, float(lobe.abg)), atol=1e-12)
-        assert keep.min() > 0.3
-        assert keep.max() <= 1.0 + 1e-12
-
-
 @pytest.mark.parametrize("finish", [MIRROR, COATED, BARE, GROUND, BLACK, SILICON, ABSORBER], ids=repr)
 def test_library_finishes_conserve_energy(finish: Finish) -> None:
     total = finish.reflectance + finish.transmission + finish.diffuse

@@ -88,17 +88,6 @@ def test_a_turned_face_makes_a_wedge() -> None:
     assert normal == pytest.approx([np.sin(angle), 0.0, np.cos(angle)], abs=ROUNDING)
 
 
-def test_a_grown_body_grows_its_own_faces() -> None:
-    tree = RigidTree((Body("glass", Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))),))
-    solid = solid_of(*BOX)
-    volumes = [
-        solid_mesh(solid, tree.place([{"glass": motion}])).mesh.volume
-        for motion in (Motion(), Motion(scale=0.01), Motion(stretch=0.01))
-    ]
-    assert volumes[1] / volumes[0] == pytest.approx(1.01**3, rel=1e-9)
-    assert volumes[2] / volumes[0] == pytest.approx(1.01**3, rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("planes", "words"),
     [

@@ -20,7 +20,6 @@ from scenes.lens.codev_reader import read_codev
 from scenes.lens.prescription import SEQUENCE
 from scenes.lens.zemax_reader import read_zemax
 from scenes.lens.zemax_writer import zemax_text
-from scenes.models.camera_model import derive_camera
 from scenes.yaml.errors import InputError
 from tests.oracles.prescription_peers import (
     AnyGlass,
@@ -163,38 +162,6 @@ def lsst(backend):
     path = Path(batoid.__file__).parent / "data" / name
     lens = replace(read_batoid(path, wavelength), fields=around(largest))
     return batoid.Optic.fromYaml(str(path)), camera_of(lens, "telescope", backend, Width(pupil)).camera
-
-
-@pytest.mark.second
-def test_edges_stop_what_batoid_stops(backend, lsst) -> None:
-    """Rays over more than the pupil: each comes through the camera made of the file, or is stopped, as in batoid."""
-    import batoid
-
-    (peer, spec), rays = lsst, 20_000
-    _, wavelength, pupil, largest = LSST
-    model = derive_camera(spec, backend)
-    system = assemble(model.bare_assembly(apertures=False), ["imaging"])
-    rng = np.random.default_rng(1)
-    radius, turn = 0.55 * pupil * np.sqrt(rng.uniform(size=rays)), rng.uniform(0.0, 2.0 * np.pi, rays)
-    over = np.array([1.0, -1.0, -1.0])
-    for field in (0.0, 1.0, largest):
-        # toward a corner of the square in the circle of the field, which is the camera's
-        heading = np.array([*np.tan(np.radians(field)) * np.full(2, np.sqrt(0.5)), -1.0])
-        heading /= np.linalg.norm(heading)
-        start = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.zeros(rays)], axis=-1)
-        start += 25.0 * heading / heading[2]
-        velocity = np.tile(heading / peer.inMedium.getN(wavelength), (rays, 1))
-        theirs = batoid.RayVector(*start.T.copy(), *velocity.T.copy(), wavelength=wavelength)
-        peer.trace(theirs)
-        rays_here = make_rays(backend, over * start, over * heading)
-        traced = trace(backend, system, rays_here, keep=range(len(model.mirrors)))
-        met = {name: traced.hit(k)[0] for k, name in enumerate(model.mirrors)}
-        stop = met[model.spec.stop]
-        through = traced.numpy()[3][0] & model.uncut(met.__getitem__)
-        through &= model.apertures[model.spec.stop].contains(stop[:, 0], stop[:, 1])
-        expected = ~(theirs.vignetted | theirs.failed)
-        assert 0.3 * rays < np.count_nonzero(expected) < 0.8 * rays
-        np.testing.assert_array_equal(through, expected)
 
 
 @pytest.mark.second

@@ -21,7 +21,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, library_names, load_camera
 from scenes.specs.procedures import PROCEDURES
-from scenes.specs.resolved import resolve, resolve_job
+from scenes.specs.resolved import resolve_job
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
 from tests.oracles.test_reference_cameras import bundle, wavefront_error
@@ -147,14 +147,6 @@ def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     assert not cameras_of(PROCEDURES["orbit calibrate"].resolve("calibrate"))
     assert not cameras_of(PROCEDURES["orbit angle"].resolve("angle"))  # a payload's lines have no mirrors
     assert not PROCEDURES["design camera"].judged
-
-
-def test_a_camera_in_a_runs_config_is_named_there(backend, tmp_path) -> None:
-    config = tmp_path / "config.yaml"
-    config.write_text(with_camera(load_camera(gf7_with(tmp_path, "-2.02 m"))).to_yaml(), "utf-8")
-    (text,) = blur_warnings(resolve(config), backend)
-    assert f"({config}) is blurred" in text
-    assert f"python -m twin.camera {config} --camera gf7 --refocus" in text
 
 
 @pytest.mark.second

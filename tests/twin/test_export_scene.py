@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pyproj
 import pytest
 
 import twin.orbit.__main__ as command
@@ -143,31 +142,6 @@ def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
     ):
         (tmp_path / "p.gcp").write_text(text)
         refused(folder / "DIM_SCENE.XML", tmp_path / "out", ("--control", tmp_path / "p.gcp"), message)
-
-
-@pytest.mark.second
-def test_gcp_files_as_others_write_them(folder: Path, tmp_path: Path) -> None:
-    """Commas, comments, a header with the system, several images in a row, a path before the image's name."""
-    text = (folder / "points.gcp").read_text()
-    rows = [row for row in text.splitlines() if not row.startswith("#")]
-    wkt = f"# WKT: {pyproj.CRS('EPSG:4326').to_wkt('WKT1_GDAL')}"
-    variants = {
-        "commas": "\n".join(row.replace(" ", ", ") for row in rows),
-        "header": wkt + "\n" + "\n".join(rows),
-        "two images": "\n".join(f"{row} other.tif 5 5 1 1" for row in rows),
-        "a folder": text.replace("SCENE_P.tif", "left/SCENE_P.tif"),
-        "blank lines": text.replace("\n", "\n\n# again\n"),
-    }
-    found = {}
-    for name, content in {"plain": text, **variants}.items():
-        (tmp_path / "p.gcp").write_text(content)
-        out = tmp_path / name.replace(" ", "-")
-        result = run("export", folder / "DIM_SCENE.XML", "--control", tmp_path / "p.gcp", "--out", out, "--quiet")
-        assert result.exit_code == 0, (name, result.stderr)
-        found[name] = json.loads((out / "export.json").read_text())["control"]["SCENE_P"]["coefficients_px"]
-    for name in variants:
-        # PROJ's two ways from the same datum differ by 1e-9 m
-        np.testing.assert_allclose(found[name], found["plain"], rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("form", quick(1, ["a_RPC.TXT", "RPC_SCENE.XML", "a.tif"]))
