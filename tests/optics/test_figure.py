@@ -85,6 +85,8 @@ def test_bad_figures_are_refused(backend) -> None:
         GridFigure(np.full((5, 5), np.nan), (0, 1, 0, 1))
     with pytest.raises(ValueError, match="x_min < x_max"):
         GridFigure(np.zeros((5, 5)), (1, 0, 0, 1))
+    with pytest.raises(ValueError, match="has no disk for a figure"):
+        plane().figure_disk(None)
     with pytest.raises(ValueError, match="needs an aperture"):
         run(backend, build(Stage(plane())), np.zeros((1, 3)), Z[None], {"e0": Motion(figure={4: 1e-9})})
 

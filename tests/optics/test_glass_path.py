@@ -147,8 +147,15 @@ def test_index_and_growth_change_the_path(backend) -> None:
 
 
 def test_what_an_assembly_refuses() -> None:
-    face = Element("face", "glass", plane(), REFRACT, solid="glass")
-    with pytest.raises(ValueError, match="'glass', which has no refractive index"):
-        Assembly(RigidTree((Body("glass"),)), {"face": face}, {})
-    with pytest.raises(ValueError, match="unknown body 'prism'"):
-        Assembly(RigidTree((Body("glass"),)), {}, {}, {"prism": 1.5})
+    face, tree = Element("face", "glass", plane(), REFRACT, solid="glass"), RigidTree((Body("glass"),))
+    for arguments, words in (
+        (({"face": face}, {}), "'glass', which has no refractive index"),
+        (({}, {}, {"prism": 1.5}), "unknown body 'prism'"),
+        (({"other": face}, {}, {"glass": 1.5}), "'face' is filed under 'other'"),
+        (({"e": Element("e", "nowhere", plane(), PASS)}, {}), "stands on unknown body 'nowhere'"),
+        (({}, {"all": ("e",)}), "names unknown element 'e'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            Assembly(tree, *arguments)
+    with pytest.raises(ValueError, match="no gradients of refractive indices by itself"):
+        Assembly(tree, {}, {}, {"glass": 1.5}).standing({"glass": Motion(index_gradient=(1e-6, 0.0, 0.0))})

@@ -64,10 +64,6 @@ def huygens(
     return out
 
 
-def shifted(grid: Grid, by: float) -> Grid:
-    return Grid(grid.start + by, grid.step, grid.count)
-
-
 class Camera:
     """The camera in its prescription frame, looking at one point of the field's edge."""
 

@@ -179,5 +179,10 @@ def test_displacements_of_another_unit() -> None:
     bend = np.stack([0 * points[:, 0], 0 * points[:, 0], 0.3 * points[:, 0] ** 2], axis=-1)
     with pytest.raises(NodesError, match="more than 1 mm"):
         nodal_deformation(points, bend, BOWL, DISK)
-    with pytest.raises(ValueError, match="finite"):
-        nodal_deformation(points, points * np.nan, BOWL, DISK)
+    for moves, terms, words in (
+        (points * np.nan, 15, "finite"),
+        (points[:-1], 15, r"must be \(N, 3\), found"),
+        (0.0 * points, 2, "between Z3 and Z"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            nodal_deformation(points, moves, BOWL, DISK, terms=terms)

@@ -154,3 +154,5 @@ def test_coatings() -> None:
         CoatingTable(np.zeros(1), np.array([0.6]), np.array([0.5]))
     with pytest.raises(ValueError, match="ascend"):
         CoatingTable(np.radians([10.0, 5.0]), np.array([0.6, 0.5]))
+    with pytest.raises(ValueError, match="one reflectance, and one transmittance"):
+        CoatingTable(np.radians([5.0, 10.0]), np.array([0.6, 0.5]), np.array([0.1]))

@@ -159,6 +159,7 @@ def test_half_plane_takes_the_tangent(mirrored: bool) -> None:
         (lambda: Polygon(SQUARE[[0, 2, 0]]), "one line"),
         (lambda: Polygon(SQUARE * np.nan), "finite"),
         (lambda: Disk((0.0, 0.0), 0.0), "positive radius"),
+        (lambda: Disk((0.0, np.nan), 1.0), "two finite numbers"),
         (lambda: Disk((0.0, 0.0), 1.0, np.ones((2, 2))), "inverse"),
         (lambda: HalfPlane((0.0, 0.0), (0.0, 0.0)), "not 0"),
         (lambda: Polygon(SQUARE).mapped(lambda p: p * np.nan), "leave the field"),

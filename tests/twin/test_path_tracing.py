@@ -16,12 +16,13 @@ from optics.raytrace.trace import make_rays, trace
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.models.scenery_parts import Detector
 from tests.optics.bench import disk_points
-from tests.twin.path_bench import IDEAL, scene_beam
+from tests.twin.path_bench import IDEAL, facing, scene_beam, screen
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, trace_stray
+from twin.path_tracing.tables import MOST_DETECTORS
 from twin.path_tracing.tracer import (
     BALANCED,
     VARIANTS,
@@ -127,12 +128,24 @@ def test_another_variant_is_not_taken_silently(backend, monkeypatch) -> None:
     assert mi.variant() == "llvm_ad_mono"
 
 
-def test_impossible_sampling_and_sources() -> None:
-    with pytest.raises(ValueError, match="impossible"):
-        Sampling(floor=1.0)
+def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
     source = DiskSource.along(np.zeros(3), np.array([0.0, 0.0, 1.0]), 1e-3, 0.1)
-    with pytest.raises(ValueError, match="does not lie in"):
-        replace(source, narrow=(0.08, 0.0, 0.05))
+    surface, grid = screen("far", facing(0.5), 1.0)
+    alone = Scenery((surface,), (grid,))
+    empty = PathTracer(backend, alone).run(replace(source, centre=np.array([0.0, 0.0, 1.0])), 10)
+    many = tuple(screen(f"s{k}", facing(0.5 + k), 1.0) for k in range(MOST_DETECTORS + 1))
+    for make, words in (
+        (lambda: Sampling(floor=1.0), "impossible"),
+        (lambda: replace(source, narrow=(0.08, 0.0, 0.05)), "does not lie in"),
+        (lambda: Scenery((surface, surface), (grid,)), "surfaces of the same name: "),
+        (lambda: Scenery((surface,), ()), "unknown detectors: far"),
+        (lambda: PathTracer(backend, alone, {"near": ()}, ways=False), "unknown detectors: near"),
+        (lambda: PathTracer(backend, Scenery(*zip(*many, strict=True))), "at most"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make()
+    with pytest.raises(LookupError, match="no path reached far by its nominal way"):
+        empty.nominal("far")
 
 
 @pytest.mark.second
