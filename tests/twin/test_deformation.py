@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +157,8 @@ def test_warnings_name_the_body_and_what_is_wrong_with_its_mesh(gf7_pair) -> Non
         for u in (5e-9 * np.sin(8.0 * x), rough)
     )
     assert deformation_warnings({M1: smooth}) == ()
+    (finer,) = deformation_warnings({M1: replace(smooth, lost=np.full_like(smooth.lost, 5e-9))})
+    assert finer.startswith(f"{M1}: 5 nm rms of the surface's change are finer than its grid and not carried")
     (mesh,) = deformation_warnings({M1: smooth, M2: noisy})
     assert mesh.startswith(f"{M2}: the mesh prints through")
     plane, _ = deformation_warnings({M1: smooth, M2: noisy}, [M1])

@@ -5,6 +5,8 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from tests.twin.dimap_bench import Scene, rpc, write
 from tests.twin.line_scanner_model import LineScannerModel
+from twin.orbit.export.export_report import _warnings as export_warnings
+from twin.orbit.export.quality_sections import quality_warnings
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.export.rpc_files import read_rpc
 from twin.orbit.measured.dimap_sensor import read_scene
@@ -187,3 +191,33 @@ def test_the_speed_of_light_is_not_passed_over(folder: Path, tmp_path: Path) -> 
     # and refraction, which straight sensor models carry at one height only, is in the numbers: 1e-8 px without
     errors = json.loads((tmp_path / "out" / "export.json").read_text())["lines"]["SCENE_P"]["isd_errors"]
     assert max(one["line_px"] for one in errors) > 0.05
+
+
+def test_doubts_of_polynomials_and_control_points_are_told() -> None:
+    """Each sentence beyond its limit, and none below all limits."""
+
+    def control(used=True, probability=2e-3, freedom=1) -> Any:
+        correction = SimpleNamespace(used=np.array([True, used]), probability=probability, factor=9.0, freedom=freedom)
+        one = SimpleNamespace(polynomial=SimpleNamespace(correction=correction), names=np.array(["1", "2"]))
+        return SimpleNamespace(products={}, control={"A": one})
+
+    stands = "the correction by control points stands in the polynomials, not in the ISD"
+    assert quality_warnings(None) == ()
+    assert quality_warnings(SimpleNamespace(products={"A": SimpleNamespace(most=0.99)}, control={})) == ()
+    assert quality_warnings(control()) == (stands,)
+    off = SimpleNamespace(products={"A": SimpleNamespace(most=1.2)}, control={})
+    for found, words in (
+        (off, "the polynomials of the product are off the rigorous model of A by up to 1.2 pixels"),
+        (control(used=False), "control points of A lie beyond their covariances and are left out: 2"),
+        (control(probability=9e-4), "control points of A scatter by 3.0 times their sigmas: "),
+        (control(freedom=0), "no control point of A is left over to check its correction"),
+    ):
+        assert quality_warnings(found)[0].startswith(words), words
+    smooth, rough = (SimpleNamespace(error_px=(0.01, error)) for error in (0.09, 0.2))
+    for line, words in (
+        (SimpleNamespace(polynomial=smooth), []),
+        (SimpleNamespace(polynomial=rough), ["the rational polynomials of A are off by up to 0.20 pixels"]),
+        (SimpleNamespace(polynomial=None, refused="they bend"), ["A has no rational polynomials: they bend"]),
+    ):
+        texts = export_warnings(SimpleNamespace(source=None, lines={"A": line}))
+        assert [text[: len(word)] for text, word in zip(texts, words, strict=True)] == words

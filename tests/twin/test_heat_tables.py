@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from optics.geometry.tree import Motion
+from optics.thermal.heat import Temperature
+from scenes.models.nodal_bodies import Coverage, HeatedBody, HeatedFace
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve, resolve_job
@@ -34,6 +38,25 @@ def silica(backend) -> MonitorExperiment:
 def job(folder: Path, text: str) -> JobSpec:
     (folder / "job.yaml").write_text(text)
     return resolve(folder / "job.yaml").job
+
+
+def test_what_a_table_of_temperatures_does_not_tell_is_said() -> None:
+    """Each sentence beyond its limit, and none below all limits."""
+    face = HeatedFace(Motion(figure={5: 1e-8}), 0.9e-9, 0.9e-9)
+    good = HeatedBody(100, 0.05, Temperature(1.0), (0.01, 0.02), 0.9e-3, Coverage(0.9e-3, 0.01), {"f": face}, 0.9e-9)
+    assert good.warnings("b") == ()
+    for changed, words in (
+        ({"coverage": Coverage(0.02, 0.013)}, "b: 2 % of its volume lie outside of the table's nodes, up to 13 mm"),
+        ({"between": 4e-3}, "b: the table is coarser than its field: nodes left out are foretold to 0.004 K rms only"),
+        ({"faces": {"f": replace(face, unmeshed=2e-9)}}, "f: finite elements here follow the table to 2 nm rms only"),
+        ({"faces": {"f": replace(face, lost=4e-9)}}, "f: 4 nm rms of its change by the table are finer than Z"),
+        (
+            {"index_path": 3e-9},
+            "b: the index of glass follows the linear part of the table; the rest is worth",
+        ),
+    ):
+        (text,) = replace(good, **changed).warnings("b")
+        assert text.startswith(words)
 
 
 @pytest.mark.second
