@@ -168,6 +168,16 @@ def test_a_start_outside_its_bounds_or_without_light(backend, gf7, beams) -> Non
         search(backend, lost, CONICS, beams, Operands(650e-9))
 
 
+def test_a_merit_function_needs_a_field_on_the_line_and_a_measure(backend, start, beams) -> None:
+    aside = replace(beams, fields=beams.fields + np.array([0.0, 1e-3]))
+    for fields, operands in ((aside, Operands(650e-9)), (beams, Operands(650e-9, measure="blur"))):
+        with pytest.raises(ValueError, match="a design needs fields on the line off its centre, and the measure"):
+            MeritFunction.of(backend, start, fields, operands)
+    merit = MeritFunction.of(backend, start, beams, Operands(650e-9))
+    with pytest.raises(ValueError, match="a design has no measure 'blur'"):
+        replace(merit, operands=Operands(650e-9, measure="blur")).evaluate(start)
+
+
 def test_numbers_of_a_prescription(start) -> None:
     values = start.values(EVERY)
     assert start.with_values(EVERY, values) == start.with_values((), np.empty(0))

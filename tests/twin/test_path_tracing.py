@@ -10,13 +10,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from optics.geometry.surface import Surface
 from optics.geometry.tree import Motion
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.models.scenery_parts import Detector
 from tests.optics.bench import disk_points
-from tests.twin.path_bench import IDEAL, facing, scene_beam, screen
+from tests.twin.path_bench import IDEAL, facing, flat_mirror, glass_scene, scene_beam, screen, slab
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
@@ -126,6 +127,10 @@ def test_another_variant_is_not_taken_silently(backend, monkeypatch) -> None:
     with pytest.raises(VariantUnavailable, match="cannot run its variant llvm_ad_double"):
         load_mitsuba(backend)
     assert mi.variant() == "llvm_ad_mono"
+    monkeypatch.setitem(VARIANTS, "llvm", "scalar_rgb")
+    monkeypatch.setattr(mi, "set_variant", lambda *_: None)
+    with pytest.raises(VariantUnavailable, match="runs its variant llvm_ad_mono where scalar_rgb is needed"):
+        load_mitsuba(backend)
 
 
 def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
@@ -133,10 +138,18 @@ def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
     surface, grid = screen("far", facing(0.5), 1.0)
     alone = Scenery((surface,), (grid,))
     empty = PathTracer(backend, alone).run(replace(source, centre=np.array([0.0, 0.0, 1.0])), 10)
+    glass, (mirror,) = glass_scene(slab(0.3, 0.02), 1.5).surfaces[:6], flat_mirror(IDEAL.mirror)
+    wavy = replace(mirror, surface=Surface(0.1, 0.0, (1e-9,) * 40))
+    rays = RaySource.even(np.zeros((2, 3)), np.tile([0.0, 0.0, 1.0], (2, 1)))
     many = tuple(screen(f"s{k}", facing(0.5 + k), 1.0) for k in range(MOST_DETECTORS + 1))
     for make, words in (
         (lambda: Sampling(floor=1.0), "impossible"),
         (lambda: replace(source, narrow=(0.08, 0.0, 0.05)), "does not lie in"),
+        (lambda: replace(source, radius=-1.0), "radius of 0 or more and a cone"),
+        (lambda: PathTracer(backend, alone).run(source, 0), "how many paths to trace, at least 1; found 0"),
+        (lambda: PathTracer(backend, alone).run(rays, 3), "a list of rays is traced as a whole"),
+        (lambda: PathTracer(backend, Scenery((*glass[:3], surface, *glass[3:]), (grid,))), "do not follow each other"),
+        (lambda: PathTracer(backend, Scenery((wavy, surface), (grid,))), "aspheric terms, found 40"),
         (lambda: Scenery((surface, surface), (grid,)), "surfaces of the same name: "),
         (lambda: Scenery((surface,), ()), "unknown detectors: far"),
         (lambda: PathTracer(backend, alone, {"near": ()}, ways=False), "unknown detectors: near"),
