@@ -65,7 +65,7 @@ def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) 
     assert compared > 3 * len(EVERY)
 
 
-@pytest.mark.parametrize("name", ["gf7", "gf7_conic"])
+@pytest.mark.parametrize("name", quick(1, ["gf7", "gf7_conic"]))
 def test_errors_and_envelope_are_those_of_the_camera(backend, camera, name: str) -> None:
     """Against wavefronts of the camera as told to users, and heights of all that its clear apertures hold."""
     model = camera(name)
@@ -138,6 +138,7 @@ def test_anamorphism_as_a_constraint(backend, gf7, beams) -> None:
     assert told.value.violated[0] == "anamorphism"
 
 
+@pytest.mark.second
 def test_starts(backend, gf7, beams) -> None:
     """Drawn starts follow from seed and number, pass light, and end where the camera itself does: one optimum."""
     nominal = prescription_of(gf7.spec)

@@ -53,7 +53,7 @@ STAR = Polygon(((0.05, 0.0), (0.015, 0.015), (0.0, 0.06), (-0.015, 0.015), (-0.0
 @pytest.mark.parametrize(
     "edges",
     quick(
-        2,
+        1,
         [
             [Edge(Circle(0.05), True), *VANES],
             [Edge(Circle(0.16, inner=0.04))],

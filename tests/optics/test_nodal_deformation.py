@@ -12,6 +12,7 @@ from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface, plane
 from optics.thermal.deformation import Formula, face_change
 from optics.thermal.nodal_deformation import NodalDeformation, NodesError, nodal_deformation
+from tests.tiers import quick
 
 BOWL = Surface(-0.25, -1.0, (1e-3,))
 DISK = Circle(0.3, (0.02, -0.45))  # off the axis, as mirrors of a TMA
@@ -52,7 +53,7 @@ def whole(face: NodalDeformation, surface: Surface, aperture: Aperture, points: 
     return np.asarray((q @ turn.T + shift)[:, 2])
 
 
-@pytest.mark.parametrize("aperture", APERTURES, ids=["disk", "ring", "rectangle", "ellipse"])
+@pytest.mark.parametrize("aperture", quick(1, APERTURES), ids=["disk", "ring", "rectangle", "ellipse"])
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
 def test_a_rigid_motion_alone_is_exact(aperture: Aperture, uneven: bool) -> None:
     points = mesh(aperture, 50, uneven=uneven)
@@ -81,6 +82,7 @@ def lifted_by(points: np.ndarray, height: float) -> np.ndarray:
     return np.asarray(points + np.array([0.0, 0.0, height]))
 
 
+@pytest.mark.second
 def test_it_is_what_face_change_finds_of_the_same_field() -> None:
     """The same displacement as a field, by the fit of heated faces: the same surface but for second order."""
 
@@ -107,6 +109,7 @@ def test_it_is_what_face_change_finds_of_the_same_field() -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=5e-11 + 5.0 * old.residual_rms)
 
 
+@pytest.mark.second
 def test_order_of_the_nodes_and_nodes_elsewhere_do_not_matter() -> None:
     points = mesh(DISK, 40)
     moves = moved(points) + 1e-7 * np.sin(20.0 * points[:, :1]) * [0.0, 0.0, 1.0]

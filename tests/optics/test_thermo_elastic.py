@@ -68,7 +68,7 @@ def volume_of(mesh) -> float:
 
 
 class TestMeshes:
-    @pytest.mark.parametrize("name", list(BODIES))
+    @pytest.mark.parametrize("name", quick(1, ["block", "bar", "rhomboid"]))
     def test_a_polyhedron_is_filled_exactly_with_upright_cells(self, name: str) -> None:
         corners, spacing = BODIES[name]
         turned = corners @ TURN.T  # no face along an axis
@@ -153,7 +153,7 @@ class TestFree:
         left = without_rigid(body.nodes, found.values - A * body.nodes)
         assert np.max(np.abs(left)) < 1e-12 * A * np.max(np.abs(body.nodes))
 
-    @pytest.mark.parametrize("name", list(BODIES))
+    @pytest.mark.parametrize("name", quick(1, ["block", "bar", "rhomboid"]))
     def test_any_gradient_reproduces_the_exact_field(self, name: str) -> None:
         corners, spacing = BODIES[name]
         mesh = polyhedron_mesh(corners, spacing)
@@ -188,7 +188,7 @@ class TestFree:
         assert abs(moved[2] @ normal) / np.linalg.norm(normal) < 1e-12 * size
         assert abs(moved[1] @ along) > 1e-3 * size  # along the line it is free
 
-    @pytest.mark.parametrize("cells", quick(2, [4, 9, 8, 16]))
+    @pytest.mark.parametrize("cells", quick(1, [4, 9, 16]))
     @pytest.mark.parametrize("aperture", [Circle(0.3, (0.0, -0.4)), Rectangle(0.3, 0.1)])
     def test_every_point_of_a_curved_face_is_found_in_its_own_cell(self, aperture, cells: int) -> None:
         surface = Surface(1 / 3, -1.0)
@@ -233,6 +233,7 @@ class TestBonded:
         # and a narrow one is disturbed more: the agreement is not by construction
         assert abs(self.layer(0.04, 8) / want - 1) > 1e-3
 
+    @pytest.mark.second
     def test_two_layers_of_one_modulus_bend_as_timoshenko_says(self) -> None:
         # Timoshenko, J. Opt. Soc. Am. 11, 233 (1925), layers of equal thickness and modulus: curvature 3/2 a T / h.
         # One material of which the upper half is hotter is such a pair; in a plate both directions bend alike.
@@ -274,6 +275,7 @@ class TestFace:
         assert np.max(np.abs(others)) + found.residual_rms < 1e-9 * abs(found.figure[4])
         assert set(found.figure) == set(range(4, 16))
 
+    @pytest.mark.second
     def test_a_turned_and_shifted_face_with_a_figure_is_read_back(self) -> None:
         body, _ = bar()
         pose = Pose(rotation_matrix(np.array([0.0, np.pi / 2, 0.0])), np.array([0.3, 0.0, 0.0]))

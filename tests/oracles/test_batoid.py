@@ -9,6 +9,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import IMAGE, collimated, field_direction
 from tests.oracles.peers import batoid_camera, batoid_rays
+from tests.tiers import quick
 
 batoid = pytest.importorskip("batoid")
 pytestmark = pytest.mark.oracle
@@ -32,7 +33,7 @@ STATES: dict[str, State] = {
 }
 
 
-@pytest.mark.parametrize("state", list(STATES))
+@pytest.mark.parametrize("state", quick(1, ["moved far", "moved", "nominal"]))
 @pytest.mark.parametrize("name", ["gf7", "monitor", "gf7_conic"])
 def test_rays_are_where_batoid_puts_them(backend, camera, name: str, state: str) -> None:
     model = camera(name)

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from tests.oracles.peers import batoid_camera, batoid_rays, optiland_camera
+from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.first_order_data import FIRST_ORDER, first_order_data, ray_paths
 
 pytestmark = pytest.mark.oracle
-NAMES = ["gf7", "monitor", "gf7_conic"]
+NAMES = quick(1, ["gf7", "monitor", "gf7_conic"])
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -53,6 +53,7 @@ def test_energy_centroid(setup, spots) -> None:
     assert np.ptp(found.column.reshape(len(STATES), 4), axis=0).min() > 1.0  # the spots did move
 
 
+@pytest.mark.second
 def test_gaussian_fit(setup, spots) -> None:
     """photutils fits Gaussian and constant too, but with equal weights and in a window with a hard edge that stays.
 

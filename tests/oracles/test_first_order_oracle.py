@@ -13,6 +13,7 @@ from scenes.models.camera_model import CameraModel, derive_camera
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
+from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.first_order_data import FIRST_ORDER, first_order_data
 
@@ -163,7 +164,7 @@ def by_batoid(system: System) -> dict[str, float]:
     }
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", quick(5, SYSTEMS))
 def test_first_order_data(backend, name: str) -> None:
     pytest.importorskip("batoid")
     model = camera(SYSTEMS[name], backend)

@@ -289,6 +289,7 @@ def live(seed: int, missions: int, years: float, jumps: int | None = None) -> Sc
     return score
 
 
+@pytest.mark.second
 def test_two_short_missions() -> None:
     score = live(36012, 2, 3.0)
     assert score.found == score.found_online == score.large > 0

@@ -62,8 +62,9 @@ def date(epoch: str, seconds: float) -> Any:
     return AbsoluteDate(epoch.removesuffix("Z"), TimeScalesFactory.getUTC()).shiftedBy(float(seconds))
 
 
-@pytest.mark.parametrize("epoch", quick(1, EPOCHS))
-@pytest.mark.parametrize("frame", quick(1, ["GCRF", "EME2000"]))
+@pytest.mark.second
+@pytest.mark.parametrize("epoch", EPOCHS)
+@pytest.mark.parametrize("frame", ["GCRF", "EME2000"])
 def test_inertial_frames_against_orekit(orekit: Path, epoch: str, frame: str) -> None:
     """With pole, UT1 and celestial pole offsets of the same table; 0.6 mm and 2 um/s: its nutation is interpolated."""
     from org.hipparchus.geometry.euclidean.threed import Vector3D

@@ -8,6 +8,7 @@ from optics.numerics import quadrature
 from optics.waves import transfer
 from optics.waves.diffraction import Grid, image
 from tests.oracles.pupil_grid import WAVELENGTH, FarPoint, fitted, pupil_grid
+from tests.tiers import quick
 
 poppy = pytest.importorskip("poppy", reason="poppy not installed (extra `oracles`)")
 pytestmark = pytest.mark.oracle
@@ -24,7 +25,7 @@ STEP, PIXELS = 1.5e-6, 96
 AXIS = Grid(-0.5 * (PIXELS - 1) * STEP, STEP, PIXELS)
 
 
-@pytest.fixture(scope="module", params=list(STATES))
+@pytest.fixture(scope="module", params=quick(1, ["moved", "nominal"]))
 def point(request, backend, gf7) -> FarPoint:
     return FarPoint(backend, gf7, np.radians(1.0), np.radians(0.05), STATES[request.param])
 

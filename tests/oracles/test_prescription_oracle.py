@@ -95,12 +95,12 @@ def held(backend, path: Path, kind: type[Rayoptics] | type[Optiland]) -> None:
             assert value < TOLERANCE[what], (what, value)
 
 
-@pytest.mark.parametrize("name", RAYOPTICS)
+@pytest.mark.parametrize("name", quick(4, RAYOPTICS))
 def test_as_ray_optics_traces_its_samples(backend, name: str) -> None:
     held(backend, package("rayoptics") / name, Rayoptics)
 
 
-@pytest.mark.parametrize("name", [*OPTILAND, *SHIPPED])
+@pytest.mark.parametrize("name", quick(3, [*SHIPPED, *OPTILAND]))
 def test_as_optiland_traces_samples(backend, name: str) -> None:
     package("optiland")
     held(backend, HERE / f"{name}.zmx" if name in SHIPPED else package("rayoptics") / name, Optiland)
@@ -123,7 +123,7 @@ LSST/Rubin_v3.14_y.yaml
 """.split()
 
 
-@pytest.mark.parametrize("name", quick(8, BATOID))
+@pytest.mark.parametrize("name", quick(4, BATOID))
 def test_as_batoid_traces_its_telescopes(backend, name: str) -> None:
     """Places, directions and paths of rays over the whole pupil at the detector; a wavefront is their paths."""
     batoid = pytest.importorskip("batoid")
@@ -213,7 +213,7 @@ def test_a_tilted_surface_of_batoid_is_refused() -> None:
 
 
 @pytest.mark.parametrize("kind", ["rayoptics", "optiland"])
-@pytest.mark.parametrize("name", ["gf7", "gf7_conic", "gf7_short", "monitor"])
+@pytest.mark.parametrize("name", quick(1, ["gf7", "gf7_conic", "gf7_short", "monitor"]))
 def test_our_cameras_as_other_programs_read_them(tmp_path: Path, backend, camera, name: str, kind: str) -> None:
     package(kind)
     lens, path = prescription_of(camera(name)), tmp_path / f"{name}.zmx"

@@ -11,6 +11,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.wavefront import fit_wavefront, path_difference
 from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction
+from tests.tiers import quick
 
 NAMES = ["gf7", "monitor", "gf7_conic"]
 NODES = quadrature.disk(12)
@@ -96,7 +97,8 @@ def test_local_focal_length_is_the_slope_of_the_image(backend, camera, name: str
 
 
 @pytest.mark.parametrize(
-    ("name", "low", "high"), [("gf7", 0.0145, 0.0182), ("monitor", 0.0105, 0.0162), ("gf7_short", 0.0085, 0.0115)]
+    ("name", "low", "high"),
+    quick(1, [("gf7", 0.0145, 0.0182), ("monitor", 0.0105, 0.0162), ("gf7_short", 0.0085, 0.0115)]),
 )
 def test_wavefront_error_along_the_line(backend, camera, name: str, low: float, high: float) -> None:
     model = camera(name)
@@ -119,6 +121,7 @@ def test_spots_of_the_conic_camera(backend, camera, x: float, y: float, spot: fl
     assert spot == pytest.approx(sheet, rel=0.06)
 
 
+@pytest.mark.second
 def test_gf7_short_is_a_fifth_shorter_at_the_same_focal_length(backend, camera) -> None:
     """By clear apertures and the image along z; its worst wavefront error over the field is what its file states."""
     lengths, distances = {}, {}

@@ -16,6 +16,7 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.models.scenery_parts import Finishes, mirror_surface
 from scenes.specs.baffle import Plate
+from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, screen, ways_and_search
 from twin.path_tracing.clear_ways import ClearWays
 from twin.path_tracing.families import Event, code
@@ -44,7 +45,7 @@ def same(one: PathResult, other: PathResult) -> None:
     assert one.balance.absorbed == pytest.approx(other.balance.absorbed, rel=1e-9, abs=1e-15)
 
 
-@pytest.mark.parametrize("sampling", [BALANCED, FAINT], ids=["balanced", "faint"])
+@pytest.mark.parametrize("sampling", quick(1, [BALANCED, FAINT]), ids=["balanced", "faint"])
 @pytest.mark.parametrize(
     ("name", "state"),
     [("gf7_pair", {}), pytest.param("monitor_pair", STATE, marks=pytest.mark.second)],

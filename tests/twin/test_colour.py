@@ -91,6 +91,7 @@ def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) 
         spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
 
 
+@pytest.mark.second
 def test_a_camera_of_mirrors_over_its_band(backend, gf7) -> None:
     """One pupil serves all wavelengths; a point's image has the MTF that the transfer function says."""
     optics = CameraOptics.alone(gf7, backend)

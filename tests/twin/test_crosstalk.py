@@ -68,6 +68,7 @@ def test_factors_of_the_printed_formulas(table):
         assert factors["paper_single", "d_gamma_arcsec"].by_truth == pytest.approx(2.0 * stretch, rel=5e-3)
 
 
+@pytest.mark.second
 def test_three_kinds_of_focal_length_change(table):
     """Scale and M2 despace are seen as d_f; a focal-plane piston hardly changes f and looks like a rotation."""
     setup, cameras = table
@@ -90,6 +91,7 @@ def test_three_kinds_of_focal_length_change(table):
         assert any("(piston)" in s and "the spots see it wrongly" in s for s in statements)
 
 
+@pytest.mark.second
 def test_reference_rotation_cannot_be_told_from_the_cameras(table):
     """A turn of the central prism reads as an opposite turn of the camera; the report has to name it."""
     _, cameras = table

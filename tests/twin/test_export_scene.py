@@ -55,6 +55,7 @@ def gcp(sensor, image: str, count: int = COUNT, wrong: int = 3) -> str:
     return "# WGS 84\n" + "\n".join(lines) + "\n"
 
 
+@pytest.mark.second
 def test_a_scene_becomes_models(folder: Path, tmp_path: Path) -> None:
     """ISD and RPC agree with the sensor of the file; the file's own polynomials are compared."""
     result = run("export", folder / "DIM_SCENE.XML", "--out", tmp_path / "out", "--json")
@@ -96,6 +97,7 @@ def test_control_points_correct_the_polynomials(folder: Path, tmp_path: Path, ki
     assert np.abs(off).max() < 4.0 * NOISE * (0.3 if kind == "shift" else 1.0)
 
 
+@pytest.mark.second
 def test_a_map_of_the_accuracy(folder: Path, tmp_path: Path) -> None:
     """By hand for a look near the vertical: the attitude's turn times the distance, and the position, on each axis."""
     sigmas = "--attitude-sigma,2 arcsec,--position-sigma,1 m,--image-sigma,0.5,--height-sigma,3 m".split(",")
@@ -148,7 +150,8 @@ def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
         refused(folder / "DIM_SCENE.XML", tmp_path / "out", ("--control", tmp_path / "p.gcp"), message)
 
 
-@pytest.mark.parametrize("form", quick(1, ["a_RPC.TXT", "RPC_SCENE.XML", "a.tif"]))
+@pytest.mark.second
+@pytest.mark.parametrize("form", ["a_RPC.TXT", "RPC_SCENE.XML", "a.tif"])
 def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str) -> None:
     """The same polynomials from three formats take the same correction, as the scene's own do."""
     model = read_rpc(folder / "RPC_SCENE.XML")

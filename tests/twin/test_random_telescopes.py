@@ -55,9 +55,8 @@ def deviation(backend, seed: int) -> float | str:
     return float(max(np.max(np.abs(mtf.values - grid.mtf(shifts))), np.max(np.abs(mtf.limit - grid.mtf(shifts, True)))))
 
 
-@pytest.mark.parametrize(
-    "seed", [seed if seed < 1 else pytest.param(seed, marks=pytest.mark.second) for seed in range(FEW)]
-)
+@pytest.mark.second
+@pytest.mark.parametrize("seed", range(FEW))
 def test_a_telescope_drawn_at_random(backend, seed: int) -> None:
     found = deviation(backend, seed)
     assert not isinstance(found, str), found

@@ -14,6 +14,7 @@ import pytest
 from optics.geometry.tree import Motion
 from optics.materials.finish import CoatingTable, Finish
 from scenes.models.scenery import build_scenery
+from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, scene_beam, ways_and_search
 from tests.twin.test_clear_ways import same
 from twin.path_tracing.families import Event, nominal_codes
@@ -33,7 +34,7 @@ STATE = {
 }
 
 
-@pytest.mark.parametrize("sampling", [BALANCED, ALL], ids=["balanced", "faint"])
+@pytest.mark.parametrize("sampling", quick(1, [ALL, BALANCED]), ids=["faint", "balanced"])
 @pytest.mark.parametrize(
     ("name", "state"),
     [("gf7_pair", {}), pytest.param("monitor_pair", STATE, marks=pytest.mark.second)],
@@ -62,6 +63,7 @@ def test_what_is_not_as_usual_on_nominal_light_is_left_to_the_loop(backend, gf7_
     same(*found.runs)
 
 
+@pytest.mark.second
 def test_paths_whose_first_surface_is_searched_are_those_of_a_search(backend, gf7_pair) -> None:
     """Prisms stand in the beam of a far point; all of the light ends on the focal plane, which absorbs it."""
     scenery = build_scenery(gf7_pair, {}, IDEAL, whole_focal_planes=True)
@@ -139,6 +141,7 @@ def weights(run: PathResult) -> dict[tuple[int, int, int], float]:
     return dict(zip(keys, d.weight.tolist(), strict=True))
 
 
+@pytest.mark.second
 def test_thinning_keeps_the_light_and_takes_away_paths(gf7_pair, stray) -> None:
     """Families of the same seeds: what both runs follow is the same, and the rest agrees within its standard error."""
     paths, toward = 4 * PATHS, f"{gf7_pair.channels[0].key}/area_ccd"
@@ -172,6 +175,7 @@ def test_thinning_keeps_the_light_and_takes_away_paths(gf7_pair, stray) -> None:
     assert abs(np.mean(runs[0]) - np.mean(runs[1])) < 4.0 * spread
 
 
+@pytest.mark.second
 def test_thinned_paths_do_not_depend_on_the_chunk_and_are_found_again(stray) -> None:
     runs = [stray(FAINT, 2 * PATHS, 3, chunk=chunk) for chunk in (1 << 20, 5000)]
     named = [{(f.detector, f.kind, f.touches): (f.count, f.energy) for f in run.families} for run in runs]
