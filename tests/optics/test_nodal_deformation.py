@@ -77,6 +77,25 @@ def test_a_large_turn_and_a_growth_are_exact_too() -> None:
     assert face.rms(face.change) < 1e-14
 
 
+def test_figure_and_ripple_come_back_with_their_sizes() -> None:
+    """Amplitudes of terms are rms, half of a ripple's amplitude is its rms; the mesh says how well it knows them."""
+    points = mesh(DISK, 90)
+    x, y = (points[:, :2] - DISK.centre).T
+    bump = 100e-9 * zernike.zernike(5, x / 0.3, y / 0.3) - 40e-9 * zernike.zernike(9, x / 0.3, y / 0.3)
+    bump = bump + 20e-9 * np.cos(2.0 * np.pi * x / 0.1) * np.cos(2.0 * np.pi * y / 0.12)
+    turn = Rotation.from_rotvec(TURN).as_matrix()
+    lifted = points + np.stack([0.0 * x, 0.0 * x, bump], axis=-1)
+    face = nodal_deformation(points, lifted @ turn.T + SHIFT - points, BOWL, DISK)
+    np.testing.assert_allclose(face.rotate, TURN, rtol=0, atol=2e-8)
+    assert face.figure[5] == pytest.approx(100e-9, rel=0.02)
+    assert face.figure[9] == pytest.approx(-40e-9, rel=0.04)
+    assert face.rms(face.residual) == pytest.approx(10e-9, rel=0.06)
+    assert face.rms(face.change) == pytest.approx(np.sqrt(100.0**2 + 40.0**2 + 10.0**2) * 1e-9, rel=0.03)
+    assert face.rms(face.lost) < 1e-11
+    assert 0.0 < face.between < 2e-9
+    assert not face.printed_through
+
+
 def lifted_by(points: np.ndarray, height: float) -> np.ndarray:
     """Points elsewhere along z."""
     return np.asarray(points + np.array([0.0, 0.0, height]))

@@ -315,6 +315,7 @@ def test_supports_bonds_temperatures_and_points_that_cannot_be_are_refused() -> 
     ):
         with pytest.raises(ValueError, match=words):
             Kinematic(np.asarray(points))
+    Kinematic(np.array([[0, 0, 0], [1, 0, 0], [2, 1e-4, 0]]))  # hardly on a line, and taken
     (u,) = body.solve_many([one_kelvin], support)
     outside = Kinematic(np.array([[0.1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.02]]))
     edge = Bonded(lambda nodes: (np.abs(nodes[:, 1]) < 1e-9) & (nodes[:, 0] > 1.2 - 1e-9))
