@@ -16,6 +16,7 @@ from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from tests.twin.dimap_bench import Scene, rpc, write
 from tests.twin.line_scanner_model import LineScannerModel
+from twin.orbit.export import ground_accuracy, line_scanner
 from twin.orbit.export.export_report import _warnings as export_warnings
 from twin.orbit.export.quality_sections import quality_warnings
 from twin.orbit.export.rational_polynomial import RationalPolynomial
@@ -148,6 +149,12 @@ def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
     ):
         (tmp_path / "p.gcp").write_text(text)
         refused(folder / "DIM_SCENE.XML", tmp_path / "out", ("--control", tmp_path / "p.gcp"), message)
+    (tmp_path / "a.ntf").write_bytes(b"NITF")
+    (tmp_path / "other.gcp").write_text(points.replace("SCENE_P", "b", 2).replace("SCENE_P", "c"))
+    model, other = folder / "RPC_SCENE.XML", ("--control", tmp_path / "other.gcp")
+    refused(tmp_path / "a.ntf", tmp_path / "out", (), "a NITF file, which is not read")
+    refused(Path("simulate"), tmp_path / "out", ("--band", "B1"), "only the scene of a DIMAP file has bands")
+    refused(model, tmp_path / "out", other, "no control point is in the image of these polynomials")
 
 
 @pytest.mark.second
@@ -224,3 +231,19 @@ def test_doubts_of_polynomials_and_control_points_are_told() -> None:
     ):
         texts = export_warnings(SimpleNamespace(source=None, lines={"A": line}))
         assert [text[: len(word)] for text, word in zip(texts, words, strict=True)] == words
+
+
+def test_looks_that_miss_the_earth_and_ground_on_the_180th_meridian_are_refused() -> None:
+    """A camera that looks into space is refused wherever its ground is needed."""
+    none = SimpleNamespace(
+        lines=4, camera=SimpleNamespace(pixels=4), ground=lambda at, *_: np.full((len(at), 3), np.nan)
+    )
+    with pytest.raises(ValueError, match="no look meets the Earth"):
+        ground_accuracy._places(none, np.zeros(2), np.zeros(2), 0.0)
+    with pytest.raises(ValueError, match="a look misses the Earth"):
+        line_scanner._error(none, None, 0.0, (0, 4))
+    with pytest.raises(ValueError, match="a look misses the Earth"):
+        RationalPolynomial.fit(none, 0, 4, (0.0, 1000.0))
+    across = np.array([[0.0, 0.0, 0.0, -179.9, 0.0], [9.0, 9.0, 0.1, 179.9, 100.0]])
+    with pytest.raises(ValueError, match="the ground lies on the 180th meridian or a pole"):
+        RationalPolynomial.through(across, across)
