@@ -1,7 +1,10 @@
+import re
+
 import numpy as np
 import pytest
 
 from optics.geometry.aperture import Circle
+from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import GridFigure, Surface, ZernikeFigure, plane
 from optics.geometry.tree import Motion
 from optics.geometry.zernike import zernike
@@ -32,7 +35,20 @@ def test_defocus_figure_is_a_paraboloid(backend) -> None:
     np.testing.assert_allclose(path - np.linalg.norm(to_focus, axis=-1), 1.0 - focal, rtol=1e-14)
 
 
-@pytest.mark.parametrize("base", [plane(), Surface(-0.2, -1.2), Surface(-0.2, -1.2, (-5e-5, 1e-6))])
+TERMS = XYPolynomial(x2=0.02, x2y=-0.03), ZernikeSag(radius=0.5, x0=0.1, Z5=2e-4)
+
+
+def test_further_terms_of_a_sag_by_their_formulas() -> None:
+    x, y = np.random.default_rng(1).uniform(-0.3, 0.3, (2, 20))
+    want = 0.02 * x**2 - 0.03 * x**2 * y + 2e-4 * np.sqrt(6.0) * 2.0 * (x - 0.1) * y / 0.5**2
+    np.testing.assert_allclose(Surface(terms=TERMS).sag(x, y), want, rtol=0, atol=1e-16)
+    for name, power in XYPolynomial.POWERS.items():
+        a, b = (name.count(v) and int((re.search(rf"{v}(\d?)", name) or [""])[1] or 1) for v in "xy")
+        assert a + b == 1 - power
+        np.testing.assert_allclose(XYPolynomial(**{name: 0.1}).sag(x, y), 0.1 * x**a * y**b, rtol=1e-14)
+
+
+@pytest.mark.parametrize("base", [plane(), Surface(-0.2, -1.2, (-5e-5, 1e-6)), Surface(-0.2, -1.2, terms=TERMS)])
 def test_figured_surfaces_meet_their_own_sag(backend, base: Surface) -> None:
     grid, _ = wavy_grid(2e-6)
     for figure in (ZernikeFigure(0.7, (0.1, -0.05), {4: 1e-6, 7: 2e-6, 11: -1e-6, 24: 5e-7}), grid):

@@ -9,6 +9,7 @@ import pytest
 
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose
+from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import Figure, GridFigure, Surface, ZernikeFigure, plane
 from optics.geometry.tree import AT_REST, Body, Motion, RigidTree, State
 from optics.raytrace.assembly import Assembly, Element, Interaction
@@ -30,6 +31,9 @@ ASTIGMATIC = ZernikeFigure(0.25, (0.01, -0.02), {5: 2e-6, 7: -1e-6, 11: 5e-7})
 y, x = np.mgrid[-1:1:21j, -1:1:31j]
 WAVY = GridFigure(2e-6 * np.cos(4.0 * x) * np.cos(3.0 * y), (-0.3, 0.3, -0.28, 0.28))
 BOWL = Surface(-0.4, -0.9, (2e-4,))
+FREEFORM = Surface(
+    -0.4, -0.9, (2e-4,), None, (XYPolynomial(x2=2e-3, x2y=-5e-3), ZernikeSag(radius=0.3, x0=0.01, Z7=1e-5))
+)
 HEAT = {"mirror": Motion(figure={4: 3e-7, 8: 2e-7}, scale=2e-5)}
 CASES: dict[str, tuple[Surface, Figure | None, State]] = {
     "own": (BOWL, ASTIGMATIC, {}),
@@ -41,6 +45,7 @@ CASES: dict[str, tuple[Surface, Figure | None, State]] = {
     "grid of a state": (BOWL, None, {"mirror": Motion(grid=WAVY, stretch=2e-5)}),
     "all of a state": (BOWL, ASTIGMATIC, {"mirror": replace(HEAT["mirror"], grid=WAVY)}),
     "two grids": (BOWL, WAVY, {"mirror": Motion(figure={4: 3e-7}, grid=WAVY)}),
+    "terms": (FREEFORM, ASTIGMATIC, HEAT),
     "flat grid of a state": (plane(), None, {"mirror": Motion(grid=WAVY)}),
 }
 
