@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
@@ -245,3 +246,19 @@ def test_paths_that_are_drawn_for_faint_light_find_what_plain_ones_find(backend)
     # the same number of paths tells the faint ones better
     twice = way("entry>", "exit", "entry", "exit>")
     assert faint["behind", twice].error < 0.5 * plain["behind", twice].error
+
+
+def test_too_many_and_turned_apertures_of_a_face_are_refused() -> None:
+    """A face carries two clear apertures at most, and none that is turned against it unless it is round."""
+    entry = frame((0, 0, -1), (0, 0, 0))
+    turned = Pose(entry.rotation @ rotation_matrix(np.array([0.0, 0.0, 0.3])), entry.translation)
+    for pose, apertures, words in (
+        (entry, [Circle(0.01), Circle(0.02), Circle(0.03)], "face 'entry' has 3 clear apertures; at most two"),
+        (turned, [Rectangle(0.01, 0.02)], "its clear aperture is turned against the face 'entry'"),
+    ):
+        common = ("glass/e", plane(), Interaction.REFRACT)
+        made = [Element(f"e{k}", *common, one, solid="glass") for k, one in enumerate(apertures)]
+        tree = RigidTree((Body("glass"), Body("glass/e", pose)))
+        assembly = Assembly(tree, {one.name: one for one in made}, {}, {"glass": INDEX})
+        with pytest.raises(ValueError, match=words):
+            solid_surfaces(slab(0.3, THICKNESS), assembly, assembly.place(), {}, Finishes(ground=ABSORBER))
