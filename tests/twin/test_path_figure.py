@@ -74,10 +74,10 @@ def scene(assembly: Assembly, state: State) -> Scenery:
 
 
 APERTURES = {
-    "disk": Circle(0.2),
-    "ring": Circle(0.2, (0.01, 0.0), 0.05),
-    "rectangle": Rectangle(0.2, 0.1),
-    "ellipse": Ellipse(0.2, 0.1),
+    "disk": Circle(0.2, (0.02, -0.03)),
+    "ring": Circle(0.2, (0.01, -0.02), 0.05),
+    "rectangle": Rectangle(0.2, 0.1, (0.02, -0.03)),
+    "ellipse": Ellipse(0.2, 0.1, (0.02, -0.03)),
 }
 PAIRS = [*((case, "disk") for case in CASES), *(("own", aperture) for aperture in APERTURES if aperture != "disk")]
 """Each figure in one aperture and each aperture with one figure."""
