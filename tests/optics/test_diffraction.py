@@ -10,6 +10,7 @@ from optics.numerics.quadrature import PupilNodes
 from optics.waves import diffraction
 from optics.waves.diffraction import Grid, PupilField, airy, image
 from optics.waves.field_samples import LONGEST, FieldSamples
+from tests.tiers import quick
 
 WAVELENGTH, F_NUMBER = 650e-9, 9.2
 APERTURE = 0.5 / F_NUMBER
@@ -76,7 +77,7 @@ def test_wave_tables_in_pieces_give_the_same_bits(single: bool, monkeypatch: pyt
     np.testing.assert_array_equal(image(perfect(0.001), axis, axis, single), whole)
 
 
-@pytest.mark.parametrize(("single", "error"), [(False, 1e-12), (True, 2e-7)])
+@pytest.mark.parametrize(("single", "error"), quick(1, [(False, 1e-12), (True, 2e-7)]))
 def test_few_samples_of_the_field_make_the_image(single: bool, error: float) -> None:
     """Against the plain sum over all waves, of an aberrated and slanted beam, on a CCD longer than samples are made for
     at once and off the beam's middle. The pixels sample the field 12 and 8 times as densely as its band asks for."""

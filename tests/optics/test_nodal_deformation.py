@@ -146,6 +146,7 @@ def test_order_of_the_nodes_and_nodes_elsewhere_do_not_matter() -> None:
     np.testing.assert_array_equal(other.grid.values, face.grid.values)
 
 
+@pytest.mark.second
 def test_a_finer_half_of_a_mesh_does_not_weigh_more() -> None:
     def bent(points: np.ndarray) -> np.ndarray:
         return 1e-6 * (points[:, :1] / 0.3) ** 3 * np.array([0.0, 0.0, 1.0])
@@ -163,6 +164,7 @@ def test_a_finer_half_of_a_mesh_does_not_weigh_more() -> None:
     assert abs(plain / (0.5e-6 / 0.3) + 1.0) > 0.02  # every node alike would be off by this
 
 
+@pytest.mark.second
 def test_a_mesh_that_prints_through_is_told() -> None:
     points = mesh(DISK, 50)
     rng = np.random.default_rng(4)

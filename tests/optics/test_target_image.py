@@ -9,7 +9,6 @@ from optics.numerics import quadrature
 from optics.targets.target_image import EdgeProfile, target_image
 from optics.targets.target_shapes import Target, bar_group, pinhole, siemens_star, slanted_edge
 from optics.waves.diffraction import Grid, airy
-from tests.tiers import quick
 
 WAVELENGTH, F_NUMBER, PITCH = 650e-9, 9.2, 7e-6
 CUTOFF = 1.0 / (WAVELENGTH * F_NUMBER)
@@ -121,7 +120,8 @@ def test_middle_of_a_disk_is_the_encircled_energy(radius: float) -> None:
     assert middle == pytest.approx(1.0 - j0(z) ** 2 - j1(z) ** 2, abs=FAINT)
 
 
-@pytest.mark.parametrize("angle", quick(1, [0.0, 0.3]))
+@pytest.mark.second
+@pytest.mark.parametrize("angle", [0.0, 0.3])
 def test_bars_have_the_fundamental_of_the_transfer_function(angle: float) -> None:
     """A square wave of unit height has the amplitude 2/pi; its harmonics from the third on lie beyond the cut-off."""
     frequency = 65e3
@@ -167,8 +167,9 @@ def test_levels_add() -> None:
     np.testing.assert_allclose(both, 0.1 + 0.5 * lone + 0.2 * alone, rtol=0, atol=1e-13)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
-    "target", quick(1, [siemens_star(12, 2e-4, 1e-5), pinhole(4.4e-4), pinhole(9e-4)]), ids=["star", "disk", "huge"]
+    "target", [siemens_star(12, 2e-4, 1e-5), pinhole(4.4e-4), pinhole(9e-4)], ids=["star", "disk", "huge"]
 )
 def test_default_guard(target: Target) -> None:
     """It agrees with copies 3 mm away to the stated error."""

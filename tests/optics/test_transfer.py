@@ -97,7 +97,8 @@ def test_a_perfect_point_beside_the_origin_and_out_of_focus(dz: float) -> None:
     assert np.all(np.max(np.abs(np.abs(got[:2]) - np.abs(want)), axis=-1) > 0.3)
 
 
-@pytest.mark.parametrize("dz", quick(1, [-300e-6, 0.0, 300e-6]))
+@pytest.mark.second
+@pytest.mark.parametrize("dz", [-300e-6, 0.0, 300e-6])
 def test_against_the_transform_of_the_image(backend, gf7, traced: PupilFunction, dz: float) -> None:
     """The image on a moved detector, summed with the kernel, against the transfer function of the unmoved one.
 

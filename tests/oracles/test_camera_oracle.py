@@ -12,6 +12,7 @@ pytestmark = pytest.mark.oracle
 NAMES = quick(1, ["gf7", "monitor", "gf7_conic"])
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", NAMES)
 def test_paraxial_data_of_optiland(backend, camera, name: str) -> None:
     """About the axis, which the field stands beside; the rays that are traced there are those of the twin."""

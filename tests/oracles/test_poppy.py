@@ -38,6 +38,7 @@ def test_image_of_the_same_samples(point) -> None:
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12 * theirs.max())
 
 
+@pytest.mark.second
 def test_image_from_the_stops_quadrature(point) -> None:
     """Some thousand traced nodes against poppy's samples on ever finer grids.
 

@@ -51,6 +51,7 @@ def test_table_is_what_the_images_say(table, backend):
         assert np.all(np.abs(true - found.true) < 0.01 * np.abs(found.true) + floor)
 
 
+@pytest.mark.second
 def test_factors_of_the_printed_formulas(table):
     setup, cameras = table
     for name, found in cameras.items():

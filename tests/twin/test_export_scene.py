@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
-from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from tests.twin.dimap_bench import Scene, rpc, write
 from tests.twin.line_scanner_model import LineScannerModel
@@ -81,7 +80,8 @@ def test_a_scene_becomes_models(folder: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(there, (row, column), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", quick(1, ["shift", "affine"]))
+@pytest.mark.second
+@pytest.mark.parametrize("kind", ["shift", "affine"])
 def test_control_points_correct_the_polynomials(folder: Path, tmp_path: Path, kind: str) -> None:
     arguments = ("--control", folder / "points.gcp", "--correction", kind)
     result = run("export", folder / "DIM_SCENE.XML", *arguments, "--out", tmp_path / "out")

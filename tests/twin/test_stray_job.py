@@ -62,6 +62,7 @@ def test_the_tilt_keeps_ghosts_off_the_spot(experiment, square_prisms):
         assert np.abs(place).max() < 0.05 * setup.path.pitch
 
 
+@pytest.mark.second
 def test_the_spread_keeps_the_light(experiment):
     spots = diffraction_spots(experiment("gf7_pair"))
     assert spots.shape[1:] == (2 * REACH + 1, 2 * REACH + 1)
