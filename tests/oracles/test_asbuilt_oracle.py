@@ -9,14 +9,7 @@ from scenes.specs.load import load_camera
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import VariedBeams
 
-pytest.importorskip("batoid", reason="batoid not installed (extra `oracles`)")
-
-
-from tests.oracles.tolerance_peer import BatoidCamera
-
 pytestmark = pytest.mark.oracle
-
-SHIFT, TURN = 2e-6, 1e-6
 
 
 OFF_AXIS = np.array([(-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, -1.0)])
@@ -40,6 +33,9 @@ def test_derivatives_of_an_off_axis_pupil_as_by_batoid_and_an_own_fit(backend) -
     optics = CameraOptics.alone(load_camera("gf7"), backend)
     beams = VariedBeams(optics, OFF_AXIS)
     rows = beams.zernike_rows(11)[:, 3:]
+    pytest.importorskip("batoid")
+    from tests.oracles.tolerance_peer import BatoidCamera
+
     peer = BatoidCamera(optics.model, OFF_AXIS)
     x, y = peer.nodes.points[1:].T
     r2 = x**2 + y**2

@@ -1,5 +1,7 @@
 """Diffraction images and transfer functions of a traced exit pupil against poppy."""
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,11 @@ from optics.waves.diffraction import Grid, image
 from tests.oracles.pupil_grid import WAVELENGTH, FarPoint, fitted, pupil_grid
 from tests.tiers import quick
 
-poppy = pytest.importorskip("poppy", reason="poppy not installed (extra `oracles`)")
-pytestmark = pytest.mark.oracle
+# not imported here: each process that runs tests collects this file
+pytestmark = [
+    pytest.mark.oracle,
+    pytest.mark.skipif(find_spec("poppy") is None, reason="poppy not installed (extra `oracles`)"),
+]
 
 ARCSEC = np.pi / 180 / 3600
 STATES: dict[str, State] = {

@@ -20,7 +20,6 @@ from scenes.specs.load import load_camera
 from tests.oracles.pupil_raster import PupilRaster, raster
 from twin.camera.camera_optics import CameraOptics
 
-batoid = pytest.importorskip("batoid", reason="batoid not installed (extra `oracles`)")
 pytestmark = pytest.mark.oracle
 
 HERE = Path(__file__).parent / "telescopes"
@@ -38,6 +37,11 @@ LSST = "LSST/LSST_r.yaml", 622e-9, 8.36, 1.75
 OVER = np.array([1.0, -1.0, -1.0])
 
 
+def data(name: str) -> Path:
+    """Return the path of a file of batoid's."""
+    return Path(pytest.importorskip("batoid").__file__).parent / "data" / name
+
+
 @cache
 def own_telescope(backend: Backend, name: str, folder: Path) -> tuple[CameraOptics, Any]:
     """A camera's file here, and what batoid makes of the same prescription."""
@@ -46,13 +50,13 @@ def own_telescope(backend: Backend, name: str, folder: Path) -> tuple[CameraOpti
     assert not notes
     path = folder / f"{name}.yaml"
     path.write_text(text, "utf-8")
-    return optics, batoid.Optic.fromYaml(str(path))
+    return optics, pytest.importorskip("batoid").Optic.fromYaml(str(path))
 
 
 @cache
 def batoids_telescope(backend: Backend, name: str, wavelength: float, pupil: float, largest: float) -> CameraOptics:
     """A telescope of batoid's as a camera, over the square in its round field."""
-    path = Path(batoid.__file__).parent / "data" / name
+    path = data(name)
     end = np.radians(largest)
     lens = replace(read_batoid(path, wavelength), fields=((0.0, 0.0), (0.0, end), (0.0, -end), (end, 0.0)))
     return CameraOptics.alone(
@@ -77,7 +81,7 @@ def test_mtf_as_by_an_fft_of_batoids_pupil(backend, folder, name, field) -> None
     """Of LSST at F/1.2, whose field of 2.5 deg surfaces vignette, by batoid's own file."""
     if name == "lsst":
         optics = batoids_telescope(backend, *LSST)
-        peer = batoid.Optic.fromYaml(str(Path(batoid.__file__).parent / "data" / LSST[0]))
+        peer = pytest.importorskip("batoid").Optic.fromYaml(str(data(LSST[0])))
     else:
         optics, peer = own_telescope(backend, name, folder)
     grid = its_raster(optics, peer, field)
@@ -112,12 +116,12 @@ def test_mtf_at_uneven_frequencies_as_by_an_fft_of_batoids_pupil(backend, folder
 def test_annular_terms_of_lsst_as_batoids(backend) -> None:
     """Gram and Schmidt's over the light of a ring are Mahajan's; batoid fits 512 x 512 rays: to 1 %."""
     optics = batoids_telescope(backend, *LSST)
-    peer = batoid.Optic.fromYaml(str(Path(batoid.__file__).parent / "data" / LSST[0]))
+    peer = pytest.importorskip("batoid").Optic.fromYaml(str(data(LSST[0])))
     wave = optics.wavefront((0.0, 0.0))
     assert wave.hole == pytest.approx(2.558 / 4.18, abs=1e-4)
     assert wave.polynomials.startswith("annular Zernike terms")
     assert wave.accuracy < 1e-3
-    theirs = batoid.zernike(peer, 0.0, 0.0, LSST[1], jmax=37, eps=wave.hole, nx=512)
+    theirs = pytest.importorskip("batoid").zernike(peer, 0.0, 0.0, LSST[1], jmax=37, eps=wave.hole, nx=512)
     for j in (4, 11, 22):
         assert wave.parts[j - 1] == pytest.approx(theirs[j], rel=0.01), j
     assert np.max(np.abs(np.delete(wave.parts - theirs[1:38], [0, 1, 2]))) < 3e-4

@@ -23,7 +23,6 @@ from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, trace_stray
-from twin.path_tracing.tables import MOST_DETECTORS
 from twin.path_tracing.tracer import (
     BALANCED,
     VARIANTS,
@@ -141,7 +140,7 @@ def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
     glass, (mirror,) = glass_scene(slab(0.3, 0.02), 1.5).surfaces[:6], flat_mirror(IDEAL.mirror)
     wavy = replace(mirror, surface=Surface(0.1, 0.0, (1e-9,) * 40))
     rays = RaySource.even(np.zeros((2, 3)), np.tile([0.0, 0.0, 1.0], (2, 1)))
-    many = tuple(screen(f"s{k}", facing(0.5 + k), 1.0) for k in range(MOST_DETECTORS + 1))
+    many = tuple(screen(f"s{k}", facing(0.5 + k), 1.0) for k in range(256))
     for make, words in (
         (lambda: Sampling(floor=1.0), "impossible"),
         (lambda: replace(source, narrow=(0.08, 0.0, 0.05)), "does not lie in"),
@@ -153,7 +152,7 @@ def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
         (lambda: Scenery((surface, surface), (grid,)), "surfaces of the same name: "),
         (lambda: Scenery((surface,), ()), "unknown detectors: far"),
         (lambda: PathTracer(backend, alone, {"near": ()}, ways=False), "unknown detectors: near"),
-        (lambda: PathTracer(backend, Scenery(*zip(*many, strict=True))), "at most"),
+        (lambda: PathTracer(backend, Scenery(*zip(*many, strict=True))), "256 detectors: at most 255 of each"),
     ):
         with pytest.raises(ValueError, match=words):
             make()
