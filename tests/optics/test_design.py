@@ -142,7 +142,12 @@ def test_anamorphism_as_a_constraint(backend, gf7, beams) -> None:
 def test_starts(backend, gf7, beams) -> None:
     """Drawn starts follow from seed and number, pass light, and end where the camera itself does: one optimum."""
     nominal = prescription_of(gf7.spec)
-    found = search(backend, nominal, CONICS, beams, Operands(650e-9), steps=5, starts=3, seed=4)
+    told = []
+    found = search(
+        backend, nominal, CONICS, beams, Operands(650e-9), 5, starts=3, seed=4, advance=lambda *n: told.append(n)
+    )
+    assert told == sorted(told)
+    assert told[-1] == (3, 3)
     merit = found.best.merit
     assert [attempt.drawn for attempt in found.attempts] == [False, True, True]  # no envelope: no order of its steps
     drawn = [drawn_start(merit, nominal, CONICS, np.random.default_rng([4, n])).values(CONICS) for n in (1, 1, 2)]

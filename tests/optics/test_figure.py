@@ -81,6 +81,10 @@ def test_grid_figure_follows_the_function_it_samples(backend) -> None:
     slope_x = -amplitude * k * np.sin(k * x) * np.cos(k * y)
     np.testing.assert_allclose(leaving[:, 0], 2 * slope_x, atol=3e-4 * amplitude * k)
     np.testing.assert_allclose(grid.sag(x, y), hit[:, 2], atol=2e-16)
+    # beyond its samples the figure is that of its edge
+    points = np.array([[0.6, 0.1], [-0.7, 0.2], [0.1, 0.58], [-0.2, -0.9], [0.6, 0.6]])
+    hit, *_ = run(backend, build(Stage(Surface(figure=grid))), *beam(points, -1.0, Z))
+    np.testing.assert_allclose(hit[:, 2], grid.sag(*np.clip(points, -0.5, 0.5).T), atol=2e-16)
 
 
 def test_a_state_adds_its_figure_on_the_aperture(backend) -> None:
