@@ -56,7 +56,7 @@ STAR = Polygon(((0.05, 0.0), (0.015, 0.015), (0.0, 0.06), (-0.015, 0.015), (-0.0
         1,
         [
             [Edge(Circle(0.05), True), *VANES],
-            [Edge(Circle(0.16, inner=0.04))],
+            [Edge(Circle(0.152, inner=0.04))],
             [Edge(Rectangle(0.1, 0.13), turn=0.3), Edge(Ellipse(0.03, 0.06), True, 0.7)],
             [Edge(STAR)],
             [Edge(Circle(0.05), True)],

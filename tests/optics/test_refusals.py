@@ -37,6 +37,7 @@ BEAM = PupilField(*(0.05 * part[None] for part in (NODES.x, NODES.y, 0.0 * NODES
 
 
 def test_what_cannot_be_is_refused() -> None:
+    azimuth, radial = np.linspace(0.0, 2.0 * np.pi, 181), np.linspace(0.0, np.pi, 1001)
     on_stop = np.stack([NODES.x, NODES.y], axis=-1)[None]
     turned = SimpleNamespace(mapping=lambda: SimpleNamespace(detDF=lambda _: np.array([1.0, -1.0])))
     glass = CatalogueGlass("F0", 2, (-5.0, 0.01, 0.0, 0.0, 0.0, 0.0), 400e-9, 700e-9)
@@ -45,6 +46,10 @@ def test_what_cannot_be_is_refused() -> None:
         (lambda: triangle_order(5), "5 monomials are not all of some order"),
         (lambda: glass(500e-9), "F0: no index comes out of its dispersion formula at 500 nm"),
         (lambda: HarveyShack(0.0, 0.1, -2.0), "needs b0 > 0"),
+        (
+            lambda: ScatterTable([0.0], azimuth, radial, np.zeros((1, 181, 1001))),
+            "1000 x 180 cells are more",
+        ),
         (lambda: NodalTemperature(NODE, np.zeros(39)), r"nodes must be \(N, 3\) and temperatures \(N,\)"),
         (lambda: NodalTemperature(NODE, np.full(40, np.nan)), "nodes and temperatures must be finite"),
         (lambda: NodalTemperature(NODE[:2], np.zeros(2)), "2 different nodes"),

@@ -117,6 +117,9 @@ def test_quadratic_map_bends_edges_within_the_tolerance() -> None:
     right = right[np.argsort(right[:, 1])]
     off = np.abs(np.interp(y, right[:, 1], right[:, 0]) - (0.5 * side + 3.0 * y**2))
     assert 0.5 * tolerance < np.max(off) <= tolerance * (1.0 + 1e-6)
+    # edges along x bend as those along y do
+    other = Polygon(10.0 * SQUARE).mapped(lambda points: quadratic(points[:, ::-1])[:, ::-1], tolerance)
+    assert len(other.vertices) == len(mapped.vertices)
     # the map is a shear: it keeps areas, and so do the chords on both sides alike
     assert mapped.area == pytest.approx(side**2, rel=1e-12)
 
