@@ -56,18 +56,31 @@ STAR = Polygon(((0.05, 0.0), (0.015, 0.015), (0.0, 0.06), (-0.015, 0.015), (-0.0
         1,
         [
             [Edge(Circle(0.05), True), *VANES],
-            [Edge(Circle(0.152, inner=0.04))],
+            [Edge(Circle(0.16, inner=0.04))],
             [Edge(Rectangle(0.1, 0.13), turn=0.3), Edge(Ellipse(0.03, 0.06), True, 0.7)],
             [Edge(STAR)],
             [Edge(Circle(0.05), True)],
             [Edge(Circle(0.14, (0.02, 0.0)))],
             [Edge(Circle(0.5, inner=0.12), True)],
+            [Edge(Circle(0.152, inner=0.12), True)],
             [Edge(Circle(0.09, (0.03, 0.02), inner=0.05), True)],
             [Edge(STAR, True)],
             [Edge(Circle(0.16)), *(Edge(c, True) for c in (Circle(0.05), Circle(0.049), Circle(0.05, (1e-12, 0.0))))],
         ],
     ),
-    ids=["spider", "annulus", "mixed", "star-hole", "obscured", "vignetted", "hole", "ring", "star", "nested"],
+    ids=[
+        "spider",
+        "annulus",
+        "mixed",
+        "star-hole",
+        "obscured",
+        "vignetted",
+        "hole",
+        "hole of one",
+        "ring",
+        "star",
+        "nested",
+    ],
 )
 def test_shadows_are_what_edges_block(edges) -> None:
     pieces = shadows(edges)
