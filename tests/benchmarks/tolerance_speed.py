@@ -1,22 +1,17 @@
-"""Tolerances: ten thousand cameras with nine fields and three compensators, every one traced exactly and adjusted; and
-cameras of a telescope with a refocus beside optiland's tolerancing of it, in turns.
-"""
+"""Tolerances: ten thousand cameras with nine fields and three compensators, every one traced exactly and adjusted."""
 
 from __future__ import annotations
 
 import tempfile
 import time
-import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from scenes.specs.tolerance import resolve_tolerance
 from scenes.yaml.yaml_file import dump_yaml
 from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.stopwatch import Work, in_turns
-from tests.benchmarks.workbench import Workbench, absent, installed
+from tests.benchmarks.workbench import Workbench
 from tests.benchmarks.yardsticks import pace
 from twin.run.memory import largest_memory
 from twin.tolerance.merit_models import sensitivities
@@ -27,9 +22,6 @@ CAMERAS, QUICK_CAMERAS = 10_000, 400
 PACE = pace(python=0.5, arithmetic=0.4, memory=0.1)
 WANTED_S = 60.0
 """Of the wall clock, for all cameras on two cores."""
-PEERS = ("batoid", "optiland")
-"""What the comparison needs: optiland, and batoid for the rays that it is given."""
-REFOCUSED, THEIRS, ROUNDS = 1200, 40, 3
 MOTIONS = ("shift x", "shift y", "shift z", "rotate x", "rotate y", "radius")
 LIMITS = {"shift": "10 um", "rotate": "5 arcsec", "radius": "20 ppm"}
 BUDGET = {
@@ -52,41 +44,6 @@ BUDGET = {
 }
 
 
-def beside_optiland(bench: Workbench, quick: bool) -> tuple[Number, ...]:
-    """How many times the twin's processor time of a camera optiland's is: where one operand traces the rays of all
-    fields at once, and where each field is an operand of optiland's own wavefront.
-    """
-    from tests.oracles.tolerance_optiland import BUDGET as TWENTY
-    from tests.oracles.tolerance_optiland import Peer, twin_budget
-
-    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # numba's remarks on optiland's code
-        camera = ToleranceBench(twin_budget(Path(name)), bench.backend)
-        peer = Peer(camera.optics.model, camera.fields)
-        peer.register()
-        drawn = np.random.default_rng(1).uniform(-1.0, 1.0, (REFOCUSED, len(camera.numbers))) * camera.sizes
-        untilted = [key for key in TWENTY if "tilt" not in key]  # optiland's pupil is paraxial
-        counts = {"twin": REFOCUSED, "optiland": THEIRS, "optiland_own_wavefronts": 2}
-
-        def twin(_: Any) -> Any:
-            return camera.try_out(drawn)
-
-        works = {
-            "twin": Work(twin),
-            "optiland": Work(lambda _: peer.drawn(peer.tolerancing(), list(TWENTY), THEIRS)),
-            "optiland_own_wavefronts": Work(lambda _: peer.drawn(peer.tolerancing(own=True), untilted, 2)),
-        }
-        twin(None)
-        spent = in_turns(works, 1 if quick else ROUNDS, bench.look)
-    each = {key: 1e3 * one.cpu_s / counts[key] for key, one in spent.items()}
-    words = {"optiland": "one operand of all fields", "optiland_own_wavefronts": "its own wavefronts"}
-    out = [Number("refocused_ms", each["twin"], "processor time of a camera of three mirrors, refocused", "ms", PACE)]
-    for key, what in words.items():
-        text = f"  times as much in optiland, {what}"
-        out.append(Number(f"times_{key}", each[key] / each["twin"], text, least=True, limited=True))
-    return tuple(out)
-
-
 def measure(bench: Workbench, quick: bool) -> Speed:
     """Seconds from the start of two workers to the last camera; processor time of a camera; of all derivatives."""
     count = QUICK_CAMERAS if quick else CAMERAS
@@ -107,7 +64,6 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     assert np.all(np.isfinite(drawn.values))
     text = f"{count} cameras with nine fields and three compensators, two workers"
     wanted = None if quick else WANTED_S
-    missing = [peer for peer in PEERS if not installed(peer)]
     each = 1e3 * drawn.seconds / count
     return Speed(
         (
@@ -117,7 +73,5 @@ def measure(bench: Workbench, quick: bool) -> Speed:
                 "derivatives_ms", 1e3 * derived, f"  first and second derivatives by {len(camera.numbers)}", "ms", PACE
             ),
             Number("memory_mb", 1e-6 * largest_memory(), "  memory of this process", "MB", limited=True),
-            *(() if missing else beside_optiland(bench, quick)),
         ),
-        tuple(absent(peer) for peer in missing),
     )

@@ -8,7 +8,6 @@ import pytest
 
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
-from optics.numerics.threads import kernel_threads
 from optics.raytrace import trace as trace_module
 from optics.raytrace.aim import AimError, RayFan, aim, transverse_axes
 from optics.raytrace.system import assemble
@@ -60,71 +59,34 @@ def ends(backend, systems, rays) -> list[np.ndarray]:
     return [*found.numpy(), *found.numpy(found.world), found.hit(0), found.hit(2)]
 
 
-@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("section", [2, trace_module.SECTION])
-def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, threads: int, section: int, monkeypatch) -> None:
+def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, section: int, monkeypatch) -> None:
     """The same recording serves any number of systems and rays."""
     bare = gf7.bare_assembly()
     monkeypatch.setattr(trace_module, "SECTION", section)
     monkeypatch.setattr(trace_module, "FEWEST_IN_LANES", 1)
     position, direction = launch(gf7, 800)
-    before = dr.thread_count()
-    kernel_threads(threads)
-    try:
-        for count, size in ((5, 37), (37, 5), (8, 100), (100, 8), (33, 7), (33, 1), (1, 33), (16, 43)):
-            states = some_states(count, count, ("M1", "M2", "M3", "image"))
-            figure = Motion(figure={4: 1e-8, 6: 2e-8}, scale=1e-5)
-            systems = assemble(bare, ["imaging"], [{**state, "M3": figure} for state in states])
-            own = position[: count * size].reshape(count, size, 3)
-            ways = {
-                "each its own": make_rays(backend, own, np.broadcast_to(direction, own.shape)),
-                "own, one direction": make_rays(backend, own, direction),
-                "all the same": make_rays(backend, own[0], direction),
-            }
-            for way, rays in ways.items():
-                found = []
-                for fewest in (1, 10**9):
-                    monkeypatch.setattr(trace_module, "FEWEST_LANES", fewest)
-                    found.append(ends(backend, systems, rays))
-                for lanes, looked_up in zip(*found, strict=True):
-                    # the same operations; the compiler may contract other products into fma
-                    np.testing.assert_allclose(lanes, looked_up, rtol=0, atol=1e-14, err_msg=f"{count} {size} {way}")
-                assert np.any(found[0][3])
-    finally:
-        kernel_threads(before)
+    for count, size in ((37, 5), (8, 100), (100, 8), (33, 1), (1, 33), (16, 43)):
+        states = some_states(count, count, ("M1", "M2", "M3", "image"))
+        figure = Motion(figure={4: 1e-8, 6: 2e-8}, scale=1e-5)
+        systems = assemble(bare, ["imaging"], [{**state, "M3": figure} for state in states])
+        own = position[: count * size].reshape(count, size, 3)
+        for start, heading in ((own, np.broadcast_to(direction, own.shape)), (own, direction), (own[0], direction)):
+            found = []
+            for fewest in (1, 10**9):
+                monkeypatch.setattr(trace_module, "FEWEST_LANES", fewest)
+                found.append(ends(backend, systems, make_rays(backend, start, heading)))
+            for lanes, looked_up in zip(*found, strict=True):
+                # the same operations; the compiler may contract other products into fma
+                np.testing.assert_allclose(lanes, looked_up, rtol=0, atol=1e-14, err_msg=f"{count} {size}")
+            assert np.any(found[0][3])
 
 
-def test_no_ray_of_a_batch_is_anothers(backend, gf7, monkeypatch) -> None:
-    """Each system's rays, traced by lanes, against the system by itself, with rays that are lost among them."""
-    monkeypatch.setattr(trace_module, "FEWEST_LANES", 1)
-    monkeypatch.setattr(trace_module, "FEWEST_IN_LANES", 1)
-    bare = gf7.bare_assembly()
-    systems = assemble(bare, ["imaging"], some_states(24, 2, ("M2", "M3")))
-    position, direction = launch(gf7, 24 * 50)
-    rng = np.random.default_rng(5)
-    heading = direction + 1e-3 * rng.standard_normal((24, 50, 3))
-    heading[rng.random((24, 50)) < 0.2, 2] = 0.0
-    heading /= np.linalg.norm(heading, axis=-1, keepdims=True)
-    own = position.reshape(24, 50, 3)
-    every = ends(backend, systems, make_rays(backend, own, heading))
-    for k in range(24):
-        alone = ends(backend, systems.take(np.array([k])), make_rays(backend, own[k], heading[k]))
-        alive = alone[3][0]
-        np.testing.assert_array_equal(every[3][k], alive)
-        for many, one in zip(every, alone, strict=True):
-            np.testing.assert_allclose(many[k][alive], one[0][alive], rtol=0, atol=1e-14)
-
-
-def test_each_system_may_have_its_own_rays(backend, gf7) -> None:
-    bare = gf7.bare_assembly()
-    systems = assemble(bare, ["imaging"], some_states(3, 1, ("M2",)))
+def test_rays_for_another_number_of_systems_are_refused(backend, gf7) -> None:
+    systems = assemble(gf7.bare_assembly(), ["imaging"], some_states(3, 1, ("M2",)))
     position, direction = launch(gf7, 60)
-    shared = trace(backend, systems, make_rays(backend, position, direction)).numpy()
-    own = trace(backend, systems, make_rays(backend, np.tile(position, (3, 1, 1)), direction)).numpy()
     with pytest.raises(ValueError, match="rays for 2 systems cannot go through 3"):
         trace(backend, systems, make_rays(backend, np.tile(position, (2, 1, 1)), direction))
-    for a, b in zip(shared, own, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("order", [(60, 200), (200, 60)], ids=["first fewer rays", "first more rays"])
@@ -166,16 +128,6 @@ def test_threads_have_recordings_of_their_own(backend, gf7) -> None:
             np.testing.assert_array_equal(one, alone)
 
 
-def test_part_of_a_batch(backend, gf7) -> None:
-    systems = assemble(gf7.bare_assembly(), ["imaging"], some_states(5, 2, ("M2",)))
-    rays = make_rays(backend, *launch(gf7, 40))
-    whole = trace(backend, systems, rays).numpy()[0]
-    for chosen in ([0, 1], [4], [3, 1, 1]):
-        part = systems.take(np.array(chosen))
-        assert part.count == len(chosen)
-        np.testing.assert_allclose(trace(backend, part, rays).numpy()[0], whole[chosen], rtol=0, atol=1e-14)
-
-
 def test_sequences_of_other_structure_are_refused(gf7_pair) -> None:
     with pytest.raises(ValueError, match="different lengths"):
         assemble(gf7_pair.assembly, ["forward/imaging", "forward/left/monitor"])
@@ -200,36 +152,6 @@ def test_aim_reaches_its_points_and_says_when_it_cannot(backend, gf7) -> None:
     np.testing.assert_array_equal(again, q)
     with pytest.raises(AimError, match="did not converge"):
         aim(backend, to_stop, fan, np.full((1, 2), np.inf))
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_few_rays_are_traced_as_many_are(backend, gf7, monkeypatch, count) -> None:
-    """Element by element in kernels of their own, or many elements in one: no number differs."""
-    bare = gf7.bare_assembly()
-    systems = assemble(bare, ["imaging"], some_states(count, 1, ("M1", "M2", "M3", "image")))
-    position, direction = launch(gf7)
-    found = []
-    for few in (trace_module.FEW, 0):
-        monkeypatch.setattr(trace_module, "FEW", few)
-        traced = trace(backend, systems, make_rays(backend, position, direction), keep=(0, 2), world=True)
-        found.append((*traced.numpy(), *traced.numpy(traced.world), traced.hit(0), traced.hit(2)))
-    assert 0 < found[0][3].mean() < 1
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_elements_of_one_structure_share_a_kernel(backend, gf7_pair) -> None:
-    """Wherever they stand: a channel of 25 elements takes some ten kernels."""
-    name = next(name for name in gf7_pair.assembly.sequences if name.endswith("/monitor"))
-    systems = assemble(gf7_pair.assembly, [name], some_states(2, 1, ("base/backward/M2",)))
-    rays = make_rays(backend, np.zeros((2, 8, 3)), np.broadcast_to([0.0, 0.0, 1.0], (2, 8, 3)))
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        trace(backend, systems, rays)
-        hashes = [k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-    assert len(hashes) >= len(systems.structure)
-    # beside the elements' kernels the one that says which system a ray belongs to
-    assert len(set(hashes)) <= len(set(systems.structure)) + 1 < len(systems.structure) / 2
 
 
 def new_kernels(work) -> tuple[int, int]:
@@ -266,10 +188,3 @@ def test_other_numbers_compile_no_new_kernel(backend, gf7, gf7_pair) -> None:
         launched, compiled = new_kernels(lambda work=work: work(2))
         assert launched > 0, name
         assert compiled == 0, f"{name} compiled {compiled} of {launched} kernels anew"
-
-
-def test_the_check_above_can_see_a_compilation(backend) -> None:
-    """A number baked in as a literal, other in every run so that no cache on disk knows it."""
-    literal = float(np.random.default_rng().uniform())
-    launched, compiled = new_kernels(lambda: dr.eval(backend.opaque([1.0, 2.0]) * literal + 1.0))
-    assert (launched, compiled) == (1, 1)

@@ -26,7 +26,6 @@ from tests.tiers import quick
 
 RNG = np.random.default_rng(7)
 SOME, OTHERS = (hull(RNG.normal(size=(60, count, 2))) for count in (7, 6))
-CIRCLE = np.array([[0.0], [0.0], [1.0]], complex)
 
 
 def test_hulls_have_the_area_of_qhull() -> None:
@@ -89,24 +88,6 @@ def test_shadows_that_overlap_count_once() -> None:
     nothing = np.where(np.arange(60)[:, None, None] % 2 == 0, SOME[:, :1], SOME)
     pieces, _ = separate([nothing, OTHERS])
     np.testing.assert_allclose(area(pieces).sum(axis=-1)[::2], area(OTHERS)[::2], atol=1e-12)
-
-
-def test_a_disk_in_a_disk_by_its_parts() -> None:
-    """What shadows take of a circle's overlap with itself: a shadow as large as half of it leaves the other half's own
-    overlap, a lens cut by chords, known from circular segments.
-    """
-    half = np.array([[[[-2.0, -2.0], [2.0, -2.0], [2.0, 0.0], [-2.0, 0.0]]]])
-    shadow = PupilShadow.within(half, CIRCLE)
-    assert shadow.area[0] == pytest.approx(0.5 * np.pi, rel=1e-5)
-    for s in (0.3, 0.9, 1.6):
-        # shifted along the cut the upper half disk overlaps itself in half the lens, square to it in less
-        lens = 2.0 * np.arccos(0.5 * s) - 0.5 * s * np.sqrt(4.0 - s * s)
-        _, weights = shadow.overlap(np.array([[s, -1j * s]]), 3)
-        # up to the polygon of the rim, which has the circle's area as a whole
-        assert lens + weights[0, 0].sum() == pytest.approx(0.5 * lens, abs=1e-4)
-        # moved up by s: the segment of the lower circle above y = s/2 + s/2 ...
-        segment = np.arccos(min(s, 1.0)) - s * np.sqrt(max(1.0 - s * s, 0.0))
-        assert lens + weights[0, 1].sum() == pytest.approx(segment if s < 1.0 else 0.0, abs=2e-4)
 
 
 def test_rounding_in_corners_cuts_nothing_off() -> None:
@@ -187,24 +168,3 @@ def test_random_shadows_in_a_pupil_take_what_a_dense_raster_of_it_says(count) ->
         assert all(-1e-6 < float(share[0]) < 1.0 + 1e-6 for share in shares.values())
         # squares of wavefronts are sums of these weights, which alternate where a sliver lies in a corner of its box
         assert np.sum(np.abs(shadows.weights)) < 100.0 * np.sum(shadows.areas) + 1e-3
-
-
-@pytest.mark.parametrize("height", [1e-9, 1e-14, 3e-17, 0.0])
-def test_slivers_have_the_weight_of_their_area(height: float) -> None:
-    """Two shadows that touch leave one: rounding of its corners is many times its height."""
-    rng = np.random.default_rng(7)
-    x = np.sort(rng.uniform(-0.6, 0.6, (200, 4)), axis=1)
-    y = 0.192 + height * rng.uniform(-1.0, 1.0, (200, 4)) + np.spacing(0.192) * rng.integers(-1, 2, (200, 4))
-    slivers = np.stack([x, y], axis=-1)
-    _, weights = quadrature(slivers, 58)
-    wide = np.ptp(x, axis=1) * np.ptp(y, axis=1)
-    assert np.all(np.abs(weights).sum(axis=1) < 10.0 * wide + 1e-15)
-
-
-def test_corners_that_repeat_one_but_for_rounding_cover_what_the_polygon_does() -> None:
-    """Polygons of a batch have as many corners as the largest; those that only fill up may lie a rounding aside."""
-    rng = np.random.default_rng(5)
-    points = rng.uniform(-2.5, 2.5, (300, 2))
-    doubled = np.repeat(SOME, 2, axis=1) * (1.0 + 2e-16 * rng.integers(-1, 2, (*SOME.shape[:1], 2 * SOME.shape[1], 1)))
-    np.testing.assert_array_equal(covered(doubled[:, None], points), covered(SOME[:, None], points))
-    assert covered(SOME[:, None], points).any()

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, State
-from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
@@ -20,7 +19,6 @@ MOTIONS = [
     for kind, axes in (("rotate", 3), ("shift", 3), ("scale", 1))
     for axis in range(axes)
 ]
-NUMBERS: dict[str, Path] = {"c": ("surface", "curvature"), "k": ("surface", "conic"), "A0": ("surface", "even", 0)}
 STEP = {"rotate": 1e-5, "shift": 1e-5, "scale": 1e-5}
 BASE: State = {
     "M2": Motion(rotate=(1e-4, -5e-5, 2e-4), shift=(5e-5, -2e-5, 3e-5)),
@@ -80,67 +78,6 @@ def test_forward_mode_for_every_motion(backend, bare, rays) -> None:
         np.testing.assert_allclose(exact, difference, rtol=1e-7, atol=1e-8)
     moves = np.max(np.abs(forward[0]), axis=(1, 2)) > 0.0
     assert [m for m, moved in zip(MOTIONS, moves, strict=True) if not moved] == [(IMAGE, "scale", 0)]  # a plane
-
-
-@pytest.mark.parametrize("mirror", [0, 1, 2])
-@pytest.mark.parametrize("name", ["c", "k", "A0"])
-def test_forward_mode_for_the_shape(backend, bare, rays, mirror: int, name: str) -> None:
-    systems = assemble(bare, ["imaging"], [BASE])
-    uploaded = replace(systems.upload(backend, own=True), differentiable=True)
-    parameter = leaves(uploaded.values[mirror])[NUMBERS[name]]
-    dr.enable_grad(parameter)
-    dr.set_grad(parameter, backend.opaque([1.0]))
-    out = trace(backend, uploaded, make_rays(backend, *rays), evaluate=False).local
-    dr.forward_to(out.position, out.path, flags=dr.ADFlag.ClearEdges)
-    exact = np.stack([c.numpy() for c in dr.grad(out.position)], axis=-1)
-    exact_path = dr.grad(out.path).numpy()
-    h = {"c": 1e-6, "k": 1e-5, "A0": 1e-6}[name]
-    sides = []
-    for sign in (1, -1):
-        path = (mirror, *NUMBERS[name])
-        numbers = systems.numbers.copy()
-        numbers[leaves(systems.form[0])[path]] += sign * h
-        sides.append(columns(trace(backend, replace(systems, numbers=numbers), make_rays(backend, *rays))))
-    np.testing.assert_allclose(exact, (sides[0][0][0] - sides[1][0][0]) / (2 * h), rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(exact_path, (sides[0][2][0] - sides[1][2][0]) / (2 * h), rtol=1e-6, atol=1e-8)
-
-
-@pytest.mark.second
-def test_reverse_mode_is_the_transpose_of_forward_mode(backend, bare, rays) -> None:
-    """d(sum w . out)/d(parameters) of all four elements in one backward sweep."""
-    systems = assemble(bare, ["imaging"], [BASE])
-    weight = np.random.default_rng(1).normal(size=(len(rays[0]), 4))
-    uploaded = replace(systems.upload(backend, own=True), differentiable=True)
-    wanted: list[Path] = [
-        (0, *NUMBERS["c"]),
-        (0, "surface", "even", 1),
-        (1, "frame", "y", "shift"),
-        (1, *NUMBERS["k"]),
-        (2, *NUMBERS["c"]),
-        (2, "frame", "y", "turn", 2),
-    ]
-    numbers = leaves(uploaded.values)
-    for path in wanted:
-        dr.enable_grad(numbers[path])
-
-    def loss(local):
-        terms = [c * backend.opaque(weight[:, j]) for j, c in enumerate((*local.position, local.path))]
-        return dr.sum(terms[0] + terms[1] + terms[2] + terms[3])
-
-    dr.backward(loss(trace(backend, uploaded, make_rays(backend, *rays), evaluate=False).local))
-    reverse = np.array([dr.grad(numbers[path])[0] for path in wanted])
-    forward = []
-    for path in wanted:
-        fresh = replace(systems.upload(backend, own=True), differentiable=True)
-        number = leaves(fresh.values)[path]
-        dr.enable_grad(number)
-        dr.set_grad(number, backend.opaque([1.0]))
-        value = loss(trace(backend, fresh, make_rays(backend, *rays), evaluate=False).local)
-        dr.forward_to(value)
-        forward.append(dr.grad(value)[0])
-    assert np.all(np.isfinite(reverse))
-    assert np.all(np.abs(reverse) > 0.0)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-10)
 
 
 def test_ray_matrix_against_neighbouring_rays(backend, gf7, bare) -> None:

@@ -12,6 +12,7 @@ from optics.design.optimiser import DesignError
 from optics.design.starts import drawn_start, search
 from scenes.models.camera_design import beams_of, camera_of, prescription_of
 from tests.tiers import quick
+from twin.camera.camera_optics import CameraOptics
 
 MIRRORS = ("M1", "M2", "M3")
 EVERY = (
@@ -62,6 +63,23 @@ def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) 
             assert np.max(np.abs(difference - slope)) < 1e-6 * np.max(np.abs(slope)) + rounding / h + 1e-8, variable
             compared += int(np.max(np.abs(slope)) > 1e3 * rounding / h)
     assert compared > 3 * len(EVERY)
+
+
+@pytest.mark.parametrize("name", quick(1, ["gf7", "gf7_conic"]))
+def test_errors_and_envelope_are_those_of_the_camera(backend, camera, name: str) -> None:
+    """Against wavefronts of the camera as told to users, and heights of all that its clear apertures hold."""
+    model = camera(name)
+    nominal, beams = prescription_of(model.spec), beams_of(model.spec)
+    found = MeritFunction.of(backend, nominal, beams, Operands(model.spec.wavelength)).evaluate(nominal)
+    half = np.array([model.spec.field.x, model.spec.field.y])
+    waves = CameraOptics.alone(model, backend).wavefronts([tuple(field) for field in (beams.fields / half).tolist()])
+    # plane waves here, spheres about the image there: 0.7 % at an exit pupil of 17 m
+    np.testing.assert_allclose(found.errors, [wave.rms for wave in waves], rtol=1e-2)
+    heights = [model.spec.image.z]
+    for mirror, aperture in model.apertures.items():
+        points = np.concatenate([aperture.outline(400), [aperture.centre]])
+        heights += list(model.spec.mirrors[mirror].z + model.surfaces[mirror].sag(*points.T))
+    assert found.envelope == pytest.approx(max(heights) - min(heights), abs=0.02)
 
 
 def test_axes_of_a_beam() -> None:
@@ -120,10 +138,16 @@ def test_anamorphism_as_a_constraint(backend, gf7, beams) -> None:
     assert told.value.violated[0] == "anamorphism"
 
 
+@pytest.mark.second
 def test_starts(backend, gf7, beams) -> None:
     """Drawn starts follow from seed and number, pass light, and end where the camera itself does: one optimum."""
     nominal = prescription_of(gf7.spec)
-    found = search(backend, nominal, CONICS, beams, Operands(650e-9), steps=5, starts=3, seed=4)
+    told = []
+    found = search(
+        backend, nominal, CONICS, beams, Operands(650e-9), 5, starts=3, seed=4, advance=lambda *n: told.append(n)
+    )
+    assert told == sorted(told)
+    assert told[-1] == (3, 3)
     merit = found.best.merit
     assert [attempt.drawn for attempt in found.attempts] == [False, True, True]  # no envelope: no order of its steps
     drawn = [drawn_start(merit, nominal, CONICS, np.random.default_rng([4, n])).values(CONICS) for n in (1, 1, 2)]
@@ -148,6 +172,16 @@ def test_a_start_outside_its_bounds_or_without_light(backend, gf7, beams) -> Non
     lost = nominal.with_values([Variable("M1", "curvature")], np.array([1.5]))
     with pytest.raises(DesignError, match="passes no light"):
         search(backend, lost, CONICS, beams, Operands(650e-9))
+
+
+def test_a_merit_function_needs_a_field_on_the_line_and_a_measure(backend, start, beams) -> None:
+    aside = replace(beams, fields=beams.fields + np.array([0.0, 1e-3]))
+    for fields, operands in ((aside, Operands(650e-9)), (beams, Operands(650e-9, measure="blur"))):
+        with pytest.raises(ValueError, match="a design needs fields on the line off its centre, and the measure"):
+            MeritFunction.of(backend, start, fields, operands)
+    merit = MeritFunction.of(backend, start, beams, Operands(650e-9))
+    with pytest.raises(ValueError, match="a design has no measure 'blur'"):
+        replace(merit, operands=Operands(650e-9, measure="blur")).evaluate(start)
 
 
 def test_numbers_of_a_prescription(start) -> None:

@@ -10,6 +10,7 @@ from optics.numerics.quadrature import PupilNodes
 from optics.waves import diffraction
 from optics.waves.diffraction import Grid, PupilField, airy, image
 from optics.waves.field_samples import LONGEST, FieldSamples
+from tests.tiers import quick
 
 WAVELENGTH, F_NUMBER = 650e-9, 9.2
 APERTURE = 0.5 / F_NUMBER
@@ -55,24 +56,6 @@ def test_encircled_energy(dark_rings: float) -> None:
     assert energy == pytest.approx(1.0 - j0(z) ** 2 - j1(z) ** 2, abs=1e-8)
 
 
-def test_energy_in_pixels_of_a_square() -> None:
-    """The same on a detector: fine pixels inside the circle of the first dark ring hold 83.8 % of the light."""
-    step, n = 0.1e-6, 160
-    axis = centred(n, step)
-    pixels = image(perfect(), axis, axis)[0] * step**2
-    radius = 1.2196698912665045 * WAVELENGTH * F_NUMBER
-    inside = np.hypot(*np.meshgrid(axis.points(), axis.points())) <= radius
-    assert np.sum(pixels[inside]) == pytest.approx(0.83785, abs=1e-4)
-
-
-def test_plancherel() -> None:
-    """An image that fades fast enough for the detector holds exactly the pupil's power."""
-    step, n = 2e-6, 128  # below the critical sampling of lambda F / 2
-    axis = centred(n, step)
-    field = perfect(apodisation=5, nodes=quadrature.disk(40, 200))
-    assert np.sum(image(field, axis, axis)) * step**2 == pytest.approx(1.0, abs=1e-8)
-
-
 def test_images_of_a_batch() -> None:
     fields = [perfect(0.001 * i, 0.0, apodisation=i) for i in range(6)]
     together = PupilField(
@@ -94,7 +77,7 @@ def test_wave_tables_in_pieces_give_the_same_bits(single: bool, monkeypatch: pyt
     np.testing.assert_array_equal(image(perfect(0.001), axis, axis, single), whole)
 
 
-@pytest.mark.parametrize(("single", "error"), [(False, 1e-12), (True, 2e-7)])
+@pytest.mark.parametrize(("single", "error"), quick(1, [(False, 1e-12), (True, 2e-7)]))
 def test_few_samples_of_the_field_make_the_image(single: bool, error: float) -> None:
     """Against the plain sum over all waves, of an aberrated and slanted beam, on a CCD longer than samples are made for
     at once and off the beam's middle. The pixels sample the field 12 and 8 times as densely as its band asks for."""
@@ -113,10 +96,6 @@ def test_few_samples_of_the_field_make_the_image(single: bool, error: float) -> 
     down = field.amplitude[0] * np.exp(1j * k * (eikonal + field.v[0] * y.points()[rows, None]))
     want = np.abs(np.einsum("rn,cn->rc", down, along)) ** 2 / WAVELENGTH**2
     np.testing.assert_allclose(got[np.ix_(rows, columns)], want, rtol=0, atol=error * got.max())
-
-
-def test_a_slanted_beam_makes_the_same_spot() -> None:
-    np.testing.assert_allclose(image(perfect(0.03, -0.05), SMALL, SMALL), image(perfect(), SMALL, SMALL), rtol=1e-9)
 
 
 def test_tilt_of_the_wavefront_moves_the_image() -> None:

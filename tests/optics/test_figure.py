@@ -1,7 +1,10 @@
+import re
+
 import numpy as np
 import pytest
 
 from optics.geometry.aperture import Circle
+from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import GridFigure, Surface, ZernikeFigure, plane
 from optics.geometry.tree import Motion
 from optics.geometry.zernike import zernike
@@ -19,26 +22,6 @@ def wavy_grid(amplitude: float) -> tuple[GridFigure, float]:
     return GridFigure(amplitude * np.outer(np.cos(k * y), np.cos(k * x)), (-0.5, 0.5, -0.5, 0.5)), k
 
 
-def test_piston_figure_shifts_a_plane(backend) -> None:
-    figure = ZernikeFigure(1.0, terms={1: 1e-4})
-    position, direction = beam(disk_points(20, 0.5), -1.0, SLANTED)
-    hit, _, path, valid = run(backend, build(Stage(Surface(figure=figure))), position, direction)
-    assert valid.all()
-    np.testing.assert_allclose(hit[:, 2], 1e-4, atol=1e-18)
-    np.testing.assert_allclose(path, (1.0 + 1e-4) / SLANTED[2], rtol=1e-15)
-
-
-def test_tilt_figure_is_a_tilted_plane(backend) -> None:
-    slope = 1e-3  # Z2 = 2 x, so an amplitude of slope / 2
-    figure = ZernikeFigure(1.0, terms={2: slope / 2})
-    position, direction = beam(disk_points(20, 0.5), -1.0, Z)
-    hit, leaving, _, valid = run(backend, build(Stage(Surface(figure=figure))), position, direction)
-    assert valid.all()
-    np.testing.assert_allclose(hit[:, 2], slope * position[:, 0], atol=1e-17)
-    angle = 2 * np.arctan(slope)
-    np.testing.assert_allclose(leaving, np.broadcast_to([np.sin(angle), 0, -np.cos(angle)], leaving.shape), atol=1e-15)
-
-
 def test_defocus_figure_is_a_paraboloid(backend) -> None:
     amplitude, radius = 1e-4, 0.6
     focal = radius**2 / (8 * np.sqrt(3) * amplitude)  # z = 2 sqrt(3) a r^2 / R^2 = r^2 / (4 f)
@@ -52,9 +35,23 @@ def test_defocus_figure_is_a_paraboloid(backend) -> None:
     np.testing.assert_allclose(path - np.linalg.norm(to_focus, axis=-1), 1.0 - focal, rtol=1e-14)
 
 
-@pytest.mark.parametrize("base", [plane(), Surface(-0.2, -1.2), Surface(-0.2, -1.2, (-5e-5, 1e-6))])
+TERMS = XYPolynomial(x2=0.02, x2y=-0.03), ZernikeSag(radius=0.5, x0=0.1, Z5=2e-4)
+
+
+def test_further_terms_of_a_sag_by_their_formulas() -> None:
+    x, y = np.random.default_rng(1).uniform(-0.3, 0.3, (2, 20))
+    want = 0.02 * x**2 - 0.03 * x**2 * y + 2e-4 * np.sqrt(6.0) * 2.0 * (x - 0.1) * y / 0.5**2
+    np.testing.assert_allclose(Surface(terms=TERMS).sag(x, y), want, rtol=0, atol=1e-16)
+    for name, power in XYPolynomial.POWERS.items():
+        a, b = (name.count(v) and int((re.search(rf"{v}(\d?)", name) or [""])[1] or 1) for v in "xy")
+        assert a + b == 1 - power
+        np.testing.assert_allclose(XYPolynomial(**{name: 0.1}).sag(x, y), 0.1 * x**a * y**b, rtol=1e-14)
+
+
+@pytest.mark.parametrize("base", [plane(), Surface(-0.2, -1.2, (-5e-5, 1e-6)), Surface(-0.2, -1.2, terms=TERMS)])
 def test_figured_surfaces_meet_their_own_sag(backend, base: Surface) -> None:
-    grid, _ = wavy_grid(2e-6)
+    x, y = np.linspace(-0.55, 0.5, 61), np.linspace(-0.6, 0.45, 71)
+    grid = GridFigure(2e-6 * np.outer(np.cos(3.0 * y), np.sin(4.0 * x)), (-0.55, 0.5, -0.6, 0.45))
     for figure in (ZernikeFigure(0.7, (0.1, -0.05), {4: 1e-6, 7: 2e-6, 11: -1e-6, 24: 5e-7}), grid):
         surface = base.with_figure(figure)
         position, direction = beam(disk_points(200, 0.4), -1.0, SLANTED)
@@ -85,6 +82,10 @@ def test_grid_figure_follows_the_function_it_samples(backend) -> None:
     slope_x = -amplitude * k * np.sin(k * x) * np.cos(k * y)
     np.testing.assert_allclose(leaving[:, 0], 2 * slope_x, atol=3e-4 * amplitude * k)
     np.testing.assert_allclose(grid.sag(x, y), hit[:, 2], atol=2e-16)
+    # beyond its samples the figure is that of its edge
+    points = np.array([[0.6, 0.1], [-0.7, 0.2], [0.1, 0.58], [-0.2, -0.9], [0.6, 0.6]])
+    hit, *_ = run(backend, build(Stage(Surface(figure=grid))), *beam(points, -1.0, Z))
+    np.testing.assert_allclose(hit[:, 2], grid.sag(*np.clip(points, -0.5, 0.5).T), atol=2e-16)
 
 
 def test_a_state_adds_its_figure_on_the_aperture(backend) -> None:
@@ -105,6 +106,8 @@ def test_bad_figures_are_refused(backend) -> None:
         GridFigure(np.full((5, 5), np.nan), (0, 1, 0, 1))
     with pytest.raises(ValueError, match="x_min < x_max"):
         GridFigure(np.zeros((5, 5)), (1, 0, 0, 1))
+    with pytest.raises(ValueError, match="has no disk for a figure"):
+        plane().figure_disk(None)
     with pytest.raises(ValueError, match="needs an aperture"):
         run(backend, build(Stage(plane())), np.zeros((1, 3)), Z[None], {"e0": Motion(figure={4: 1e-9})})
 

@@ -1,4 +1,3 @@
-import numpy as np
 import pytest
 
 from optics.materials.glass import FUSED_SILICA, GLASSES, N_BK7, ZERODUR, air_index, glass
@@ -47,29 +46,19 @@ def test_vacuum_index_is_that_of_the_glass_times_the_air() -> None:
     assert step == pytest.approx(N_BK7.index(D_LINE, 303.15) - N_BK7.index(D_LINE), rel=1e-9)
 
 
-@pytest.mark.parametrize("entry", list(GLASSES.values()), ids=list(GLASSES))
-def test_outside_of_the_range_is_refused_by_name(entry) -> None:
-    for wavelength in (0.99 * entry.shortest, 1.01 * entry.longest, float("nan")):
-        with pytest.raises(ValueError, match=f"{entry.name}: wavelength .* nm is outside"):
-            entry.index(wavelength)
-    assert entry.index(entry.shortest) > entry.index(entry.longest)
-
-
-@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan"), float("inf")])
-def test_no_temperature_below_absolute_zero(temperature: float) -> None:
-    with pytest.raises(ValueError, match="N-BK7: a temperature must be above 0 K"):
-        N_BK7.index(D_LINE, temperature)
-
-
-def test_a_glass_without_constants_says_so() -> None:
+def test_outside_of_ranges_is_refused_by_name() -> None:
+    for entry in GLASSES.values():
+        for wavelength in (0.99 * entry.shortest, 1.01 * entry.longest, float("nan")):
+            with pytest.raises(ValueError, match=f"{entry.name}: wavelength .* nm is outside"):
+                entry.index(wavelength)
+        assert entry.index(entry.shortest) > entry.index(entry.longest)
+        assert entry.source
+    for temperature in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="N-BK7: a temperature must be above 0 K"):
+            N_BK7.index(D_LINE, temperature)
     assert ZERODUR.index(D_LINE, 293.15) > 1.5
     with pytest.raises(ValueError, match="Zerodur: no constants"):
         ZERODUR.index(D_LINE, 300.0)
-
-
-def test_names() -> None:
     assert glass("n-bk7") is N_BK7
     with pytest.raises(KeyError, match="did you mean 'N-BK7'"):
         glass("N-BK8")
-    assert all(entry.source for entry in GLASSES.values())
-    assert np.all(np.diff([N_BK7.index(w) for w in np.linspace(0.31e-6, 2.4e-6, 200)]) < 0)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from optics.geometry.aperture import Ellipse
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree
@@ -102,18 +101,6 @@ def test_prism(backend, apex_deg) -> None:
     assert np.all(np.abs(got[[2, 4]] - least) < 3e-9 * apex)
 
 
-@pytest.mark.parametrize("apex", [1e-3, 1e-2, 0.1])
-def test_thin_prism(backend, apex) -> None:
-    """(n - 1) A, and beyond that n (n^2 - 1) A^3 / 24; the next term is of fifth order."""
-    least = 2.0 * np.arcsin(N * np.sin(0.5 * apex)) - apex
-    into = slanted([0.5 * (apex + least) - 0.5 * apex])
-    _, direction, _, _ = send(backend, wedge(apex), np.zeros((1, 3)), into)
-    third = N * (N**2 - 1.0) * apex**3 / 24.0
-    got = abs(deviation(direction, into)[0])
-    assert got == pytest.approx((N - 1.0) * apex + third, abs=apex**5 + 1e-15)
-    assert got - (N - 1.0) * apex > 0.9 * third - 1e-15
-
-
 def test_critical_angle(backend) -> None:
     """Total reflection inside a right-angled prism begins where n sin = 1; the same ray refracts just before."""
     critical = np.arcsin(1.0 / N)
@@ -159,33 +146,16 @@ def test_index_and_growth_change_the_path(backend) -> None:
     assert placed.scale[:, placed.index["glass"]] == pytest.approx([1.5, 1.5])
 
 
-def test_elliptic_aperture_vignettes(backend) -> None:
-    element = Element("e", "e", plane(), PASS, Ellipse(0.03, 0.01, (0.005, -0.002)))
-    assembly = Assembly(RigidTree((Body("e"),)), {"e": element}, {"all": ("e",)})
-    xy = np.random.default_rng(3).uniform(-0.04, 0.04, (400, 2))
-    start = np.column_stack([xy, np.full(400, -1.0)])
-    valid = send(backend, assembly, start, np.broadcast_to([0.0, 0.0, 1.0], start.shape))[3]
-    inside = ((xy[:, 0] - 0.005) / 0.03) ** 2 + ((xy[:, 1] + 0.002) / 0.01) ** 2 <= 1.0
-    assert np.array_equal(valid, inside)
-    assert 20 < inside.sum() < 100
-
-
 def test_what_an_assembly_refuses() -> None:
-    face = Element("face", "glass", plane(), REFRACT, solid="glass")
-    with pytest.raises(ValueError, match="'glass', which has no refractive index"):
-        Assembly(RigidTree((Body("glass"),)), {"face": face}, {})
-    with pytest.raises(ValueError, match="unknown body 'prism'"):
-        Assembly(RigidTree((Body("glass"),)), {}, {}, {"prism": 1.5})
-
-
-def test_glasses_of_one_batch_may_differ(backend) -> None:
-    """Two plates of different index are one structure; each ray sees its own."""
-    bodies, elements, sequences = [], {}, {}
-    for name in ("a", "b"):
-        bodies += [Body(name), Body(f"{name}/front", at(0.0, np.pi)), Body(f"{name}/back", at(0.05))]
-        for face in ("front", "back"):
-            elements[f"{name}_{face}"] = Element(f"{name}_{face}", f"{name}/{face}", plane(), REFRACT, solid=name)
-        sequences[name] = (f"{name}_front", f"{name}_back")
-    both = Assembly(RigidTree(tuple(bodies)), elements, sequences, {"a": 1.4, "b": 1.9})
-    traced = trace(backend, assemble(both, ["a", "b"]), make_rays(backend, np.zeros(3), np.array([0.0, 0.0, 1.0])))
-    assert traced.numpy()[2][:, 0] == pytest.approx([0.05 * 1.4, 0.05 * 1.9], rel=1e-15)
+    face, tree = Element("face", "glass", plane(), REFRACT, solid="glass"), RigidTree((Body("glass"),))
+    for arguments, words in (
+        (({"face": face}, {}), "'glass', which has no refractive index"),
+        (({}, {}, {"prism": 1.5}), "unknown body 'prism'"),
+        (({"other": face}, {}, {"glass": 1.5}), "'face' is filed under 'other'"),
+        (({"e": Element("e", "nowhere", plane(), PASS)}, {}), "stands on unknown body 'nowhere'"),
+        (({}, {"all": ("e",)}), "names unknown element 'e'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            Assembly(tree, *arguments)
+    with pytest.raises(ValueError, match="no gradients of refractive indices by itself"):
+        Assembly(tree, {}, {}, {"glass": 1.5}).standing({"glass": Motion(index_gradient=(1e-6, 0.0, 0.0))})

@@ -52,18 +52,6 @@ def test_against_the_ray_equation(backend, gradient) -> None:
     assert abs(numbers(curve.optical_path(tau)) - want[6]) < 1e-12
 
 
-@pytest.mark.parametrize("gradient", GRADIENTS)
-def test_optical_path_is_the_integral_along_the_ray(backend, gradient) -> None:
-    """Of n^2 d tau with n at the traced positions, by Gauss's rule (8 nodes: exact far beyond rounding)."""
-    tau = 0.4 / N0
-    curve, g = ray(backend, gradient), np.array(gradient)
-    x, w = np.polynomial.legendre.leggauss(8)
-    index = [N0 + g @ numbers(curve.position(0.5 * tau * (1.0 + k))) for k in x]
-    assert numbers(curve.optical_path(tau)) == pytest.approx(0.5 * tau * w @ np.square(index), rel=2e-15)
-    # and n is the length of the slope: the eikonal equation
-    assert np.linalg.norm(numbers(curve.slope(tau))) == pytest.approx(N0 + g @ numbers(curve.position(tau)), rel=1e-15)
-
-
 @pytest.mark.parametrize("strength", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (0.6, 0.0, 0.8), (0.0, 0.0, 1.0)])
 def test_truncation_bound(backend, strength, way) -> None:
@@ -81,13 +69,6 @@ def test_truncation_bound(backend, strength, way) -> None:
     assert short < path + rounding
     assert position < 30.0 * missed + rounding
     assert path < 30.0 * short + rounding
-
-
-def test_in_space_the_cut_is_far_below_a_wave() -> None:
-    """A prism of 1.4 m with 20 K/m at dn/dT = 1e-5 /K."""
-    position, path = truncation_bound(2e-4, 1.4)
-    assert position < 1e-20
-    assert path < 1e-20
 
 
 def slab(length: float, index: float = N0, tilt: float = 0.0) -> Assembly:
@@ -163,30 +144,6 @@ def test_the_gradient_turns_with_the_glass(backend) -> None:
     start = np.concatenate([first, N0 * heading])
     found = solve_ivp(equation, (0.0, 5.0), start, "DOP853", events=far_side, rtol=3e-14, atol=1e-15)
     assert traced.hit(1)[0, 0, :2] == pytest.approx(found.y_events[0][0][:2], abs=1e-12)
-
-
-def test_no_gradient_is_the_homogeneous_glass(backend) -> None:
-    """Continuous as g -> 0, and with a state's gradient of zero beside a graded one the same to rounding."""
-    assembly, slant = slab(0.8), np.array([0.2, -0.1, 0.9])
-    slant /= np.linalg.norm(slant)
-    start = (0.01, 0.02, -0.1)
-    plain = through(backend, assembly, {}, start, slant)
-    systems = assemble(assembly, ["all"], [{}, {"glass": Motion(index_gradient=(0.01, 0.0, 0.0))}])
-    assert systems.structure[1].graded == (True, False)
-    both = trace(backend, systems, make_rays(backend, np.array(start), slant), world=True)
-    position, direction, path, valid = both.numpy(both.world)
-    assert valid.all()
-    assert np.abs(position[0, 0] - plain[0]).max() < 3e-16
-    assert np.abs(direction[0, 0] - plain[1]).max() < 3e-16
-    assert abs(path[0, 0] - plain[2]) < 5e-16
-    assert np.abs(position[1, 0] - plain[0]).max() > 1e-4
-    for g in (1e-6, 1e-9, 1e-12):
-        position, direction, path, _ = through(
-            backend, assembly, {"glass": Motion(index_gradient=(g, g, g))}, start, slant
-        )
-        assert np.abs(direction - plain[1]).max() < 2.0 * g + 3e-16
-        assert np.abs(position - plain[0]).max() < 2.0 * g + 3e-16
-        assert abs(path - plain[2]) < 2.0 * g + 5e-16
 
 
 def test_forward_derivative_through_graded_glass(backend) -> None:

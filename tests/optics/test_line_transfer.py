@@ -16,8 +16,6 @@ CUTOFF = 1.0 / (F_NUMBER * WAVELENGTH)
 COUNT = 65
 STEP = CUTOFF / (COUNT - 1)
 ALONG = np.array([1.0, 0.0])
-DEFOCUS = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-"""Coefficients of 2 (x^2 + y^2) - 2."""
 AGREE = 2e-5
 """What lines are right to: they stop where a third of them tells 1e-4 else, and errors fall with their square."""
 
@@ -95,33 +93,9 @@ def test_disk_and_vanes_as_by_pieces_of_shadows(turn: float) -> None:
     assert np.max(np.abs(np.abs(told.values) - told.perfect)) > 0.1  # the wavefront matters
 
 
-def test_edges_that_share_a_cell_count_together() -> None:
-    """A vane narrower than a cell: the same lines with cells an eighth as long, which hold no two of its edges."""
-    cut = CutPupil(aberrated(0.05), (), (disk(0.3), vane(1.3, 0.01)))
-    coarse = by_lines(cut, lines=(400,))
-    fine = by_lines(cut, step=STEP / 8.0, count=8 * (COUNT - 1) + 1, lines=(400,))
-    np.testing.assert_allclose(coarse.values, fine.values[::8], rtol=0, atol=2e-6)
-    np.testing.assert_allclose(coarse.perfect, fine.perfect[::8], rtol=0, atol=1e-12)
-
-
-def test_long_steps_are_several_cells() -> None:
-    cut = CutPupil(aberrated(0.12), (), (disk(0.3),))
-    few = by_lines(cut, step=8.0 * STEP, count=9, lines=(400,))
-    np.testing.assert_allclose(few.values, by_lines(cut, lines=(400,)).values[::8], rtol=0, atol=2e-6)
-
-
 def test_too_few_lines_are_refused() -> None:
     with pytest.raises(UnphysicalError, match=r"still changes by .* with further lines"):
         by_lines(CutPupil(circular_pupil(F_NUMBER), (), (disk(0.35), vane(0.7), vane(2.3))), lines=(12,))
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("waves", [1.0, 6.0])
-def test_far_out_of_focus(waves: float) -> None:
-    pupil = circular_pupil(F_NUMBER, waves * WAVELENGTH * np.sqrt(3.0) * DEFOCUS)
-    told = by_lines(CutPupil(pupil, (), ()))
-    exact = transfer(pupil, STEP * np.arange(COUNT)[:, None] * ALONG, WAVELENGTH, np.zeros(1))[0]
-    np.testing.assert_allclose(told.values, exact, rtol=0, atol=AGREE)
 
 
 def test_outlines_come_from_the_stop_and_tell_what_is_lit() -> None:

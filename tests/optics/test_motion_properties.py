@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optics.geometry.pose import Pose, rotation_matrix, rotation_vector
-from optics.geometry.solid import Coating, Face, Solid, solid_mesh
-from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, compose
+from optics.geometry.tree import Body, Motion, RigidTree, compose
 
 ROUNDING = 1e-14
 """Some ten roundings of numbers near 1."""
@@ -43,13 +42,6 @@ TREE = RigidTree(
 )
 
 
-@given(vectors(1.8), vectors(1.8))
-def test_a_turned_rotation_turns_about_the_turned_vector(vector, other) -> None:
-    frame = rotation_matrix(other)
-    got = rotation_matrix(frame @ vector)
-    np.testing.assert_allclose(got, frame @ rotation_matrix(vector) @ frame.T, atol=ROUNDING)
-
-
 @given(vectors(1.0), st.floats(-1.5, 1.5), st.floats(-1.5, 1.5))
 def test_turns_about_one_axis_add(axis, first, second) -> None:
     together = rotation_matrix(first * axis) @ rotation_matrix(second * axis)
@@ -57,26 +49,6 @@ def test_turns_about_one_axis_add(axis, first, second) -> None:
     np.testing.assert_allclose(rotation_matrix(axis) @ rotation_matrix(-axis), np.eye(3), atol=ROUNDING)
     # |vector| < 1.8, so that the angle's sine tells it to some roundings
     np.testing.assert_allclose(rotation_vector(rotation_matrix(axis)), axis, atol=ROUNDING)
-
-
-@given(vectors(1.0), st.floats(-9.0, -1.0))
-def test_small_turns_are_their_series(vector, exponent) -> None:
-    small = vector * 10.0**exponent
-    cross = np.cross(np.eye(3), small)  # cross @ x is small x x
-    size = np.linalg.norm(small)
-    left = rotation_matrix(small) - np.eye(3) - cross - 0.5 * cross @ cross
-    # the next term is cross^3 / 6
-    assert np.abs(left).max() <= size**3 / 6.0 + 4e-16
-
-
-@given(vectors(1.8), vectors(1.0))
-def test_complex_step_gives_an_angular_velocity(vector, direction) -> None:
-    """The derivative of a rotation times its inverse is skew, and along the vector itself it is the vector."""
-    turn = rotation_matrix(vector)
-    slope = rotation_matrix(vector + 1j * COMPLEX_STEP * direction).imag / COMPLEX_STEP @ turn.T
-    np.testing.assert_allclose(slope + slope.T, 0.0, atol=ROUNDING)
-    own = rotation_matrix(vector + 1j * COMPLEX_STEP * vector).imag / COMPLEX_STEP @ turn.T
-    np.testing.assert_allclose(own, np.cross(np.eye(3), vector), atol=ROUNDING)
 
 
 @given(poses(), poses(), poses())
@@ -103,60 +75,3 @@ def test_a_motion_and_its_inverse_leave_everything_where_it_was(first, second) -
         np.testing.assert_allclose(placed.rotation, nominal.rotation, atol=ROUNDING)
         np.testing.assert_allclose(placed.translation, nominal.translation, atol=4 * ROUNDING)
         np.testing.assert_allclose(placed.scale, nominal.scale, atol=ROUNDING)
-
-
-@given(motions(), motions(), motions())
-def test_composing_motions_is_associative(a, b, c) -> None:
-    bodies = {body.path: body for body in TREE.bodies}
-    one = compose(compose({"a": a}, {"a": b}, bodies), {"a": c}, bodies)
-    two = compose({"a": a}, compose({"a": b}, {"a": c}, bodies), bodies)
-    placed = TREE.place([one, two])
-    np.testing.assert_allclose(placed.rotation[0], placed.rotation[1], atol=4 * ROUNDING)
-    np.testing.assert_allclose(placed.translation[0], placed.translation[1], atol=8 * ROUNDING)
-
-
-def _box(*more) -> Solid:
-    planes = [(s * np.eye(3)[k], s * np.eye(3)[k] * half) for k, half in enumerate((0.2, 0.05, 0.03)) for s in (1, -1)]
-    faces = []
-    for k, (normal, point) in enumerate([*planes, *more]):
-        side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-        side /= np.linalg.norm(side)
-        faces.append(
-            Face(f"f{k}", "g", Coating.TRANSMITTING, Pose(np.stack([side, np.cross(normal, side), normal], -1), point))
-        )
-    return Solid("g", "N-BK7", tuple(faces))
-
-
-BOX_VOLUME = 0.4 * 0.1 * 0.06
-
-
-@given(vectors(1.0).filter(lambda v: np.linalg.norm(v) > 0.1), poses(), st.floats(-0.01, 0.01))
-def test_a_cut_glass_body_is_two_that_add_up_wherever_it_stands(normal, pose, offset) -> None:
-    """The volume of a body that stands at some metres is known to 1e-9 of it: corners lose four of 16 digits of a size
-    of centimetres.
-    """
-    normal = normal / np.linalg.norm(normal)
-    placed = RigidTree((Body("g", pose),)).place([{}, {"g": Motion(scale=0.02)}])
-    volumes = []
-    for sign in (1.0, -1.0):
-        half = _box((sign * normal, offset * normal))
-        # the cut may take a small face at an end away, which would be an error
-        kept = (
-            *(f for k, f in enumerate(half.faces[:6]) if np.min(_corners(k) @ normal * sign) < sign * offset - 1e-6),
-        )
-        solid = Solid("g", half.material, (*kept, half.faces[6]))
-        volumes.append([solid_mesh(solid, placed, state).mesh.volume for state in (0, 1)])
-    total = np.sum(volumes, axis=0)
-    np.testing.assert_allclose(total, BOX_VOLUME * np.array([1.0, 1.02**3]), rtol=1e-9)
-
-
-def _corners(k: int) -> np.ndarray:
-    """(4, 3) corners of the box's face number k."""
-    half = np.array([0.2, 0.05, 0.03])
-    axis, sign = k // 2, 1.0 if k % 2 == 0 else -1.0
-    others = [j for j in range(3) if j != axis]
-    out = np.zeros((4, 3))
-    out[:, axis] = sign * half[axis]
-    for i, (a, b) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        out[i, others[0]], out[i, others[1]] = a * half[others[0]], b * half[others[1]]
-    return out

@@ -12,6 +12,7 @@ from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface, plane
 from optics.thermal.deformation import Formula, face_change
 from optics.thermal.nodal_deformation import NodalDeformation, NodesError, nodal_deformation
+from tests.tiers import quick
 
 BOWL = Surface(-0.25, -1.0, (1e-3,))
 DISK = Circle(0.3, (0.02, -0.45))  # off the axis, as mirrors of a TMA
@@ -52,7 +53,7 @@ def whole(face: NodalDeformation, surface: Surface, aperture: Aperture, points: 
     return np.asarray((q @ turn.T + shift)[:, 2])
 
 
-@pytest.mark.parametrize("aperture", APERTURES, ids=["disk", "ring", "rectangle", "ellipse"])
+@pytest.mark.parametrize("aperture", quick(1, APERTURES), ids=["disk", "ring", "rectangle", "ellipse"])
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
 def test_a_rigid_motion_alone_is_exact(aperture: Aperture, uneven: bool) -> None:
     points = mesh(aperture, 50, uneven=uneven)
@@ -76,33 +77,23 @@ def test_a_large_turn_and_a_growth_are_exact_too() -> None:
     assert face.rms(face.change) < 1e-14
 
 
-@pytest.mark.slow
-def test_figure_and_ripple_on_20000_nodes_come_back_within_the_sampling_error() -> None:
-    points = mesh(DISK, 160)
-    assert len(points) > 20_000
+def test_figure_and_ripple_come_back_with_their_sizes() -> None:
+    """Amplitudes of terms are rms, half of a ripple's amplitude is its rms; the mesh says how well it knows them."""
+    points = mesh(DISK, 90)
     x, y = (points[:, :2] - DISK.centre).T
-
-    def bump(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        smooth = 100e-9 * zernike.zernike(5, x / 0.3, y / 0.3) - 40e-9 * zernike.zernike(9, x / 0.3, y / 0.3)
-        return smooth + 20e-9 * np.cos(2.0 * np.pi * x / 0.05) * np.cos(2.0 * np.pi * y / 0.07)
-
-    lifted = points + np.stack([0.0 * x, 0.0 * x, bump(x, y)], axis=-1)
-    face = nodal_deformation(points, lifted @ _turned().T + SHIFT - points, BOWL, DISK)
-    # the bump's own nearest rigid motion is at most its rms over the radius
-    np.testing.assert_allclose(face.rotate, TURN, rtol=0, atol=1e-9)
-    assert face.figure[5] == pytest.approx(100e-9, rel=0.01)
-    assert face.figure[9] == pytest.approx(-40e-9, rel=0.02)
-    assert face.rms(face.residual) == pytest.approx(10e-9, rel=0.03)  # half of the ripple's amplitude
+    bump = 100e-9 * zernike.zernike(5, x / 0.3, y / 0.3) - 40e-9 * zernike.zernike(9, x / 0.3, y / 0.3)
+    bump = bump + 20e-9 * np.cos(2.0 * np.pi * x / 0.1) * np.cos(2.0 * np.pi * y / 0.12)
+    turn = Rotation.from_rotvec(TURN).as_matrix()
+    lifted = points + np.stack([0.0 * x, 0.0 * x, bump], axis=-1)
+    face = nodal_deformation(points, lifted @ turn.T + SHIFT - points, BOWL, DISK)
+    np.testing.assert_allclose(face.rotate, TURN, rtol=0, atol=2e-8)
+    assert face.figure[5] == pytest.approx(100e-9, rel=0.02)
+    assert face.figure[9] == pytest.approx(-40e-9, rel=0.04)
+    assert face.rms(face.residual) == pytest.approx(10e-9, rel=0.06)
+    assert face.rms(face.change) == pytest.approx(np.sqrt(100.0**2 + 40.0**2 + 10.0**2) * 1e-9, rel=0.03)
+    assert face.rms(face.lost) < 1e-11
+    assert 0.0 < face.between < 2e-9
     assert not face.printed_through
-    # the surface itself, at places between the nodes; the mesh says how well it knows them
-    rng = np.random.default_rng(7)
-    r, t = 0.3 * np.sqrt(rng.uniform(0.0, 1.0, 3000)), rng.uniform(0.0, 2.0 * np.pi, 3000)
-    at = np.stack([r * np.cos(t), r * np.sin(t)], axis=-1) + DISK.centre
-    true = np.stack([*at.T, BOWL.sag(*at.T) + bump(*(at - DISK.centre).T)], axis=-1) @ _turned().T + SHIFT
-    error = whole(face, BOWL, DISK, true) - true[:, 2]
-    assert face.between < 0.2e-9
-    assert np.sqrt(np.mean(error**2)) < face.between
-    assert face.rms(face.lost) < 1e-12
 
 
 def lifted_by(points: np.ndarray, height: float) -> np.ndarray:
@@ -110,10 +101,7 @@ def lifted_by(points: np.ndarray, height: float) -> np.ndarray:
     return np.asarray(points + np.array([0.0, 0.0, height]))
 
 
-def _turned() -> np.ndarray:
-    return Rotation.from_rotvec(TURN).as_matrix()
-
-
+@pytest.mark.second
 def test_it_is_what_face_change_finds_of_the_same_field() -> None:
     """The same displacement as a field, by the fit of heated faces: the same surface but for second order."""
 
@@ -140,6 +128,7 @@ def test_it_is_what_face_change_finds_of_the_same_field() -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=5e-11 + 5.0 * old.residual_rms)
 
 
+@pytest.mark.second
 def test_order_of_the_nodes_and_nodes_elsewhere_do_not_matter() -> None:
     points = mesh(DISK, 40)
     moves = moved(points) + 1e-7 * np.sin(20.0 * points[:, :1]) * [0.0, 0.0, 1.0]
@@ -157,6 +146,7 @@ def test_order_of_the_nodes_and_nodes_elsewhere_do_not_matter() -> None:
     np.testing.assert_array_equal(other.grid.values, face.grid.values)
 
 
+@pytest.mark.second
 def test_a_finer_half_of_a_mesh_does_not_weigh_more() -> None:
     def bent(points: np.ndarray) -> np.ndarray:
         return 1e-6 * (points[:, :1] / 0.3) ** 3 * np.array([0.0, 0.0, 1.0])
@@ -174,6 +164,7 @@ def test_a_finer_half_of_a_mesh_does_not_weigh_more() -> None:
     assert abs(plain / (0.5e-6 / 0.3) + 1.0) > 0.02  # every node alike would be off by this
 
 
+@pytest.mark.second
 def test_a_mesh_that_prints_through_is_told() -> None:
     points = mesh(DISK, 50)
     rng = np.random.default_rng(4)
@@ -183,17 +174,6 @@ def test_a_mesh_that_prints_through_is_told() -> None:
     assert face.between > 4e-9  # what is independent from node to node cannot be foretold
     fine = nodal_deformation(points, moved(points) + 1e-3 * rough, BOWL, DISK)
     assert not fine.printed_through  # 5 pm does not show
-
-
-def test_a_noisy_mesh_does_not_make_waves_where_it_has_no_nodes() -> None:
-    points = mesh(DISK, 50)
-    moves = 1e-8 * np.random.default_rng(5).normal(size=(len(points), 3))
-    face = nodal_deformation(points, moves, BOWL, DISK)
-    assert face.grid is not None
-    # 3000 places: 10 nm of noise is beyond 4.5 sigma at one of a hundred tries; a spline may overshoot by as much again
-    at = mesh(DISK, 55, 9)
-    at = at[DISK.contains(at[:, 0], at[:, 1])]
-    assert np.max(np.abs(face.grid.sag(at[:, 0], at[:, 1]))) < 9e-8
 
 
 @pytest.mark.parametrize(
@@ -223,5 +203,10 @@ def test_displacements_of_another_unit() -> None:
     bend = np.stack([0 * points[:, 0], 0 * points[:, 0], 0.3 * points[:, 0] ** 2], axis=-1)
     with pytest.raises(NodesError, match="more than 1 mm"):
         nodal_deformation(points, bend, BOWL, DISK)
-    with pytest.raises(ValueError, match="finite"):
-        nodal_deformation(points, points * np.nan, BOWL, DISK)
+    for moves, terms, words in (
+        (np.where(np.arange(len(points))[:, None] == 7, np.nan, points), 15, "finite"),
+        (points[:-1], 15, r"must be \(N, 3\), found"),
+        (0.0 * points, 2, "between Z3 and Z"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            nodal_deformation(points, moves, BOWL, DISK, terms=terms)

@@ -49,6 +49,7 @@ def test_coarse_pixels_are_refused() -> None:
         PixelResponse.fit(PITCH, 0.0, cutoff=0.5 / PITCH)
 
 
+@pytest.mark.second
 def test_a_source_far_wider_than_its_pixels_is_refused() -> None:
     with pytest.raises(UnsampledImageError) as caught:
         PixelResponse.fit(PITCH, 35 * PITCH, cutoff=0.2 / PITCH)

@@ -88,42 +88,11 @@ def test_draws_follow_the_bsdf(scatter: ABg | HarveyShack) -> None:
     assert statistic < chi2.ppf(1.0 - FALSE_ALARM, len(rest) - 1)
 
 
-def test_a_wrong_exponent_is_found() -> None:
-    """The test above can fail: draws of g = 2.5 are not those of 2.45."""
-    rng, n = np.random.default_rng(5), 400_000
-    edges = np.geomspace(1e-3, 2.0, 30)
-    counts = [np.histogram(sample_distance(rng.uniform(size=n), 0.01, g), edges)[0].astype(float) for g in (2.5, 2.45)]
-    statistic = np.sum((counts[0] - counts[1]) ** 2 / (counts[0] + counts[1]))
-    assert statistic > chi2.ppf(1.0 - FALSE_ALARM, 29)
-
-
-def test_drjit_draws_as_numpy(backend) -> None:
-    u = np.linspace(0.0, 0.999999, 1000)
-    for scatter in LOBES:
-        lobe = scatter.lobe
-        exact = sample_distance(u, lobe.scale, lobe.exponent)
-        got = sample_distance(backend.opaque(u), backend.opaque(lobe.scale), backend.opaque(lobe.exponent)).numpy()
-        np.testing.assert_allclose(got, exact, rtol=0, atol=1e-9)
-        keep = acceptance(
-            backend.opaque(exact), lobe.scale, backend.opaque(lobe.exponent), backend.opaque(lobe.abg)
-        ).numpy()
-        np.testing.assert_allclose(keep, acceptance(exact, lobe.scale, lobe.exponent, float(lobe.abg)), atol=1e-12)
-        assert keep.min() > 0.3
-        assert keep.max() <= 1.0 + 1e-12
-
-
 @pytest.mark.parametrize("finish", [MIRROR, COATED, BARE, GROUND, BLACK, SILICON, ABSORBER], ids=repr)
 def test_library_finishes_conserve_energy(finish: Finish) -> None:
     total = finish.reflectance + finish.transmission + finish.diffuse
     assert 0.0 <= total <= (0.0 if finish.bare else 1.0)
     assert len(finish.numbers) == 8
-
-
-def test_black_is_black() -> None:
-    for finish in (GROUND, BLACK):
-        assert 0.03 <= finish.reflectance + finish.diffuse <= 0.05
-    assert MIRROR.scatter is not None
-    assert 1e-5 < total_scatter(MIRROR.scatter) < 1e-3
 
 
 def test_impossible_finishes() -> None:

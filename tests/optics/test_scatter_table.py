@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
 from optics.materials.finish import CoatingTable, Finish
 from optics.materials.scatter import STEPS, ABg, ScatterTable, total_scatter
+from scenes.models.scenery import MeasuredFinishes
+from scenes.models.scenery_parts import Finishes
 
 INCIDENCE = np.radians([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0])
 HALF = np.radians(np.linspace(0.0, 180.0, 19))
@@ -94,7 +98,11 @@ def test_reciprocity() -> None:
     assert lambert(0.3).reciprocity() == pytest.approx(0.0, abs=1e-12)
     # 10 deg of incidence, 10 deg of azimuth: linear between them
     assert of_lobe(ABg(1e-2, 0.2, 2.0)).reciprocity() < 0.1
-    assert table_of(lambda t, x, y, up: np.full(up.shape, 0.1 * np.cos(t) ** 2)).reciprocity() > 0.3
+    one_way = table_of(lambda t, x, y, up: np.full(up.shape, 0.1 * np.cos(t) ** 2))
+    assert one_way.reciprocity() > 0.3
+    for table, words in ((lambert(0.3), []), (one_way, ["the BSDF of black surfaces is not reciprocal"])):
+        told = MeasuredFinishes(Finishes(), {"black": SimpleNamespace(table=table)}, {}).warnings()
+        assert [text.partition(":")[0] for text in told] == words
 
 
 def test_shares_of_drawn_cells_are_those_of_the_table() -> None:
@@ -154,3 +162,5 @@ def test_coatings() -> None:
         CoatingTable(np.zeros(1), np.array([0.6]), np.array([0.5]))
     with pytest.raises(ValueError, match="ascend"):
         CoatingTable(np.radians([10.0, 5.0]), np.array([0.6, 0.5]))
+    with pytest.raises(ValueError, match="one reflectance, and one transmittance"):
+        CoatingTable(np.radians([5.0, 10.0]), np.array([0.6, 0.5]), np.array([0.1]))

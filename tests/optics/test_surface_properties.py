@@ -4,7 +4,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optics.geometry import zernike
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.surface import Surface
 
@@ -19,17 +18,6 @@ def test_a_conic_is_a_quadric(curvature, conic) -> None:
     z = Surface(curvature, conic).sag(x, y)
     np.testing.assert_allclose(curvature * (x * x + y * y + (1.0 + conic) * z * z), 2.0 * z, rtol=0, atol=1e-15)
     assert np.all((1.0 + conic) * curvature * z < 1.0)
-
-
-@given(CURVATURE, CONIC, st.floats(-1e-2, 1e-2), st.floats(0.1, 10.0), st.floats(0.0, 6.3))
-def test_surfaces_scale_and_turn(curvature, conic, fourth, scale, turn) -> None:
-    x, y = PLACES
-    surface = Surface(curvature, conic, (fourth, 0.1 * fourth))
-    z = surface.sag(x, y)
-    grown = Surface(curvature / scale, conic, (fourth / scale**3, 0.1 * fourth / scale**5))
-    np.testing.assert_allclose(grown.sag(scale * x, scale * y), scale * z, rtol=1e-13, atol=1e-16 * scale)
-    c, s = np.cos(turn), np.sin(turn)
-    np.testing.assert_allclose(surface.sag(c * x - s * y, s * x + c * y), z, rtol=1e-13, atol=1e-16)
 
 
 def _apertures() -> st.SearchStrategy[Aperture]:
@@ -52,24 +40,3 @@ def test_apertures_are_convex_within_their_outline_and_bounds(aperture, shrink, 
     x, y = (centre[:, None] + 3.0 * PLACES)[:, np.newaxis].reshape(2, -1)
     inside = aperture.contains(x, y)
     assert np.all((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max) | ~inside)
-
-
-@given(st.floats(0.0, 6.3))
-def test_zernike_pairs_turn_together(angle) -> None:
-    """Turned by t, the cosine and sine terms of order m mix by m t; Z(-x, -y) has the parity of its radial order."""
-    x, y = PLACES
-    c, s = np.cos(angle), np.sin(angle)
-    turned = zernike.basis(28, c * x - s * y, s * x + c * y)
-    basis = zernike.basis(28, x, y)
-    numbers = {zernike.noll_to_nm(j): j - 1 for j in range(1, 29)}
-    for (n, m), j in numbers.items():
-        own, phase = basis[:, j], abs(m) * angle
-        if m == 0:
-            expected = own
-        else:
-            other = basis[:, numbers[n, -m]]
-            # cos(m(a + t)) and sin(m(a + t))
-            expected = np.cos(phase) * own - np.sign(m) * np.sin(phase) * other
-        np.testing.assert_allclose(turned[:, j], expected, atol=1e-12)
-    parity = [(-1) ** n for n, _ in sorted(numbers, key=numbers.__getitem__)]
-    np.testing.assert_allclose(zernike.basis(28, -x, -y), basis * parity, atol=1e-13)

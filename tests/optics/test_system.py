@@ -13,6 +13,7 @@ from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.numerics.number_tree import leaves
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import SystemBatch, assemble
+from tests.tiers import quick
 
 ROUNDINGS = 8 * np.finfo(float).eps
 """Powers of a size of 1 by products, and sums of a figure's terms in another order."""
@@ -61,7 +62,7 @@ def one_by_one(assembly: Assembly, sequences: list[str], states: list[State]) ->
     return assemble(assembly, sequences, states, placed=replace(placed, **poses))
 
 
-@pytest.mark.parametrize("names", [*([name] for name in NAMES), NAMES], ids=[*NAMES, "all"])
+@pytest.mark.parametrize("names", quick(3, [NAMES, *([name] for name in NAMES)]), ids=["all", *NAMES])
 def test_states_are_written_over_the_design(instrument, names: list[str]) -> None:
     assembly = instrument("gf7_pair").assembly
     states = some_states(assembly, names, 3)

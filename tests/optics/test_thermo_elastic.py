@@ -7,7 +7,6 @@ from skfem import CellBasis, ElementHex2, MeshTet1
 
 from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.pose import Pose, rotation_matrix
-from optics.geometry.solid import enclosed
 from optics.geometry.surface import Surface, ZernikeFigure, plane
 from optics.geometry.zernike import zernike
 from optics.materials.material import material
@@ -69,7 +68,7 @@ def volume_of(mesh) -> float:
 
 
 class TestMeshes:
-    @pytest.mark.parametrize("name", list(BODIES))
+    @pytest.mark.parametrize("name", quick(1, ["block", "bar", "rhomboid"]))
     def test_a_polyhedron_is_filled_exactly_with_upright_cells(self, name: str) -> None:
         corners, spacing = BODIES[name]
         turned = corners @ TURN.T  # no face along an axis
@@ -94,27 +93,11 @@ class TestMeshes:
             np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0], axis=0), axis=0
         )
         assert area.sum() / 2 == pytest.approx(hull.area, rel=1e-12)
-
-    @pytest.mark.parametrize("name", list(BODIES))
-    def test_a_polyhedron_is_cut_the_same_way_anywhere(self, name: str) -> None:
-        """Its cells depend on its own shape and not on where the origin lies: 1e-16 of 10 m of rounding."""
-        corners, spacing = BODIES[name]
+        # its cells do not depend on where the origin lies: 1e-16 of 10 m of rounding
         shift = np.array([3.0, -4.0, 8.0])
-        here, there = polyhedron_mesh(corners @ TURN.T, spacing), polyhedron_mesh(corners @ TURN.T + shift, spacing)
-        assert there.t.shape == here.t.shape
-        distance, _ = cKDTree(here.p.T + shift).query(there.p.T)
-        assert distance.max() < 1e-12
-
-    @pytest.mark.parametrize("scale", [1e-4, 1e4])
-    def test_a_polyhedron_is_cut_the_same_way_at_any_size(self, scale: float) -> None:
-        for corners, spacing in BODIES.values():
-            one, other = (
-                polyhedron_mesh(corners @ TURN.T, spacing),
-                polyhedron_mesh(scale * corners @ TURN.T, scale * spacing),
-            )
-            assert other.t.shape == one.t.shape
-            distance, _ = cKDTree(one.p.T).query(other.p.T / scale)
-            assert distance.max() < 1e-12
+        there = polyhedron_mesh(turned + shift, spacing)
+        assert there.t.shape == mesh.t.shape
+        assert cKDTree(mesh.p.T + shift).query(there.p.T)[0].max() < 1e-12
 
     @pytest.mark.parametrize("behind", [1.0, -1.0])
     @pytest.mark.parametrize(
@@ -144,52 +127,22 @@ class TestMeshes:
         assert errors[0] < 1e-3
         assert errors[1] < errors[0] / 12.0
 
-    @pytest.mark.second
-    def test_facets_that_miss_their_apex_are_meshed_whatever_the_size_of_the_gap(self) -> None:
-        """A block under four mirror facets, from 1e-13 to 3 mm off a common point: edges of any length at the apex."""
-        rng = np.random.default_rng(0)
-        walls = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -1]])
-        for size in 10.0 ** np.linspace(-13.0, -2.5, 40):
-            facets = np.array([[0.24, 0.2, 0.97], [-0.04, 0.2, 0.97], [0.24, -0.2, 0.97], [-0.04, -0.2, 0.97]])
-            facets += size * rng.normal(size=facets.shape)
-            normals = np.concatenate([facets / np.linalg.norm(facets, axis=1, keepdims=True), walls])
-            offsets = np.array([*size * rng.uniform(-0.1, 0.1, 4), 0.12, 0.12, 0.1, 0.1, 0.06])
-            corners = enclosed(normals, offsets).vertices
-            mesh = polyhedron_mesh(corners, 0.06)
-            p = mesh.p[:, mesh.t]
-            edges = [np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], axis=0), p[:, 3] - p[:, 0]]
-            volume = np.abs(np.einsum("it,it->t", *edges)).sum() / 6.0
-            hull = ConvexHull(corners)
-            # corners within a thousandth of the spacing are one
-            assert volume == pytest.approx(hull.volume, abs=6e-5 * hull.area)
-
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            ((np.zeros((3, 3)), 0.1), "four or more"),
-            ((np.eye(4, 3) * np.nan, 0.1), "four or more finite"),
-            (([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], 0.1), "degenerate"),
-            (([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], 0.1), "degenerate"),
-            ((np.vstack([RHOMBOID, RHOMBOID.mean(axis=0)]), 0.1), "vertex 8 lies inside"),
-            ((RHOMBOID, 0.0), "positive spacing"),
-        ],
-    )
-    def test_what_is_no_polyhedron_is_refused(self, arguments, words: str) -> None:
-        with pytest.raises(ValueError, match=words):
-            polyhedron_mesh(*arguments)
-
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            ((plane(), Circle(1.0), 0.1, 0.5, 8), "side"),
-            ((plane(), Circle(1.0), -0.1, 1, 8), "positive thickness"),
-            ((plane(), Circle(1.0), 0.1, 1, 1), "2 cells"),
-            ((Surface(2.0), Circle(1.0), 0.1, 1, 8), "domain"),
-        ],
-    )
-    def test_what_is_no_mirror_is_refused(self, arguments, words: str) -> None:
-        with pytest.raises(ValueError, match=words):
-            mirror_mesh(*arguments)
+    def test_what_is_no_polyhedron_or_mirror_is_refused(self) -> None:
+        disk = Circle(1.0)
+        for make, arguments, words in (
+            (polyhedron_mesh, (np.zeros((3, 3)), 0.1), "four or more"),
+            (polyhedron_mesh, (np.eye(4, 3) * np.nan, 0.1), "four or more finite"),
+            (polyhedron_mesh, ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], 0.1), "degenerate"),
+            (polyhedron_mesh, ([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], 0.1), "degenerate"),
+            (polyhedron_mesh, (np.vstack([RHOMBOID, RHOMBOID.mean(axis=0)]), 0.1), "vertex 8 lies inside"),
+            (polyhedron_mesh, (RHOMBOID, 0.0), "positive spacing"),
+            (mirror_mesh, (plane(), disk, 0.1, 0.5, 8), "side"),
+            (mirror_mesh, (plane(), disk, -0.1, 1, 8), "positive thickness"),
+            (mirror_mesh, (plane(), disk, 0.1, 1, 1), "2 cells"),
+            (mirror_mesh, (Surface(2.0), disk, 0.1, 1, 8), "domain"),
+        ):
+            with pytest.raises(ValueError, match=words):
+                make(*arguments)
 
 
 class TestFree:
@@ -200,7 +153,7 @@ class TestFree:
         left = without_rigid(body.nodes, found.values - A * body.nodes)
         assert np.max(np.abs(left)) < 1e-12 * A * np.max(np.abs(body.nodes))
 
-    @pytest.mark.parametrize("name", list(BODIES))
+    @pytest.mark.parametrize("name", quick(1, ["block", "bar", "rhomboid"]))
     def test_any_gradient_reproduces_the_exact_field(self, name: str) -> None:
         corners, spacing = BODIES[name]
         mesh = polyhedron_mesh(corners, spacing)
@@ -235,7 +188,7 @@ class TestFree:
         assert abs(moved[2] @ normal) / np.linalg.norm(normal) < 1e-12 * size
         assert abs(moved[1] @ along) > 1e-3 * size  # along the line it is free
 
-    @pytest.mark.parametrize("cells", quick(2, [4, 9, 8, 16]))
+    @pytest.mark.parametrize("cells", quick(1, [4, 9, 16]))
     @pytest.mark.parametrize("aperture", [Circle(0.3, (0.0, -0.4)), Rectangle(0.3, 0.1)])
     def test_every_point_of_a_curved_face_is_found_in_its_own_cell(self, aperture, cells: int) -> None:
         surface = Surface(1 / 3, -1.0)
@@ -280,6 +233,7 @@ class TestBonded:
         # and a narrow one is disturbed more: the agreement is not by construction
         assert abs(self.layer(0.04, 8) / want - 1) > 1e-3
 
+    @pytest.mark.second
     def test_two_layers_of_one_modulus_bend_as_timoshenko_says(self) -> None:
         # Timoshenko, J. Opt. Soc. Am. 11, 233 (1925), layers of equal thickness and modulus: curvature 3/2 a T / h.
         # One material of which the upper half is hotter is such a pair; in a plate both directions bend alike.
@@ -321,6 +275,7 @@ class TestFace:
         assert np.max(np.abs(others)) + found.residual_rms < 1e-9 * abs(found.figure[4])
         assert set(found.figure) == set(range(4, 16))
 
+    @pytest.mark.second
     def test_a_turned_and_shifted_face_with_a_figure_is_read_back(self) -> None:
         body, _ = bar()
         pose = Pose(rotation_matrix(np.array([0.0, np.pi / 2, 0.0])), np.array([0.3, 0.0, 0.0]))
@@ -341,35 +296,6 @@ class TestFace:
         assert found.figure[6] == pytest.approx(3e-9, rel=1e-6)
         assert found.residual_rms < 1e-15
 
-    def test_rigid_part_and_figure_hold_the_normal_displacement_of_a_prism_face(self) -> None:
-        body, support = bar()
-        (u,) = body.solve_many([lambda p: 0.1 * np.exp(-((p[:, 0] - 0.3) ** 2) / 0.1) + 3 * p[:, 2]], support)
-        pose = Pose(np.eye(3), np.array([0.5, 0.0, 0.03]))
-        aperture = Rectangle(0.3, 0.04)
-        found = face_change(u, plane(), aperture, pose)
-        rng = np.random.default_rng(3)
-        x, y = rng.uniform(-0.3, 0.3, 200), rng.uniform(-0.04, 0.04, 200)
-        z = u.at(np.stack([x + 0.5, y, np.full(200, 0.03)], axis=-1))[:, 2]
-        radius = np.hypot(0.3, 0.04)
-        told = found.shift[2] + found.rotate[0] * y - found.rotate[1] * x
-        told = told + sum(a * zernike(j, x / radius, y / radius) for j, a in found.figure.items())
-        left = np.sqrt(np.mean((told - z) ** 2))
-        # what fifteen terms do not hold is what the residual says, up to the two samplings; and it is little
-        assert left == pytest.approx(found.residual_rms, rel=0.3)
-        assert found.residual_rms < 0.02 * np.std(z)
-        assert np.max(np.abs(list(found.figure.values()))) < 1e3 * np.std(z)
-
-    @pytest.mark.second
-    def test_uniform_growth_of_a_parabola_lengthens_its_radius(self) -> None:
-        aperture, c = Circle(0.3), 1 / 3.0
-        surface = Surface(c, -1.0)
-        mesh = mirror_mesh(surface, aperture, 0.06, 1, 12)
-        support = Kinematic(np.array([[0.2, 0.0, 0.07], [-0.1, 0.2, 0.07], [-0.1, -0.2, 0.07]]))
-        found = face_change(solve(mesh, SILICA, one_kelvin, support), surface, aperture, Pose())
-        # z = c r^2 / 2 becomes c (1 - a) r^2 / 2
-        assert found.figure[4] == pytest.approx(-A * c * 0.3**2 / (4 * np.sqrt(3)), rel=1e-8)
-        assert found.residual_rms < 1e-8 * abs(found.figure[4])
-
     def test_the_disk_is_that_of_the_figure_when_there_is_one(self) -> None:
         body, support = bar()
         (u,) = body.solve_many([linear(0.0, (0.0, 0.0, 2.0))], support)
@@ -380,51 +306,31 @@ class TestFace:
         assert set(face_change(u, plane(), aperture, pose, terms=3).figure) == set()
 
 
-class TestErrors:
-    @pytest.mark.parametrize(
-        ("points", "words"),
-        [
-            (np.zeros((2, 3)), "three finite points"),
-            ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], "on a line"),
-            ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], "three finite"),
-        ],
-    )
-    def test_a_kinematic_support_needs_three_points(self, points, words: str) -> None:
+def test_supports_bonds_temperatures_and_points_that_cannot_be_are_refused() -> None:
+    body, support = bar()
+    for points, words in (
+        (np.zeros((2, 3)), "three finite points"),
+        ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], "on a line"),
+        ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], "three finite"),
+    ):
         with pytest.raises(ValueError, match=words):
             Kinematic(np.asarray(points))
-
-    def test_a_support_outside_of_the_body_is_refused(self) -> None:
-        body, _ = bar()
-        with pytest.raises(ValueError, match=r"\[0.5, 0.5, 0.0\] m lies outside"):
-            body.solve_many([one_kelvin], Kinematic(np.array([[0.1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.02]])))
-
-    @pytest.mark.parametrize(
-        "where",
-        [lambda nodes: nodes[:, 2] > 1.0, lambda nodes: (np.abs(nodes[:, 1]) < 1e-9) & (nodes[:, 0] > 1.2 - 1e-9)],
-        ids=["nothing", "an edge"],
-    )
-    def test_a_bond_needs_a_face(self, where) -> None:
-        body, _ = bar()
-        with pytest.raises(ValueError, match="three nodes that are not on a line"):
-            body.solve_many([one_kelvin], Bonded(where))
-
-    def test_temperatures_must_be_finite_and_one_for_each_point(self) -> None:
-        body, support = bar()
-        with pytest.raises(ValueError, match="not finite at"):
-            body.solve_many([lambda p: np.where(p[:, 0] > 0.5, np.nan, 0.0)], support)
-        with pytest.raises(ValueError, match="one value for each"):
-            body.solve_many([lambda p: p], support)
-        with pytest.raises(ValueError, match="finite expansion"):
-            Bonded(lambda nodes: nodes[:, 0] > 0, np.nan)
-
-    def test_points_and_apertures_beyond_the_body_are_refused(self) -> None:
-        body, support = bar()
-        (u,) = body.solve_many([one_kelvin], support)
-        with pytest.raises(ValueError, match="lies outside of the body"):
-            u.at([[0.5, 0.0, 0.031]])
-        with pytest.raises(ValueError, match="shape"):
-            u.at([0.5, 0.0, 0.0])
-        with pytest.raises(ValueError, match="lies outside of the body"):
-            face_change(u, plane(), Circle(0.2), Pose(np.eye(3), np.array([0.5, 0.0, 0.03])))
-        with pytest.raises(ValueError, match="between Z3 and"):
-            face_change(u, plane(), Circle(0.02), Pose(), terms=2)
+    Kinematic(np.array([[0, 0, 0], [1, 0, 0], [2, 1e-4, 0]]))  # hardly on a line, and taken
+    (u,) = body.solve_many([one_kelvin], support)
+    outside = Kinematic(np.array([[0.1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.02]]))
+    edge = Bonded(lambda nodes: (np.abs(nodes[:, 1]) < 1e-9) & (nodes[:, 0] > 1.2 - 1e-9))
+    pose = Pose(np.eye(3), np.array([0.5, 0.0, 0.03]))
+    for call, words in (
+        (lambda: body.solve_many([one_kelvin], outside), r"\[0.5, 0.5, 0.0\] m lies outside"),
+        (lambda: body.solve_many([one_kelvin], Bonded(lambda nodes: nodes[:, 2] > 1.0)), "three nodes that are not on"),
+        (lambda: body.solve_many([one_kelvin], edge), "three nodes that are not on a line"),
+        (lambda: body.solve_many([lambda p: np.where(p[:, 0] > 0.5, np.nan, 0.0)], support), "not finite at"),
+        (lambda: body.solve_many([lambda p: p], support), "one value for each"),
+        (lambda: Bonded(lambda nodes: nodes[:, 0] > 0, np.nan), "finite expansion"),
+        (lambda: u.at([[0.5, 0.0, 0.031]]), "lies outside of the body"),
+        (lambda: u.at([0.5, 0.0, 0.0]), "shape"),
+        (lambda: face_change(u, plane(), Circle(0.2), pose), "lies outside of the body"),
+        (lambda: face_change(u, plane(), Circle(0.02), Pose(), terms=2), "between Z3 and"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()

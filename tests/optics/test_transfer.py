@@ -7,14 +7,13 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from optics.geometry import zernike
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.numerics.quadrature import PupilNodes
 from optics.waves import transfer
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.pupil_edge import PupilEdge
-from optics.waves.pupil_stack import PupilFunction, PupilStack, circular_pupil, fit_pupils
+from optics.waves.pupil_stack import PupilFunction, circular_pupil, fit_pupils
 from optics.waves.transfer import TransferTable, polychromatic_transfer
 from scenes.models.camera_model import IMAGE
 from tests.optics.test_imaging import PERTURBED, WAVELENGTH, Camera
@@ -58,35 +57,6 @@ def traced(backend, gf7) -> PupilFunction:
     return pupil
 
 
-def test_a_pupil_alone_is_what_it_is_among_others(backend, gf7) -> None:
-    """By itself, among others of other wavefronts and with shadows, by both integrals."""
-    first, second = (Camera(backend, gf7, state).field(NODES) for state in ({}, PERTURBED))
-    both = PupilField(
-        *(np.concatenate([getattr(f, n) for f in (first, second)]) for n in ("u", "v", "eikonal", "amplitude")),
-        WAVELENGTH,
-    )
-    square = 0.2 * np.array([[[[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]]])
-    for shadows, close in ((None, 2e-6), (square, 5e-5)):
-        many = None if shadows is None else np.concatenate([shadows, shadows + 0.1])
-        among = fit_pupils(both, NODES, shadows=many)
-        alone = [
-            fit_pupils(f, NODES, shadows=None if many is None else many[k : k + 1])[0]
-            for k, f in enumerate((first, second))
-        ]
-        stack = PupilStack.fit(both.u, both.v, both.eikonal, both.amplitude, NODES, shadows=many)
-        for k, (one, other) in enumerate(zip(alone, among, strict=True)):
-            frequency = random_frequencies(one, 30, WAVELENGTH)
-            apart = transfer.transfer(one, frequency, WAVELENGTH, FOCUS)
-            # rounding of a few hundred terms
-            np.testing.assert_allclose(
-                transfer.transfer(other, frequency, WAVELENGTH, FOCUS), apart, rtol=0, atol=1e-12
-            )
-            few = stack.transfer(frequency, np.array([WAVELENGTH]), np.ones(1))[k]
-            np.testing.assert_allclose(few, apart[0], rtol=0, atol=close)
-            assert one.light == pytest.approx(float(stack.light[k]), abs=close)
-        assert (min(p.light for p in among) < 0.97) == (many is not None)
-
-
 @pytest.mark.parametrize("pupil", [circular_pupil(F_NUMBER), *fit_pupils(circle(), NODES)], ids=["ideal", "fitted"])
 def test_perfect_circle(pupil: PupilFunction) -> None:
     ratio = np.array([0.0, 1e-9, 1e-6, 1e-4, 0.01, 0.1, 0.3, 0.5, 0.8, 0.95, 0.999, 0.999999, 1.0 + 1e-9, 1.1, 3.0])
@@ -127,6 +97,7 @@ def test_a_perfect_point_beside_the_origin_and_out_of_focus(dz: float) -> None:
     assert np.all(np.max(np.abs(np.abs(got[:2]) - np.abs(want)), axis=-1) > 0.3)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("dz", [-300e-6, 0.0, 300e-6])
 def test_against_the_transform_of_the_image(backend, gf7, traced: PupilFunction, dz: float) -> None:
     """The image on a moved detector, summed with the kernel, against the transfer function of the unmoved one.
@@ -177,34 +148,6 @@ def test_symmetry_energy_and_shift(backend, gf7, traced: PupilFunction) -> None:
     np.testing.assert_allclose(transfer.transfer(moved, f, WAVELENGTH, dz), want, rtol=0, atol=1e-9)
 
 
-def test_cutoffs_of_an_anamorphic_pupil(backend, gf7, traced: PupilFunction) -> None:
-    """Longest chords of the polygon of traced rim rays; its 2000 corners are 1e-6 of the radius inside the edge."""
-    angle = 2.0 * np.pi * np.arange(2000) / 2000
-    rim = PupilNodes(np.cos(angle), np.sin(angle), np.ones(2000))
-    field = Camera(backend, gf7, PERTURBED).field(rim)
-    edge = np.stack([field.u[0], field.v[0]], axis=-1)
-    checked = []
-    for along in (0, 1):
-        across = edge[:, 1 - along]
-        first, last = sorted((int(np.argmin(across)), int(np.argmax(across))))
-        sides = [np.arange(first, last + 1), np.r_[np.arange(last, 2000), np.arange(first + 1)]]
-        offsets = np.linspace(across.min(), across.max(), 4001)[1500:2500]
-        ends = []
-        for side in sides:
-            ordered = side[np.argsort(across[side])]
-            ends.append(np.interp(offsets, across[ordered], edge[ordered, along]))
-        longest = np.max(np.abs(ends[0] - ends[1]))
-        cutoff = float(traced.cutoff(np.eye(2)[along : along + 1], WAVELENGTH)[0])
-        assert cutoff == pytest.approx(longest / WAVELENGTH, rel=5e-6)
-        below, above = np.outer([0.999, 1.0 + 1e-9], np.eye(2)[along]) * cutoff
-        got = transfer.transfer(traced, np.stack([below, above]), WAVELENGTH, FOCUS)[0]
-        assert 1e-6 < np.abs(got[0]) < 1e-4
-        assert got[1] == 0.0
-        checked.append(1.0 / (WAVELENGTH * cutoff))
-    # paper design: F/9.2 along the line; the field bias lengthens the focal ratio across it
-    assert checked == pytest.approx([9.22, 9.45], abs=0.02)
-
-
 def test_overlap_of_a_distorted_edge() -> None:
     """Area of the overlap against the intersection of polygons, for an edge as far from a circle as is allowed.
 
@@ -236,41 +179,10 @@ def test_overlap_of_a_distorted_edge() -> None:
         assert np.isfinite([right, left]).all()
 
 
-@pytest.mark.parametrize("terms", [(7,), (8,), (5,), (6,), (7, 5, 11)])
-def test_aberrations_of_007_waves(terms: tuple[int, ...]) -> None:
-    """They lower the MTF and never raise it; the area under the transfer function is the Strehl ratio of the pupil."""
-    coefficients = np.zeros(11)
-    coefficients[np.array(terms) - 1] = 0.07 * WAVELENGTH / np.sqrt(len(terms))
-    wavefront = zernike.basis(11, NODES.x, NODES.y) @ coefficients
-    (pupil,) = fit_pupils(circle(wavefront), NODES)
-    node, weight = np.polynomial.legendre.leggauss(20)
-    t = 0.25 * np.pi * (node + 1.0)
-    ratio, angle = np.cos(t), 2.0 * np.pi * np.arange(24) / 24
-    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1) / (WAVELENGTH * F_NUMBER)
-    got = transfer.transfer(pupil, (ratio[:, None, None] * unit).reshape(-1, 2), WAVELENGTH, FOCUS).reshape(20, 24)
-    ideal = perfect(ratio)[:, None]
-    assert np.all(np.abs(got) <= ideal + 1e-9)
-    assert np.max(ideal - np.abs(got)) > 0.05
-    area = weight * np.sin(t) * np.cos(t)
-    strehl = np.abs(np.sum(NODES.share * np.exp(2j * np.pi * wavefront / WAVELENGTH))) ** 2
-    assert np.sum(area @ got) / (24 * area @ perfect(ratio)) == pytest.approx(strehl, abs=1e-8)
-
-
 @pytest.mark.parametrize("span", [0.1, 1.0, 3.0, 10.0, 30.0, 100.0])
 def test_rule_for_the_nodes(span: float) -> None:
     node, weight = np.polynomial.legendre.leggauss(transfer.nodes_for(span, transfer.LEAST_ALONG))
     assert np.sum(weight * np.cos(span * node)) == pytest.approx(2.0 * np.sin(span) / span, abs=1e-8)
-
-
-@pytest.mark.parametrize("reach", [0.0, 1e-3, 2e-3])
-def test_independent_of_the_number_of_nodes(traced: PupilFunction, monkeypatch, reach: float) -> None:
-    """+-1 mm at F/9.2 and 450 nm are 3.3 waves of defocus at the edge."""
-    f = random_frequencies(traced, 60, BAND[0])
-    dz = np.linspace(-reach, reach, 5)
-    got = transfer.transfer(traced, f, BAND[0], dz)
-    rule = transfer.nodes_for
-    monkeypatch.setattr(transfer, "nodes_for", lambda span, least: 2 * rule(span, least))
-    assert np.max(np.abs(transfer.transfer(traced, f, BAND[0], dz) - got)) < 1e-7
 
 
 def test_polychromatic_mean(traced: PupilFunction) -> None:

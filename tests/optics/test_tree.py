@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from optics.geometry.pose import Pose, about_axis, rotation_matrix
+from optics.geometry.pose import Pose, about_axis
 from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, State, compose
 
 PIVOT = (0.0, 0.2, -0.1)
@@ -18,14 +18,6 @@ def tree() -> RigidTree:
             Body("c"),
         )
     )
-
-
-def test_nominal_poses_are_products_down_the_tree(tree: RigidTree) -> None:
-    placed = tree.place()
-    assert placed.pose("a") == tree["a"].pose
-    want = tree["a"].pose @ tree["a/b"].pose
-    np.testing.assert_allclose(placed.pose("a/b").rotation, want.rotation, atol=1e-15)
-    np.testing.assert_allclose(placed.pose("a/b").translation, want.translation, atol=1e-15)
 
 
 def test_the_pivot_stays_in_place(tree: RigidTree) -> None:
@@ -89,21 +81,6 @@ def test_complex_step_against_differences(tree: RigidTree, kind: str, axis: int)
     assert exact.rotation.dtype == np.complex128
 
 
-def test_states_are_independent(tree: RigidTree) -> None:
-    states: list[State] = [{"a": Motion(rotate=(0.1, 0, 0))}, {}, {"a/b": Motion(shift=(0, 0, 1.0))}]
-    together = tree.place(states)
-    for s, state in enumerate(states):
-        alone = tree.place([state])
-        np.testing.assert_array_equal(together.rotation[s], alone.rotation[0])
-        np.testing.assert_array_equal(together.translation[s], alone.translation[0])
-
-
-def test_rotations_about_two_axes_are_one_rotation_vector(tree: RigidTree) -> None:
-    vector = (0.2, 0.3, 0.0)
-    got = tree.place([{"c": Motion(rotate=vector)}]).pose("c").rotation
-    np.testing.assert_allclose(got, rotation_matrix(vector), atol=1e-15)
-
-
 def test_bad_trees_and_states_are_refused(tree: RigidTree) -> None:
     with pytest.raises(ValueError, match="twice"):
         RigidTree((Body("a"), Body("a")))
@@ -124,24 +101,6 @@ def test_numbers_of_a_motion_by_name() -> None:
     assert motion.component("figure", 5) == 0.0
     with pytest.raises(ValueError, match="not a 'stretch'"):
         motion.component("stretch", 0)
-
-
-@pytest.mark.parametrize("derivative", [False, True])
-def test_a_body_at_rest_is_where_it_is_when_it_is_moved_by_nothing(tree: RigidTree, derivative: bool) -> None:
-    """What nothing moves is not worked out anew: to the bit what a motion of zero gives, alone or among others."""
-    still = {path: Motion() for path in tree.paths}
-    turned: State = {"a/plate": Motion(rotate=(1e-3, 0.0, 2e-3), shift=(0.0, 1e-4, 0.0), scale=1e-3)}
-    for count in (1, 2, 9):
-        step = [("a/plate", "rotate", 1)] * count if derivative else None
-        for some in ({}, turned):
-            short, long = (tree.place([{**part, **some}] * count, step) for part in ({}, still))
-            assert short.rotation.dtype == long.rotation.dtype
-            assert np.array_equal(short.rotation, long.rotation)
-            assert np.array_equal(short.translation, long.translation)
-            assert np.array_equal(short.scale, long.scale)
-    # what a state does to one body is not kept for the next
-    assert np.array_equal(tree.place([turned]).translation, tree.place([turned]).translation)
-    assert np.array_equal(tree.place().translation[0], tree.place([still]).translation[0])
 
 
 def test_a_tree_stands_by_itself_as_another_does_in_a_state() -> None:

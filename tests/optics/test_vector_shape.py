@@ -1,6 +1,5 @@
 """Spectra of shapes against quadrature and against each other; shapes under maps."""
 
-import pickle
 from itertools import pairwise
 
 import numpy as np
@@ -66,43 +65,6 @@ def test_thin_bar_is_sinc_times_sinc() -> None:
     np.testing.assert_allclose(Polygon(BAR).spectrum(fx, fy) / (wide * long), want / (wide * long), rtol=0, atol=1e-12)
 
 
-def test_product_grid_is_the_same_as_single_frequencies() -> None:
-    fx, fy = np.linspace(0.0, 2e5, 301), np.linspace(-2e5, 2e5, 211)  # several blocks of rows
-    u, v = np.meshgrid(fx, fy)
-    for shape in (Polygon(ARROW), Disk((1e-5, 2e-5), 2e-5)):
-        grid = shape.spectrum(fx, fy[:, None])
-        assert grid.shape == (211, 301)
-        np.testing.assert_allclose(grid.ravel(), shape.spectrum(u.ravel(), v.ravel()), rtol=0, atol=1e-14 * shape.area)
-
-
-def test_orientation_does_not_matter() -> None:
-    forward, backward = Polygon(ARROW), Polygon(ARROW[::-1])
-    fx, fy = frequencies(ARROW)
-    assert forward.area == pytest.approx(backward.area, rel=1e-15)
-    np.testing.assert_allclose(forward.spectrum(fx, fy), backward.spectrum(fx, fy), rtol=0, atol=1e-14 * forward.area)
-
-
-def test_square_is_two_triangles() -> None:
-    f = np.linspace(-3e5, 3e5, 61)
-    whole = Polygon(SQUARE).spectrum(f, f[:, None])
-    halves = [Polygon(SQUARE[[0, 1, 2]]), Polygon(SQUARE[[0, 2, 3]])]
-    parts = sum(half.spectrum(f, f[:, None]) for half in halves)
-    np.testing.assert_allclose(parts, whole, rtol=0, atol=1e-13 * 36e-10)
-
-
-@pytest.mark.parametrize("corners", [100, 400])
-def test_disk_is_a_polygon_of_many_corners(corners: int) -> None:
-    """Of equal area: the outline's ripple has mean 0, the spectra differ by the fourth order of the corner angle."""
-    radius, turn = 2e-5, 2.0 * np.pi / corners
-    angle = turn * np.arange(corners)
-    rim = radius * np.sqrt(turn / np.sin(turn)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    f = np.linspace(-2e5, 2e5, 41)  # up to q = 36 radians, far below the number of corners
-    disk, polygon = Disk((3e-5, -1e-5), radius), Polygon(rim + np.array([3e-5, -1e-5]))
-    difference = np.abs(disk.spectrum(f, f[:, None]) - polygon.spectrum(f, f[:, None])) / disk.area
-    assert polygon.area == pytest.approx(disk.area, rel=1e-12)
-    assert np.max(difference) < 0.1 * turn**4
-
-
 def test_ellipse_against_quadrature() -> None:
     shape = Disk((1e-5, 5e-6), 3e-5, [[1.3, 0.4], [-0.2, 0.8]])
     nodes = quadrature.disk(30, 120)
@@ -155,15 +117,11 @@ def test_quadratic_map_bends_edges_within_the_tolerance() -> None:
     right = right[np.argsort(right[:, 1])]
     off = np.abs(np.interp(y, right[:, 1], right[:, 0]) - (0.5 * side + 3.0 * y**2))
     assert 0.5 * tolerance < np.max(off) <= tolerance * (1.0 + 1e-6)
+    # edges along x bend as those along y do
+    other = Polygon(10.0 * SQUARE).mapped(lambda points: quadratic(points[:, ::-1])[:, ::-1], tolerance)
+    assert len(other.vertices) == len(mapped.vertices)
     # the map is a shear: it keeps areas, and so do the chords on both sides alike
     assert mapped.area == pytest.approx(side**2, rel=1e-12)
-
-
-def test_an_edge_with_an_inflection_is_divided() -> None:
-    """A cubic crosses its chord in the middle, where one look would find no bend."""
-    square = Polygon(10.0 * SQUARE)
-    mapped = square.mapped(lambda p: p + np.stack([1e4 * p[:, 1] ** 3, np.zeros(len(p))], axis=-1), 1e-9)
-    assert len(mapped.vertices) > 4
 
 
 def test_bent_disk_becomes_a_polygon() -> None:
@@ -204,6 +162,7 @@ def test_half_plane_takes_the_tangent(mirrored: bool) -> None:
         (lambda: Polygon(SQUARE[[0, 2, 0]]), "one line"),
         (lambda: Polygon(SQUARE * np.nan), "finite"),
         (lambda: Disk((0.0, 0.0), 0.0), "positive radius"),
+        (lambda: Disk((0.0, np.nan), 1.0), "two finite numbers"),
         (lambda: Disk((0.0, 0.0), 1.0, np.ones((2, 2))), "inverse"),
         (lambda: HalfPlane((0.0, 0.0), (0.0, 0.0)), "not 0"),
         (lambda: Polygon(SQUARE).mapped(lambda p: p * np.nan), "leave the field"),
@@ -217,13 +176,3 @@ def test_half_plane_takes_the_tangent(mirrored: bool) -> None:
 def test_bad_input_is_refused(make, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
-
-
-@pytest.mark.parametrize("shape", [Polygon(ARROW), Disk((1e-5, 0.0), 2e-5), HalfPlane((0.0, 1.0), (1.0, 2.0))])
-def test_shapes_are_values(shape) -> None:
-    copy = pickle.loads(pickle.dumps(shape))
-    for name, value in vars(shape).items():
-        np.testing.assert_array_equal(getattr(copy, name), value)
-        if isinstance(value, np.ndarray):
-            with pytest.raises(ValueError, match="read-only"):
-                value[...] = 0.0

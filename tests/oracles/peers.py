@@ -15,31 +15,10 @@ from tests.own_trace import OwnCamera
 
 
 def batoid_camera(model: CameraModel, apertures: bool = False) -> Any:
-    """The camera as a ``batoid.CompoundOptic`` in the prescription frame; mirrors keep their names."""
-    import batoid
+    """Return the camera as a ``batoid.CompoundOptic`` in the prescription frame; surfaces keep their names.
 
-    items = []
-    for name, surface in model.surfaces.items():
-        radius = 1.0 / surface.curvature
-        shape = batoid.Asphere(radius, surface.conic, list(surface.even)) if surface.even else None
-        shape = shape or batoid.Quadric(radius, surface.conic)
-        blocked = None
-        if apertures:
-            edge = model.apertures[name]
-            if isinstance(edge, Circle):
-                inside = batoid.ObscCircle(edge.radius, *edge.centre)
-            else:
-                inside = batoid.ObscRectangle(2.0 * edge.half_x, 2.0 * edge.half_y, *edge.centre)
-            blocked = batoid.ObscNegation(inside)
-        stand = batoid.CoordSys(origin=model.vertex(name))
-        items.append(batoid.Mirror(shape, name=name, coordSys=stand, obscuration=blocked))
-    stand = batoid.CoordSys(origin=[0.0, 0.0, model.spec.image.z])
-    items.append(batoid.Detector(batoid.Plane(), name=IMAGE, coordSys=stand))
-    return batoid.CompoundOptic(items, name=model.spec.name)
-
-
-def batoid_lenses(model: CameraModel) -> Any:
-    """As ``batoid_camera``, with lenses whose glasses are Sellmeier's (formula 2, or of the catalogue) in air."""
+    Glasses of lenses are Sellmeier's (formula 2, or of the catalogue) in air.
+    """
     import batoid
 
     from optics.materials.glass import glass
@@ -53,10 +32,15 @@ def batoid_lenses(model: CameraModel) -> Any:
             shape = batoid.Quadric(radius, surface.conic)
             if surface.even:
                 shape = batoid.Asphere(radius, surface.conic, list(surface.even))
-        stand = batoid.CoordSys(origin=model.vertex(name))
-        face = model.spec.mirrors[name]
+        stand, face = batoid.CoordSys(origin=model.vertex(name)), model.spec.mirrors[name]
         if face.light is None:
-            items.append(batoid.Mirror(shape, name=name, coordSys=stand))
+            blocked = None
+            if apertures:
+                edge = model.apertures[name]
+                clear: Any = batoid.ObscCircle(edge.radius, *edge.centre) if isinstance(edge, Circle) else None
+                clear = clear or batoid.ObscRectangle(2.0 * edge.half_x, 2.0 * edge.half_y, *edge.centre)
+                blocked = batoid.ObscNegation(clear)
+            items.append(batoid.Mirror(shape, name=name, coordSys=stand, obscuration=blocked))
             continue
         behind = air
         if face.glass is not None:
@@ -95,7 +79,7 @@ Tracer = Callable[[np.ndarray, np.ndarray, float], PeerRays]
 
 
 def _by_batoid(model: CameraModel) -> Tracer:
-    peer = batoid_lenses(model)
+    peer = batoid_camera(model)
 
     def trace(start: np.ndarray, direction: np.ndarray, wavelength: float) -> PeerRays:
         rays = batoid_rays(start, direction, wavelength)
@@ -109,40 +93,13 @@ def _by_batoid(model: CameraModel) -> Tracer:
 
 def _by_optiland(model: CameraModel) -> Tracer:
     """With optiland's own glasses, by name."""
-    from optiland.materials import Material
-    from optiland.optic import Optic
-    from optiland.rays import RealRays
-
-    names = {"N-BK7": ("N-BK7", "schott"), "F2": ("F2", "schott"), "fused silica": ("SiO2", "Malitson")}
-    optic, spec = Optic(), model.spec
-    optic.surfaces.add(index=0, z=-np.inf)
-    for i, (name, surface) in enumerate(model.surfaces.items(), start=1):
-        face, shape = spec.mirrors[name], {"surface_type": "standard"}
-        if surface.even:
-            shape = {"surface_type": "even_asphere", "coefficients": [0.0, *surface.even]}
-        material = "mirror" if face.light is None else "air"
-        if face.glass is not None:
-            known, reference = names[face.glass.name]
-            material = Material(known, reference)
-        optic.surfaces.add(
-            index=i,
-            z=float(model.vertex(name)[2]),
-            radius=1.0 / surface.curvature if surface.curvature else np.inf,
-            conic=surface.conic,
-            material=material,
-            is_stop=name == spec.stop,
-            **shape,
-        )
-    optic.surfaces.add(index=len(model.surfaces) + 1, z=spec.image.z)
-    optic.wavelengths.add(1e6 * spec.wavelength, is_primary=True)
+    optic = optiland_camera(model)
     for surface in optic.surfaces:
         if hasattr(surface.geometry, "tol"):
             surface.geometry.tol = 1e-14
 
     def trace(start: np.ndarray, direction: np.ndarray, wavelength: float) -> PeerRays:
-        n = len(start)
-        columns = [np.array(a[:, i]) for a in (start, np.broadcast_to(direction, start.shape)) for i in range(3)]
-        rays = RealRays(*columns, np.ones(n), np.full(n, 1e6 * wavelength))
+        rays = optiland_rays(start, direction, 1e6 * wavelength)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba's remarks on optiland's code
             optic.surfaces.trace(rays, record=False)
@@ -172,47 +129,46 @@ LENSES: dict[str, Callable[[CameraModel], Tracer]] = {
 """Programs that trace cameras with lenses at any wavelength, by name."""
 
 
+GLASSES = {"N-BK7": ("N-BK7", "schott"), "F2": ("F2", "schott"), "fused silica": ("SiO2", "Malitson")}
+"""Names here -> optiland's material and its source."""
+
+
 def optiland_camera(model: CameraModel, apertures: bool = False, unit: float = 1.0) -> Any:
-    """The camera as an ``optiland.optic.Optic`` in the prescription frame, in metres, or in a unit of as many metres;
-    what optiland tells in waves is meant for millimetres.
+    """Return the camera as an ``optiland.optic.Optic`` in the prescription frame, in metres, or in a unit of as many
+    metres; what optiland tells in waves is meant for millimetres.
     """
+    from optiland.materials import Material
     from optiland.optic import Optic
     from optiland.physical_apertures import RadialAperture, RectangularAperture
 
-    optic = Optic()
+    optic, spec = Optic(), model.spec
     optic.surfaces.add(index=0, z=-np.inf)
     for i, (name, surface) in enumerate(model.surfaces.items(), start=1):
-        edge = model.apertures[name]
-        clear = None
+        face, clear = spec.mirrors[name], None
         if apertures:
+            edge = model.apertures[name]
             bounds = [side / unit for side in edge.bounds]
             clear = RadialAperture(edge.radius / unit) if isinstance(edge, Circle) else RectangularAperture(*bounds)
         shape: dict[str, Any] = {"surface_type": "standard"}
         if surface.even:
-            shape = {
-                "surface_type": "even_asphere",
-                "coefficients": [0.0, *(a * unit ** (2 * n + 3) for n, a in enumerate(surface.even))],
-            }
-        optic.surfaces.add(
-            index=i,
-            z=float(model.vertex(name)[2]) / unit,
-            radius=1.0 / surface.curvature / unit,
-            conic=surface.conic,
-            material="mirror",
-            is_stop=name == model.spec.stop,
-            aperture=clear,
-            **shape,
-        )
-    optic.surfaces.add(index=len(model.surfaces) + 1, z=model.spec.image.z / unit)
-    optic.wavelengths.add(0.65, is_primary=True)
+            terms = [0.0, *(a * unit ** (2 * n + 3) for n, a in enumerate(surface.even))]
+            shape = {"surface_type": "even_asphere", "coefficients": terms}
+        material: Any = "mirror" if face.light is None else "air"
+        if face.glass is not None:
+            material = Material(*GLASSES[face.glass.name])
+        radius = 1.0 / surface.curvature / unit if surface.curvature else np.inf
+        shape |= {"radius": radius, "conic": surface.conic, "material": material, "aperture": clear}
+        optic.surfaces.add(index=i, z=float(model.vertex(name)[2]) / unit, is_stop=name == spec.stop, **shape)
+    optic.surfaces.add(index=len(model.surfaces) + 1, z=spec.image.z / unit)
+    optic.wavelengths.add(1e6 * spec.wavelength, is_primary=True)
     return optic
 
 
-def optiland_rays(position: np.ndarray, direction: np.ndarray) -> Any:
-    """``optiland`` rays from arrays (N, 3)."""
+def optiland_rays(position: np.ndarray, direction: np.ndarray, micrometres: float = 0.65) -> Any:
+    """Return ``optiland`` rays from arrays (N, 3)."""
     from optiland.rays import RealRays
 
     n = len(position)
     both = (position, np.broadcast_to(direction, position.shape))
     columns = [np.array(a[:, i]) for a in both for i in range(3)]
-    return RealRays(*columns, np.ones(n), np.full(n, 0.65))
+    return RealRays(*columns, np.ones(n), np.full(n, micrometres))

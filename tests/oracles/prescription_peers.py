@@ -207,20 +207,15 @@ OVER = np.diag([1.0, -1.0, -1.0])
 
 
 def batoid_beam(
-    telescope: Any,
-    wavelength: float,
-    x: float = 0.0,
-    y: float = 0.0,
-    rays: tuple[np.ndarray, np.ndarray] | None = None,
+    telescope: Any, wavelength: float, x: float = 0.0, y: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, Rays, np.ndarray]:
-    """A beam through a telescope of batoid, told in the twin's axes.
+    """Trace a beam over the entrance pupil of a telescope of batoid, told in the twin's axes.
 
     Args:
         telescope: a ``batoid.Optic``.
         wavelength: metres.
-        x: field angle of a beam over its entrance pupil, radians.
+        x: field angle, radians.
         y: likewise.
-        rays: launch points and directions in the twin's axes in place of that beam.
 
     Returns:
         Launch points (N, 3), directions (N, 3), what batoid makes of them at its detector, and which rays failed.
@@ -228,13 +223,7 @@ def batoid_beam(
     import batoid
 
     index = float(telescope.inMedium.getN(wavelength))
-    if rays is None:
-        beam = batoid.RayVector.asPolar(optic=telescope, wavelength=wavelength, theta_x=x, theta_y=y, nrad=8, naz=40)
-    else:
-        launch, direction = rays
-        heading = np.broadcast_to(direction, launch.shape) @ OVER / index
-        columns = [np.ascontiguousarray(a[:, i]) for a in (launch @ OVER, heading) for i in range(3)]
-        beam = batoid.RayVector(*columns, np.zeros(len(launch)), np.full(len(launch), wavelength))
+    beam = batoid.RayVector.asPolar(optic=telescope, wavelength=wavelength, theta_x=x, theta_y=y, nrad=8, naz=40)
     start, heading, begun = beam.r @ OVER, index * beam.v @ OVER, np.array(beam.t)
     out = telescope.trace(beam.copy())
     out.toCoordSys(telescope.itemDict[list(telescope.itemDict)[-1]].coordSys)

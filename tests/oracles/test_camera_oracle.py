@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 
 from tests.oracles.peers import batoid_camera, batoid_rays, optiland_camera
+from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.first_order_data import FIRST_ORDER, first_order_data, ray_paths
 
 pytestmark = pytest.mark.oracle
-NAMES = ["gf7", "monitor", "gf7_conic"]
+NAMES = quick(1, ["gf7", "monitor", "gf7_conic"])
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", NAMES)
 def test_paraxial_data_of_optiland(backend, camera, name: str) -> None:
     """About the axis, which the field stands beside; the rays that are traced there are those of the twin."""
@@ -71,56 +73,3 @@ def test_wavefronts_of_batoids_rays(backend, camera, name: str) -> None:
         # and where the chief ray falls
         place = peer.items[-1].coordSys.origin + rays.r[0] - model.focal_plane.translation
         np.testing.assert_allclose(wave.place, place[:2], atol=1e-12)
-
-
-def test_poppys_names_of_zernike_terms() -> None:
-    """To fourth order, beyond which it calls trefoil astigmatism: kinds by their word, x and y of coma by theirs."""
-    zern_name = pytest.importorskip("poppy").zernike.zern_name
-    from optics.geometry import zernike
-
-    words = {"Focus": "defocus", "Astig": "astigmatism", "Coma": "coma", "Spherical": "spherical", "Tilt": "tilt"}
-    words |= {"Trefoil": "trefoil", "Tetrafoil": "tetrafoil", "Pentafoil": "pentafoil", "Piston": "piston"}
-    compared = 0
-    for j in range(1, 16):
-        theirs = zern_name(j)
-        kind = [own for word, own in words.items() if word in theirs]
-        if len(kind) == 1:
-            assert kind[0] in zernike.name(j), (j, theirs)
-            compared += 1
-    assert compared >= 13
-    for j in (2, 3, 7, 8):
-        assert zernike.name(j)[-1] == zern_name(j)[-1].lower()
-
-
-@pytest.mark.second
-def test_mtf_of_poppys_image(backend, camera) -> None:
-    """The camera's own wavefront in a round pupil through poppy's matrix transform: its MTF along both axes."""
-    poppy = pytest.importorskip("poppy")
-    import astropy.units as u
-
-    model = camera("gf7")
-    optics = CameraOptics.alone(model, backend)
-    field = (1.0, 1.0)
-    wave, mtf = optics.wavefront(field), optics.mtf(field)
-    f_number = optics.spot(field).airy / (1.22 * model.spec.wavelength)
-    system = poppy.OpticalSystem(oversample=1, npix=1024, pupil_diameter=1.0 * u.m)
-    system.add_pupil(poppy.CircularAperture(radius=0.5))
-    coefficients = (wave.coefficients * model.spec.wavelength).tolist()
-    system.add_pupil(poppy.ZernikeWFE(radius=0.5, coefficients=coefficients))
-    # pixels of a quarter of lambda / D, a field of 256 lambda / D: what is beyond it holds 0.2 % of the light
-    count, step = 1024, 0.25
-    scale = np.rad2deg(model.spec.wavelength / 1.0) * 3600 * step
-    system.add_detector(pixelscale=scale, fov_pixels=count)
-    image = system.calc_psf(wavelength=model.spec.wavelength * u.m)[0].data
-    own = np.arange(count) * step * model.spec.wavelength * f_number
-    for k, frequency in enumerate((20e3, 50e3, 71.4e3)):
-        turn = np.exp(-2j * np.pi * frequency * own)
-        along = abs(np.sum(image * turn)) / np.sum(image)
-        track = abs(np.sum(image * turn[:, None])) / np.sum(image)
-        # the true pupil is elliptic by 1.2 % and its edge a little uneven; poppy's is round and of the same area
-        for direction, value in enumerate((along, track)):
-            ratio = np.interp(frequency, mtf.frequency, mtf.values[direction] / np.maximum(mtf.limit[direction], 1e-9))
-            s = frequency * model.spec.wavelength * f_number
-            limit = 2.0 / np.pi * (np.arccos(s) - s * np.sqrt(1.0 - s**2))
-            assert value / limit == pytest.approx(ratio, abs=0.006), (k, direction)
-            assert ratio < 0.995

@@ -7,7 +7,6 @@ from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
 
-centroids = pytest.importorskip("photutils.centroids", reason="photutils not installed (extra `oracles`)")
 pytestmark = pytest.mark.oracle
 
 FRAMES = 9
@@ -41,6 +40,7 @@ def test_energy_centroid(setup, spots) -> None:
 
     What is left is the iteration's last step, 1e-7 px, and the moments' rounding.
     """
+    centroids = pytest.importorskip("photutils.centroids")
     found = energy_centroid(spots, FRAMES, setup.calibration.noise, RADIUS, border_px=BORDER)
     assert found.converged.all()
     for spot, row, column in zip(spots, found.row, found.column, strict=True):
@@ -53,12 +53,14 @@ def test_energy_centroid(setup, spots) -> None:
     assert np.ptp(found.column.reshape(len(STATES), 4), axis=0).min() > 1.0  # the spots did move
 
 
+@pytest.mark.second
 def test_gaussian_fit(setup, spots) -> None:
     """photutils fits Gaussian and constant too, but with equal weights and in a window with a hard edge that stays.
 
     A spot is no Gaussian, so each has a bias of its own. Spots of a diffraction image are so nearly symmetric that it
     stays below what the noise of nine frames does to our centre; these images have no noise.
     """
+    centroids = pytest.importorskip("photutils.centroids")
     images = setup.expected_frames(setup.path.expected_photons(STATES)).reshape(spots.shape)
     found = gaussian_fit(images, FRAMES, setup.calibration.noise, RADIUS, elliptical=True)
     variance = np.diagonal(found.temporal_covariance + found.fixed_covariance, axis1=1, axis2=2)

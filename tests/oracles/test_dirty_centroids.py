@@ -9,7 +9,6 @@ from optics.numerics.threads import one_blas_thread
 from tests.tiers import quick
 from tests.twin.dirty_frames import draw, measurement
 
-centroids = pytest.importorskip("photutils.centroids", reason="photutils not installed (extra `oracles`)")
 pytestmark = pytest.mark.oracle
 
 HALF = 7
@@ -23,6 +22,7 @@ def test_shifts_agree_with_those_of_photutils(experiment, kind):
     Both see the same frames, so that their difference is no more than what the less efficient of both does: the spread
     over the sets, by which it is judged, is that of the Gaussian's own sigma and ours together.
     """
+    centroids = pytest.importorskip("photutils.centroids")
     pair = experiment("gf7_pair")
     template = one_shape(pair.calibration.template, 0, pair.calibration.template.shape)
     noise: NoiseModel = pair.calibration.noise

@@ -1,5 +1,7 @@
 """Diffraction images and transfer functions of a traced exit pupil against poppy."""
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 
@@ -8,9 +10,13 @@ from optics.numerics import quadrature
 from optics.waves import transfer
 from optics.waves.diffraction import Grid, image
 from tests.oracles.pupil_grid import WAVELENGTH, FarPoint, fitted, pupil_grid
+from tests.tiers import quick
 
-poppy = pytest.importorskip("poppy", reason="poppy not installed (extra `oracles`)")
-pytestmark = pytest.mark.oracle
+# not imported here: each process that runs tests collects this file
+pytestmark = [
+    pytest.mark.oracle,
+    pytest.mark.skipif(find_spec("poppy") is None, reason="poppy not installed (extra `oracles`)"),
+]
 
 ARCSEC = np.pi / 180 / 3600
 STATES: dict[str, State] = {
@@ -24,7 +30,7 @@ STEP, PIXELS = 1.5e-6, 96
 AXIS = Grid(-0.5 * (PIXELS - 1) * STEP, STEP, PIXELS)
 
 
-@pytest.fixture(scope="module", params=list(STATES))
+@pytest.fixture(scope="module", params=quick(1, ["moved", "nominal"]))
 def point(request, backend, gf7) -> FarPoint:
     return FarPoint(backend, gf7, np.radians(1.0), np.radians(0.05), STATES[request.param])
 
@@ -37,6 +43,7 @@ def test_image_of_the_same_samples(point) -> None:
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12 * theirs.max())
 
 
+@pytest.mark.second
 def test_image_from_the_stops_quadrature(point) -> None:
     """Some thousand traced nodes against poppy's samples on ever finer grids.
 

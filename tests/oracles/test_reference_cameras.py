@@ -1,20 +1,17 @@
 """The three reference cameras are what their data sheets say: first order, image quality, no obscuration."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from optics.geometry.aperture import Circle, Rectangle
-from optics.geometry.surface import plane
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
-from optics.raytrace.assembly import Assembly, Element, Interaction, points_to_world
+from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import LineChange, chief_rays, line_change
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.wavefront import fit_wavefront, path_difference
 from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction
+from tests.tiers import quick
 
 NAMES = ["gf7", "monitor", "gf7_conic"]
 NODES = quadrature.disk(12)
@@ -99,7 +96,10 @@ def test_local_focal_length_is_the_slope_of_the_image(backend, camera, name: str
     assert abs(sides[0] - sides[1]) / angle == pytest.approx(abs(model.first_order.scale[0, 0, 0]), rel=1e-7)
 
 
-@pytest.mark.parametrize(("name", "low", "high"), [("gf7", 0.0145, 0.0182), ("monitor", 0.0105, 0.0162)])
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    quick(1, [("gf7", 0.0145, 0.0182), ("monitor", 0.0105, 0.0162), ("gf7_short", 0.0085, 0.0115)]),
+)
 def test_wavefront_error_along_the_line(backend, camera, name: str, low: float, high: float) -> None:
     model = camera(name)
     errors = [
@@ -121,20 +121,26 @@ def test_spots_of_the_conic_camera(backend, camera, x: float, y: float, spot: fl
     assert spot == pytest.approx(sheet, rel=0.06)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_geometric_spots_are_far_smaller_than_the_airy_disk(backend, camera, name: str) -> None:
-    model = camera(name)
-    airy = 1.22 * model.spec.wavelength * model.spec.focal_length / model.spec.entrance_pupil
-    for x in (0.0, 0.5, 1.0):
-        for y in (-1.0, 0.0, 1.0):
-            assert rms_spot(bundle(backend, model, x * model.spec.field.x, y * model.spec.field.y)[0]) < 0.35 * airy
-
-
-def test_exit_pupils(camera) -> None:
-    # gf7 and monitor are nearly telecentric in image space; gf7_conic's pupil is far but finite
-    assert abs(camera("gf7").first_order.exit_pupil_distance[0]) > 25 * 5.52
-    assert abs(camera("monitor").first_order.exit_pupil_distance[0]) > 8 * 7.68
-    assert camera("gf7_conic").first_order.exit_pupil_distance[0] == pytest.approx(16.8, abs=0.1)
+@pytest.mark.second
+def test_gf7_short_is_a_fifth_shorter_at_the_same_focal_length(backend, camera) -> None:
+    """By clear apertures and the image along z; its worst wavefront error over the field is what its file states."""
+    lengths, distances = {}, {}
+    for name in ("gf7", "gf7_short"):
+        model = camera(name)
+        heights = [model.spec.image.z]
+        for mirror, aperture in model.apertures.items():
+            points = np.concatenate([aperture.outline(400), [aperture.centre]])
+            heights += list(model.spec.mirrors[mirror].z + model.surfaces[mirror].sag(*points.T))
+        lengths[name] = max(heights) - min(heights)
+        distances[name] = line_geometry(backend, model, [{}, {}]).nominal_distance
+    assert 1.5 < lengths["gf7_short"] <= 0.80 * lengths["gf7"]
+    assert distances["gf7_short"] == pytest.approx(distances["gf7"], abs=2e-3)  # distortion along the line is another
+    field = camera("gf7_short").spec.field
+    errors = [
+        wavefront_error(camera("gf7_short"), bundle(backend, camera("gf7_short"), x * field.x, y * field.y))
+        for x, y in ((1.0, -1.0), (1.0, 1.0), (0.5, -1.0), (0.5, 1.0))
+    ]
+    assert max(errors) == pytest.approx(0.0231, abs=0.0003)
 
 
 def test_a_piston_of_the_conic_cameras_focal_plane_changes_its_principal_distance(backend, camera) -> None:
@@ -146,56 +152,3 @@ def test_a_piston_of_the_conic_cameras_focal_plane_changes_its_principal_distanc
     assert change.d_f[0] > 0.0 > change.d_f[1]
     ratio = change.nominal_distance / float(model.first_order.exit_pupil_distance[0])
     assert change.d_f[0] * 1e3 == pytest.approx(ratio, rel=0.02)
-
-
-def blocked(backend, assembly: Assembly, obstacle: Element, start: np.ndarray, end: np.ndarray) -> int:
-    """How many of the segments start..end (N, 3) meet the obstacle's clear area."""
-    reach = np.linalg.norm(end - start, axis=-1)
-    direction = (end - start) / reach[:, None]
-    system = assemble(assembly.with_element(replace(obstacle, interaction=Interaction.PASS)), [(obstacle.name,)])
-    _, _, path, inside = (a[0] for a in trace(backend, system, make_rays(backend, start, direction)).numpy())
-    return int(np.sum(inside & (path > 1e-6) & (path < reach - 1e-6)))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_nothing_stands_in_the_light(backend, camera, name: str) -> None:
-    """Segments of rays of all fields against the other mirrors, with their edges, and the focal plane."""
-    model = camera(name)
-    spec, bare = model.spec, model.bare_assembly(apertures=False)
-    margin = spec.edge_margin
-    obstacles = {}
-    for mirror, aperture in model.apertures.items():
-        edge = Circle(aperture.radius + margin) if isinstance(aperture, Circle) else aperture
-        obstacles[mirror] = replace(bare.elements[mirror], aperture=edge)
-    width = spec.focal_length * np.tan(spec.field.x) + margin
-    depth = spec.focal_length * np.tan(spec.field.y) + margin
-    centre = model.focal_plane.translation
-    detector = Rectangle(width, depth, (float(centre[0]), float(centre[1])))
-    obstacles[IMAGE] = Element(IMAGE, IMAGE, plane(), Interaction.PASS, detector)
-
-    to_stop = assemble(bare, [model.mirrors[:2]])
-    stop = model.apertures[spec.stop].bounds[1] * quadrature.disk(4, 24).x
-    stop = np.stack([stop, model.apertures[spec.stop].bounds[1] * quadrature.disk(4, 24).y], axis=-1)
-    rim = 2 * np.pi * np.arange(48) / 48
-    stop = np.concatenate([stop, model.apertures[spec.stop].bounds[1] * np.stack([np.cos(rim), np.sin(rim)], axis=-1)])
-    fields = [(x, y) for x in np.linspace(-1, 1, 5) for y in np.linspace(-1, 1, 3)]
-    directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in fields])
-    launch = (collimated(backend, to_stop, directions, stop) - 6.0 * directions[:, None]).reshape(-1, 3)
-    rays = make_rays(backend, launch, np.repeat(directions, len(stop), axis=0))
-    traced = trace(backend, assemble(bare, ["imaging"]), rays, keep=range(4))
-    assert traced.numpy()[3].all()
-    corners = [launch] + [
-        traced.hit(i)[0] + bare.nominal_pose(n).translation for i, n in enumerate((*model.mirrors, IMAGE))
-    ]
-    ends = [None, *model.mirrors, IMAGE]
-    tested = 0
-    for i in range(4):
-        for body, obstacle in obstacles.items():
-            if body in (ends[i], ends[i + 1]):
-                continue
-            assert blocked(backend, bare, obstacle, corners[i], corners[i + 1]) == 0, f"{body} blocks segment {i}"
-            tested += len(launch)
-    assert tested > 15_000
-    # the check sees an obstacle: M1's own light, if M1 were in the way of what reaches M2's plane
-    wide = replace(bare.elements["M2"], aperture=Rectangle(3.0, 3.0))
-    assert blocked(backend, bare, wide, corners[0], corners[1]) == len(launch)

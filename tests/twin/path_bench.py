@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
 import numpy as np
 
 from optics.geometry.aperture import Circle
@@ -25,6 +28,9 @@ from scenes.models.scenery_parts import (
     solid_surfaces,
 )
 from scenes.specs.baffle import Plate, box
+
+if TYPE_CHECKING:
+    from twin.path_tracing.path_result import PathResult
 
 IDEAL = Finishes(
     mirror=Finish(reflectance=1.0),
@@ -129,3 +135,27 @@ def focal_plane_housing(instrument: Instrument, camera: str) -> tuple[Plate, ...
     pose = FACING_THE_LIGHT @ Pose(np.eye(3), np.array([0.0, 0.0, -2.0 * BOARD]))
     size = (2.0 * reach_x, 2.0 * reach_y, 2.0 * BOARD + 0.03)
     return box(f"{camera}/housing", f"base/{camera}/focal_plane", pose, size)
+
+
+class Compared(NamedTuple):
+    """Runs of the light of a channel with clear ways and with a search alone, and steps along nominal light of both."""
+
+    runs: list[PathResult]
+    steps: list[Sequence[Any]]
+    toward: str
+
+
+def ways_and_search(
+    backend, instrument, scenery: Scenery, paths: int, sampling=None, state=None, channel: int = 0
+) -> Compared:
+    """Trace the pinhole's light of a channel with clear ways and with a search, with the same random numbers."""
+    from twin.path_tracing.stray_light import monitor_families, pinhole
+    from twin.path_tracing.tracer import BALANCED, PathTracer
+
+    chosen = instrument.channels[channel]
+    toward, families = f"{chosen.key}/area_ccd", monitor_families(scenery, instrument)
+    source = pinhole(instrument, backend, state or {}, chosen)
+    tracers = [PathTracer(backend, scenery, families, sampling or BALANCED, ways) for ways in (True, False)]
+    assert [tracer.features().ways for tracer in tracers] == [True, False]
+    steps = [tracer.nominal_steps(source, toward, paths) for tracer in tracers]
+    return Compared([tracer.run(source, paths, 4, keep=True, toward=toward) for tracer in tracers], steps, toward)

@@ -1,6 +1,5 @@
 """A blurred camera is told about: how many waves, where, in which file, and what would help."""
 
-import json
 import re
 from pathlib import Path
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.models import camera_sharpness
 from scenes.models.camera_model import derive_camera
 from scenes.models.camera_sharpness import (
     BLURRED,
@@ -23,13 +21,11 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, library_names, load_camera
 from scenes.specs.procedures import PROCEDURES
-from scenes.specs.resolved import resolve, resolve_job
+from scenes.specs.resolved import resolve_job
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
 from tests.oracles.test_reference_cameras import bundle, wavefront_error
-from tests.twin.commands import invoke
 from twin.camera.camera_optics import CameraOptics
-from twin.study.__main__ import app as study_app
 
 GF7 = (LIBRARY / "cameras" / "gf7.yaml").read_text("utf-8")
 M2 = "z: -2.01593047747168 m"
@@ -112,18 +108,6 @@ def test_just_beyond_the_limit(backend, tmp_path) -> None:
     assert [len(text) for text in texts] == [0, 1]
 
 
-def test_each_camera_is_traced_once(backend, tmp_path, monkeypatch) -> None:
-    camera = load_camera(gf7_with(tmp_path, "-2.0201 m"))
-    traced = []
-    monkeypatch.setattr(camera_sharpness, "derive_camera", lambda *given: traced.append(given) or derive_camera(*given))
-    for _ in range(3):
-        assert blur_warnings(with_camera(camera), backend)
-    assert len(traced) == 1
-    # a few hundred rays
-    beams = FieldBeams.trace(derive_camera(camera, backend), backend, camera_sharpness._FEW_FIELDS, 3)
-    assert beams.path.size < 300
-
-
 def test_the_best_plane_is_best(backend, tmp_path) -> None:
     """Neither a shift nor a turn makes the mean square error less, also where it starts from a plane that is turned."""
     camera = load_camera(gf7_with(tmp_path, "-2.03 m"))
@@ -165,14 +149,6 @@ def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     assert not PROCEDURES["design camera"].judged
 
 
-def test_a_camera_in_a_runs_config_is_named_there(backend, tmp_path) -> None:
-    config = tmp_path / "config.yaml"
-    config.write_text(with_camera(load_camera(gf7_with(tmp_path, "-2.02 m"))).to_yaml(), "utf-8")
-    (text,) = blur_warnings(resolve(config), backend)
-    assert f"({config}) is blurred" in text
-    assert f"python -m twin.camera {config} --camera gf7 --refocus" in text
-
-
 @pytest.mark.second
 def test_a_tilted_image_plane(backend) -> None:
     """The focal plane of a camera with a tilt is the plane that ``FocalPlane`` says, and its middle is on it."""
@@ -193,42 +169,3 @@ def test_a_tilted_image_plane(backend) -> None:
     assert max(own) > 1.03 * min(own)
     assert validate(CameraSpec, YamlFile("", tilted.plain(), {})) == tilted
     assert "tilt" not in camera.plain()["image"]
-
-
-@pytest.mark.slow
-def test_studies_and_gradients_warn(tmp_path) -> None:
-    """On stderr, in the manifest and the report; a study that is run again from its config.yaml as well."""
-    gf7_with(tmp_path, "-2.02 m", "blurred")
-    pair = (
-        (LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8").replace("camera: gf7", "camera: ./blurred.yaml")
-    )
-    (tmp_path / "pair.yaml").write_text(pair, "utf-8")
-    (tmp_path / "job.yaml").write_text("instrument: ./pair.yaml\nrender: {images: [spots], frames: 2}\n", "utf-8")
-    study = tmp_path / "study.yaml"
-    study.write_text(STUDY, "utf-8")
-    for options in (("--workers", 1), ("--gradient",)):
-        out = tmp_path / "-".join(map(str, options)).strip("-")
-        done = invoke(study_app, study, *options, "--out", out)
-        assert done.exit_code == 0, done.stderr
-        told = [
-            text for text in json.loads((out / "manifest.json").read_text("utf-8"))["warnings"] if "blurred" in text
-        ]
-        assert len(told) == 1
-        assert f"{tmp_path}/blurred.yaml --refocus moves image.z by +10.61 mm" in told[0]
-        assert "is blurred as designed: 6.75 waves rms" in (out / "report.html").read_text("utf-8")
-        assert "is blurred as designed: 6.75 waves rms" in " ".join((done.stderr + done.stdout).split())
-    config = tmp_path / "workers-1" / "config.yaml"
-    again = invoke(study_app, config, "--workers", 1, "--out", tmp_path / "again")
-    assert again.exit_code == 0, again.stderr
-    assert f"{config} --camera ./blurred.yaml --refocus" in "".join(again.stderr.split("\n"))
-
-
-STUDY = """\
-name: study
-base: {command: render, file: ./job.yaml}
-factors:
-  turn: {key: [job, perturb, base/backward/focal_plane, rotate, 2], normal: {mean: 0 arcsec, sigma: 2 arcsec}}
-design: {kind: monte_carlo, runs: 3, seed: 1}
-responses:
-  gamma: {key: [truth, cameras, backward, d_gamma_arcsec]}
-"""

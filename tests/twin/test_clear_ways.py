@@ -16,13 +16,14 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.models.scenery_parts import Finishes, mirror_surface
 from scenes.specs.baffle import Plate
-from tests.twin.path_bench import IDEAL, facing, screen
+from tests.tiers import quick
+from tests.twin.path_bench import IDEAL, facing, screen, ways_and_search
 from twin.path_tracing.clear_ways import ClearWays
 from twin.path_tracing.families import Event, code
 from twin.path_tracing.path_result import PathResult
 from twin.path_tracing.source import DiskSource
-from twin.path_tracing.stray_light import monitor_families, pinhole
-from twin.path_tracing.tracer import BALANCED, FAINT, PathTracer, Sampling
+from twin.path_tracing.stray_light import monitor_families
+from twin.path_tracing.tracer import BALANCED, FAINT, Sampling
 
 PATHS = 20_000
 STATE = {
@@ -44,7 +45,7 @@ def same(one: PathResult, other: PathResult) -> None:
     assert one.balance.absorbed == pytest.approx(other.balance.absorbed, rel=1e-9, abs=1e-15)
 
 
-@pytest.mark.parametrize("sampling", [BALANCED, FAINT], ids=["balanced", "faint"])
+@pytest.mark.parametrize("sampling", quick(1, [BALANCED, FAINT]), ids=["balanced", "faint"])
 @pytest.mark.parametrize(
     ("name", "state"),
     [("gf7_pair", {}), pytest.param("monitor_pair", STATE, marks=pytest.mark.second)],
@@ -53,14 +54,10 @@ def same(one: PathResult, other: PathResult) -> None:
 def test_paths_on_clear_ways_are_those_of_a_search(backend, instrument, name: str, state: dict, sampling: Sampling):
     chosen = instrument(name)
     scenery = build_scenery(chosen, state)
-    families = monitor_families(scenery, chosen)
-    tracers = [PathTracer(backend, scenery, families, sampling, ways) for ways in (True, False)]
-    assert [tracer.features().ways for tracer in tracers] == [True, False]
-    for channel in chosen.channels[:2]:
-        source, toward = pinhole(chosen, backend, state, channel), f"{channel.key}/area_ccd"
-        runs = [tracer.run(source, PATHS, 4, keep=True, toward=toward) for tracer in tracers]
-        assert len(runs[0].detections.path) > 0.1 * PATHS
-        same(*runs)
+    for channel in (0, 1):
+        found = ways_and_search(backend, chosen, scenery, PATHS, sampling, state, channel)
+        assert len(found.runs[0].detections.path) > 0.1 * PATHS
+        same(*found.runs)
 
 
 def test_light_out_and_back_has_clear_ways_everywhere(gf7_pair) -> None:
@@ -87,10 +84,7 @@ def test_a_baffle_in_the_way_closes_it(backend, gf7_pair) -> None:
     numbers = {scenery.of_element(f"forward/{name}") for name in ("M1", "M2")}
     pairs = [[{way.start, way.end.surface} for way in ClearWays(s, families).ways] for s in (bare, scenery)]
     assert [numbers in found for found in pairs] == [True, False]
-    source = pinhole(gf7_pair, backend, {}, gf7_pair.channels[0])
-    runs = [
-        PathTracer(backend, scenery, families, ways=ways).run(source, PATHS, 1, keep=True) for ways in (True, False)
-    ]
+    runs = ways_and_search(backend, gf7_pair, scenery, PATHS).runs
     assert runs[0].balance.absorbed["rod"] > 1e-3
     same(*runs)
 
@@ -111,19 +105,11 @@ def two_mirrors(*more: tuple[float, float]) -> Scenery:
     return Scenery((*(mirror_surface(one, placed, finishes) for one in elements.values()), surface), (grid,))
 
 
-@pytest.mark.parametrize(
-    ("x", "z", "clear"),
-    [
-        (0.0, 0.1, False),
-        (0.0158, 0.1, False),  # half-way the hull of the squares around both reaches to 15 mm
-        (0.0165, 0.1, True),
-        (0.0, -0.01, True),
-        (0.0, 0.21, True),
-    ],
-)
-def test_only_what_reaches_into_the_hull_is_in_the_way(x: float, z: float, clear: bool) -> None:
-    found = ClearWays(two_mirrors((x, z)), {"screen": (code(0, Event.REFLECT),)})
-    assert len(found.ways) == clear
+def test_only_what_reaches_into_the_hull_is_in_the_way() -> None:
+    """Half-way the hull of the squares around both apertures reaches to 15 mm, and the small mirror by 1 mm more."""
+    for x, z, clear in ((0.0, 0.1, 0), (0.0158, 0.1, 0), (0.0165, 0.1, 1), (0.0, -0.01, 1), (0.0, 0.21, 1)):
+        found = ClearWays(two_mirrors((x, z)), {"screen": (code(0, Event.REFLECT),)})
+        assert len(found.ways) == clear, (x, z)
 
 
 def test_apertures_that_do_not_face_each_other_have_no_way() -> None:

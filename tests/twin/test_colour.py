@@ -1,7 +1,6 @@
 """A camera over all wavelengths of its light: colours, their MTF and point images, against other ways to them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,12 +8,9 @@ import pytest
 from optics.geometry.tree import Motion
 from optics.numerics.physical_error import UnphysicalError
 from optics.waves.transfer import polychromatic_transfer
-from scenes.specs.resolved import resolve_camera
 from scenes.specs.spectrum import SpectrumSpec
 from tests.scenes.lens.colour_cameras import colour_camera
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.camera_report import camera_report
-from twin.camera.camera_run import CAMERA, MTF_FIELDS, camera_data, run_camera
 from twin.camera.colour import axial_colour, judge_colours, lateral_colour, spectral_mtfs, spectral_psfs
 from twin.targets import band_light
 
@@ -82,41 +78,20 @@ def test_lateral_colour_is_in_the_pupils(achromat) -> None:
     assert mtf.weights.tolist() == [0.25, 0.75]
 
 
-def test_images_that_stand_apart_blur_what_they_make_together(achromat) -> None:
-    """Two images of one kind at a distance s have the transfer function of one times cos(pi f s)."""
-    light, apart = achromat.directions([(0.0, 0.0)]), 5e-6
-    places = achromat.path.places({}, light)
-    pupils = [achromat.path.pupils({}, light, np.add(places, (k * apart, 0.0)))[0] for k in (0, 1)]
-    frequency = np.array([[20e3, 0.0], [70e3, 0.0], [70e3, 40e3]])
-    colours = np.full(2, achromat.wavelength)
-    both = polychromatic_transfer(pupils, frequency, colours, np.ones(2), np.zeros(1))[0]
-    alone = polychromatic_transfer(pupils[0], frequency, colours[:1], np.ones(1), np.zeros(1))[0]
-    wanted = np.abs(alone) * np.abs(np.cos(np.pi * frequency[:, 0] * apart))
-    np.testing.assert_allclose(np.abs(both), wanted, atol=1e-7)
-    with pytest.raises(ValueError, match="zip"):
-        polychromatic_transfer(pupils, frequency, colours[:1], np.ones(1), np.zeros(1))
-
-
-@pytest.mark.slow
+@pytest.mark.second
 def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) -> None:
-    light = SpectrumSpec.evenly(500e-9, 640e-9)
-    frequency = np.array([0.0, 30e3, 70e3])
+    light, frequency = SpectrumSpec.evenly(500e-9, 640e-9), np.array([0.0, 30e3, 70e3])
     (mtf,) = spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
     (fine,) = achromat.mtfs([(0.0, 0.0)], frequency, *light.rule(24))
     assert 0.0 < mtf.error <= band_light.WORST_CHANGE
     np.testing.assert_allclose(mtf.values, fine.values, atol=mtf.error)
-    # a trapezoidal rule comes to the same mean
-    wavelengths = np.linspace(500e-9, 640e-9, 36)
-    weights = np.ones(36)
-    weights[[0, -1]] = 0.5
-    (even,) = achromat.mtfs([(0.0, 0.0)], frequency, wavelengths, weights)
-    np.testing.assert_allclose(even.values, fine.values, atol=5e-4)
     monkeypatch.setattr(band_light, "LARGEST_RULE", 9)
     monkeypatch.setattr(band_light, "WORST_CHANGE", 1e-9)
     with pytest.raises(UnphysicalError, match="still changes by"):
         spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
 
 
+@pytest.mark.second
 def test_a_camera_of_mirrors_over_its_band(backend, gf7) -> None:
     """One pupil serves all wavelengths; a point's image has the MTF that the transfer function says."""
     optics = CameraOptics.alone(gf7, backend)
@@ -168,30 +143,3 @@ def test_no_colours_without_named_glass(achromat, backend) -> None:
         old.at(500e-9)
     with pytest.raises(ValueError, match="name its glass"):
         axial_colour(old, [(0.0, 0.0)], np.array([500e-9]))
-
-
-@pytest.mark.second
-def test_report_and_files_have_the_colours(tmp_path: Path, backend) -> None:
-    (tmp_path / "c.yaml").write_text(colour_camera("achromat").file_text(""), "utf-8")
-    run = run_camera(resolve_camera(tmp_path / "c.yaml"), backend)
-    told = CAMERA(run)["colours"]
-    assert [told[key] for key in ("shortest_nm", "longest_nm", "wavelengths_of_mtf")] == pytest.approx(
-        [486.1327, 656.2725, 3]
-    )
-    assert told["mtf_error"] == 0.0
-    corner = told["fields"][MTF_FIELDS.index((1.0, 1.0))]
-    assert corner["lateral_primary_um"][0] == pytest.approx(corner["lateral_primary_um"][1], rel=1e-6)
-    data = camera_data(run)
-    assert data["lateral_colour"].shape == (5, 3, 2)
-    assert float(data["axial_colour"][0, 0]) == pytest.approx(
-        1e-6 * told["fields"][0]["axial_primary_um"] + float(data["axial_colour"][0, -1])
-    )
-    names = [a.name for section in camera_report(run).sections for a in section.artefacts]
-    assert {"lateral-colour", "axial-colour", "colour", "light-mtf", "light-mtf-nyquist"} <= set(names)
-    design = CAMERA(run)["mtf_at_nyquist"][0]["along_line"]
-    assert told["fields"][0]["mtf_at_nyquist"][0] < design  # other wavelengths are out of focus
-    # without lenses no wavelength stands apart, and there is no section of it
-    assert run.colours is not None
-    mirrors = replace(run, colours=replace(run.colours, lateral=None, axial=None, axial_reference=None))
-    assert "lateral-colour" not in {a.name for s in camera_report(mirrors).sections for a in s.artefacts}
-    assert "lateral_primary_um" not in CAMERA(mirrors)["colours"]["fields"][0]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.monitoring import PER_SI
 from analysis.monitor.recovery import measure_spots
 from analysis.units import ARCSEC
 from tests.tiers import quick
@@ -51,6 +51,7 @@ def test_table_is_what_the_images_say(table, backend):
         assert np.all(np.abs(true - found.true) < 0.01 * np.abs(found.true) + floor)
 
 
+@pytest.mark.second
 def test_factors_of_the_printed_formulas(table):
     setup, cameras = table
     for name, found in cameras.items():
@@ -68,6 +69,7 @@ def test_factors_of_the_printed_formulas(table):
         assert factors["paper_single", "d_gamma_arcsec"].by_truth == pytest.approx(2.0 * stretch, rel=5e-3)
 
 
+@pytest.mark.second
 def test_three_kinds_of_focal_length_change(table):
     """Scale and M2 despace are seen as d_f; a focal-plane piston hardly changes f and looks like a rotation."""
     setup, cameras = table
@@ -90,6 +92,7 @@ def test_three_kinds_of_focal_length_change(table):
         assert any("(piston)" in s and "the spots see it wrongly" in s for s in statements)
 
 
+@pytest.mark.second
 def test_reference_rotation_cannot_be_told_from_the_cameras(table):
     """A turn of the central prism reads as an opposite turn of the camera; the report has to name it."""
     _, cameras = table
@@ -101,12 +104,3 @@ def test_reference_rotation_cannot_be_told_from_the_cameras(table):
         assert any(
             s.startswith("central prism about Y") and "not separable" in s for s in found.observability.statements
         )
-
-
-def test_table_as_plain_data(table):
-    _, cameras = table
-    for found in cameras.values():
-        plain = found.to_dict()
-        assert len(plain["motions"]) == 49
-        assert set(plain["motions"][0]["model"]) == set(PARAMETERS)
-        assert len(plain["factors"]) == 8

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,22 +13,15 @@ from optics.geometry.surface import GridFigure
 from optics.geometry.tree import Motion, compose
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import nodal_deformation
-from scenes.specs.instrument import MaterialsSpec
-from scenes.specs.job import JobSpec
-from scenes.specs.resolved import resolve, resolve_job
+from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
-from tests.twin.commands import invoke
 from tests.twin.path_bench import scene_beam
 from twin.main_job.job_tables import deformation_warnings
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.render import app
 from twin.study.runs.render_base import JobMaker
 from twin.study.runs.setup import resolve_study
 
 M1, M2 = "base/forward/M1", "base/forward/M2"
-FIELD = Temperature(0.5, (0.25, -0.5, 0.75))
 
 
 def rippled(instrument, body: str, amplitude: float = 2e-8) -> GridFigure:
@@ -69,13 +61,6 @@ def test_states_with_and_without_a_grid_in_one_batch(backend, gf7_pair) -> None:
     assert both.take(np.array([6])).values[0].surface.grid.first == both.values[0].surface.grid.first[6]
 
 
-def test_without_grids_nothing_is_read(gf7_pair) -> None:
-    batch = assemble(gf7_pair.assembly, ["forward/imaging"], [{M1: Motion(figure={5: 1e-8})}, {}])
-    assert set(batch.grids) == {None}
-    assert not any(structure.grid for structure in batch.structure)
-    assert all(value.surface.grid is None for value in batch.values)
-
-
 def test_grids_add_up_or_are_refused(gf7_pair) -> None:
     grid = rippled(gf7_pair, M1)
     bodies = {body.path: body for body in gf7_pair.assembly.tree.bodies}
@@ -96,39 +81,6 @@ def centres(experiment, states) -> np.ndarray:
     rows, columns = (np.arange(count) for count in photons.shape[2:])
     out = [np.einsum("scij,i->sc", photons, rows), np.einsum("scij,j->sc", photons, columns)]
     return np.stack(out, axis=-1) / np.sum(photons, axis=(2, 3))[..., None]
-
-
-def solution(experiment, path: str) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes of the finite elements of a mirror and their displacements in FIELD, (N, 3) each."""
-    model = experiment.thermal
-    units = model.unit_displacements(path)
-    about = np.array({b.path: b for b in experiment.instrument.assembly.tree.bodies}[path].pivots["centre"])
-    nodes = units[0].nodes
-    moves = sum(g * unit.values for g, unit in zip(FIELD.gradient, units, strict=True))
-    return nodes, moves + model.materials[path].expansion * FIELD.at(about) * (nodes - about)
-
-
-@pytest.mark.slow
-def test_our_own_thermo_elastic_solution_as_a_table_gives_the_same_spots(backend, tmp_path) -> None:
-    given = resolve_job(JobSpec(instrument="gf7_pair"))
-    silica = given.instrument.model_copy(update={"materials": MaterialsSpec(mirror="fused silica")})
-    bench = MonitorExperiment(given.model_copy(update={"instrument": silica}), backend)
-    nodes, moves = solution(bench, M1)
-    place = tmp_path / "m1.csv"
-    rows = [",".join(repr(float(v)) for v in (*(1e3 * p), *(1e9 * u))) for p, u in zip(nodes, moves, strict=True)]
-    place.write_text("\n".join(["x [mm],y [mm],z [mm],dx [nm],dy [nm],dz [nm]", *rows]))
-    text = {"instrument": "gf7_pair", "perturb": {M1: {"deformation": str(place)}}}
-    read = JobSpec.model_validate(text)
-    text["perturb"] = {M1: {"deformation": {"table": str(place), "terms": 15}}}
-    fifteen = JobSpec.model_validate(text)
-    table, heat = bench.motions(read), bench.thermal.state({M1: FIELD})
-    assert table[M1].stretch == pytest.approx(heat[M1].stretch, rel=0.2)
-    # heat carries 15 Zernike terms and no grid: what they leave, picometres of the elements' own, is the difference
-    few = replace(bench.deformed(fifteen)[M1].motion(), grid=None)
-    nominal, by_table, by_terms, by_heat = centres(bench, [{}, table, {M1: few}, heat])
-    assert np.max(np.abs(by_heat - nominal)) > 0.1  # it does move the spots
-    np.testing.assert_allclose(by_table, by_heat, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(by_terms, by_heat, rtol=0, atol=1e-5)
 
 
 def test_a_rigid_table_is_the_rigid_motion(experiment, gf7_pair) -> None:
@@ -194,30 +146,6 @@ def test_other_motions_come_on_top(experiment, job) -> None:
     assert experiment("gf7_pair").deformed(read)[M1] is face  # worked out once
 
 
-@pytest.mark.slow
-def test_a_run_folder_repeats_its_run_without_the_job(job, tmp_path) -> None:
-    out = invoke(app, job, "--out", tmp_path / "one")
-    assert out.exit_code == 0, out.output
-    moved = (tmp_path / "one").rename(tmp_path / "elsewhere")
-    numbers = json.loads((moved / "deformation.json").read_text())["bodies"][M1]
-    assert numbers["table"] == "deformation/base_forward_M1.csv"
-    assert numbers["rotate_arcsec"] == pytest.approx([0.4125, -0.6188, 0.2063], abs=2e-3)
-    assert (moved / numbers["table"]).read_bytes() == (job.parent / "m1.csv").read_bytes()
-    page = (moved / "report.html").read_text()
-    assert "Deformed mirrors and faces" in page
-    assert str(job.parent) not in page + (moved / "config.yaml").read_text()
-    again = invoke(app, moved / "config.yaml", "--out", tmp_path / "two")
-    assert again.exit_code == 0, again.output
-    for name in ("truth.json", "recovered.json", "irradiance.nc", "config.yaml", "deformation.json"):
-        assert (moved / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-    with (moved / numbers["table"]).open("a") as table:
-        table.write("\n")
-    changed = invoke(app, moved / "config.yaml", "--out", tmp_path / "three")
-    assert changed.exit_code == 2
-    assert "checksum is another" in changed.stderr
-    assert not (tmp_path / "three").exists()
-
-
 def test_warnings_name_the_body_and_what_is_wrong_with_its_mesh(gf7_pair) -> None:
     element = gf7_pair.assembly.elements["forward/M1"]
     x0, x1, y0, y1 = element.aperture.bounds
@@ -229,6 +157,8 @@ def test_warnings_name_the_body_and_what_is_wrong_with_its_mesh(gf7_pair) -> Non
         for u in (5e-9 * np.sin(8.0 * x), rough)
     )
     assert deformation_warnings({M1: smooth}) == ()
+    (finer,) = deformation_warnings({M1: replace(smooth, lost=np.full_like(smooth.lost, 5e-9))})
+    assert finer.startswith(f"{M1}: 5 nm rms of the surface's change are finer than its grid and not carried")
     (mesh,) = deformation_warnings({M1: smooth, M2: noisy})
     assert mesh.startswith(f"{M2}: the mesh prints through")
     plane, _ = deformation_warnings({M1: smooth, M2: noisy}, [M1])

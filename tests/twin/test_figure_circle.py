@@ -16,10 +16,7 @@ from scenes.models.camera_model import derive_camera
 from scenes.specs.load import load_camera
 from scenes.specs.tolerance import resolve_tolerance
 from scenes.yaml.yaml_file import dump_yaml
-from twin.run.artefact import Table
 from twin.tolerance.tolerance_bench import ToleranceBench
-from twin.tolerance.tolerance_report import tolerance_report
-from twin.tolerance.tolerance_run import run_tolerance
 from twin.tolerance.variations import spectrum_over, states_of
 
 # a classical Cassegrain: F/2.5 primary of 0.6 m, secondary at 0.25 of its focal length before the focus, m = 4
@@ -140,23 +137,3 @@ def test_a_ring_and_a_disk() -> None:
     hole = (Edge(Circle(0.2), blocks=True),)
     for ring in (replace(disk, aperture=Circle(0.4, inner=0.2)), replace(disk, edges=hole)):
         assert spectrum_over(ring, (4,), 3.0) == pytest.approx([1.0 / (1.0 - 0.25)], rel=2e-3)
-
-
-def test_the_page_names_circle_and_aperture(backend, tmp_path) -> None:
-    path = file_with(tmp_path, edges=[{"clear": "rectangle", "half": ["80 mm", "90 mm"]}])
-    bench = bench_of(tmp_path, path.name, backend, first="M1 figure", second="M2 figure")
-    run = run_tolerance(bench.setup, backend)
-    section = next(s for s in tolerance_report(run).sections if s.name == "figures")
-    (table,) = (a for a in section.artefacts if isinstance(a, Table))
-    radius = 1e3 * float(np.hypot(0.08, 0.09))
-    assert table.rows[0] == [
-        "first",
-        "M1 figure",
-        pytest.approx(300.0),
-        0.0,
-        0.0,
-        "circle",
-        *[pytest.approx(600.0)] * 2,
-    ]
-    sizes = [pytest.approx(160.0), pytest.approx(180.0)]
-    assert table.rows[1] == ["second", "M2 figure", pytest.approx(radius), 0.0, 0.0, "rectangle", *sizes]

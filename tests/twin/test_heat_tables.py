@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from optics.thermal.nodal_temperature import NodalTemperature
-from scenes.models.nodal_bodies import FINE_CELLS
+from optics.geometry.tree import Motion
+from optics.thermal.heat import Temperature
+from scenes.models.nodal_bodies import Coverage, HeatedBody, HeatedFace
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.errors import InputError
-from tests.scenes.test_finish_tables import bsdf_text
 from tests.scenes.test_temperature_tables import lattice, quadratic, write
-from tests.twin.commands import invoke
-from tests.twin.test_deformation import STUDY, centres
+from tests.twin.test_deformation import STUDY
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import series_states
 from twin.monitor.truth import trace_truth
-from twin.render import app
 from twin.study.runs.render_base import JobMaker
 from twin.study.runs.setup import resolve_study
 
 M1 = "base/forward/M1"
-PRISM = "base/forward/monitor/left/prism_180"
 
 
 @pytest.fixture(scope="module")
@@ -43,40 +40,23 @@ def job(folder: Path, text: str) -> JobSpec:
     return resolve(folder / "job.yaml").job
 
 
-@pytest.mark.slow
-def test_a_table_of_temperatures_and_its_displacements_move_spots_alike(silica, tmp_path) -> None:
-    """Our own elements solved for the field, given as displaced nodes: another way from table to spots."""
-    points = lattice(silica.thermal, M1, (21, 19, 9))
-    write(tmp_path / "heat.csv", points, 3.0 * quadratic(points))
-    nodes = NodalTemperature(points, 3.0 * quadratic(points))
-    warm = job(tmp_path, f"instrument: gf7_pair\nperturb:\n  {M1}: {{temperature: heat.csv}}\n")
-    held = silica.thermal.elastic(M1, cells=FINE_CELLS)
-    assert held is not None
-    body = silica.heated(warm)[M1]
-    elastic, support = held
-    # what is linear goes the same way in both; the support is about the body's origin, the linear part about its mount
-    (rest,) = elastic.solve_many([lambda p: nodes.at(p) - _linear(body.linear, p)], support)
-    face = np.abs(
-        rest.nodes[:, 2] - silica.instrument.assembly.elements["forward/M1"].surface.sag(*rest.nodes[:, :2].T)
-    )
-    rows = np.hstack([1e3 * rest.nodes, 1e9 * rest.values])[face < 1e-9]
-    table = "\n".join(
-        ["x [mm],y [mm],z [mm],dx [nm],dy [nm],dz [nm]", *(",".join(map(repr, r)) for r in rows.tolist())]
-    )
-    (tmp_path / "nodes.csv").write_text(table)
-    change, slope = body.linear.change, ", ".join(f"{float(g)!r} K/m" for g in body.linear.gradient)
-    text = f"{{deformation: nodes.csv, temperature: {{change: {change!r} K, gradient: [{slope}]}}}}"
-    bent = job(tmp_path, f"instrument: gf7_pair\nperturb:\n  {M1}: {text}\n")
-    one, two, linear = silica.state(warm), silica.state(bent), silica.thermal.state({M1: body.linear})
-    nominal, by_heat, by_nodes, without = centres(silica, [{}, one, two, linear])
-    assert np.max(np.abs(by_heat - nominal)) > 0.05
-    assert np.max(np.abs(by_heat - without)) > 0.01
-    # one and the same solution: rounding of the table's numbers
-    np.testing.assert_allclose(by_heat, by_nodes, rtol=0, atol=1e-7)
-
-
-def _linear(field, points: np.ndarray) -> np.ndarray:
-    return np.asarray(field.change + points @ np.array(field.gradient))
+def test_what_a_table_of_temperatures_does_not_tell_is_said() -> None:
+    """Each sentence beyond its limit, and none below all limits."""
+    face = HeatedFace(Motion(figure={5: 1e-8}), 0.9e-9, 0.9e-9)
+    good = HeatedBody(100, 0.05, Temperature(1.0), (0.01, 0.02), 0.9e-3, Coverage(0.9e-3, 0.01), {"f": face}, 0.9e-9)
+    assert good.warnings("b") == ()
+    for changed, words in (
+        ({"coverage": Coverage(0.02, 0.013)}, "b: 2 % of its volume lie outside of the table's nodes, up to 13 mm"),
+        ({"between": 4e-3}, "b: the table is coarser than its field: nodes left out are foretold to 0.004 K rms only"),
+        ({"faces": {"f": replace(face, unmeshed=2e-9)}}, "f: finite elements here follow the table to 2 nm rms only"),
+        ({"faces": {"f": replace(face, lost=4e-9)}}, "f: 4 nm rms of its change by the table are finer than Z"),
+        (
+            {"index_path": 3e-9},
+            "b: the index of glass follows the linear part of the table; the rest is worth",
+        ),
+    ):
+        (text,) = replace(good, **changed).warnings("b")
+        assert text.startswith(words)
 
 
 @pytest.mark.second
@@ -155,35 +135,3 @@ def test_a_study_keeps_the_table_and_varies_what_is_added(silica, tmp_path) -> N
     changed = maker.job(((("job", "perturb", M1, "temperature", "change"), "1.5 K"),)).job.perturb[M1].temperature
     assert changed.change == 1.5
     assert changed.table == str(tmp_path / "heat.csv")
-
-
-@pytest.mark.slow
-def test_a_run_folder_keeps_all_tables(silica, tmp_path) -> None:
-    points = lattice(silica.thermal, PRISM, (9, 9, 9))
-    write(tmp_path / "heat.csv", points, 0.2 + 0.05 * points[:, 0] + 1e-3 * points[:, 2] ** 2)
-    (tmp_path / "paint.bsdf").write_text(bsdf_text(np.full((3, 3, 6), 0.05 / np.pi), tis=[0.05] * 3))
-    text = f"instrument: gf7_pair\nperturb:\n  {PRISM}: {{temperature: heat.csv}}\n"
-    text += "render: {frames: 1, stray: {paths: 20000, finishes: {black: paint.bsdf}}}\n"
-    (tmp_path / "job.yaml").write_text(text)
-    out = invoke(app, tmp_path / "job.yaml", "--out", tmp_path / "one")
-    assert out.exit_code == 0, out.output
-    moved = (tmp_path / "one").rename(tmp_path / "elsewhere")
-    numbers = json.loads((moved / "temperature.json").read_text())["bodies"][PRISM]
-    assert numbers["table"] == f"temperature/{PRISM.replace('/', '_')}.csv"
-    assert numbers["linear_gradient_k_per_m"][0] == pytest.approx(0.05, rel=1e-6)
-    finishes = json.loads((moved / "stray.json").read_text())["finishes"]
-    assert finishes["black"]["bsdf"]["total_scatter"] == pytest.approx([0.05] * 3, rel=5e-3)
-    page = (moved / "report.html").read_text()
-    assert "Bodies warmed by tables" in page
-    assert "warmed by a table of nodes" in page
-    assert "Measured finishes" in page
-    assert str(tmp_path / "heat.csv") not in page + (moved / "config.yaml").read_text()
-    again = invoke(app, moved / "config.yaml", "--out", tmp_path / "two")
-    assert again.exit_code == 0, again.output
-    for name in ("truth.json", "temperature.json", "config.yaml"):
-        assert (moved / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-    with (moved / "finish" / "black_bsdf.bsdf").open("a") as table:
-        table.write("# changed\n")
-    changed = invoke(app, moved / "config.yaml", "--out", tmp_path / "three")
-    assert changed.exit_code == 2
-    assert "checksum is another" in changed.stderr

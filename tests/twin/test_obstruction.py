@@ -1,27 +1,23 @@
 """Shadows of bodies in pupils: against rays that meet triangles, rasters of the pupil, and one way against another."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 
-import twin.render as command
 from optics.geometry import zernike
-from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.aperture import Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.solid import solid_mesh
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import imaging_rays
-from optics.waves.transfer import TransferTable, polychromatic_transfer, transfer
+from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import path_to_sphere
 from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams
 from scenes.specs.baffle import Plate
 from scenes.specs.load import load_band_detectors
-from tests.twin.commands import invoke
 from twin.monitor.image_quality import _CameraBench, image_quality
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
@@ -104,15 +100,6 @@ def test_share_of_the_prisms_against_rays_and_triangles(gf7_pair, backend, state
     assert np.all(np.sum(shadows.areas, axis=-1) / np.pi > 0.05)
 
 
-def test_a_moved_prism_moves_its_shadow(gf7_pair, backend) -> None:
-    path = path_of(gf7_pair, backend)
-    directions = path.directions(places_of(gf7_pair))
-    still, moved = (shadows_of(path, state, directions).shares() for state in ({}, MOVED))
-    right = PRISM.replace("left", "right")
-    np.testing.assert_allclose(moved[right], still[right], atol=2e-5)  # only the beam has moved, by micrometres
-    assert np.max(np.abs(moved[PRISM] - still[PRISM])) > 1e-3
-
-
 @pytest.mark.parametrize("chord", [-0.5, 0.1, 0.62, 0.97])
 def test_shadows_on_the_stop_end_at_its_edge(chord: float) -> None:
     """A straight body that reaches over the edge takes the segment beyond its chord: area and moment about x = 0."""
@@ -139,70 +126,6 @@ def test_a_state_with_shadows_is_the_same_alone_and_among_others(gf7_pair, backe
         alone = image_quality(gf7_pair, backend, [state]).cameras[CAMERA]
         for key in ("wfe", "wfe_refocused", "mtf_along_line", "mtf_along_track", "light_lost"):
             np.testing.assert_allclose(getattr(several, key)[k], getattr(alone, key)[0], rtol=0, atol=5e-7)
-
-
-def raster(pupil, size: int, parts: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Share of each cell of [-1, 1]^2 that is free, and cells' middles; shadows by half-planes."""
-    step = 2.0 / size
-    middle = -1.0 + step * (np.arange(size) + 0.5)
-    x, y = np.meshgrid(middle, middle)
-    free = np.zeros((size, size))
-    angle = np.linspace(-np.pi, np.pi, 2001)
-    edge = pupil.edge.boundary(angle)[0]
-    order = np.argsort(np.angle(edge))
-    for i in range(parts):
-        for j in range(parts):
-            px, py = x + ((i + 0.5) / parts - 0.5) * step, y + ((j + 0.5) / parts - 0.5) * step
-            rim = np.interp(np.arctan2(py, px), np.angle(edge)[order], np.abs(edge)[order], period=2.0 * np.pi)
-            inside = np.hypot(px, py) < rim
-            for piece in pupil.shadow.pieces[0]:
-                after = np.roll(piece, -1, axis=0)
-                left = [(q - p)[0] * (py - p[1]) - (q - p)[1] * (px - p[0]) for p, q in zip(piece, after, strict=True)]
-                if np.ptp(piece, axis=0).min() > 0.0:
-                    inside &= ~np.all(np.array(left) >= 0.0, axis=0)
-            free += inside
-    return free / parts**2, x + 1j * y
-
-
-@pytest.mark.second
-def test_transfer_function_against_the_autocorrelation_of_a_raster(gf7_pair, backend) -> None:
-    """Shifts by whole cells, so that only the edges of the raster err: 1e-3 of the diameter a cell, a sixteenth of it
-    known; some 1e-4 of the result, of which the mean over an edge leaves 3e-5.
-    """
-    path = path_of(gf7_pair, backend)
-    directions = path.directions(places_of(gf7_pair)[:2])
-    size, wavelength = 512, 650e-9
-    for pupil in path.pupils({}, directions, path.places({}, directions)):
-        free, p = raster(pupil, size)
-        path_length, amplitude = pupil.values(p)
-        field = free * amplitude * np.exp(2j * np.pi / wavelength * path_length)
-        spectrum = np.fft.fft2(field, (2 * size, 2 * size))
-        found = np.fft.ifft2(np.abs(spectrum) ** 2) / np.sum(free * amplitude**2)
-        cells = [(40, 0), (0, 40), (128, -64), (200, 90), (0, 230), (230, 0), (-150, 150), (300, 120)]
-        shift = 2.0 / size * np.array(cells)
-        frequency = shift @ pupil.axes.T / wavelength
-        got = transfer(pupil, frequency, wavelength, np.zeros(1))[0]
-        want = np.array([found[row, column] for column, row in cells])
-        np.testing.assert_allclose(got, want, atol=2e-4)
-        clear = transfer(replace(pupil, shadow=None), frequency, wavelength, np.zeros(1))[0]
-        assert np.max(np.abs(clear - want)) > 0.01
-
-
-@pytest.mark.second
-def test_light_and_table_of_a_cut_pupil(gf7_pair, backend) -> None:
-    path = path_of(gf7_pair, backend)
-    directions = path.directions(places_of(gf7_pair))
-    pupil = path.pupils({}, directions, path.places({}, directions))[1]
-    share = sum(s[1] for s in shadows_of(path, {}, directions).shares().values())
-    # the beam is evenly lit before the first mirror, the stop is not quite its picture
-    assert 1.0 - pupil.light == pytest.approx(share, rel=0.01)
-    wavelengths, weights = np.linspace(480e-9, 800e-9, 4), np.ones(4)
-    table = TransferTable.build(pupil, wavelengths, weights)
-    angle = np.radians(np.arange(0.0, 180.0, 7.5))
-    frequency = 30e3 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    frequency = np.concatenate([0.1 * frequency, frequency, 2.0 * frequency])
-    want = polychromatic_transfer(pupil, frequency, wavelengths, weights, np.zeros(1))[0]
-    np.testing.assert_allclose(table(*frequency.T), want, atol=2e-4)  # as the table says
 
 
 def test_batch_and_single_pupils_agree(gf7_pair, backend) -> None:
@@ -270,33 +193,6 @@ def with_plate(instrument, plate: Plate):
     return replace(instrument, baffles=(*instrument.baffles, plate))
 
 
-@pytest.mark.second
-def test_a_round_plate_before_the_first_mirror(gf7_pair, backend) -> None:
-    """A disk square to the beam takes its share of the beam's cross-section, by each of two parts, or as a ring."""
-    path = path_of(gf7_pair, backend)
-    directions = path.directions(places_of(gf7_pair)[1:2])
-    _, _, rays = rays_of(path, {}, directions, path.nodes)
-    middle = rays.launched[0].mean(axis=0) + 0.0 * directions[0]
-    z = directions[0]
-    x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    turn = np.stack([x, np.cross(z, x), z], axis=-1)
-    cross_section = float(np.sum(rays.launch_area))
-    base = np.sum(shadows_of(path, {}, directions).areas[0]) / np.pi
-
-    def light(outline) -> float:
-        own = path_of(with_plate(gf7_pair, Plate("disk", "base", Pose(turn, middle), outline)), backend)
-        return own.pupils({}, directions, own.places({}, directions))[0].light
-
-    clear = light(Circle(1e-4))
-    assert clear == pytest.approx(1.0 - base, abs=1e-3)
-    # 48 corners of a circle have 0.3 % less than its area
-    polygon = 24.0 * np.sin(np.pi / 24.0)
-    assert clear - light(Circle(0.05)) == pytest.approx(polygon * 0.05**2 / cross_section, rel=2e-3)
-    ring = polygon * (0.05**2 - 0.03**2) / cross_section
-    assert clear - light(Circle(0.05, inner=0.03)) == pytest.approx(ring, rel=2e-3)
-
-
 def test_a_plate_between_two_mirrors(gf7_pair, backend) -> None:
     """Against the rays themselves: which of them go through the plate on their way from the first to the second."""
     path = path_of(gf7_pair, backend)
@@ -328,32 +224,3 @@ def test_a_plate_between_two_mirrors(gf7_pair, backend) -> None:
         taken = outline.contains(at[:, 0], at[:, 1]) & (share > 0.0) & (share < 1.0)
         assert 0.005 < taken.mean() < 0.2
         assert shares["plate"][k] == pytest.approx(taken.mean(), abs=2e-4)
-
-
-@pytest.mark.slow
-def test_ignored_obstruction_is_told_everywhere_and_leaves_the_monitor_alone(tmp_path) -> None:
-    """The same frames of the spots, since their way through prisms is no obstruction; another image quality, another
-    target; terminal, JSON and report say it.
-    """
-    found = {}
-    for mode in ("traced", "ignore"):
-        render = {"images": ["spots", "pinhole"], "quality": True, "frames": 2, "obstruction": mode}
-        job = tmp_path / f"{mode}.yaml"
-        job.write_text(yaml.safe_dump({"instrument": "gf7_pair", "render": render}))
-        result = invoke(command.app, job, "--out", tmp_path / mode)
-        assert result.exit_code == 0
-        quality, mtf = (json.loads((tmp_path / mode / name).read_text()) for name in ("quality.json", "mtf.json"))
-        assert quality["obstruction"] == mtf["obstruction"] == mode
-        report = (tmp_path / mode / "report.html").read_text()
-        assert ("free" in result.output) == (mode == "ignore") == ("<code>obstruction: ignore</code>" in report)
-        spots = {file.name: file.read_bytes() for file in (tmp_path / mode / "images").glob("*_after.tiff")}
-        found[mode] = quality, mtf, {name: data for name, data in spots.items() if "pinhole" not in name}
-    traced, ignored = found["traced"], found["ignore"]
-    assert traced[2]
-    assert traced[2] == ignored[2]
-    lost = traced[0]["cameras"][CAMERA]["light_lost"]["centre"]
-    place = traced[1]["truth"]["cameras"][CAMERA]["places"]["centre"]
-    assert lost == pytest.approx(place["light_lost"]["after"], abs=1e-3)
-    assert lost > 0.07
-    assert ignored[0]["cameras"][CAMERA]["light_lost"]["centre"] == 0.0
-    assert ignored[1]["truth"]["cameras"][CAMERA]["places"]["centre"]["light_lost"]["after"] == 0.0

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
@@ -82,14 +83,6 @@ def test_ghosts_of_a_plane_parallel_plate(backend, angle: float, coated: Finish)
         assert abs(found - total) < Z_LIMIT * error
 
 
-def test_a_plate_is_found_with_another_index(backend) -> None:
-    """The test above can fail: an index of 1.52 is not 1.5."""
-    source = DiskSource.along(np.array([0.0, 0.0, -0.2]), np.array([0.0, 0.0, 1.0]), 1e-3)
-    result = PathTracer(backend, glass_scene(slab(0.3, THICKNESS), 1.52), sampling=FLOOR).run(source, PATHS, 3)
-    family = find(result, "front", way("entry"))
-    assert abs(family.energy - 0.04) > Z_LIMIT * family.error
-
-
 def hand_made_prism(backend, coated: Finish) -> tuple[Assembly, Scenery, str]:
     """A turned right-angle prism whose faces carry elements, a screen behind it, and the sequence's name."""
     solid = right_angle_prism(0.03)
@@ -134,27 +127,6 @@ def test_a_prism_as_the_sequential_trace_has_it(backend) -> None:
     assert valid[path].all()
     np.testing.assert_allclose(found.place[own], place[path, :2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(found.length[own], length[path], rtol=0, atol=1e-12)
-
-
-def test_light_through_a_bare_prism_loses_what_fresnel_says(backend) -> None:
-    assembly, scenery, name = hand_made_prism(backend, BARE)
-    entry = scenery.surfaces[scenery.of_element("entry")]
-    exit_face = scenery.surfaces[scenery.of_element("exit")]
-    direction = unit(0.0, 0.0, 1.0)
-    middle = scenery.surfaces[scenery.of_element("hypotenuse")].pose.translation
-    tracer = PathTracer(backend, scenery, {"screen": nominal_codes(scenery, assembly, name)})
-    result = tracer.run(DiskSource.along(middle - 1.0 * direction, direction, 2e-3), PATHS, 1)
-    first = abs(direction @ entry.pose.rotation[:, 2])
-    inside = np.sqrt(1.0 - (1.0 - first**2) / INDEX**2)
-    refracted = direction / INDEX - (inside - first / INDEX) * entry.pose.rotation[:, 2]
-    normal = scenery.surfaces[scenery.of_element("hypotenuse")].pose.rotation[:, 2]
-    turned = refracted - 2.0 * (refracted @ normal) * normal
-    second = turned @ exit_face.pose.rotation[:, 2]
-    expected = (1.0 - reflectance(first, 1.0, INDEX)) * (1.0 - reflectance(second, INDEX, 1.0))
-    nominal = result.nominal("screen")
-    assert abs(nominal.energy - expected) < Z_LIMIT * nominal.error
-    assert nominal.error < 1e-3
-    assert abs(result.balance.error) < 1e-12
 
 
 def near_edges(rng: np.random.Generator, half: float, n: int) -> RaySource:
@@ -210,24 +182,6 @@ def test_what_the_step_limit_cuts_off_is_under_way(backend) -> None:
         balance = tracer.run(source, 1000).balance
         assert balance.under_way == pytest.approx(expected, abs=1e-12)
         assert abs(balance.error) < 1e-12
-
-
-@pytest.mark.second
-def test_a_screen_sees_the_plate_move_the_beam(backend) -> None:
-    """Refraction shifts a beam sideways by d sin(a - b) / cos(b)."""
-    angle = 0.6
-    direction = unit(0.0, np.sin(angle), np.cos(angle))
-    centre = -0.2 * direction / direction[2]
-    scenery = glass_scene(slab(0.3, THICKNESS), INDEX, Finish(transmission=1.0))
-    with_glass = PathTracer(backend, scenery).run(DiskSource.along(centre, direction, 0.0), 10, keep=True).detections
-    surface, grid = screen("behind", facing(0.5), 1.0)
-    bare = PathTracer(backend, Scenery((surface,), (grid,)))
-    without = bare.run(DiskSource.along(centre, direction, 0.0), 10, keep=True).detections
-    bent = np.arcsin(np.sin(angle) / INDEX)
-    aside = THICKNESS * np.sin(angle - bent) / np.cos(bent) / np.cos(angle)
-    np.testing.assert_allclose(without.place[:, 1] - with_glass.place[:, 1], aside, rtol=0, atol=1e-15)
-    longer = THICKNESS * (INDEX / np.cos(bent) - 1.0 / np.cos(angle))
-    np.testing.assert_allclose(with_glass.length - without.length, longer, rtol=0, atol=1e-14)
 
 
 def test_more_detections_than_expected_are_all_kept(backend) -> None:
@@ -292,3 +246,19 @@ def test_paths_that_are_drawn_for_faint_light_find_what_plain_ones_find(backend)
     # the same number of paths tells the faint ones better
     twice = way("entry>", "exit", "entry", "exit>")
     assert faint["behind", twice].error < 0.5 * plain["behind", twice].error
+
+
+def test_too_many_and_turned_apertures_of_a_face_are_refused() -> None:
+    """A face carries two clear apertures at most, and none that is turned against it unless it is round."""
+    entry = frame((0, 0, -1), (0, 0, 0))
+    turned = Pose(entry.rotation @ rotation_matrix(np.array([0.0, 0.0, 0.3])), entry.translation)
+    for pose, apertures, words in (
+        (entry, [Circle(0.01), Circle(0.02), Circle(0.03)], "face 'entry' has 3 clear apertures; at most two"),
+        (turned, [Rectangle(0.01, 0.02)], "its clear aperture is turned against the face 'entry'"),
+    ):
+        common = ("glass/e", plane(), Interaction.REFRACT)
+        made = [Element(f"e{k}", *common, one, solid="glass") for k, one in enumerate(apertures)]
+        tree = RigidTree((Body("glass"), Body("glass/e", pose)))
+        assembly = Assembly(tree, {one.name: one for one in made}, {}, {"glass": INDEX})
+        with pytest.raises(ValueError, match=words):
+            solid_surfaces(slab(0.3, THICKNESS), assembly, assembly.place(), {}, Finishes(ground=ABSORBER))

@@ -26,26 +26,34 @@ N = 1_000_000
 ANGLES = np.linspace(-np.pi, np.pi, 9)
 
 
-def scattered(backend, lobe, direction, index: float, diffusing: bool, floor: float = 0.0, near: float | None = None):
-    """Directions (N, 3), events and weights of N paths that leave z = 0 in a direction."""
+def left(backend, direction, index: float, event: Event, lobe, floor: float, near: float | None, drawn=None):
+    """Return directions (N, 3), events and weights of N paths that leave z = 0 in a direction.
+
+    ``lobe`` is the scattered share and the numbers of the lobe, ``drawn`` a table in place of it.
+    """
     vector = backend.Vector3(*(dr.full(backend.Float, float(c), N) for c in direction))
-    normal = backend.Vector3(0.0, 0.0, 1.0)
-    event = dr.full(backend.UInt, int(Event.DIFFUSE if diffusing else Event.REFLECT), N)
-    toward = dr.full(backend.Float, -float(abs(direction[2])), N)
     leaving = Leaving(
         vector,
-        normal,
+        backend.Vector3(0.0, 0.0, 1.0),
         backend.Float(index),
-        event,
+        dr.full(backend.UInt, int(event), N),
         dr.full(backend.Float, 1.0, N),
-        toward,
-        dr.full(backend.Bool, diffusing, N),
+        dr.full(backend.Float, -float(abs(direction[2])), N),
+        dr.full(backend.Bool, event is Event.DIFFUSE, N),
     )
     rng = random_streams(backend, dr.arange(backend.UInt, N), 1)
-    share, *shape = [backend.Float(v) for v in (*lobe, lobe_area(*lobe[1:3]))]
+    share, shape = backend.Float(lobe[0]), [backend.Float(v) for v in lobe[1]]
     met, some = dr.full(backend.Bool, True, N), None if near is None else backend.Float(near)
-    out, event, weight, _ = spread(backend, rng, met, share, lambda active: shape, backend.Float(floor), some, leaving)
+    more = () if drawn is None else (drawn,)
+    out, event, weight, _ = spread(
+        backend, rng, met, share, lambda active: shape, backend.Float(floor), some, leaving, *more
+    )
     return np.stack([c.numpy() for c in out], axis=-1), event.numpy(), weight.numpy()
+
+
+def scattered(backend, lobe, direction, index: float = 1.0, floor: float = 0.0, near: float | None = None):
+    """Return what leaves after reflection by a surface with a lobe."""
+    return left(backend, direction, index, Event.REFLECT, (lobe[0], (*lobe[1:], lobe_area(*lobe[1:3]))), floor, near)
 
 
 def check(counts: np.ndarray, expected: np.ndarray) -> None:
@@ -63,7 +71,7 @@ def check(counts: np.ndarray, expected: np.ndarray) -> None:
 )
 def test_scattered_directions_follow_the_bsdf(backend, scatter, index: float) -> None:
     specular = unit(0.4, -0.2, 0.8)
-    direction, event, weight = scattered(backend, scatter.lobe.numbers, specular, index, False)
+    direction, event, weight = scattered(backend, scatter.lobe.numbers, specular, index)
     assert np.all(weight == 1.0)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0, atol=1e-12)
     assert np.all(direction[:, 2] > 0.0)
@@ -90,7 +98,7 @@ def test_drawing_more_scatter_keeps_its_power(backend, near: float | None) -> No
     scatter = ABg(1e-5, 1e-4, 2.0)
     specular = unit(0.2, 0.1, 0.9)
     total = total_scatter(scatter, float(np.hypot(*specular[:2])))
-    direction, event, weight = scattered(backend, scatter.lobe.numbers, specular, 1.0, False, floor=0.4, near=near)
+    direction, event, weight = scattered(backend, scatter.lobe.numbers, specular, 1.0, 0.4, near)
     found = np.where(event == Event.SCATTER, weight, 0.0)
     assert (event == Event.SCATTER).mean() > 0.3
     assert abs(found.mean() - total) < 3.3 * found.std() / np.sqrt(N)
@@ -106,7 +114,9 @@ def test_drawing_more_scatter_keeps_its_power(backend, near: float | None) -> No
 
 
 def test_diffused_directions_follow_lambert(backend) -> None:
-    direction, event, _ = scattered(backend, (0.0, 1.0, 2.0, 0.0), unit(0.6, 0.0, 0.8), 1.0, True)
+    direction, event, _ = left(
+        backend, unit(0.6, 0.0, 0.8), 1.0, Event.DIFFUSE, (0.0, (1.0, 2.0, 0.0, lobe_area(1.0, 2.0))), 0.0, None
+    )
     assert np.all(event == Event.DIFFUSE)
     assert np.all(direction[:, 2] > 0.0)
     r2, phi = np.sum(direction[:, :2] ** 2, axis=1), np.arctan2(direction[:, 1], direction[:, 0])

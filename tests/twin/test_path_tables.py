@@ -16,10 +16,12 @@ from optics.materials.scatter import ABg, ScatterTable
 from scenes.models.scenery import Scenery
 from tests.optics.bench import unit
 from tests.optics.test_scatter_table import lambert, of_lobe
+from tests.tiers import quick
 from tests.twin.path_bench import flat_mirror, glass_scene, screen, slab
+from tests.twin.test_path_scatter import left
 from twin.path_tracing.families import Event
-from twin.path_tracing.source import DiskSource, random_streams
-from twin.path_tracing.spreading import Leaving, TableDraw, spread
+from twin.path_tracing.source import DiskSource
+from twin.path_tracing.spreading import TableDraw
 from twin.path_tracing.tables import upload_finishes
 from twin.path_tracing.tracer import PathTracer, Sampling
 
@@ -38,31 +40,14 @@ def skewed() -> ScatterTable:
     return ScatterTable(np.radians([0.0, 35.0, 70.0]), azimuth, radial, 0.3 * values)
 
 
-def scattered(backend, finish: Finish, specular: np.ndarray, floor: float = 0.0, seed: int = 1):
-    """Directions (N, 3), events and weights of N paths that leave z = 0."""
+def scattered(backend, finish: Finish, specular: np.ndarray, floor: float = 0.0):
+    """Return directions (N, 3), events and weights of N paths that leave z = 0."""
     tables = upload_finishes(backend, flat_mirror(finish))
     assert tables is not None
-    vector = backend.Vector3(*(dr.full(backend.Float, float(c), N) for c in specular))
-    every = dr.full(backend.Bool, True, N)
-    leaving = Leaving(
-        vector,
-        backend.Vector3(0.0, 0.0, 1.0),
-        backend.Float(1.0),
-        dr.full(backend.UInt, int(Event.REFLECT), N),
-        dr.full(backend.Float, 1.0, N),
-        dr.full(backend.Float, -float(specular[2]), N),
-        dr.full(backend.Bool, False, N),
-    )
-    cosine = dr.full(backend.Float, float(specular[2]), N)
+    every, cosine = dr.full(backend.Bool, True, N), dr.full(backend.Float, float(specular[2]), N)
     marks = tables.of(dr.zeros(backend.UInt, N), every)
-    share = tables.total(marks, cosine, every)
-    rng = random_streams(backend, dr.arange(backend.UInt, N), seed)
-    lobe = [backend.Float(v) for v in (1.0, 2.0, 0.0, 1.0)]
-    drawn, near = TableDraw(tables, marks, cosine), backend.Float(0.5)  # of lobes alone
-    out, event, weight, _ = spread(
-        backend, rng, every, share, lambda active: lobe, backend.Float(floor), near, leaving, drawn
-    )
-    return np.stack([c.numpy() for c in out], axis=-1), event.numpy(), weight.numpy()
+    share, drawn = tables.total(marks, cosine, every), TableDraw(tables, marks, cosine)
+    return left(backend, specular, 1.0, Event.REFLECT, (share, (1.0, 2.0, 0.0, 1.0)), floor, 0.5, drawn)
 
 
 def relative(directions: np.ndarray, specular: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -89,19 +74,10 @@ def expected_cells(table: ScatterTable, angle: float, radial: np.ndarray, azimut
     return out
 
 
-@pytest.mark.parametrize(
-    ("kind", "degrees"),
-    [
-        ("skewed", 52.0),
-        *(
-            pytest.param(kind, degrees, marks=pytest.mark.slow)
-            for kind, degrees in [("skewed", 21.0), ("skewed", 35.0), ("lambert", 35.0), ("abg", 21.0), ("abg", 52.0)]
-        ),
-    ],
-)
+@pytest.mark.parametrize(("kind", "degrees"), quick(1, [("skewed", 52.0), ("skewed", 21.0), ("abg", 35.0)]))
 def test_drawn_directions_follow_the_table(backend, kind: str, degrees: float) -> None:
     """At whole degrees, where no neighbour is taken for the angle of incidence."""
-    table = {"skewed": skewed, "lambert": lambda: lambert(0.6), "abg": lambda: of_lobe(ABg(2e-2, 1e-1, 1.8))}[kind]()
+    table = skewed() if kind == "skewed" else of_lobe(ABg(2e-2, 1e-1, 1.8))
     angle = np.radians(degrees)
     specular = np.array([np.sin(angle) * 0.6, -np.sin(angle) * 0.8, np.cos(angle)])
     direction, event, weight = scattered(backend, Finish(reflectance=1.0, table=table), specular)
@@ -123,21 +99,6 @@ def test_drawn_directions_follow_the_table(backend, kind: str, degrees: float) -
     # cells are filled evenly in solid angle: 1e-3 of each beside the noise
     statistic = np.sum((counts - expected)[seen] ** 2 / (expected + (1e-3 * expected) ** 2)[seen])
     assert statistic < chi2.ppf(1.0 - FALSE_ALARM, int(seen.sum()))
-
-
-@pytest.mark.second
-def test_between_whole_degrees_all_that_the_table_says_is_scattered(backend) -> None:
-    table, angle = lambert(0.6), np.radians(67.43)
-    specular = np.array([np.sin(angle), 0.0, np.cos(angle)])
-    direction, event, _ = scattered(backend, Finish(table=table, scattered_only=True), specular)
-    away = event == Event.SCATTER
-    assert abs(away.mean() - 0.6) < 3.3 * np.sqrt(0.24 / N) + 1e-3
-    # Lambert's law about the normal, whatever the specular direction: even in sin^2
-    sine2 = 1.0 - direction[away, 2] ** 2
-    counts = np.histogram(sine2, np.linspace(0.0, 1.0, 11))[0]
-    expected = away.sum() / 10.0
-    # 1 % for the two angles of incidence, one degree apart, at the horizon
-    assert np.all(np.abs(counts - expected) < 3.9 * np.sqrt(expected) + 0.01 * expected)
 
 
 def test_between_two_angles_of_incidence_both_have_their_part(backend) -> None:
@@ -167,25 +128,17 @@ def test_drawing_more_scatter_keeps_its_power(backend) -> None:
 
 
 @pytest.mark.second
-@pytest.mark.parametrize(
-    ("analytic", "tabled"),
-    [
-        (Finish(diffuse=0.3), Finish(table=lambert(0.3), scattered_only=True)),
-        (
-            Finish(reflectance=0.5, scatter=ABg(2e-2, 3e-2, 2.0)),
-            # the analytic lobe is per power of the specular beam, a table per incident power
-            Finish(reflectance=0.5, table=of_lobe(ABg(1e-2, 3e-2, 2.0))),
-        ),
-    ],
-    ids=["lambert", "abg"],
-)
-def test_an_analytic_finish_as_a_table_gives_the_same_stray_light(backend, analytic: Finish, tabled: Finish) -> None:
-    """Onto a small screen: within Monte Carlo noise, and 2e-3 for what is linear between 400 radial angles."""
-    aside = np.array([0.15, 0.0, 0.4])
-    direction = unit(-0.3, 0.1, -1.0)
+def test_an_analytic_finish_as_a_table_gives_the_same_stray_light(backend) -> None:
+    """Onto a small screen: within Monte Carlo noise, and 2e-3 for what is linear between 400 radial angles.
+
+    The analytic lobe is per power of the specular beam, a table per incident power.
+    """
+    analytic = Finish(reflectance=0.5, scatter=ABg(2e-2, 3e-2, 2.0))
+    tabled = Finish(reflectance=0.5, table=of_lobe(ABg(1e-2, 3e-2, 2.0)))
+    pose, direction = Pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.15, 0.0, 0.4])), unit(-0.3, 0.1, -1.0)
     found = []
     for finish in (analytic, tabled):
-        surface, grid = screen("screen", Pose(np.diag([-1.0, 1.0, -1.0]), aside), 0.05, 4)
+        surface, grid = screen("screen", pose, 0.05, 4)
         sampling = Sampling(floor=0.3, scatter_floor=0.4)
         tracer = PathTracer(backend, Scenery((*flat_mirror(finish), surface), (grid,)), sampling=sampling)
         result = tracer.run(DiskSource.along(-0.3 * direction, direction, 0.0), N, 7)
@@ -209,19 +162,15 @@ def test_energy_is_kept_path_by_path(backend) -> None:
         assert abs(result.balance.error) < 1e-12
 
 
-def fresnel(degrees: np.ndarray, index: float) -> np.ndarray:
-    return np.asarray(reflectance(np.cos(np.radians(degrees)), 1.0, index))
-
-
 @pytest.mark.second
-@pytest.mark.parametrize("turn", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
-def test_a_coating_by_its_table_is_the_surface_itself(backend, turn: float) -> None:
+def test_a_coating_by_its_table_is_the_surface_itself(backend) -> None:
     """Fresnel's reflectance as a table, met from outside and from inside, is bare glass."""
     degrees = np.linspace(0.0, 90.0, 361)
-    table = CoatingTable(np.radians(degrees), np.minimum(fresnel(np.minimum(degrees, 89.9999), 1.5), 1.0))
+    fresnel = reflectance(np.cos(np.radians(np.minimum(degrees, 89.9999))), 1.0, 1.5)
+    table = CoatingTable(np.radians(degrees), np.minimum(np.asarray(fresnel), 1.0))
     found = []
     for finish in (Finish(bare=True), Finish(transmission=1.0, coating=table)):
-        scene = glass_scene(slab(0.3, 0.05, Coating.GROUND), 1.5, finish, (turn, 0.0, 0.0))
+        scene = glass_scene(slab(0.3, 0.05, Coating.GROUND), 1.5, finish, (0.5, 0.0, 0.0))
         result = PathTracer(backend, scene).run(
             DiskSource.along(np.array([0.0, 0.0, -0.2]), np.array([0.0, 0.0, 1.0]), 0.0), 400_000, 5
         )

@@ -7,34 +7,29 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
-from optics.geometry.pose import Pose
+from optics.geometry.surface import Surface
 from optics.geometry.tree import Motion
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.scenery import FACING_THE_LIGHT, Scenery, build_scenery
-from scenes.models.scenery_parts import Detector, detector_surface
+from scenes.models.scenery import Scenery, build_scenery
+from scenes.models.scenery_parts import Detector
 from tests.optics.bench import disk_points
-from tests.twin.path_bench import IDEAL, scene_beam
+from tests.twin.path_bench import IDEAL, facing, flat_mirror, glass_scene, scene_beam, screen, slab
 from twin.monitor.monitor_path import MonitorPath
-from twin.path_tracing.families import nominal_codes, signature
+from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, trace_stray
 from twin.path_tracing.tracer import (
     BALANCED,
-    FAINT,
-    NAME,
     VARIANTS,
     PathTracer,
     Sampling,
     VariantUnavailable,
     load_mitsuba,
-    make_integrator,
 )
 
 INSTRUMENTS = ["gf7_pair", "monitor_pair"]
@@ -109,84 +104,11 @@ def test_out_and_back_through_all_prisms_as_the_sequential_trace_has_it(
     assert checked > 2000
 
 
-def spot_counts(backend, chosen, paths: int, chunk: int = 1 << 20) -> tuple[np.ndarray, DiskSource, Pose, dict]:
-    """Counts on a grid of 80 um over the blurred spot of a focal plane 5 mm out of focus."""
-    state = {"base/forward/focal_plane": Motion(shift=(0.0, 0.0, 0.005))}
-    middle, heading, across = scene_beam(chosen, backend)
-    source = DiskSource(middle, heading, across, 0.36)
-    systems = assemble(chosen.assembly, ["forward/imaging"], [state])
-    chief = trace(backend, systems, make_rays(backend, middle, heading)).numpy()[0][0, 0]
-    placed = chosen.assembly.place([state])
-    pose = placed.pose("base/forward/focal_plane") @ Pose(np.eye(3), chief) @ FACING_THE_LIGHT
-    grid = Detector("forward/focal_plane", 9, 9, (8e-5, 8e-5))
-    scenery = without_prisms(build_scenery(chosen, state, IDEAL, whole_focal_planes=True))
-    kept = tuple(s for s in scenery.surfaces if s.detector is None)
-    scenery = Scenery((*kept, detector_surface(grid, pose, IDEAL, (grid.name,))), (grid,))
-    tracer = PathTracer(backend, scenery, {grid.name: nominal_codes(scenery, chosen.assembly, "forward/imaging")})
-    image = tracer.run(source, paths, seed=11, chunk=chunk).images[grid.name][NOMINAL]
-    return image * paths, source, Pose(np.eye(3), chief), state
-
-
-def expected_shares(backend, chosen, source: DiskSource, centre: Pose, state: dict, fine: int) -> np.ndarray:
-    """Share of the disk's area whose rays the sequential trace brings to each cell."""
-    systems = assemble(chosen.assembly, ["forward/imaging"], [state]).upload(backend)
-    edges = (np.arange(10) - 4.5) * 8e-5
-    shares = np.zeros((9, 9))
-    angle = 2.0 * np.pi * (np.arange(fine) + 0.5) / fine
-    rings = source.radius * np.sqrt((np.arange(fine) + 0.5) / fine)
-    block = max(1, 2_000_000 // fine)
-    for first in range(0, fine, block):
-        r = rings[first : first + block, None]
-        points = np.stack([r * np.cos(angle + r * 1e3), r * np.sin(angle + r * 1e3)], axis=-1).reshape(-1, 2)
-        place, _, _, valid = (
-            a[0]
-            for a in trace(
-                backend, systems, make_rays(backend, source.centre + points @ source.across, source.axis)
-            ).numpy()
-        )
-        at = (place[valid, :2] - centre.translation[:2]) * [-1.0, 1.0]
-        shares += np.histogram2d(at[:, 1], at[:, 0], [edges, edges])[0]
-    return shares / fine**2
-
-
-def spot_statistic(counts: np.ndarray, shares: np.ndarray, paths: int) -> tuple[float, int]:
-    use = shares * paths > 50.0
-    assert use.sum() > 25
-    found = np.append(counts[use], paths - counts[use].sum())
-    expected = paths * np.append(shares[use], 1.0 - shares[use].sum())
-    return float(np.sum((found - expected) ** 2 / expected)), len(found) - 1
-
-
-@pytest.mark.parametrize(
-    ("paths", "fine"),
-    [pytest.param(400_000, 1000, marks=pytest.mark.second), pytest.param(10_000_000, 5000, marks=pytest.mark.slow)],
-    ids=["fast", "1e7"],
-)
+@pytest.mark.second
 @pytest.mark.parametrize("name", INSTRUMENTS)
-def test_spot_has_the_shape_of_the_sequential_trace(backend, instrument, name: str, paths: int, fine: int) -> None:
-    """Chi-square over the cells of a defocused spot with a sharp pupil edge; false alarm 1e-3 at most: neighbouring
-    paths start alike and fill the beam more evenly than independent ones.
-    """
-    chosen = instrument(name)
-    counts, source, centre, state = spot_counts(backend, chosen, paths)
-    np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
-    shares = expected_shares(backend, chosen, source, centre, state, fine)
-    statistic, freedom = spot_statistic(counts, shares, paths)
-    assert statistic < chi2.ppf(0.999, freedom)
-    # and the test can fail: the spot of a pupil 0.5 % larger is told apart
-    wrong = expected_shares(backend, chosen, replace(source, radius=1.005 * source.radius), centre, state, fine)
-    assert spot_statistic(counts, wrong, paths)[0] > chi2.ppf(0.999, freedom)
-
-
-@pytest.mark.parametrize(
-    "paths",
-    [pytest.param(200_000, marks=pytest.mark.second), pytest.param(10_000_000, marks=pytest.mark.slow)],
-    ids=["fast", "1e7"],
-)
-@pytest.mark.parametrize("name", INSTRUMENTS)
-def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, name: str, paths: int) -> None:
+def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, name: str) -> None:
     """Within three standard errors in x and y (false alarm 0.5 %)."""
-    chosen = instrument(name)
+    chosen, paths = instrument(name), 200_000
     stray = trace_stray(chosen, backend, {}, paths, 3, channels=chosen.channels[:1], finishes=IDEAL, sampling=BALANCED)
     nominal = stray.runs["forward/left"].nominal(CCD)
     path = MonitorPath(chosen, backend)
@@ -198,59 +120,44 @@ def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, nam
     np.testing.assert_allclose(nominal.rms, 5e-6, rtol=0.02)
 
 
-@pytest.mark.second
-def test_one_kernel_for_all_states_and_seeds(backend, gf7_pair) -> None:
-    def run(state: dict, seed: int) -> None:
-        trace_stray(gf7_pair, backend, state, 20_000, seed, channels=gf7_pair.channels[:1])
-
-    run({}, 0)
-    run(STATE, 9)
-    flag = dr.flag(dr.JitFlag.KernelHistory)
-    dr.set_flag(dr.JitFlag.KernelHistory, True)
-    try:
-        dr.kernel_history_clear()
-        for seed in range(3):
-            run(STATE, seed)
-        history = dr.kernel_history([dr.KernelType.JIT])
-    finally:
-        dr.set_flag(dr.JitFlag.KernelHistory, flag)
-    large = [k for k in history if k["size"] == 20_000 and k["operation_count"] > 500]
-    assert len(large) >= 3
-    # what other tests left in the process may be worked out with the first of them, in a kernel of its own
-    assert len({k["hash"] for k in large}) <= 2
-    assert all(k["cache_hit"] for k in large)
-
-
-def test_the_integrator_is_mitsubas(backend) -> None:
-    integrator = make_integrator(backend, FAINT)
-    mi = load_mitsuba(backend)
-    assert isinstance(integrator, mi.SamplingIntegrator)
-    assert integrator.sampling == FAINT
-    assert NAME in str(integrator)
-    with pytest.raises(NotImplementedError):
-        integrator.sample()
-
-
 def test_another_variant_is_not_taken_silently(backend, monkeypatch) -> None:
     mi = load_mitsuba(backend)
     monkeypatch.setitem(VARIANTS, "llvm", "llvm_ad_double")
     with pytest.raises(VariantUnavailable, match="cannot run its variant llvm_ad_double"):
         load_mitsuba(backend)
     assert mi.variant() == "llvm_ad_mono"
+    monkeypatch.setitem(VARIANTS, "llvm", "scalar_rgb")
+    monkeypatch.setattr(mi, "set_variant", lambda *_: None)
+    with pytest.raises(VariantUnavailable, match="runs its variant llvm_ad_mono where scalar_rgb is needed"):
+        load_mitsuba(backend)
 
 
-def test_signatures_differ(gf7_pair) -> None:
-    scenery = build_scenery(gf7_pair, {})
-    names = [n for n in gf7_pair.assembly.sequences if n.endswith(("monitor", "imaging"))]
-    assert len({signature(nominal_codes(scenery, gf7_pair.assembly, name)) for name in names}) == len(names) == 6
-
-
-def test_impossible_sampling_and_sources() -> None:
-    with pytest.raises(ValueError, match="impossible"):
-        Sampling(floor=1.0)
+def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
     source = DiskSource.along(np.zeros(3), np.array([0.0, 0.0, 1.0]), 1e-3, 0.1)
-    with pytest.raises(ValueError, match="does not lie in"):
-        replace(source, narrow=(0.08, 0.0, 0.05))
+    surface, grid = screen("far", facing(0.5), 1.0)
+    alone = Scenery((surface,), (grid,))
+    empty = PathTracer(backend, alone).run(replace(source, centre=np.array([0.0, 0.0, 1.0])), 10)
+    glass, (mirror,) = glass_scene(slab(0.3, 0.02), 1.5).surfaces[:6], flat_mirror(IDEAL.mirror)
+    wavy = replace(mirror, surface=Surface(0.1, 0.0, (1e-9,) * 40))
+    rays = RaySource.even(np.zeros((2, 3)), np.tile([0.0, 0.0, 1.0], (2, 1)))
+    many = tuple(screen(f"s{k}", facing(0.5 + k), 1.0) for k in range(256))
+    for make, words in (
+        (lambda: Sampling(floor=1.0), "impossible"),
+        (lambda: replace(source, narrow=(0.08, 0.0, 0.05)), "does not lie in"),
+        (lambda: replace(source, radius=-1.0), "radius of 0 or more and a cone"),
+        (lambda: PathTracer(backend, alone).run(source, 0), "how many paths to trace, at least 1; found 0"),
+        (lambda: PathTracer(backend, alone).run(rays, 3), "a list of rays is traced as a whole"),
+        (lambda: PathTracer(backend, Scenery((*glass[:3], surface, *glass[3:]), (grid,))), "do not follow each other"),
+        (lambda: PathTracer(backend, Scenery((wavy, surface), (grid,))), "aspheric terms, found 40"),
+        (lambda: Scenery((surface, surface), (grid,)), "surfaces of the same name: "),
+        (lambda: Scenery((surface,), ()), "unknown detectors: far"),
+        (lambda: PathTracer(backend, alone, {"near": ()}, ways=False), "unknown detectors: near"),
+        (lambda: PathTracer(backend, Scenery(*zip(*many, strict=True))), "256 detectors: at most 255 of each"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make()
+    with pytest.raises(LookupError, match="no path reached far by its nominal way"):
+        empty.nominal("far")
 
 
 @pytest.mark.second
@@ -278,21 +185,3 @@ def test_oblique_hits_are_exact_as_well(backend, gf7_pair, degrees: float) -> No
     np.testing.assert_allclose(found.place[same], place[found.path[same], :2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(found.length[same], length[found.path[same]], rtol=0, atol=1e-12)
     assert same.mean() > 0.95
-
-
-def test_a_line_ccd_gets_its_star(backend, gf7_pair) -> None:
-    """Light of a point on the line's field falls on the pixel where the sequential trace has it."""
-    scenery = without_prisms(build_scenery(gf7_pair, {}, IDEAL))
-    tracer = PathTracer(
-        backend, scenery, {"forward/line": nominal_codes(scenery, gf7_pair.assembly, "forward/imaging")}
-    )
-    middle, heading, across = scene_beam(gf7_pair, backend, 0.0005, 0.0)
-    systems = assemble(gf7_pair.assembly, ["forward/imaging"])
-    chief = trace(backend, systems, make_rays(backend, middle, heading)).numpy()[0][0, 0]
-    line = gf7_pair.cameras["forward"].spec.line
-    assert abs(chief[0]) < 0.4 * line.pitch  # the smile of the field is small here
-    result = tracer.run(DiskSource(middle, heading, across, 0.25), 20_000)
-    image = result.images["forward/line"][NOMINAL][:, 0]
-    assert result.balance.detected["forward/line"] > 0.9
-    row = chief[1] / line.pitch + 0.5 * (line.pixels - 1)
-    assert np.sum(image * np.arange(line.pixels)) / image.sum() == pytest.approx(row, abs=0.5)

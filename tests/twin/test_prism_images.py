@@ -7,9 +7,7 @@ error has the effect of turning the facet by -V, and a spot moves by twice that 
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from analysis.monitor.recovery import measure_spots
 from optics.geometry.tree import Motion
 from optics.materials.glass import glass
 from optics.raytrace.system import assemble
@@ -17,6 +15,7 @@ from optics.raytrace.trace import make_rays, trace
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import load_camera
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
+from tests.twin.commands import invoke
 from twin.monitor.monitor_path import MonitorPath
 from twin.render import app
 
@@ -202,52 +201,11 @@ def test_an_imperfect_prism_that_turns(imperfect, instrument, backend, prism, ax
     assert np.abs(want).max() > 1e-3
 
 
-@pytest.fixture(scope="module")
-def measured(experiment):
-    """Shifts of the monitor pair's spots (row, column), px, rendered without noise and measured, per state."""
-    setup = experiment("monitor_pair")
-    path = setup.path
-    kinds = [*((p, "", 10.0 * e) for p in PRISMS for e in np.eye(3)), ("prism_180", "mirror", np.eye(3)[0])]
-    kinds += [("prism_180", "roof_a", np.eye(3)[1]), ("prism_180", "roof_b", np.eye(3)[0])]
-    kinds += [("prism_0", "mirror_b", np.eye(3)[0]), ("prism_0", "entry", np.eye(3)[1])]
-    states = [{}, *(on_prisms(path, p, v, face) for p, face, v in kinds)]
-    photons = path.expected_photons(states)
-    images = setup.expected_frames(photons).reshape(-1, *photons.shape[2:])
-    place = measure_spots(images, 9, setup.calibration).position.reshape(len(states), -1, 2)
-    return path, dict(zip([(p, f, int(np.argmax(v))) for p, f, v in kinds], place[1:] - place[0], strict=True))
-
-
-def test_perfect_prisms_may_turn_in_images(measured) -> None:
-    _, moved = measured
-    still = {kind: np.abs(change).max() for kind, change in moved.items() if not kind[1]}
-    assert len(still) == 6
-    assert max(still.values()) < STILL
-
-
-@pytest.mark.second
-def test_angle_errors_in_images(measured) -> None:
-    """Rows are y, columns x; the facet's turn is traced. Images and beams differ by the shape of coma, which
-    changes over the up to 19 px: 0.02 px.
-    """
-    path, moved = measured
-    checked = 0
-    for (prism, face, axis), change in moved.items():
-        if not face:
-            continue
-        vectors = [-seen_turn(path, c, prism, face, ARCSEC * np.eye(3)[axis]) for c in path.channels]
-        beams = spots(path, [{}, facets_turned(path, vectors)])
-        want = (beams[:, 1] - beams[:, 0])[:, ::-1]
-        assert np.abs(change - want).max() < 0.02
-        assert np.abs(want).max() > 2.0
-        checked += 1
-    assert checked == 5
-
-
 def test_a_beam_that_misses_its_prism_is_told_by_name(tmp_path):
     job = tmp_path / "job.yaml"
     prism = "base/forward/monitor/left/prism_180"
     job.write_text(f"instrument: gf7_pair\nperturb:\n  {prism}: {{shift: [0 mm, 60 mm, 0 mm]}}\n")
-    done = CliRunner().invoke(app, [str(job), "--out", str(tmp_path / "run")])
+    done = invoke(app, job, "--out", tmp_path / "run")
     assert done.exit_code == 2
-    assert f"misses forward/left/prism_180/entry on {prism}/window/entry" in done.output
+    assert f"misses forward/left/prism_180/entry on {prism}/window/entry" in done.stderr
     assert not (tmp_path / "run").exists()

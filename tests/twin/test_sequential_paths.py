@@ -13,8 +13,9 @@ import pytest
 
 from optics.geometry.tree import Motion
 from optics.materials.finish import CoatingTable, Finish
-from scenes.models.scenery import Scenery, build_scenery
-from tests.twin.path_bench import IDEAL, scene_beam
+from scenes.models.scenery import build_scenery
+from tests.tiers import quick
+from tests.twin.path_bench import IDEAL, scene_beam, ways_and_search
 from tests.twin.test_clear_ways import same
 from twin.path_tracing.families import Event, nominal_codes
 from twin.path_tracing.path_result import PathResult
@@ -33,7 +34,7 @@ STATE = {
 }
 
 
-@pytest.mark.parametrize("sampling", [BALANCED, ALL], ids=["balanced", "faint"])
+@pytest.mark.parametrize("sampling", quick(1, [ALL, BALANCED]), ids=["faint", "balanced"])
 @pytest.mark.parametrize(
     ("name", "state"),
     [("gf7_pair", {}), pytest.param("monitor_pair", STATE, marks=pytest.mark.second)],
@@ -41,17 +42,11 @@ STATE = {
 )
 def test_paths_along_nominal_light_are_those_of_a_search(backend, instrument, name, state, sampling: Sampling) -> None:
     chosen = instrument(name)
-    scenery = build_scenery(chosen, state)
-    families = monitor_families(scenery, chosen)
-    channel = chosen.channels[0]
-    source, toward = pinhole(chosen, backend, state, channel), f"{channel.key}/area_ccd"
-    tracers = [PathTracer(backend, scenery, families, sampling, ways) for ways in (True, False)]
-    steps = [tracer.nominal_steps(source, toward, PATHS) for tracer in tracers]
-    assert [len(one) for one in steps] == [26, 0]
-    runs = [tracer.run(source, PATHS, 4, keep=True, toward=toward) for tracer in tracers]
-    assert runs[0].nominal(toward).count > 0.03 * PATHS
-    same(*runs)
-    assert [f.touches for f in runs[0].families] == [f.touches for f in runs[1].families]
+    found = ways_and_search(backend, chosen, build_scenery(chosen, state), PATHS, sampling, state)
+    assert [len(one) for one in found.steps] == [26, 0]
+    assert found.runs[0].nominal(found.toward).count > 0.03 * PATHS
+    same(*found.runs)
+    assert [f.touches for f in found.runs[0].families] == [f.touches for f in found.runs[1].families]
 
 
 @pytest.mark.parametrize(
@@ -59,21 +54,16 @@ def test_paths_along_nominal_light_are_those_of_a_search(backend, instrument, na
 )
 def test_what_is_not_as_usual_on_nominal_light_is_left_to_the_loop(backend, gf7_pair, sampling: Sampling) -> None:
     """Roulette among paths on their nominal way; nominal light that a floor makes likelier than it is."""
-    scenery, channel = build_scenery(gf7_pair, {}), gf7_pair.channels[0]
-    families, toward = monitor_families(scenery, gf7_pair), f"{channel.key}/area_ccd"
-    source = pinhole(gf7_pair, backend, {}, channel)
-    runs = [
-        PathTracer(backend, scenery, families, sampling, ways).run(source, PATHS, 4, keep=True, toward=toward)
-        for ways in (True, False)
-    ]
-    nominal = runs[0].nominal(toward)
+    found = ways_and_search(backend, gf7_pair, build_scenery(gf7_pair, {}), PATHS, sampling)
+    nominal = found.runs[0].nominal(found.toward)
     assert nominal.count > 50
     if sampling.roulette:
         # without roulette these paths have a third of this weight
         assert nominal.energy / nominal.count > 0.7 * sampling.roulette / PATHS
-    same(*runs)
+    same(*found.runs)
 
 
+@pytest.mark.second
 def test_paths_whose_first_surface_is_searched_are_those_of_a_search(backend, gf7_pair) -> None:
     """Prisms stand in the beam of a far point; all of the light ends on the focal plane, which absorbs it."""
     scenery = build_scenery(gf7_pair, {}, IDEAL, whole_focal_planes=True)
@@ -101,38 +91,17 @@ def test_paths_whose_first_surface_is_searched_are_those_of_a_search(backend, gf
 )
 def test_paths_at_other_finishes_of_glass_are_those_of_a_search(backend, gf7_pair, metal: Finish, steps: int) -> None:
     """The fifth surface of nominal light is the mirror of a prism."""
-    scenery, channel = build_scenery(gf7_pair, {}, replace(IDEAL, metallised=metal)), gf7_pair.channels[0]
-    families, toward = monitor_families(scenery, gf7_pair), f"{channel.key}/area_ccd"
-    source = pinhole(gf7_pair, backend, {}, channel)
-    tracers = [PathTracer(backend, scenery, families, ways=ways) for ways in (True, False)]
-    assert len(tracers[0].nominal_steps(source, toward, PATHS)) == steps
-    same(*(tracer.run(source, PATHS, 4, keep=True, toward=toward) for tracer in tracers))
-
-
-def test_light_that_is_not_reflected_totally_is_left_to_the_loop(backend, gf7_pair) -> None:
-    """Glass of so low an index that its mirrors, which let light through, are met below the critical angle."""
-    finishes = replace(IDEAL, metallised=Finish(reflectance=0.6, transmission=0.3))
-    made = build_scenery(gf7_pair, {}, finishes)
-    thin = [replace(s, index=1.3) if s.index > 1.0 else s for s in made.surfaces]
-    scenery, channel = Scenery(tuple(thin), made.detectors), gf7_pair.channels[0]
-    families, toward = monitor_families(scenery, gf7_pair), f"{channel.key}/area_ccd"
-    source = pinhole(gf7_pair, backend, {}, channel)
-    tracers = [PathTracer(backend, scenery, families, ways=ways) for ways in (True, False)]
-    mirror = tracers[0].nominal_steps(source, toward, PATHS)[4]
-    assert mirror.total
-    runs = [tracer.run(source, PATHS, 4, keep=True, toward=toward) for tracer in tracers]
-    same(*runs)
-    part = scenery.surfaces[mirror.surface].part
-    assert runs[0].balance.absorbed[part] > 1e-3  # of total reflection nothing would stay
+    scenery = build_scenery(gf7_pair, {}, replace(IDEAL, metallised=metal))
+    found = ways_and_search(backend, gf7_pair, scenery, PATHS)
+    assert len(found.steps[0]) == steps
+    same(*found.runs)
 
 
 def test_steps_say_what_nominal_light_does(backend, gf7_pair) -> None:
     scenery = build_scenery(gf7_pair, {})
-    families = monitor_families(scenery, gf7_pair)
-    channel = gf7_pair.channels[0]
-    toward = f"{channel.key}/area_ccd"
+    families, channel = monitor_families(scenery, gf7_pair), gf7_pair.channels[0]
+    toward, source = f"{channel.key}/area_ccd", pinhole(gf7_pair, backend, {}, channel)
     tracer = PathTracer(backend, scenery, families)
-    source = pinhole(gf7_pair, backend, {}, channel)
     steps = tracer.nominal_steps(source, toward, PATHS)
     assert [step.code for step in steps[:-1]] == list(families[toward])
     assert [step.detects for step in steps] == [False] * 25 + [True]
@@ -172,6 +141,7 @@ def weights(run: PathResult) -> dict[tuple[int, int, int], float]:
     return dict(zip(keys, d.weight.tolist(), strict=True))
 
 
+@pytest.mark.second
 def test_thinning_keeps_the_light_and_takes_away_paths(gf7_pair, stray) -> None:
     """Families of the same seeds: what both runs follow is the same, and the rest agrees within its standard error."""
     paths, toward = 4 * PATHS, f"{gf7_pair.channels[0].key}/area_ccd"
@@ -205,6 +175,7 @@ def test_thinning_keeps_the_light_and_takes_away_paths(gf7_pair, stray) -> None:
     assert abs(np.mean(runs[0]) - np.mean(runs[1])) < 4.0 * spread
 
 
+@pytest.mark.second
 def test_thinned_paths_do_not_depend_on_the_chunk_and_are_found_again(stray) -> None:
     runs = [stray(FAINT, 2 * PATHS, 3, chunk=chunk) for chunk in (1 << 20, 5000)]
     named = [{(f.detector, f.kind, f.touches): (f.count, f.energy) for f in run.families} for run in runs]

@@ -85,38 +85,6 @@ def test_families_scatter_as_their_sigma_says(backend, gf7_pair) -> None:
     assert chi2.ppf(1e-6, degrees) < total < chi2.isf(1e-6, degrees)
 
 
-@pytest.mark.second
-def test_neither_chunks_nor_threads_change_a_run(backend, gf7_pair) -> None:
-    scenery = build_scenery(gf7_pair, {})
-    source = pinhole(gf7_pair, backend, {}, gf7_pair.channels[0])
-    tracer = PathTracer(backend, scenery, monitor_families(scenery, gf7_pair), FAINT)
-    whole, parts = tracer.run(source, 30_000, 5), tracer.run(source, 30_000, 5, chunk=7_000)
-    first, second = (sorted(run.families, key=lambda f: (f.text, f.detector)) for run in (whole, parts))
-    assert [(f.text, f.count) for f in first] == [(f.text, f.count) for f in second]
-    assert len(first) > 3
-    for a, b in zip(first, second, strict=True):
-        assert a.energy == pytest.approx(b.energy, rel=1e-12)
-    np.testing.assert_allclose(whole.images[CCD], parts.images[CCD], atol=1e-18)
-    assert parts.balance.escaped == pytest.approx(whole.balance.escaped, rel=1e-12)
-    other = tracer.run(source, 30_000, 6)
-    assert other.balance.escaped != whole.balance.escaped
-
-
-def test_progress_is_told(backend, gf7_pair) -> None:
-    told = []
-    trace_stray(
-        gf7_pair,
-        backend,
-        {},
-        30_000,
-        0,
-        channels=gf7_pair.channels[:2],
-        chunk=20_000,
-        progress=lambda *n: told.append(n),
-    )
-    assert told == [(20_000, 60_000), (30_000, 60_000), (50_000, 60_000), (60_000, 60_000)]
-
-
 def share_of(family: Family, finishes: Finishes) -> float:
     """What reflections and transmissions leave of a family that no edge cuts."""
     assert finishes.mirror.scatter is not None
