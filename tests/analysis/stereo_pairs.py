@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy import ndimage
 from sklearn.datasets import load_sample_image
@@ -156,46 +155,3 @@ def _pair(shown, size, places, noise, disparity, radiometry, seed) -> Pair:
 def parabola(pair: Pair) -> np.ndarray:
     """Errors (n, 2) of normalised cross-correlation with a parabola through its peak."""
     return search(pair.second, pair.templates(), pair.predicted(), 4).place - pair.true
-
-
-def rivals(pair: Pair) -> dict[str, np.ndarray]:
-    """Errors (n, 2) of other methods from the whole pixel of the correlation's peak; NaN where one fails."""
-    peaks = pair.true + parabola(pair)
-    templates = pair.templates().astype(np.float32)
-    start = np.nan_to_num(np.rint(peaks), nan=HALF).astype(int)
-    out = {"NCC, parabola": peaks - pair.true}
-    for name, method in (("phase correlation", _phase), ("upsampled correlation", _upsampled), ("ECC", _ecc)):
-        error = np.full(peaks.shape, np.nan)
-        for k, (row, column) in enumerate(start):
-            if np.isfinite(peaks[k]).all():
-                window = pair.second[row - HALF : row + HALF + 1, column - HALF : column + HALF + 1]
-                error[k] = start[k] + method(templates[k], window.astype(np.float32)) - pair.true[k]
-        out[name] = error
-    return out
-
-
-def _phase(template, window):
-    hann = cv2.createHanningWindow(template.shape, cv2.CV_32F)
-    (x, y), _ = cv2.phaseCorrelate(template - template.mean(), window - window.mean(), hann)
-    return np.array([y, x])
-
-
-def _upsampled(template, window):
-    """Peak of the cross-correlation on a grid of a hundredth of a pixel by matrix Fourier transforms."""
-    hann = np.outer(np.hanning(template.shape[0] + 2)[1:-1], np.hanning(template.shape[0] + 2)[1:-1])
-    a, b = (np.fft.fft2(hann * (x - x.mean())) for x in (template, window))
-    shift, frequency = np.arange(-1.0, 1.005, 0.01), np.fft.fftfreq(template.shape[0])
-    kernel = np.exp(2j * np.pi * np.outer(shift, frequency))
-    height = (kernel @ (b * a.conj()) @ kernel.T).real
-    return shift[np.array(np.unravel_index(np.argmax(height), height.shape))]
-
-
-def _ecc(template, window):
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
-    try:
-        _, warp = cv2.findTransformECC(
-            template, window, np.eye(2, 3, dtype=np.float32), cv2.MOTION_AFFINE, stop, None, 1
-        )
-    except cv2.error:
-        return np.full(2, np.nan)
-    return (warp @ [HALF, HALF, 1.0] - HALF)[::-1]

@@ -21,6 +21,7 @@ from analysis.turntable.dividing_error import (
     rejection_rate,
     step_kernel,
 )
+from tests.analysis.refusals import refuses
 
 ARCSEC = math.pi / 648000
 FALSE_ALARM = 1e-4
@@ -57,8 +58,7 @@ def test_few_or_equal_readings_stay() -> None:
     assert not chauvenet([0.0, 0.1, -0.1, 0.05, 1e6]).all()
     # equal but for the rounding of a sum
     assert chauvenet([0.1 + 0.2] * 9 + [0.3]).all()
-    with pytest.raises(ValueError, match="finite"):
-        chauvenet([0.0, np.nan, 1.0])
+    refuses(ValueError, "finite", chauvenet, [0.0, np.nan, 1.0])
 
 
 def test_many_series_at_once() -> None:
@@ -194,8 +194,7 @@ def test_a_series_without_noise() -> None:
     ],
 )
 def test_bad_series(angle: list[float], comparisons: np.ndarray, text: str) -> None:
-    with pytest.raises(ValueError, match=text):
-        CalibrationSeries(np.array(angle), comparisons)
+    refuses(ValueError, text, CalibrationSeries, np.array(angle), comparisons)
 
 
 def slow_error(rng: np.random.Generator, reading: np.ndarray) -> np.ndarray:
@@ -220,8 +219,7 @@ def test_a_gap_is_outside_and_a_missing_angle_has_a_sigma_that_holds(name: str) 
         made = compensate(series, choose(series, names=(name,)))
         ratios.append((made.error(missing) - truth[-1]) / made.sigma(missing)[0])
         for inside in (4.5, 8.0, 11.9):
-            with pytest.raises(UndeterminedError, match="lies in a gap of the calibration"):
-                made.correct(np.radians([0.0, inside]))
+            refuses(UndeterminedError, "lies in a gap of the calibration", made.correct, np.radians([0.0, inside]))
     # the misfit is stated from all angles, so that sigma may be on the safe side
     assert np.mean(np.square(ratios)) < 1.0 + 4.0 * np.sqrt(2.0 / len(ratios))
     assert not np.any(covered(angle, np.radians([3.5, 8.0, 20.1])))

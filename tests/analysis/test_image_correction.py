@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from analysis.orbit.image_correction import ImageCorrection, image_correction
+from tests.analysis.refusals import refuses
 
 SIZE = np.array([12_000.0, 20_000.0])
 TRUE = {
@@ -117,12 +118,8 @@ def test_one_point_and_three() -> None:
 def test_what_points_do_not_determine() -> None:
     place, spread = points(8)
     for count, kind, message in ((0, "shift", "do not determine"), (2, "affine", "3 or more")):
-        with pytest.raises(ValueError, match=message):
-            image_correction(place[:count], place[:count], spread[:count], kind)
+        refuses(ValueError, message, image_correction, place[:count], place[:count], spread[:count], kind)
     line = np.stack([np.linspace(0.0, 1e4, 8), np.linspace(5.0, 2e4, 8)], axis=-1)
-    with pytest.raises(ValueError, match="one line"):
-        image_correction(line, line, spread, "affine")
-    with pytest.raises(ValueError, match="not finite"):
-        image_correction(place, np.where(place > 1e4, np.nan, place), spread, "shift")
-    with pytest.raises(ValueError, match="not above zero"):
-        image_correction(place, place, np.zeros((8, 2, 2)), "shift")
+    refuses(ValueError, "one line", image_correction, line, line, spread, "affine")
+    refuses(ValueError, "not finite", image_correction, place, np.where(place > 1e4, np.nan, place), spread, "shift")
+    refuses(ValueError, "not above zero", image_correction, place, place, np.zeros((8, 2, 2)), "shift")

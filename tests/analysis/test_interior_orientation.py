@@ -15,6 +15,7 @@ from analysis.orientation.distortion_model import (
     slope,
 )
 from analysis.orientation.interior import fit_interior_orientation
+from tests.analysis.refusals import refuses
 
 FALSE_ALARM = 1e-6
 ARCSEC = np.pi / 180 / 3600
@@ -314,8 +315,7 @@ WITH_NAN = np.where(np.arange(55) == 7, np.nan, GF7)
     ],
 )
 def test_errors_say_what_to_change(arguments, message):
-    with pytest.raises(OrientationError, match=message):
-        fit(**arguments)
+    refuses(OrientationError, message, fit, **arguments)
 
 
 def test_terms_that_cannot_be_told_apart_are_named():
@@ -334,21 +334,12 @@ def test_terms_that_cannot_be_told_apart_are_named():
 
 def test_errors_of_the_printed_equations():
     position = line_image(GF7)
-    with pytest.raises(OrientationError, match="1 angle for the 2 unknowns"):
-        principal_distance_and_point(position[:1], GF7[:1])
-    with pytest.raises(OrientationError, match="cannot be separated"):
-        principal_distance_and_point(np.full(5, 0.1), np.full(5, 0.02))
-    with pytest.raises(OrientationError, match="all angles are zero"):
-        principal_distance(np.zeros(3), np.zeros(3))
-    with pytest.raises(OrientationError, match="all angles are zero"):
-        principal_point(np.zeros(3), np.zeros(3), F)
-    with pytest.raises(OrientationError, match="opposite senses"):
-        principal_distance(-position, GF7)
-    with pytest.raises(OrientationError, match="opposite senses"):
-        principal_distance_and_point(-position, GF7)
-    with pytest.raises(OrientationError, match="no points"):
-        principal_distance([], [])
-    with pytest.raises(OrientationError, match="do not match"):
-        principal_distance(np.zeros((2, 5)), np.zeros((3, 5)))
-    with pytest.raises(OrientationError, match="one angle per spot"):
-        distortion(position[:5], GF7, F)
+    refuses(OrientationError, "1 angle for the 2 unknowns", principal_distance_and_point, position[:1], GF7[:1])
+    refuses(OrientationError, "cannot be separated", principal_distance_and_point, np.full(5, 0.1), np.full(5, 0.02))
+    refuses(OrientationError, "all angles are zero", principal_distance, np.zeros(3), np.zeros(3))
+    refuses(OrientationError, "all angles are zero", principal_point, np.zeros(3), np.zeros(3), F)
+    refuses(OrientationError, "opposite senses", principal_distance, -position, GF7)
+    refuses(OrientationError, "opposite senses", principal_distance_and_point, -position, GF7)
+    refuses(OrientationError, "no points", principal_distance, [], [])
+    refuses(OrientationError, "do not match", principal_distance, np.zeros((2, 5)), np.zeros((3, 5)))
+    refuses(OrientationError, "one angle per spot", distortion, position[:5], GF7, F)

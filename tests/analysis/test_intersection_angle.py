@@ -6,6 +6,7 @@ import pytest
 from analysis.monitor.intersection_angle import IntersectionAngleChange, exact
 from analysis.monitor.monitoring import CameraParameters
 from analysis.units import ARCSEC
+from tests.analysis.refusals import refuses
 
 FORWARD, BACKWARD = np.deg2rad(26.0), np.deg2rad(-5.0)
 SIGMA = np.diag([0.03, 0.04, 1.0, 1.0]) * ARCSEC
@@ -90,7 +91,5 @@ def test_sigma_of_the_exact_form_by_draws():
 
 
 def test_bad_look_angles():
-    with pytest.raises(ValueError, match="same way"):
-        exact(camera(), camera(), 0.1, 0.1)
-    with pytest.raises(ValueError, match="forward_look_rad"):
-        exact(camera(), camera(), np.nan, 0.1)
+    refuses(ValueError, "same way", exact, camera(), camera(), 0.1, 0.1)
+    refuses(ValueError, "forward_look_rad", exact, camera(), camera(), np.nan, 0.1)

@@ -10,6 +10,7 @@ from scipy import stats
 
 from analysis.orbit.jitter_lines import search, splined
 from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
+from tests.analysis.refusals import refuses
 
 GAPS = (0.1216, 0.1024)
 """Seconds between the sights of ZY-3's blue and green, and of its green and red band."""
@@ -187,47 +188,15 @@ def test_a_spline_follows_what_is_no_line() -> None:
     ],
 )
 def test_what_says_nothing_is_told(change, told: str) -> None:
-    with pytest.raises(JitterError, match=told):
-        Observations.of_disparities(**change(np.linspace(0.0, 10.0, 200)), sigma=0.1)
+    refuses(JitterError, told, Observations.of_disparities, **change(np.linspace(0.0, 10.0, 200)), sigma=0.1)
 
 
 def test_frequencies_that_cannot_be_looked_at_are_told() -> None:
     given = Pass().observed(1)
-    with pytest.raises(JitterError, match="no frequencies"):
-        periodogram(given, 3.0, 3.001)
+    refuses(JitterError, "no frequencies", periodogram, given, 3.0, 3.001)
     both = np.concatenate([given.weight, 0.0 * given.weight], axis=2)
     unseen = Observations.of(given.value, given.group, given.time, both, given.nuisance)
-    with pytest.raises(JitterError, match="moves nothing"):
-        periodogram(unseen, 1.0, 2.0)
-
-
-@pytest.mark.slow
-def test_a_wrong_variance_of_one_kind_spoils_no_rate() -> None:
-    """Two axes, each seen by observations of its own, one of them four times as noisy as its covariances say: taken for
-    alike, false alarms are too many; with a factor for each kind they keep to the rate.
-    """
-    alike, apart, rate = [], [], 0.05
-    for seed in range(200):
-        one, two = (Pass(count=60).observed(1000 + 2 * seed + k) for k in (0, 1))
-        weight = np.zeros((120, 2, 2))
-        weight[:60, :, 0], weight[60:, :, 1] = one.weight[..., 0], 2.0 * two.weight[..., 0]
-        trend = np.zeros((120, one.nuisance.shape[1] + two.nuisance.shape[1]))
-        trend[:60, : one.nuisance.shape[1]], trend[60:, one.nuisance.shape[1] :] = one.nuisance, 2.0 * two.nuisance
-        given = Observations.of(
-            np.concatenate([one.value, 2.0 * two.value]),
-            np.arange(120),
-            np.concatenate([one.time, two.time]),
-            weight,
-            trend,
-            np.repeat([0, 1], 60),
-        )
-        for chances, observed in ((alike, given), (apart, given.evened(given.factors()))):
-            found = periodogram(observed, 0.5, 12.0)
-            chances.append(float(found.chance(found.power[found.best])))
-    limit = stats.binom.ppf(1.0 - LIMIT, 200, rate)
-    assert np.sum(np.array(apart) < rate) <= limit < np.sum(np.array(alike) < rate)
-    # variances of 57 and 57 degrees of freedom: their ratio scatters by a quarter
-    assert 2.0 < given.factors()[1] / given.factors()[0] < 8.0
+    refuses(JitterError, "moves nothing", periodogram, unseen, 1.0, 2.0)
 
 
 SLOW = 2.7

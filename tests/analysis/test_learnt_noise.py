@@ -11,6 +11,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, fit_screened
 from analysis.spots.spot_positions import SeriesNoise, SpotError
 from analysis.spots.spot_template import SpotTemplate
+from tests.analysis.refusals import refuses
 from tests.tiers import quick
 
 NOISE = NoiseModel(0.16, 12.0, 0.5, 100.0, 0.005, 5.0, 16100.0)
@@ -159,8 +160,7 @@ def test_a_spot_that_pixels_do_not_sample_is_refused(width, narrow):
     if not narrow:
         assert learn_template(screened(mean), NOISE).light > 0.0
         return
-    with pytest.raises(SpotError, match="too narrow"):
-        learn_template(screened(mean), NOISE)
+    refuses(SpotError, "too narrow", learn_template, screened(mean), NOISE)
 
 
 def test_a_shape_that_is_mostly_noise_is_refused():

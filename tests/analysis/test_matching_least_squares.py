@@ -7,6 +7,7 @@ from scipy import stats
 from analysis.matching.least_squares import least_squares
 from analysis.matching.matches import MatchOptions, Reason, resampled
 from analysis.matching.spline import SplineStack
+from tests.analysis.refusals import refuses
 from tests.analysis.texture_image import Texture, detected, lattice
 from tests.tiers import quick
 
@@ -40,24 +41,6 @@ def chi_square(error, covariance):
 def limits(freedom):
     """Of chi-square, false alarm 1e-4."""
     return stats.chi2.ppf([0.5e-4, 1 - 0.5e-4], freedom)
-
-
-@pytest.mark.slow
-def test_shift_without_noise_and_pixel_locking(clean, templates):
-    """What is left is the spline's error for detail up to 0.45 cycles a pixel; it has the period of a pixel."""
-    fits = least_squares(clean, templates, started())
-    assert np.all(fits.reason == Reason.ACCEPTED)
-    error = fits.place - PLACES
-    assert np.abs(error).max() < 0.005
-    phase = PLACES - np.rint(PLACES)
-    for axis in range(2):
-        bins = np.digitize(phase[:, axis], np.linspace(-0.5, 0.5, 11)[1:-1])
-        means = [error[bins == k, axis].mean() for k in range(10)]
-        assert np.abs(means).max() < 0.004
-    # without detail above 0.3 cycles a pixel the spline is better; left is the rim of the template, which it must guess
-    smooth = Texture(5, top=0.3)
-    fits = least_squares(smooth.grid(np.arange(SIZE), np.arange(SIZE)), smooth.patches(PLACES), started())
-    assert np.abs(fits.place - PLACES).max() < 1e-3
 
 
 def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
@@ -124,21 +107,6 @@ def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpnes
     assert np.abs(error.mean(axis=0)).max() < 0.001
 
 
-@pytest.mark.slow
-def test_reference_of_finer_pixels(texture, clean):
-    """Templates resampled from half the pixel, with an MTF of its own, about half a fine pixel off the coarse grid."""
-    fine = 0.5 * texture.grid(
-        np.arange(2 * SIZE), np.arange(2 * SIZE), matrix=0.5 * np.eye(2), shift=(-0.25, -0.25), sharp=(0.7, 0.6)
-    )
-    offset = np.arange(-15, 16.0)
-    rows, columns = np.broadcast_arrays(PLACES[:, 0, None, None] + offset[:, None], PLACES[:, 1, None, None] + offset)
-    other = resampled(fine, 2.0 * (rows + 0.25), 2.0 * (columns + 0.25), smoothing=0.7)
-    fits = least_squares(detected(clean, 11), other, started())
-    plain = least_squares(clean, other, started())
-    assert np.abs(plain.place - PLACES).max() < 0.01
-    assert limits(2 * len(PLACES))[0] < chi_square(fits.place - PLACES, fits.covariance()) < limits(2 * len(PLACES))[1]
-
-
 @pytest.mark.second
 @pytest.mark.parametrize("seed", quick(1, [21, 22]))
 def test_covariance_with_noise(clean, templates, seed):
@@ -152,30 +120,6 @@ def test_covariance_with_noise(clean, templates, seed):
     assert low / 1.4 < chi_square(error, fits.covariance()) < high
     assert 0.01 < np.sqrt(np.median(fits.covariance()[:, 0, 0])) < 0.03
     assert fits.sigma.mean() == pytest.approx(np.sqrt(800 + 400), rel=0.02)
-
-
-@pytest.mark.slow
-def test_covariance_with_a_noisy_template(texture, clean, templates):
-    """Image against image: both are noisy, the second is resampled at other phases, and errors keep in their sigmas."""
-    shift = np.array([0.37, -0.21])
-    second = detected(texture.grid(np.arange(SIZE), np.arange(SIZE), shift=shift), 32)
-    offset = np.arange(-15, 16.0)
-    at = PLACES - shift
-    rows, columns = np.broadcast_arrays(at[:, 0, None, None] + offset[:, None], at[:, 1, None, None] + offset)
-    noisy = resampled(second, rows, columns)
-    image = detected(clean, 31)
-    fits = least_squares(image, noisy, started())
-    low, high = limits(2 * len(PLACES))
-    error = fits.place - PLACES
-    assert low < chi_square(error, fits.covariance()) < high
-    # twice the noise: sqrt(2) times the sigma, a little more for what is not used
-    ratio = np.median(fits.covariance()[:, 0, 0]) / np.median(
-        least_squares(image, templates, started()).covariance()[:, 0, 0]
-    )
-    assert 1.6 < ratio < 3.0
-    # pull towards whole pixels, with its own standard error of 0.0025 px
-    phase = PLACES - np.rint(PLACES)
-    assert np.abs(2 * np.mean(error * np.sin(2 * np.pi * phase), axis=0)).max() < 0.01
 
 
 @pytest.mark.slow
@@ -246,15 +190,9 @@ def test_bad_input_is_told():
     image, patch = np.zeros((50, 50)), np.zeros((3, 15, 15))
     with pytest.raises(ValueError, match=r"one band.*|plane of real grey values"):
         least_squares(np.zeros((5, 5, 3)), patch, np.zeros((3, 2)))
-    with pytest.raises(ValueError, match=r"k odd.*\(3, 14, 14\)"):
-        least_squares(image, np.zeros((3, 14, 14)), np.zeros((3, 2)))
-    with pytest.raises(ValueError, match=r"need \(3, 2\) places.*\(2, 2\)"):
-        least_squares(image, patch, np.zeros((2, 2)))
-    with pytest.raises(ValueError, match="take 17 px or more"):
-        least_squares(image, patch, np.zeros((3, 2)), MatchOptions(margin=5))
-    with pytest.raises(ValueError, match="largest_sigma must be positive"):
-        MatchOptions(largest_sigma=0.0)
-    with pytest.raises(ValueError, match="does not hold"):
-        MatchOptions(largest_move=3.0)
-    with pytest.raises(ValueError, match=r"grids of one shape"):
-        resampled(image, np.zeros((3, 3)), np.zeros((3, 4)))
+    refuses(ValueError, r"k odd.*\(3, 14, 14\)", least_squares, image, np.zeros((3, 14, 14)), np.zeros((3, 2)))
+    refuses(ValueError, r"need \(3, 2\) places.*\(2, 2\)", least_squares, image, patch, np.zeros((2, 2)))
+    refuses(ValueError, "take 17 px or more", least_squares, image, patch, np.zeros((3, 2)), MatchOptions(margin=5))
+    refuses(ValueError, "largest_sigma must be positive", MatchOptions, largest_sigma=0.0)
+    refuses(ValueError, "does not hold", MatchOptions, largest_move=3.0)
+    refuses(ValueError, r"grids of one shape", resampled, image, np.zeros((3, 3)), np.zeros((3, 4)))

@@ -6,6 +6,7 @@ from scipy import stats
 
 from analysis.monitor.model_fit import RankError, gain, observability
 from analysis.monitor.monitoring import CameraParameters
+from tests.analysis.refusals import refuses
 
 FALSE_ALARM = 1e-6
 NAMES = ["shift x", "shift y", "turn z", "scale"]
@@ -90,19 +91,14 @@ def test_rank_deficiency_names_the_null_vector():
     assert "turn z" not in str(caught.value)
     dead = SPOTS.copy()
     dead[:, 1] = 0
-    with pytest.raises(RankError, match="shift y"):
-        fit(np.zeros(4), COVARIANCE, dead, PARAMETERS, NAMES)
+    refuses(RankError, "shift y", fit, np.zeros(4), COVARIANCE, dead, PARAMETERS, NAMES)
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match="at most 4"):
-        fit(np.zeros(4), COVARIANCE, np.ones((4, 5)), np.ones((4, 5)))
-    with pytest.raises(ValueError, match="positive definite"):
-        fit(np.zeros(4), -COVARIANCE, SPOTS, PARAMETERS)
-    with pytest.raises(ValueError, match="finite"):
-        gain(np.nan * COVARIANCE, SPOTS, PARAMETERS)
-    with pytest.raises(ValueError, match=r"\(4, P\)"):
-        fit(np.zeros(4), COVARIANCE, SPOTS[:3], PARAMETERS[:3])
+    refuses(ValueError, "at most 4", fit, np.zeros(4), COVARIANCE, np.ones((4, 5)), np.ones((4, 5)))
+    refuses(ValueError, "positive definite", fit, np.zeros(4), -COVARIANCE, SPOTS, PARAMETERS)
+    refuses(ValueError, "finite", gain, np.nan * COVARIANCE, SPOTS, PARAMETERS)
+    refuses(ValueError, r"\(4, P\)", fit, np.zeros(4), COVARIANCE, SPOTS[:3], PARAMETERS[:3])
 
 
 def test_observability_report():
@@ -148,10 +144,8 @@ def test_observability_outside_a_small_family():
     cosines = [white[:, 2] @ white[:, j] / np.linalg.norm(white[:, 2]) / np.linalg.norm(white[:, j]) for j in (0, 1)]
     assert turn.cosine == pytest.approx(cosines[int(np.argmax(np.abs(cosines)))], rel=1e-9)
     assert any("leaves a residual" in line for line in report.statements)
-    with pytest.raises(ValueError, match="family"):
-        observability(NAMES, SPOTS, PARAMETERS, SIZES, COVARIANCE, [0, 0])
-    with pytest.raises(ValueError, match="positive scales"):
-        observability(NAMES, SPOTS, PARAMETERS, SIZES[:2], COVARIANCE, [0])
+    refuses(ValueError, "family", observability, NAMES, SPOTS, PARAMETERS, SIZES, COVARIANCE, [0, 0])
+    refuses(ValueError, "positive scales", observability, NAMES, SPOTS, PARAMETERS, SIZES[:2], COVARIANCE, [0])
 
 
 def test_more_spots_than_a_pair():

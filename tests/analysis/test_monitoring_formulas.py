@@ -17,6 +17,7 @@ from analysis.monitor.monitoring import (
 )
 from analysis.monitor.recovery import joint
 from analysis.units import ARCSEC
+from tests.analysis.refusals import refuses
 
 # Field angles far larger than real ones, so that a forgotten cos^2 cannot hide.
 GEOMETRY = MonitorGeometry(7.68, 0.73, 7e-6, field_alpha_rad=0.3, field_beta_rad=0.2)
@@ -150,16 +151,11 @@ def test_geometry_options_and_errors():
     other = MonitorGeometry(7.68, 0.73, 7e-6, principal_distance_across_m=7.0)
     assert coefficients("derived", other)[0, 1] == pytest.approx(-7e-6 / 28)
     assert coefficients("derived", other)[1, 0] == pytest.approx(-7e-6 / (4 * 7.68))
-    with pytest.raises(ValueError, match="separation_m"):
-        MonitorGeometry(7.68, 0.0, 7e-6)
-    with pytest.raises(ValueError, match="field_beta_rad"):
-        MonitorGeometry(7.68, 0.7, 7e-6, 0.0, 2.0)
-    with pytest.raises(ValueError, match="paper_single"):
-        coefficients("paper", other)
-    with pytest.raises(ValueError, match="2 channels"):
-        derived(np.zeros(4), np.zeros(4), ZERO, other)
-    with pytest.raises(ValueError, match="finite"):
-        derived(np.full((2, 2), np.nan), np.zeros((2, 2)), ZERO, other)
+    refuses(ValueError, "separation_m", MonitorGeometry, 7.68, 0.0, 7e-6)
+    refuses(ValueError, "field_beta_rad", MonitorGeometry, 7.68, 0.7, 7e-6, 0.0, 2.0)
+    refuses(ValueError, "paper_single", coefficients, "paper", other)
+    refuses(ValueError, "2 channels", derived, np.zeros(4), np.zeros(4), ZERO, other)
+    refuses(ValueError, "finite", derived, np.full((2, 2), np.nan), np.zeros((2, 2)), ZERO, other)
 
 
 def test_covariances_of_spots_stand_by_themselves():

@@ -1,15 +1,10 @@
 """python -m analysis.mtf on image files: what is printed and written, and every sentence after bad input."""
 
-import csv
-import importlib.util
 import json
 import math
 import resource
-import subprocess
-import sys
 import zlib
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -69,16 +64,6 @@ def test_json_against_the_formula(edge_tiff):
     assert (data["dark_dn"], data["bright_dn"]) == pytest.approx((1000, 11000), abs=2)
 
 
-def test_printed_table(edge_tiff):
-    result = run(edge_tiff, "--roi", ROI, "--pitch", "0.007 mm")
-    assert result.exit_code == 0, result.stderr
-    for text in ("cycles/mm", "sigma", "MTF at Nyquist (71.4 cycles/mm): 0.0", "MTF50: 3", "near-vertical", "deg"):
-        assert text in result.stdout
-    row = next(line.split() for line in result.stdout.splitlines() if line.strip().startswith("28.6"))
-    assert float(row[1]) == 0.2
-    assert float(row[2]) == pytest.approx(gaussian_mtf(0.2), abs=0.002)
-
-
 def test_bars_with_even_fields(tmp_path):
     """Levels from images of even fields, their mean over the region; patches beside the bars may be wrong."""
     frame = tifffile.imread(bars_tiff(tmp_path))
@@ -97,35 +82,6 @@ def test_bars_with_even_fields(tmp_path):
     result = run(*told, "--dark", "none.tiff", "--bright", "0,0,9,9")
     assert result.exit_code == 2
     assert "or an image of an even field" in result.stderr
-
-
-def test_files(edge_tiff, tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    plot, table = out / "mtf.png", out / "mtf.csv"
-    result = run(edge_tiff, "--roi", ROI, "--pitch", "7 um", "--plot", plot, "--csv", table)
-    assert result.exit_code == 0, result.stderr
-    assert {path.name for path in out.iterdir()} == {"mtf.png", "mtf.csv"}
-    picture = cv2.imread(str(plot))
-    assert picture.shape[1] > 1000
-    assert picture.std() > 10
-    rows = list(csv.DictReader(table.open(encoding="utf-8")))
-    assert len(rows) == 65
-    assert float(rows[32]["frequency_cycles_per_mm"]) == pytest.approx(0.5 / 0.007)
-    assert float(rows[16]["mtf"]) == pytest.approx(gaussian_mtf(0.25), abs=0.002)
-
-
-def test_kinds_of_images(tmp_path):
-    """16-bit PNG, 8-bit colour PNG with alpha, float TIFF, colour TIFF: the same edge."""
-    frame = edge_frame()
-    small = np.round(edge_frame(noise=120) / 50.0).astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "grey16.png"), frame)
-    cv2.imwrite(str(tmp_path / "colour8.png"), np.dstack([small] * 3 + [np.full_like(small, 255)]))
-    tifffile.imwrite(tmp_path / "real.tif", frame.astype(np.float32))
-    tifffile.imwrite(tmp_path / "colour.tif", np.dstack([frame] * 3), photometric="rgb")
-    for path in sorted(tmp_path.iterdir()):
-        data = run_json(path, "--roi", ROI, "--pitch", "7 um")
-        assert data["mtf"][16] == pytest.approx(gaussian_mtf(0.25), abs=5 * data["sigma"][16] + 5e-4), path.name
 
 
 def test_luminance_weighs_the_channels(tmp_path):
@@ -382,48 +338,6 @@ def test_numbers_at_the_ends_of_double_precision(tmp_path, scale, what):
         assert result.stderr.count("\n") == (1 if result.exit_code else 0)
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("options", [["--json"], []])
-def test_a_result_that_cannot_be_printed(edge_tiff, options):
-    command = [sys.executable, "-m", "analysis.mtf", str(edge_tiff), "--roi", ROI, "--pitch", "7 um", *options]
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode == 1
-    assert "the result cannot be printed (No space left on device)" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("kind", ["edge.tiff", "packed.tiff", "colour.tiff", "edge.png", "edge.jpg"])
-def test_spoilt_files_are_measured_or_refused(tmp_path, kind, seed):
-    """Cut off, with wrong bytes in header and data, with bytes taken out or put in: never a traceback."""
-    frame, path = edge_frame(), tmp_path / kind
-    if kind == "edge.jpg":
-        cv2.imwrite(str(path), (frame >> 6).astype(np.uint8))
-    elif kind == "edge.png":
-        cv2.imwrite(str(path), frame)
-    else:
-        packed = {"compression": "zlib", "predictor": True} if kind == "packed.tiff" else {}
-        colour = {"photometric": "rgb", "planarconfig": "separate"} if kind == "colour.tiff" else {}
-        tifffile.imwrite(path, np.stack([frame] * 3) if colour else frame, **packed, **colour)
-    sound = path.read_bytes()
-    rng = np.random.default_rng([seed, len(kind)])
-    place = int(rng.integers(len(sound)))
-    wrong = bytearray(sound)
-    for at in [*rng.integers(0, 250, 4), *rng.integers(0, len(sound), 4)]:
-        wrong[at] = rng.integers(256)
-    for data in (
-        sound[:place],
-        bytes(wrong),
-        sound[:place] + sound[place + 50 :],
-        sound[:place] + bytes(50) + sound[place:],
-    ):
-        path.write_bytes(data)
-        result = run(path, "--roi", ROI, "--pitch", "7 um")
-        assert result.exit_code in (0, 2)
-        assert result.exit_code == 0 or result.stderr.startswith("error: ")
-
-
 def test_one_saturated_page_is_enough(tmp_path):
     pages = np.stack([edge_frame(50.0, seed) for seed in range(4)])
     pages[2, 40, 80] = 65535
@@ -550,15 +464,3 @@ def test_the_image_is_never_overwritten(tmp_path):
     result = run(path, "--roi", ROI, "--pitch", "7 um", "--plot", path)
     assert result.exit_code == 2
     assert path.read_bytes() == before
-
-
-def test_help_teaches():
-    result = run("--help")
-    assert result.exit_code == 0
-    for text in ("ISO 12233", "2 to 10 deg", "linear in light", "ROW,COLUMN,HEIGHT,WIDTH", "cycles/mm", "Exit codes"):
-        assert text in result.stdout
-
-
-def test_the_module_is_a_command():
-    spec = importlib.util.find_spec("analysis.mtf.__main__")
-    assert 'if __name__ == "__main__":\n    app()' in Path(spec.origin).read_text("utf-8")

@@ -20,6 +20,7 @@ from analysis.orbit.angles import (
     off_axis_angle,
 )
 from analysis.orbit.planes import METHODS, NearVerticalWarning, PlaneError, Station, Strip, fit_plane
+from tests.analysis.refusals import refuses
 from tests.tiers import quick
 
 FALSE_ALARM = 1e-6
@@ -167,8 +168,7 @@ def test_printed_equation_turns_every_plane_by_half_a_turn_about_z():
     a, b = intersection_angles(*printed), intersection_angles(*corrected)
     assert a.values == pytest.approx(b.values, abs=1e-14)
     assert a.covariance == pytest.approx(b.covariance, rel=1e-9)
-    with pytest.raises(AngleError, match="printed and a corrected"):
-        intersection_angles(printed[0], corrected[1], printed[2])
+    refuses(AngleError, "printed and a corrected", intersection_angles, printed[0], corrected[1], printed[2])
 
 
 def test_coefficients_solve_the_papers_least_squares():
@@ -340,8 +340,7 @@ def test_nearly_vertical_plane_is_announced():
                 assert not fit_plane(station, strip, "corrected").near_vertical
     # without noise nothing is left in that direction
     for method in ("printed", "corrected"):
-        with pytest.raises(PlaneError, match="vertical in this frame"):
-            fits(Pass(*_local(SCENE, orbital(SCENE))), method)
+        refuses(PlaneError, "vertical in this frame", fits, Pass(*_local(SCENE, orbital(SCENE))), method)
     assert intersection_angles(*fits(SCENE, "tls", turn=orbital(SCENE))).values == pytest.approx(LOOK, abs=1e-13)
 
 
@@ -495,25 +494,20 @@ def test_bad_points():
         ray = points[0] - SCENE.station
         with pytest.raises(PlaneError, match="on one line through the station"):
             fit_plane(station, Strip.of(SCENE.station + np.linspace(0.9, 1, 5)[:, None] * ray, 1.0), method)
-        with pytest.raises(PlaneError, match="at one place"):
-            fit_plane(station, Strip.of(np.repeat(points[:1], 5, axis=0), 1.0), method)
+        refuses(PlaneError, "at one place", fit_plane, station, Strip.of(np.repeat(points[:1], 5, axis=0), 1.0), method)
         # the spread that is needed counts in sigmas of an axis, of unequal ones in their root mean square
         for noise, needed in ((1.0, "10"), (np.tile(np.diag([1.0, 1.0, 10.0]), (5, 1, 1)), "20")):
             with pytest.raises(PlaneError, match=rf"10 sigmas \({needed} m\) are needed"):
                 fit_plane(station, Strip.of(np.repeat(points[:1], 5, axis=0), noise), method)
         # noise of 2 m does not make a strip of one place
         scatter = points[0] + 2.0 * np.random.default_rng(1).standard_normal((30, 3))
-        with pytest.raises(PlaneError, match="at one place"):
-            fit_plane(station, Strip.of(scatter, 2.0), method)
-    with pytest.raises(PlaneError, match="lies at the station"):
-        fit_plane(station, Strip.of(np.vstack([points, SCENE.station]), 1.0))
-    with pytest.raises(PlaneError, match="method must be one of"):
-        fit_plane(station, Strip.of(points, 1.0), "other")
+        refuses(PlaneError, "at one place", fit_plane, station, Strip.of(scatter, 2.0), method)
+    refuses(PlaneError, "lies at the station", fit_plane, station, Strip.of(np.vstack([points, SCENE.station]), 1.0))
+    refuses(PlaneError, "method must be one of", fit_plane, station, Strip.of(points, 1.0), "other")
     lost = points.copy()
     lost[3, 1] = np.nan
     for wrong in (lost, points[:, :2], points[0]):
-        with pytest.raises(PlaneError, match="strip"):
-            Strip.of(wrong, 1.0)
+        refuses(PlaneError, "strip", Strip.of, wrong, 1.0)
     for noise in (
         0.0,
         -1.0,
@@ -524,13 +518,10 @@ def test_bad_points():
         np.diag([1.0, 1.0, np.inf]),
         np.ones((4, 4)),
     ):
-        with pytest.raises(PlaneError, match="strip"):
-            Strip.of(points, noise)
-    with pytest.raises(PlaneError, match="symmetric"):
-        Strip.of(points, np.array([[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]))
+        refuses(PlaneError, "strip", Strip.of, points, noise)
+    refuses(PlaneError, "symmetric", Strip.of, points, np.array([[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]))
     for wrong in ([1.0, 2.0], [np.nan, 0, 0]):
-        with pytest.raises(PlaneError, match="station"):
-            Station.of(wrong)
+        refuses(PlaneError, "station", Station.of, wrong)
 
 
 @pytest.mark.parametrize("method", ["tls", "corrected"])
@@ -552,15 +543,10 @@ def test_normals_point_down(method):
 def test_bad_pairs():
     forward, nadir, _ = fits(SCENE)
     other = fit_plane(Station.of(SCENE.station + 1.0, 0.5), nadir.strip)
-    with pytest.raises(AngleError, match="one and the same station"):
-        off_axis_angle(forward, other)
-    with pytest.raises(AngleError, match="coincide"):
-        off_axis_angle(nadir, nadir)
-    with pytest.raises(AngleError, match="finite tangents"):
-        line_frame(nadir, [0.0])
+    refuses(AngleError, "one and the same station", off_axis_angle, forward, other)
+    refuses(AngleError, "coincide", off_axis_angle, nadir, nadir)
+    refuses(AngleError, "finite tangents", line_frame, nadir, [0.0])
     with pytest.raises(AngleError, match="finite tangents"):
         line_frame(nadir, np.where(np.arange(len(SCENE.tangents["nadir"])) == 1, np.nan, SCENE.tangents["nadir"]))
-    with pytest.raises(AngleError, match="wrong tangents"):
-        line_frame(nadir, 2 * SCENE.tangents["nadir"])
-    with pytest.raises(AngleError, match="printed plane"):
-        line_frame(fits(SCENE, "printed")[1], SCENE.tangents["nadir"])
+    refuses(AngleError, "wrong tangents", line_frame, nadir, 2 * SCENE.tangents["nadir"])
+    refuses(AngleError, "printed plane", line_frame, fits(SCENE, "printed")[1], SCENE.tangents["nadir"])

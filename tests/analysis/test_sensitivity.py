@@ -5,6 +5,7 @@ import pytest
 
 from analysis.orbit.angles import sensitivity
 from analysis.orbit.planes import METHODS, Station
+from tests.analysis.refusals import refuses
 from tests.analysis.test_planes import ARCSEC, LOOK, SCENE, noisy, rotation
 
 AXES = "xyz"
@@ -90,5 +91,4 @@ def test_any_lines_and_angles():
 
 @pytest.mark.parametrize("amounts", [[0, 1], [1, 2, 3], [0, 2, 1], [0, 1, np.nan], np.zeros((3, 3))])
 def test_bad_amounts(amounts):
-    with pytest.raises(ValueError, match="rising numbers"):
-        table(amounts=amounts)
+    refuses(ValueError, "rising numbers", table, amounts=amounts)

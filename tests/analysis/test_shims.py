@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from analysis.focal_plane import shims
 from analysis.focal_plane.plane_fit import LineLevel, RigidMotion, fit_focal_plane
 from analysis.focal_plane.shims import Mount, ShimError
+from tests.analysis.refusals import refuses
 
 FALSE_ALARM = 1e-6
 ARCMIN, DEG = np.pi / 10800, np.pi / 180
@@ -249,10 +250,8 @@ def test_errors_say_what_to_change():
     plan = shim_plan(RigidMotion.of([5 * ARCMIN, 0, 0], [0, 0, 0]), make_mount(count=4), now)
     assert plan.thickness.min() == pytest.approx(0, abs=1e-9)
     holes = make_mount().holes
-    with pytest.raises(ShimError, match="2 holes cannot hold a plane"):
-        Mount.of(holes[:2], [0, 0, 1], MM, STEP)
-    with pytest.raises(ShimError, match="on one line"):
-        Mount.of(np.outer(np.arange(4), [0.01, 0.1, 0]), [0, 0, 1], MM, STEP)
+    refuses(ShimError, "2 holes cannot hold a plane", Mount.of, holes[:2], [0, 0, 1], MM, STEP)
+    refuses(ShimError, "on one line", Mount.of, np.outer(np.arange(4), [0.01, 0.1, 0]), [0, 0, 1], MM, STEP)
     with pytest.raises(ShimError, match="seen along the normal"):
         Mount.of([[0, 0, 0], [0, 0.1, 0], [0, 0.05, 0.05]], [0, 0, 1], MM, STEP)
     for change, message in (
@@ -263,12 +262,9 @@ def test_errors_say_what_to_change():
     ):
         with pytest.raises(ValueError, match=message):
             Mount.of(**({"holes": holes, "normal": [0, 0, 1], "clearance": MM, "step": STEP} | change))
-    with pytest.raises(ValueError, match="present thicknesses"):
-        shim_plan(RigidMotion.of([0, 0, 0], [0, 0, 0]), make_mount(), np.nan)
-    with pytest.raises(ValueError, match="finite"):
-        RigidMotion.of([0, 0, np.nan], [0, 0, 0])
-    with pytest.raises(ValueError, match=r"must be \(3,\)"):
-        RigidMotion.of([0, 0], [0, 0, 0])
+    refuses(ValueError, "present thicknesses", shim_plan, RigidMotion.of([0, 0, 0], [0, 0, 0]), make_mount(), np.nan)
+    refuses(ValueError, "finite", RigidMotion.of, [0, 0, np.nan], [0, 0, 0])
+    refuses(ValueError, r"must be \(3,\)", RigidMotion.of, [0, 0], [0, 0, 0])
 
 
 def test_one_round_of_shimming():

@@ -5,6 +5,7 @@ import pytest
 from scipy.special import j1
 
 from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
+from tests.analysis.refusals import refuses
 
 FIRST_ZERO_PX = 7.0
 
@@ -95,8 +96,7 @@ def test_range_is_tight_and_explained():
     ],
 )
 def test_bad_calibration_images(image, words):
-    with pytest.raises(ValueError, match=words):
-        SpotTemplate.from_image(image, 20, 20, (48, 48))
+    refuses(ValueError, words, SpotTemplate.from_image, image, 20, 20, (48, 48))
 
 
 @pytest.mark.parametrize("oversampling", [1, 2])
@@ -109,8 +109,7 @@ def test_the_smallest_calibration_image_has_one_place(oversampling):
         assert 0 <= high - low <= 1 / oversampling
     template.evaluate(*(low for low, _ in template.supported()))
     for less in (image[:-1], image[:, :-1]):
-        with pytest.raises(ValueError, match="margin"):
-            SpotTemplate.from_image(less, rows // 2, columns // 2, (10, 8), oversampling)
+        refuses(ValueError, "margin", SpotTemplate.from_image, less, rows // 2, columns // 2, (10, 8), oversampling)
 
 
 # --- smeared ----------------------------------------------------------------------------------------------------------

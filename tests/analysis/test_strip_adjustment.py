@@ -9,6 +9,7 @@ from scipy import stats
 from analysis.calibration.strip_adjustment import adjust_strip
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.forward_intersection import check_errors, intersect
+from tests.analysis.refusals import refuses
 from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, make_rays, observe, orbit
 
 BIAS = np.array([40.0, -60.0, 90.0]) * ARCSEC
@@ -82,8 +83,7 @@ def test_corrections_take_the_errors_out_of_other_rays():
         )
         squares.append([e.plan_rms**2 + e.height_rms**2 for e in (before, after)])
     assert np.sqrt(np.mean(squares, axis=0)[1] / np.mean(squares, axis=0)[0]) < 0.9
-    with pytest.raises(CalibrationError, match="no times"):
-        found.corrected(replace(rays["backward"], time=None))
+    refuses(CalibrationError, "no times", found.corrected, replace(rays["backward"], time=None))
 
 
 @pytest.mark.slow
@@ -144,7 +144,5 @@ def test_points_of_one_line_and_bad_input():
     assert np.isnan(found.ground[3]).all()
     assert np.isfinite(np.delete(found.ground, 3, axis=0)).all()
     assert found.degrees_of_freedom == 2 * 29 * 3 - 3 * 29
-    with pytest.raises(CalibrationError, match="needs the times"):
-        adjusted(rays, Noise(PITCH, ARCSEC))
-    with pytest.raises(CalibrationError, match="needs the times"):
-        adjusted({k: replace(r, time=None) for k, r in rays.items()}, WHITE)
+    refuses(CalibrationError, "needs the times", adjusted, rays, Noise(PITCH, ARCSEC))
+    refuses(CalibrationError, "needs the times", adjusted, {k: replace(r, time=None) for k, r in rays.items()}, WHITE)

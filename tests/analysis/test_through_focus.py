@@ -9,6 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from analysis.focal_plane import through_focus as module
 from analysis.focal_plane.through_focus import FocusError, focus_vertex, focus_vertices
+from tests.analysis.refusals import refuses
 from tests.tiers import quick
 
 FALSE_ALARM = 1e-6
@@ -247,8 +248,7 @@ def test_other_faults():
     assert not np.any(focus_vertices(fine, curve(fine, np.linspace(0, step, 9), PAN, 0.2), 0.004, strict=False).fault)
     with pytest.raises(FocusError, match="fewer than 5") as caught:
         focus_vertex(np.repeat(z[10:14], 3), np.repeat(value[10:14], 3), 0.004)  # repeats are not positions
-    with pytest.raises(FocusError, match="not finite"):
-        focus_vertex(z, np.where(np.arange(z.size) == 4, np.nan, value), 0.004)
+    refuses(FocusError, "not finite", focus_vertex, z, np.where(np.arange(z.size) == 4, np.nan, value), 0.004)
     batch = np.stack([value, np.full_like(value, 0.1), value])
     with pytest.raises(FocusError, match="curve 1: no curvature") as caught:
         focus_vertices(z, batch, 0.004)
@@ -294,8 +294,7 @@ def test_the_unit_of_length_does_not_matter(unit):
 )
 def test_bad_arguments(change, message):
     given = {"position": np.linspace(-1, 1, 9), "value": np.ones(9), "sigma": 0.1} | change
-    with pytest.raises(ValueError, match=message):
-        focus_vertex(**given)
+    refuses(ValueError, message, focus_vertex, **given)
 
 
 def test_the_unit_of_the_mtf_does_not_matter():

@@ -8,6 +8,7 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.unseen_motions import floor, unseen_modes
 from tests.analysis.followed_series import of_shifts
+from tests.analysis.stated_motions import correlation_of, disturbances
 
 MOTIONS, SPOTS, PARAMETERS = 14, 4, 3
 SWING, DRIFT = TimeLaw(period_s=5000.0, drift_s=50_000.0), TimeLaw(drift_s=900.0)
@@ -15,26 +16,9 @@ SWING, DRIFT = TimeLaw(period_s=5000.0, drift_s=50_000.0), TimeLaw(drift_s=900.0
 
 def stated(seed: int, laws: tuple[TimeLaw, ...] = (SWING,) * MOTIONS, correlated: bool = True) -> Disturbances:
     rng = np.random.default_rng(seed)
-    correlation = np.eye(MOTIONS)
-    if correlated:
-        for law in set(laws):
-            own = np.flatnonzero([one == law for one in laws])
-            root = rng.standard_normal((len(own), len(own)))
-            spread = root @ root.T + np.eye(len(own))
-            size = np.sqrt(np.diag(spread))
-            correlation[np.ix_(own, own)] = spread / size[:, None] / size
-    return Disturbances(
-        "some",
-        tuple(f"body{k // 2} shift {'xy'[k % 2]}" for k in range(MOTIONS)),
-        tuple(f"body{k // 2}" for k in range(MOTIONS)),
-        ("cause",) * MOTIONS,
-        np.ones(MOTIONS),
-        ("um",) * MOTIONS,
-        rng.standard_normal((SPOTS, MOTIONS)),
-        rng.standard_normal((PARAMETERS, MOTIONS)),
-        correlation,
-        laws,
-    )
+    labels = [f"body{k // 2} shift {'xy'[k % 2]}" for k in range(MOTIONS)]
+    see, tell = (rng.standard_normal((n, MOTIONS)) for n in (SPOTS, PARAMETERS))
+    return disturbances(laws, see, tell, labels, correlation_of(rng, laws) if correlated else None)
 
 
 def hidden(one: Disturbances, rows: np.ndarray, own: np.ndarray) -> np.ndarray:

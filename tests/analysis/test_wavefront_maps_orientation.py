@@ -10,6 +10,7 @@ from analysis.wavefront_maps.orientation import ORIENTATIONS, READINGS, Orientat
 from analysis.wavefront_maps.pupil_fit import fit_map
 from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
 from analysis.wavefront_maps.zernike_terms import circle_terms
+from tests.analysis.refusals import refuses
 from tests.analysis.wavefront_files import metropro
 from tests.tiers import quick
 
@@ -28,10 +29,8 @@ def test_there_are_eight_and_sixteen():
     assert len({one.matrix.tobytes() for one in ORIENTATIONS}) == len(ORIENTATIONS) == 8
     assert len(set(READINGS)) == len({str(one) for one in READINGS}) == 16
     assert [Orientation.named(one.name, one.sign) for one in READINGS] == list(READINGS)
-    with pytest.raises(MapError, match="turned 270"):
-        Orientation.named("turned 45")
-    with pytest.raises(ValueError, match="quarter turns"):
-        Orientation(quarter_turns=4)
+    refuses(MapError, "turned 270", Orientation.named, "turned 45")
+    refuses(ValueError, "quarter turns", Orientation, quarter_turns=4)
 
 
 @pytest.mark.parametrize(
@@ -70,8 +69,7 @@ def test_a_map_that_is_no_square_turns_into_another():
 
 def test_terms_without_their_partners():
     assert Orientation.named("turned 180").of_terms([4, 7]).tolist() == [[1, 0], [0, -1]]
-    with pytest.raises(MapError, match="Z7 turns into a term that was not fitted"):
-        Orientation.named("turned 90").of_terms([4, 7])
+    refuses(MapError, "Z7 turns into a term that was not fitted", Orientation.named("turned 90").of_terms, [4, 7])
 
 
 FIELDS, USED = 5, tuple(range(4, 12))
@@ -161,7 +159,5 @@ def test_no_reading_is_allowed_of_another_camera():
 
 def test_a_covariance_that_is_none():
     expected, covariance = camera(5e-9, 0.5e-6)
-    with pytest.raises(UndeterminedError, match="add the noise"):
-        tellable(expected, expected, 0.0 * covariance, USED)
-    with pytest.raises(UndeterminedError, match="not finite"):
-        tellable(expected * np.nan, expected, covariance, USED)
+    refuses(UndeterminedError, "add the noise", tellable, expected, expected, 0.0 * covariance, USED)
+    refuses(UndeterminedError, "not finite", tellable, expected * np.nan, expected, covariance, USED)
