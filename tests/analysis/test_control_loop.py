@@ -115,13 +115,3 @@ def test_the_limit_cycle(gain: float, delay: int, band: float) -> None:
     assert found.steps == steps
     # the two look at other places between the steps, 1/41 of a step apart
     assert found.left == pytest.approx(left, abs=0.05)
-
-
-@pytest.mark.parametrize("delay", [0, 1])
-@pytest.mark.parametrize("share", [0.1, 0.3, 0.5])
-def test_a_mechanism_of_whole_steps_goes_to_and_fro_by_one_step_at_most(share: float, delay: int) -> None:
-    """At up to half of the limit, a gain margin of 2, whatever there is to correct."""
-    found = limit_cycle(share * margins(0.1, delay).limit, delay)
-    assert found.steps == 1
-    assert found.left <= 1.0
-    assert limit_cycle(share * margins(0.1, delay).limit, delay, 0.75).steps == 0

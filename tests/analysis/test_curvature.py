@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.monitor.curvature import BEYOND, Curvature, LinearReading, MotionModel, Retraced, read_again
+from analysis.monitor.curvature import BEYOND, LinearReading, MotionModel, Retraced, read_again
 
 RNG = np.random.default_rng(4)
 A = RNG.standard_normal((4, 4)) + 3.0 * np.eye(4)
@@ -128,10 +128,3 @@ def test_estimators_that_trace_alike_are_traced_together_and_keep_their_own() ->
         np.testing.assert_array_equal(together[name][1].off, alone[1].off)
         assert together[name][1].rests.tolist() == alone[1].rests.tolist()
     assert not together["none"][1].beyond.any()
-
-
-def test_states_of_a_series_stay_in_their_order() -> None:
-    one, two = (Curvature(np.full((2, 3), v), np.array([v > 3, False]), np.array([True, v < 3])) for v in (1.0, 5.0))
-    both = Curvature.joined([one, two])
-    assert both.beyond.tolist() == [False, False, True, False]
-    assert both.at(slice(2, 4)).rests.tolist() == [True, False]

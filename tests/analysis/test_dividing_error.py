@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from analysis.measurement_error import UndeterminedError
 from analysis.turntable.dividing_error import (
@@ -146,24 +145,6 @@ def test_misfits_are_told_apart() -> None:
     assert np.mean(common) == pytest.approx(0.1, rel=0.1)
 
 
-@pytest.mark.second
-def test_covariance_matches_the_scatter() -> None:
-    """Slope of the corrected error over the camera's field, 200 calibrations of a curve that the spline follows."""
-    reading = np.radians(np.linspace(100.75, 103.25, 55))
-    slope = (reading - reading.mean()) / np.sum((reading - reading.mean()) ** 2)
-    squares = 0.0
-    for seed in range(200):
-        calibration = series(seed)
-        made = compensate(calibration, choose(calibration, names=("piecewise_linear",)))
-        noise = made.fit.covariance(reading)
-        left = made.fit(reading) - np.interp(reading, ANGLE, curve(ANGLE))
-        squares += (slope @ left) ** 2 / (slope @ noise @ slope)
-        assert np.min(np.linalg.eigvalsh(made.covariance(reading))) > -1e-12 * np.max(noise)
-        assert np.all(np.diag(made.covariance(reading)) >= np.diag(noise))
-    low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], 200)
-    assert low < squares < high
-
-
 def test_covariance_of_two_sets_of_readings() -> None:
     calibration = series(6)
     choice = choose(calibration, names=("fourier",))
@@ -173,14 +154,6 @@ def test_covariance_of_two_sets_of_readings() -> None:
     np.testing.assert_allclose(made.covariance(both[:1], both[1:]), whole[:1, 1:], rtol=1e-12)
     np.testing.assert_allclose(made.sigma(both) ** 2, np.diag(whole), rtol=1e-12)
     assert step_kernel(both, both, calibration.step)[0].tolist() == pytest.approx([1.0, 0.8, 0.0])
-
-
-def test_a_series_without_noise() -> None:
-    exact = CalibrationSeries(ANGLE, np.repeat(curve(ANGLE)[:, None], 5, axis=1))
-    assert exact.rejected == 0
-    made = compensate(exact, choose(exact, names=("cubic_spline",)))
-    # natural ends: the curve is bent there and the spline is not, some 1e-3 of the amplitude
-    assert np.max(np.abs(made.error(ANGLE[3] + 0.004) - curve(ANGLE[3] + 0.004))) < 1e-3 * ARCSEC
 
 
 @pytest.mark.parametrize(

@@ -74,18 +74,6 @@ def test_signs(turn, shift, expected):
     assert motion.shift == pytest.approx(expected[1], abs=1e-15)
 
 
-def test_small_angles_are_the_slopes():
-    """omega = (slope_y, -slope_x, -level) and shift (0, 0, piston), to second order of 5'."""
-    defocus = 0.2 * MM + 1.2e-3 * PLACE[:, 0] - 0.9e-3 * PLACE[:, 1]
-    fit = fit_focal_plane(PLACE, defocus, SIGMA)
-    assert (fit.piston, fit.slope_x, fit.slope_y) == pytest.approx((0.2 * MM, 1.2e-3, -0.9e-3), rel=1e-9)
-    level = LineLevel(1e-3, 5e-5)
-    motion = fit.correction(level)
-    assert motion.rotation == pytest.approx([-0.9e-3, -1.2e-3, -1e-3], abs=1.5e-6)
-    assert motion.shift == pytest.approx([0, 0, 0.2 * MM], abs=1e-15)
-    assert motion.line_turn == pytest.approx(-1e-3, abs=1.5e-6)
-
-
 def test_scatter_agrees_with_covariance():
     """500 noisy repeats: chi-square of the three parameters, of the residuals, and uniform p-values."""
     rng = np.random.default_rng(4)

@@ -163,28 +163,6 @@ def test_a_gross_error_is_left_out() -> None:
     np.testing.assert_allclose(found.mean / model.prior.sigma, other.mean / model.prior.sigma, atol=1e-9)
 
 
-def test_order_and_units_do_not_matter_and_more_data_never_hurt() -> None:
-    """Groups in another order, numbers in another unit: the same estimate. A group more: no variance grows."""
-    rng = np.random.default_rng(13)
-    groups = [random_group(rng, "one", 6, 1, True), random_group(rng, "two", 5)]
-    model = Linear(rng, random_prior(rng), groups)
-    _, measured = model.drawn()
-    found = model.estimate(measured)
-    turned = np.concatenate([model.table[6:], model.table[:6] * 1e6])
-    one = measured[0]
-    scaled = MeasuredGroup(
-        "one", "numbers", one.labels, 1e6 * one.values, 1e12 * one.covariance, one.biases, one.bias_sigmas, one.blocks
-    )
-    other = estimate_state(model.prior, [measured[1], scaled], lambda x: x @ turned.T, lambda x: turned)
-    scale = model.prior.sigma
-    np.testing.assert_allclose(found.mean / scale, other.mean / scale, atol=1e-9)
-    np.testing.assert_allclose(found.sigma / scale, other.sigma / scale, atol=1e-9)
-    table = model.table[6:]
-    few = estimate_state(model.prior, [measured[1]], lambda x: x @ table.T, lambda x: table)
-    gain = (few.covariance - found.covariance) / np.outer(scale, scale)
-    assert np.linalg.eigvalsh(gain)[0] > -1e-9
-
-
 def test_a_curved_instrument_settles_at_the_mode() -> None:
     """Of a model with squares the estimate is where the derivative of the cost by every motion vanishes."""
     rng = np.random.default_rng(17)

@@ -28,12 +28,6 @@ def points(frame):
     return distinct_points(frame, 500, spacing=12, border=60)
 
 
-def way(places):
-    """A smooth error of prediction, up to 28 px along an axis and 35 px in all."""
-    row, column = ((places - SIZE / 2) / (SIZE / 2)).T
-    return np.stack([22 + 5 * row + 3 * column**2, -20 + 2 * row * column - 8 * column], axis=1)
-
-
 @pytest.mark.second
 @pytest.mark.parametrize(("slope", "contrast", "lost"), quick(1, [(2.0, 120.0, 0.1), (1.0, 40.0, 0.1)]))
 def test_wrong_patches_in_worse_texture(slope, contrast, lost):

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from analysis.monitor.model_fit import RankError, gain, observability
 from analysis.monitor.monitoring import CameraParameters
@@ -38,21 +37,6 @@ def test_round_trip_without_noise():
     truth = motions @ PARAMETERS.T
     assert np.abs(found.vector - truth).max(axis=0) == pytest.approx(np.zeros(4), abs=1e-15)
     assert not found.sigma.any()
-
-
-@pytest.mark.parametrize("chosen", [[0, 1, 2, 3], [0, 1]])
-def test_scatter_agrees_with_covariance(chosen):
-    """Chi-square of 500 estimates; with two motions and four coordinates the parameters have rank two."""
-    rng = np.random.default_rng(6)
-    spots, parameters = SPOTS[:, chosen], PARAMETERS[:, chosen]
-    motions = rng.standard_normal((500, len(chosen))) * SIZES[chosen]
-    noise = rng.multivariate_normal(np.zeros(4), COVARIANCE, 500)
-    found = fit(motions @ spots.T + noise, COVARIANCE, spots, parameters)
-    error = found.vector - motions @ parameters.T
-    rows = [0, 1, 2, 3] if len(chosen) == 4 else [0, 1]
-    weight = np.linalg.inv(found.covariance[0][np.ix_(rows, rows)])
-    chi2 = np.einsum("bi,ij,bj->", error[:, rows], weight, error[:, rows])
-    assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, 500 * len(rows)) < 1 - FALSE_ALARM / 2
 
 
 def test_weighting_is_the_best_linear_one():

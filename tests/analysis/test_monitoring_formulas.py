@@ -63,16 +63,6 @@ def test_joint_is_table_1(spots):
     assert np.allclose(result.vector, np.stack([alpha, beta, gamma, d_f], axis=1), rtol=1e-12, atol=1e-22)
 
 
-def test_ratios_between_the_formulas():
-    single, joint, own = (coefficients(name, GEOMETRY) for name in FUNCTIONS)
-    assert np.allclose(single[2], 2 * own[2], rtol=1e-15)
-    assert np.allclose(joint[2], 2 * own[2], rtol=1e-15)
-    assert np.allclose(joint[3], 0.5 * own[3], rtol=1e-15)
-    assert np.allclose(single[3], own[3], rtol=1e-15)
-    assert np.allclose(single[0], math.cos(0.3) ** 2 * own[0], rtol=1e-15)
-    assert np.allclose(single[1], math.cos(0.2) ** 2 * own[1], rtol=1e-15)
-
-
 def test_derived_inverts_a_plane_mirror_return():
     """Detector shifted by d moves the image by -2 d on it; ends of a line turned by t about Z shift by -+ t L/2 along
     X.

@@ -124,27 +124,3 @@ def test_nothing_to_repair_is_nothing_repaired(template, measure):
     size = float(np.max(own.covariance))
     np.testing.assert_allclose(found.covariance, own.covariance, rtol=0, atol=0.02 * size)
     assert 0.0 < cost < 0.02
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("measure", MEASURES)
-def test_sigma_holds_over_drawn_images(template, measure):
-    """300 images with drawn noise, temporal and fixed: chi-square of 600 coordinates within 99.9 %."""
-    dirty = bench(template, "all")
-    found, _ = dirty.place(dirty.image, measure)
-    level = dirty.fit(dirty.image).level
-    counts = dirty.screened(dirty.image).counts
-    sigma = np.sqrt(NOISE.temporal_variance_dn2(level, 1) / counts + NOISE.fixed_variance_dn2(level))
-    random = np.random.default_rng(11)
-    away = np.array(
-        [
-            (
-                dirty.place(dirty.image + sigma * random.standard_normal(sigma.shape), measure)[0].position
-                - found.position
-            )[0]
-            for _ in range(300)
-        ]
-    )
-    chi = float(np.einsum("ni,ij,nj->", away, np.linalg.inv(found.covariance[0]), away))
-    # 600 degrees of freedom: standard deviation 34.6, 3.3 of them
-    assert abs(chi - 600.0) < 115.0

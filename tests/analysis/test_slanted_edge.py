@@ -8,7 +8,6 @@ Statistical limits are two-sided chi-square quantiles with a false-alarm rate of
 """
 
 import math
-import re
 from functools import cache
 
 import numpy as np
@@ -147,11 +146,6 @@ def test_perfect_pupil(degrees, size, pitch):
         assert (edge.dark, edge.bright) == pytest.approx((DARK, BRIGHT), abs=levels)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(64, 40), (24, 64), (160, 48), (100, 200)])
-def test_regions_that_are_not_square(rows, columns):
-    assert error_of(measure_edge(edge_image(4, rows, columns)), 4)[0] < 2 * ACCURACY
-
-
 def test_smear_along_the_columns():
     """TDI smear of two pixels: at 10 deg it takes 1% of the MTF at Nyquist of a near-vertical edge."""
     image = edge_image(10, smear=2.0)
@@ -257,22 +251,6 @@ def test_sigma_agrees_with_the_scatter(contrast_e, use_model):
         assert low < np.sum((value - value.mean()) ** 2) / np.mean(sigma**2) < high
     # no sigma at zero frequency, where the normalisation makes 1
     assert all(edge.sigma[0] < 1e-9 for edge in edges)
-
-
-@pytest.mark.second
-def test_the_line_is_that_of_least_squares():
-    """Residuals say nothing more of its offset and slope: in units of what noise alone would make of them, second
-    order and the finer knots of the last spread function are left."""
-    left = []
-    for edge in repeats(4000)[:50]:
-        inside = np.flatnonzero(np.abs(edge.pixel_place) <= edge.core / 4)
-        x, along = edge.pixel_place[inside], inside // 64 - 31.5
-        expected, slope = CubicSpline(edge.place, edge.esf)(x), CubicSpline(edge.place, edge.lsf)(x)
-        share = (expected - edge.dark) / (edge.bright - edge.dark)
-        sigma = np.sqrt((1 - share) * edge.noise_dark**2 + share * edge.noise_bright**2)
-        parts = slope, slope * along
-        left.append([part @ (edge.pixel_grey[inside] - expected) / np.linalg.norm(part * sigma) for part in parts])
-    assert np.all(np.mean(np.square(left), axis=0) < 0.3**2)
 
 
 def test_no_bias_where_the_signal_is_long():
@@ -413,19 +391,6 @@ def ramp(degrees):
 )
 def test_bad_regions_are_explained(image, message):
     refuses(EdgeError, message, measure_edge, image)
-
-
-def test_a_speck_is_named_where_it_is_all_ways_round():
-    def place(image):
-        with pytest.raises(EdgeError) as caught:
-            measure_edge(image)
-        row, column = re.search(r"near its row (\d+), column (\d+) ", str(caught.value)).groups()
-        return int(row), int(column)
-
-    row, column = place(spot())
-    assert place(spot()[:, ::-1]) == (row, 63 - column)
-    assert place(spot().T) == (column, row)
-    assert place(spot().T[::-1]) == (63 - column, row)
 
 
 @pytest.mark.parametrize("turned", [slice(None), slice(None, None, -1)])

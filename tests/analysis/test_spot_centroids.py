@@ -248,21 +248,6 @@ def test_bad_spots_are_named(name, template, before):
     assert "spot 3: " in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["likelihood", "energy", "gauss"])
-@pytest.mark.parametrize("reason", ["no spot", "saturated", "edge"])
-def test_one_bad_spot_among_good_ones_is_named(name, reason, template, before):
-    batch = before[:4].copy()
-    if reason == "no spot":
-        batch[1] = OFFSET + 0.3 * np.random.default_rng(4).standard_normal(SHAPE)
-    elif reason == "saturated":
-        batch[1] = np.minimum(OFFSET + 2 * (batch[1] - OFFSET), 4095.0)
-    else:
-        batch[1] = np.roll(batch[1], -42, axis=0)
-    with pytest.raises(SpotError, match=reason) as caught:
-        measure(name, batch, template)
-    assert caught.value.indices == [1]
-
-
 def test_spot_beyond_the_template_is_named(before):
     narrow = SpotTemplate.from_image(airy(51.7, 51.2, (104, 104)), 51.7, 51.2, SHAPE)
     refuses(SpotError, "larger margin", maximum_likelihood_fit, np.roll(before[:2], 25, axis=1), FRAMES, NOISE, narrow)

@@ -10,7 +10,6 @@ from scipy.optimize import minimize_scalar
 from analysis.focal_plane import through_focus as module
 from analysis.focal_plane.through_focus import FocusError, focus_vertex, focus_vertices
 from tests.analysis.refusals import refuses
-from tests.tiers import quick
 
 FALSE_ALARM = 1e-6
 WAVELENGTH, F_NUMBER = 650e-9, 9.2
@@ -139,25 +138,6 @@ def test_sigma_agrees_with_scatter(frequency, step, half, noise):
     assert stats.chi2.sf(total, freedom) > FALSE_ALARM / 2
 
 
-@pytest.mark.second
-def test_spurious_resolution_is_not_the_peak():
-    """Scans that show several bounces: the main peak is found wherever it lies, with noise, in any order of points."""
-    rng = np.random.default_rng(3)
-    z = steps(40 * UM, -1e-3, 1e-3)
-    focus = rng.uniform(-0.75e-3, 0.75e-3, 40)
-    value = curve(z, focus, PAN, 0.2) + rng.normal(0, 0.006, (40, z.size))
-    order = rng.permutation(z.size)
-    found = focus_vertices(z[order], value[:, order], 0.006)
-    # six sigma: 1e-7 over the 40
-    assert np.all(np.abs(found.position - focus) < 6 * found.sigma)
-    assert found.sigma.max() < 10 * UM
-    assert np.all(found.used.sum(axis=1) <= 10)
-    assert np.array_equal(found.position, focus_vertices(z, value, 0.006).position)
-    for k in (0, 7):
-        taken = np.sort(z[order][found.used[k]])
-        assert np.all(np.diff(taken) < 41 * UM)  # one run of neighbours
-
-
 def test_the_best_measured_points_are_not_the_peak():
     """Ten times the precision beyond the dark zeros, where the contrast is a tenth: sigmas tell values, not heights."""
     z = steps(25 * UM, -0.6e-3, 0.6e-3)
@@ -265,22 +245,6 @@ def test_three_faults_are_told_and_more_are_counted(count, rest):
     assert str(caught.value).count("no curvature above the noise") == 3
     assert str(caught.value).split("; and ")[1:] == rest
     assert list(caught.value.faults) == [(k,) for k in range(count)]
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("unit", quick(1, [1e6, 1e3]))
-def test_the_unit_of_length_does_not_matter(unit):
-    """Metres, millimetres, micrometres: the same vertices and the same faults, of clear and of faint curves."""
-    z = steps(50 * UM, -0.6e-3, 0.6e-3)
-    noise = np.random.default_rng(4).normal(0, 0.02, (200, z.size))
-    value = curve(z, np.linspace(-0.7e-3, 0.7e-3, 200), PAN, 0.2) + noise
-    metres = focus_vertices(z, value, 0.02, strict=False)
-    other = focus_vertices(unit * z, value, 0.02, strict=False)
-    assert np.array_equal(other.fault, metres.fault)
-    assert np.array_equal(other.used, metres.used)
-    assert 20 < np.sum(metres.fault == "") < 180
-    for name, power in (("position", 1), ("sigma", 1), ("peak", 0), ("peak_sigma", 0), ("curvature", -2)):
-        assert getattr(other, name) == pytest.approx(unit**power * getattr(metres, name), rel=1e-9, nan_ok=True), name
 
 
 @pytest.mark.parametrize(

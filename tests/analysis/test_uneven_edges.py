@@ -4,20 +4,16 @@ The image is the error function of the distance to the curve, found by Newton's 
 Gauss-Legendre quadrature: no oversampled grid, no straight line and nothing of the program.
 """
 
-import json
 import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 from scipy import stats
 from scipy.special import erf
-from typer.testing import CliRunner
 
 from analysis.images.image_file import ImageFile, Region
-from analysis.mtf.__main__ import app
 from analysis.mtf.bar_mtf import measure_bars, page_warnings
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
@@ -184,20 +180,6 @@ def test_a_photograph_against_sfrmat5(name):
     # 0.01: what levels cost at low frequencies and its bins of a quarter of a pixel at high ones
     np.testing.assert_allclose(value, other, atol=0.01)
     assert "does not explain" in found.doubt
-
-
-def test_the_command_says_what_it_sees(tmp_path):
-    image = edge(64, 64, 5, 0.6, (0.0, 0.4), lambda row, column: 1.0 - 0.03 * column**2)
-    image = noisy(image, 0.3, np.random.default_rng(4))
-    tifffile.imwrite(tmp_path / "edge.tif", image)
-    options = [str(tmp_path / "edge.tif"), "--roi", "0,0,64,64", "--pitch", "7 um"]
-    data = json.loads(CliRunner().invoke(app, [*options, "--json"]).stdout)
-    assert data["order"] == 2
-    assert "does not explain" in data["warnings"][0]
-    assert data["bright_change_across_dn_sigma"] > 0.0
-    printed = CliRunner().invoke(app, options).output
-    assert "order 2" in printed
-    assert "light: bright level changes by" in printed
 
 
 def bars(light, where, seed=0):
