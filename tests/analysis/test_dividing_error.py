@@ -23,7 +23,6 @@ from analysis.turntable.dividing_error import (
 from tests.analysis.refusals import refuses
 
 ARCSEC = math.pi / 648000
-FALSE_ALARM = 1e-4
 ANGLE = np.radians(np.linspace(92.0, 112.0, 41))
 
 

@@ -114,55 +114,38 @@ def test_noise_of_angles_acts_through_the_slope():
 
 
 def common_noise():
-    """Covariance of the angles: zero, scale and a subdivision error of 0.2", and 0.04" from reading to reading.
-
-    Returns angle covariance (rad^2) and that of positions for an ideal camera with spots known to 0.3 um (m^2).
-    """
+    """Covariance of the angles: zero, scale and a subdivision error of 0.2", and 0.04" from reading to reading."""
     turn = GF7 / EDGE
     shapes = np.stack([np.ones(55), turn, np.sin(2 * np.pi * 3.3 * turn), np.cos(2 * np.pi * 3.3 * turn)])
     sizes = np.array([0.1, 0.15, 0.2, 0.2]) * ARCSEC
-    angles = (shapes.T * sizes**2) @ shapes + np.eye(55) * (0.04 * ARCSEC) ** 2
-    rate = F / np.cos(GF7) ** 2
-    return angles, rate[:, None] * angles * rate + np.eye(55) * (0.3 * UM) ** 2
+    return (shapes.T * sizes**2) @ shapes + np.eye(55) * (0.04 * ARCSEC) ** 2
 
 
-@pytest.fixture(scope="module")
-def simulated():
-    """400 tests: the *angles* err, by common errors; truth as used, and fits."""
-    angles, _ = common_noise()
-    rng = np.random.default_rng(20)
-    read = GF7 + rng.multivariate_normal(np.zeros(55), angles, 400)
-    position = line_image(GF7, constant=1e-6, point=1e-3, radial3=-0.8) + rng.standard_normal((400, 55)) * 0.3 * UM
+def test_scatter_agrees_with_sigmas():
+    """Noise of the angles that many points share: its covariance and that of the residuals by dense
+    matrices, the slope of the angles' noise by a complex step; chi-squares of 200 draws at 1e-6."""
+    angles = common_noise()
+    rng, total, fit = np.random.default_rng(20), 0.0, 0.0
     truth = np.array([1e-6, F, 1e-3, -0.8])
-    return truth, [
-        fit_interior_orientation(position[k], read[k], 0.3 * UM, TERMS, angle_covariance=angles) for k in range(400)
-    ]
-
-
-def test_scatter_agrees_with_sigmas(simulated):
-    """Each parameter's chi-square over 400 tests, all parameters together, and the chi-square that the fit states.
-
-    Two-sided false-alarm rate 1e-6 each. The error of tan W itself (attenuation) shifts f by
-    f (0.2" / 0.7 deg)^2 = 0.03 um, 2e-4 of its sigma.
-    """
-    truth, fits = simulated
-    errors = np.array([one.values - truth for one in fits])
-    sigmas = np.array([[one.sigma(term) for term in TERMS] for one in fits])
-    for k, term in enumerate(TERMS):
-        assert in_range(np.sum((errors[:, k] / sigmas[:, k]) ** 2), 400), term
-        assert abs(np.sum(errors[:, k] / sigmas[:, k])) < stats.norm.isf(FALSE_ALARM / 2) * np.sqrt(400), term
-    joint = sum(e @ np.linalg.solve(one.covariance, e) for e, one in zip(errors, fits, strict=True))
-    assert in_range(joint, 400 * 4)
-    assert in_range(sum(one.chi_square for one in fits), 400 * 51)
-
-
-def test_residuals_have_the_stated_covariance(simulated):
-    """A quadratic form with the pseudo-inverse, of rank N - P."""
-    _, fits = simulated
-    residual = sum(
-        one.residual @ np.linalg.pinv(one.residual_covariance, rcond=1e-9) @ one.residual for one in fits[:100]
-    )
-    assert in_range(residual, 100 * 51)
+    for _ in range(200):
+        read = GF7 + rng.multivariate_normal(np.zeros(55), angles)
+        position = line_image(GF7, constant=1e-6, point=1e-3, radial3=-0.8) + rng.standard_normal(55) * 0.3 * UM
+        found = fit_interior_orientation(position, read, 0.3 * UM, TERMS, angle_covariance=angles)
+        error = found.values - truth
+        total, fit = total + error @ np.linalg.solve(found.covariance, error), fit + found.chi_square
+    assert in_range(total, 800)
+    assert in_range(fit, 200 * 51)
+    t, (constant, f, point, radial3) = np.tan(read), found.values
+    rate = line_image(read + 1e-30j, f, constant, point, radial3).imag / 1e-30
+    spread = rate[:, None] * angles * rate + np.eye(55) * (0.3 * UM) ** 2
+    columns = np.column_stack([np.ones(55), t, -(t**2), t**3])
+    # equal weights, as the points' own noise has them, and all noise in the covariance
+    gain = np.linalg.pinv(columns)
+    known = gain @ spread @ gain.T
+    scale = np.sqrt(np.outer(*2 * [np.diag(known)]))
+    assert found.covariance / scale == pytest.approx(known / scale, abs=1e-6)
+    rest = (np.eye(55) - columns @ gain) @ spread @ (np.eye(55) - columns @ gain).T
+    assert found.residual_covariance == pytest.approx(rest, abs=1e-6 * rest.max())
 
 
 # ---- the principal point

@@ -58,23 +58,6 @@ def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
     assert np.all(np.isnan(fits.place[5:]))
 
 
-@pytest.mark.second
-def test_as_many_steps_as_were_counted_are_enough(clean, templates):
-    """Each limit refuses the fits that need more. Where the smoothing is chosen anew the steps begin anew, too, and the
-    limit holds for either."""
-    free = least_squares(clean, templates[:32], started()[:32])
-    needed = np.zeros(32, int)
-    for limit in range(1, int(free.iterations.max()) + 1):
-        fits = least_squares(clean, templates[:32], started()[:32], MatchOptions(iterations=limit))
-        rests = fits.reason == Reason.ACCEPTED
-        assert np.all(rests | (fits.reason == Reason.DIVERGED))
-        assert np.array_equal(fits.place[rests], free.place[rests])
-        needed[rests & (needed == 0)] = limit
-    assert needed.min() > 0
-    assert np.all((needed <= free.iterations) & (free.iterations <= 2 * needed))
-    assert np.mean(needed == free.iterations) > 0.3
-
-
 def test_affine_change_without_noise(texture, templates):
     matrix = np.array([[1.03, 0.02], [-0.04, 0.98]])
     shift = np.array([12.3, 20.7])

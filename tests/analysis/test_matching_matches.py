@@ -193,20 +193,6 @@ def test_second_peaks_count_from_four_pixels_on():
     assert _second(corner, 0, 1) == 0.0
 
 
-def test_missing_pixels_have_no_points_around_them_and_leave_the_others(frame, points):
-    """A tenth of the image missing in one block: the best points elsewhere stay, but for cells at its rim."""
-    holed = frame.astype(float)
-    holed[300:550, 200:450] = np.nan
-    found = distinct_points(holed, 500, spacing=12, border=60)
-    away = np.maximum(np.abs(found[:, 0] - 424.5), np.abs(found[:, 1] - 324.5)) - 125
-    assert away.min() > 0
-    assert len(found) == 500
-    strongest = distinct_points(frame, 100, spacing=12, border=60)
-    outside = np.maximum(np.abs(strongest[:, 0] - 424.5), np.abs(strongest[:, 1] - 324.5)) > 145
-    same = (strongest[outside, None] == distinct_points(holed, 100, spacing=12, border=60)).all(axis=2).any(axis=1)
-    assert same.mean() > 0.9
-
-
 def test_thresholds_are_options(texture, frame, points):
     patches = texture.patches(points[:30])
     strict = match(frame, patches, points[:30], reach=5, options=MatchOptions(largest_sigma=0.005))

@@ -7,7 +7,6 @@ from analysis.monitor.model_fit import RankError, gain, observability
 from analysis.monitor.monitoring import CameraParameters
 from tests.analysis.refusals import refuses
 
-FALSE_ALARM = 1e-6
 NAMES = ["shift x", "shift y", "turn z", "scale"]
 # px per metre, metre, radian, unit scale: entries of very different size, as in life
 SPOTS = np.array(

@@ -11,9 +11,6 @@ from analysis.orbit.resection import ObservedLine, ResectionError, resect
 from tests.analysis.refusals import refuses
 from tests.analysis.test_planes import ARCSEC, DEG, LINES, LOOK, SCENE, descending_pass, noisy, rotation
 
-FALSE_ALARM = 1e-6
-
-
 PAIRS = (("forward", "nadir"), ("nadir", "backward"))
 NAMES = ("roll", "pitch", "yaw", "forward look", "backward look")
 

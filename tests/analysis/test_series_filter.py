@@ -182,20 +182,6 @@ def test_no_jump_is_told_where_none_is() -> None:
         assert not follow(SeriesFilter(told, life_s=30.0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), []).jumps
 
 
-def test_more_readings_never_hurt() -> None:
-    """Of what is at work at all times: every further reading, of spots or of a parameter, leaves no sigma larger."""
-    told, (times, shifts) = stated(LAWS[:6]), series(12, 1.0)
-    how = SeriesFilter(told, window=0, parameters_read=True)
-    read = of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS))
-    row = np.eye(PARAMETERS)[:1]
-    one = Observed(30.0, np.array([1e-6]), np.array([[1e-14]]), parameters=row)
-    more = sorted([*read, one], key=lambda each: each.time)
-    few, many = (follow(how, which, times).smoothed.total for which in (read, more))
-    gained = np.linalg.eigvalsh((few - many) / 1e-12)
-    assert gained.min() > -1e-8
-    assert gained.max() > 1e-3
-
-
 def heated(sigma: float) -> tuple[Disturbances, HeatInputs]:
     """Two bodies that wander in temperature, with a sensor each, beside a mount that drifts."""
     told = stated((TimeLaw(drift_s=30.0), TimeLaw(drift_s=200.0)), seed=9, each=2)

@@ -5,7 +5,6 @@ statistics of rounding, and the coupling of focus and line level through an incl
 import cv2
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from analysis.focal_plane import shims
@@ -13,7 +12,6 @@ from analysis.focal_plane.plane_fit import LineLevel, RigidMotion, fit_focal_pla
 from analysis.focal_plane.shims import Mount, ShimError
 from tests.analysis.refusals import refuses
 
-FALSE_ALARM = 1e-6
 ARCMIN, DEG = np.pi / 10800, np.pi / 180
 UM, MM = 1e-6, 1e-3
 STEP = 10 * UM
@@ -80,25 +78,6 @@ def test_exact_shims_reproduce_the_wanted_motion(angle, azimuth, count):
         assert fine.achieved.shift == pytest.approx(wanted.shift, abs=1e-14)
 
 
-def test_three_pads_carry_the_plane_that_is_wanted():
-    """From the thicknesses alone: the plane over three pads against the rotated mounting surface.
-
-    The pads stay where they are while the body slides over them by less than 1 mm, a few thousandths of the pads'
-    distance, so the tilt agrees to 1% of itself.
-    """
-    rng = np.random.default_rng(2)
-    mount = make_mount(20 * DEG, 0, 3)
-    for _ in range(20):
-        wanted = random_correction(rng)
-        plan = shim_plan(wanted, mount)
-        top = mount.holes + np.outer(plan.change, mount.normal)
-        normal = np.cross(top[1] - top[0], top[2] - top[0])
-        normal /= np.linalg.norm(normal) * np.sign(normal @ mount.normal)
-        expected = rotation(wanted.rotation) @ mount.normal
-        tilt = np.linalg.norm(expected - mount.normal)
-        assert np.linalg.norm(normal - expected) < 0.01 * max(tilt, 1 * ARCMIN)
-
-
 def test_thickness_signs():
     """A thicker shim lifts along +n; a tilt about +X' lifts the +Y' side."""
     mount = make_mount()
@@ -158,39 +137,6 @@ def test_level_turn_is_made_by_hand():
     assert piston.change == pytest.approx(np.full(4, 0.3 * MM * np.cos(20 * DEG)), rel=1e-12)
 
 
-@pytest.mark.second
-def test_rounding_statistics():
-    """500 random motions: errors of the thickness uniform within half a step (variance step^2/12), and the motion that
-    rounding leaves as these errors propagate by hand to a body on four pads.
-    """
-    rng = np.random.default_rng(6)
-    mount = make_mount(count=4)
-    plans = [shim_plan(random_correction(rng), mount) for _ in range(500)]
-    error = np.array([p.rounded_change - p.change for p in plans])
-    assert np.abs(error).max() <= 0.5 * STEP * (1 + 1e-9)
-    assert stats.kstest((error / STEP + 0.5).ravel(), "uniform").pvalue > FALSE_ALARM
-    # variance of the square of a uniform error: step^4 (1/80 - 1/144) = step^4 / 180
-    z = (np.mean(error**2) - STEP**2 / 12) / (STEP**2 / np.sqrt(180 * error.size))
-    assert abs(z) < stats.norm.isf(FALSE_ALARM / 2)
-    # least squares by hand, flat mount, pads symmetric about O': three independent means over the pads; the wanted turn
-    # of up to 5' moves the pads by some 0.4% of the narrower half width, hence 1% of the largest
-    x, y = mount.holes[0, :2]
-    *tilt, piston = np.array([rounding(p) for p in plans]).T
-    tilt = np.column_stack(tilt)
-    assert tilt[:, 0] == pytest.approx(error @ mount.holes[:, 1] / (4 * y**2), abs=0.01 * STEP / 2 / abs(y))
-    assert tilt[:, 1] == pytest.approx(-error @ mount.holes[:, 0] / (4 * x**2), abs=0.01 * STEP / 2 / abs(x))
-    assert piston == pytest.approx(error.mean(axis=1), abs=0.01 * STEP / 2)
-    predicted = np.array([STEP / np.sqrt(12 * 4) / abs(y), STEP / np.sqrt(12 * 4) / abs(x), STEP / np.sqrt(12 * 4)])
-    # means of four uniform errors are nearly normal (kurtosis -0.3): the variance of 500 has a sigma of 6%
-    ratio = np.array([tilt[:, 0].std(), tilt[:, 1].std(), piston.std()]) / predicted
-    assert ratio == pytest.approx(np.ones(3), abs=5 * 0.5 * 0.063)
-    # the focal plane: z of the CCD where it was wanted minus where it is
-    place = np.array([[0.0, 0.0], [0.0, 0.115], [0.01, -0.115]])
-    left = np.array([p.focus_error(place) for p in plans])
-    by_hand = -(piston[:, None] + tilt[:, :1] * place[:, 1] - tilt[:, 1:2] * place[:, 0])
-    assert left == pytest.approx(by_hand, abs=0.01 * STEP / 2)
-
-
 def test_three_pads_are_met_exactly_after_rounding():
     rng = np.random.default_rng(7)
     mount = make_mount(20 * DEG, 30 * DEG, 3)
@@ -204,25 +150,21 @@ def test_three_pads_are_met_exactly_after_rounding():
 
 
 def test_covariance_of_the_thickness():
-    """Scatter of the changes over 500 noisy plane fits against the predicted covariance."""
-    rng = np.random.default_rng(9)
+    """Propagated by differences from the fitted plane and the level of the line."""
     place = np.array([(x, y) for x in (-10 * MM, 0, 10 * MM) for y in np.linspace(-115, 115, 5) * MM])
+    mount, theodolite = make_mount(20 * DEG, count=3), 5 * UM * np.sqrt(2) / 0.23
     sigma = np.linspace(3, 8, 15) * UM
-    mount = make_mount(20 * DEG, count=3)
-    theodolite = 5 * UM * np.sqrt(2) / 0.23
-    exact = 0.1 * MM + place @ [1e-3, -5e-4]
-    changes, expected = [], None
-    for _ in range(500):
-        fit = fit_focal_plane(place, exact + sigma * rng.standard_normal(15), sigma)
-        level = LineLevel(theodolite * rng.standard_normal(), theodolite)
-        plan = shim_plan(fit.correction(level), mount)
-        changes.append(plan.change)
-        expected = plan.change_covariance
-    centre = shim_plan(fit_focal_plane(place, exact, sigma).correction(), mount).change
-    error = np.array(changes) - centre
-    statistic = np.einsum("ni,ij,nj->", error, np.linalg.inv(expected), error)
-    assert FALSE_ALARM / 2 < stats.chi2.sf(statistic, 1500) < 1 - FALSE_ALARM / 2
-    assert plan.change_sigma == pytest.approx(np.sqrt(np.diag(expected)))
+
+    def plan(extra=0.0, level=0.0):
+        fit = fit_focal_plane(place, 0.1 * MM + place @ [1e-3, -5e-4] + extra, sigma)
+        return shim_plan(fit.correction(LineLevel(level, theodolite)), mount)
+
+    steps = [0.5 * (plan(d).change - plan(-d).change) for d in np.diag(sigma)]
+    steps.append(0.5 * (plan(level=theodolite).change - plan(level=-theodolite).change))
+    expected = np.array(steps).T @ np.array(steps)
+    # first order: slopes of 1e-3 times a few
+    assert plan().change_covariance == pytest.approx(expected, rel=6e-3)
+    assert plan().change_sigma == pytest.approx(np.sqrt(np.diag(expected)), rel=3e-3)
 
 
 def test_present_shims():

@@ -86,33 +86,6 @@ def test_corrections_take_the_errors_out_of_other_rays():
     refuses(CalibrationError, "no times", found.corrected, replace(rays["backward"], time=None))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("noise", "least", "most"), [(WHITE, 0.02, 0.15), (SLOW, 0.2, 0.9)])
-def test_gain_in_height_is_large_for_slow_errors_only(noise, least, most):
-    """The gain that the covariances predict, and the one that is met over five passes.
-
-    White readings of 0.5 arcsec and 0.3 px: almost all of the error is what all rays of a place have in common. Errors
-    of a place are common to its neighbours, within one reading (480 in five passes) or one slow error (10): 4 sigmas.
-    """
-    rng, view = np.random.default_rng(4), strip(4, 450, 12.0)
-    squares, expected = [], []
-    up = view.points / np.linalg.norm(view.points, axis=1, keepdims=True)
-    for _ in range(5):
-        rays = make_rays(view, rng, noise)
-        before, after = alone(rays, noise), adjusted(rays, noise)
-        squares.append([check_errors(g.ground, view.points).height_rms ** 2 for g in (before, after)])
-        heights = [np.einsum("ni,nij,nj->n", up, g.covariance, up).mean() for g in (before, after)]
-        expected.append(heights)
-    ratio = np.sqrt(np.mean(squares, axis=0)[1] / np.mean(squares, axis=0)[0])
-    predicted = np.sqrt(np.mean(expected, axis=0)[1] / np.mean(expected, axis=0)[0])
-    assert 1 - most < predicted < 1 - least
-    independent = 480 if noise is WHITE else 10
-    assert np.sqrt(np.mean(squares, axis=0)) == pytest.approx(
-        np.sqrt(np.mean(expected, axis=0)), rel=4 * np.sqrt(0.5 / independent)
-    )
-    assert ratio < 1.0
-
-
 @pytest.mark.second
 def test_the_datum_keeps_its_prior():
     """A common roll is left to the prior to some per cent, ends of the pass apart; a common pitch is told."""

@@ -52,23 +52,6 @@ def steps(step, low, high):
     return np.arange(round(low / step), round(high / step) + 1) * step
 
 
-def test_curves_of_the_tests_are_physical():
-    """In focus the closed form of the diffraction MTF; the pan curve's first zero and its bounce beyond."""
-    for frequency in (PAN, MS):
-        s = frequency * WAVELENGTH * F_NUMBER
-        exact = 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
-        # Gauss quadrature on a kink at the middle of the overlap: 48 nodes reach 1e-4
-        assert through_focus(0.0, frequency) == pytest.approx(exact, abs=2e-4)
-    z = np.linspace(0, 0.6e-3, 601)
-    pan = through_focus(z, PAN)
-    dark = int(np.argmax(pan < 0.01 * pan[0]))
-    assert 0.25e-3 < z[dark] < 0.32e-3
-    assert pan[dark:].max() > 0.08 * pan[0]
-    # geometrical blur disc: first zero of 2 J1(x)/x at defocus 1.22 F / frequency; diffraction adds to it
-    wide = through_focus(np.linspace(0, 1e-3, 501), MS)
-    assert 1.22 * F_NUMBER / MS < np.linspace(0, 1e-3, 501)[np.argmin(wide)] < 1.3 * 1.22 * F_NUMBER / MS
-
-
 @pytest.mark.parametrize(
     ("frequency", "step", "low", "high", "middle", "lobe_um", "parabola_um"),
     [
@@ -238,15 +221,6 @@ def test_other_faults():
     assert np.isfinite(told.position[[0, 2]]).all()
 
 
-@pytest.mark.parametrize(("count", "rest"), [(3, []), (5, ["2 more"])])
-def test_three_faults_are_told_and_more_are_counted(count, rest):
-    with pytest.raises(FocusError) as caught:
-        focus_vertices(np.linspace(-1e-3, 1e-3, 25), np.full((count, 25), 0.2), 0.01)
-    assert str(caught.value).count("no curvature above the noise") == 3
-    assert str(caught.value).split("; and ")[1:] == rest
-    assert list(caught.value.faults) == [(k,) for k in range(count)]
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -259,13 +233,3 @@ def test_three_faults_are_told_and_more_are_counted(count, rest):
 def test_bad_arguments(change, message):
     given = {"position": np.linspace(-1, 1, 9), "value": np.ones(9), "sigma": 0.1} | change
     refuses(ValueError, message, focus_vertex, **given)
-
-
-def test_the_unit_of_the_mtf_does_not_matter():
-    """Weights are 1/sigma^2: of an MTF in units of 1e-4 they are far below one, and count as much."""
-    z = steps(50 * UM, -0.6e-3, 0.6e-3)
-    value = curve(z, [30 * UM], PAN, 0.2)[0] + np.random.default_rng(3).normal(0, 0.004, z.size)
-    one, other = focus_vertex(z, value, 0.004), focus_vertex(z, 1e4 * value, 40.0)
-    np.testing.assert_array_equal(one.used, other.used)
-    assert other.position == pytest.approx(one.position, abs=1e-9 * 1e-3)
-    assert other.sigma == pytest.approx(one.sigma, rel=1e-6)

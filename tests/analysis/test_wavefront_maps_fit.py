@@ -11,7 +11,6 @@ from analysis.wavefront_maps.map_files import read_map
 from analysis.wavefront_maps.pupil_fit import Pupil, find_pupil, fit_map
 from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
 from analysis.wavefront_maps.zernike_terms import annular_terms, circle_terms
-from optics.waves.wavefront import fit_part, orthonormal_parts
 from tests.analysis.refusals import refuses
 from tests.analysis.wavefront_files import real_file
 from tests.tiers import quick
@@ -78,29 +77,6 @@ def test_coefficients_come_back_exactly(light):
     assert found.points == np.count_nonzero(lit)
     assert found.beyond == 0
     assert found.residual_rms < 1e-20
-
-
-def test_parts_are_those_of_the_traced_wavefront():
-    """The same numbers as the fit of traced wavefronts over a part of the disk."""
-    x, y = disk(70, 34.0, 35.0, 31.0)
-    lit = LIGHT["cut"](x, y)
-    values = np.where(lit, 1e-7 * (np.sin(3.0 * x) + x * y**2), np.nan)
-    found = fit_map(map_of(values), range(1, 12), Pupil(34.0, 35.0, 31.0))
-    weight = np.ones(np.count_nonzero(lit))
-    parts = orthonormal_parts(x[lit], y[lit], weight, values[lit], 11)
-    np.testing.assert_allclose(found.parts, parts, rtol=0, atol=1e-20)
-    np.testing.assert_allclose(
-        found.coefficients,
-        fit_part(x[lit], y[lit], weight, values[lit], 11).coefficients + _plane(x[lit], y[lit], values[lit]),
-        rtol=0,
-        atol=1e-18,
-    )
-
-
-def _plane(x: np.ndarray, y: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Piston and tilt by themselves, which ``fit_part`` takes out first."""
-    level, *_ = np.linalg.lstsq(circle_terms([1, 2, 3], x, y), values, rcond=None)
-    return np.concatenate([level, np.zeros(8)])
 
 
 def test_over_a_ring_parts_are_mahajans_coefficients():
