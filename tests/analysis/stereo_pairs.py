@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
-from sklearn.datasets import load_sample_image
 
 from analysis.matching.correlation import search
 from analysis.matching.matches import Matches, MatchOptions, match, resampled
@@ -54,30 +53,6 @@ def textured(side, *, slope=1.0, noise=0.1, relief=0.0, length=12.0, radiometry=
         noise,
         _relief(size, relief, length, seed),
         radiometry,
-        seed,
-    )
-
-
-def photographed(*, noise=0.0, relief=1.0, step=0.0, seed=0) -> Pair:
-    """A photograph of a palace by the water (427 x 640, grey values 0 to 255), points where it is distinct or not.
-
-    step: px by which what lies right of every second stretch of 120 columns is nearer, with an edge of depth.
-    """
-    grey = load_sample_image("china.jpg").astype(float) @ [0.299, 0.587, 0.114]
-    # what an exact resampling takes: detail below the sampling limit
-    surface = ndimage.spline_filter(ndimage.gaussian_filter(grey, 0.7), 5)
-    smooth = _relief(380, relief, 12.0, seed)
-
-    def disparity(row, column):
-        return smooth(row, column) + step * (np.floor(column / 120.0) % 2)
-
-    return _pair(
-        lambda row, column: _at(surface, row + 24.0, column + 120.0),
-        380,
-        lattice(12, 30, 25, seed + 3),
-        noise,
-        disparity,
-        "same",
         seed,
     )
 

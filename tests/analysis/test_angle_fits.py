@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import minimize
-from scipy.stats import chi2
 
 from analysis.turntable import angle_network
 from analysis.turntable.angle_fits import FITS, GAP_ORDER, angles_left, cross_validate, fewest, fit
@@ -19,7 +18,6 @@ from analysis.turntable.dividing_error import CalibrationSeries, choose
 from tests.analysis.refusals import refuses
 
 LINEAR = tuple(name for name in FITS if name != "network")
-FALSE_ALARM = 1e-4
 ANGLE = np.radians(np.linspace(92.0, 112.0, 41))
 BETWEEN = np.radians(np.random.default_rng(7).uniform(92.0, 112.0, 60))
 
@@ -155,17 +153,14 @@ def test_cross_validation_does_not_see_what_it_predicts(name: str) -> None:
         assert changed.residual[i - 1] - plain.residual[i - 1] == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.second
 def test_cross_validation_states_its_noise() -> None:
-    """Residuals of straight lines through points of a straight line are noise alone; one residual of each of 300."""
-    squares = 0.0
+    """Of a value and of what a fit without it predicts there, by the fit's weights."""
     sigma = np.where(np.arange(41) % 3 == 0, 0.2, 0.1)
-    for seed in range(300):
-        value = np.degrees(ANGLE) + sigma * np.random.default_rng(seed).standard_normal(41)
-        checked = cross_validate("piecewise_linear", ANGLE, value, sigma)
-        squares += checked.residual[20] ** 2 / checked.variance[20]
-    low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], 300)
-    assert low < squares < high
+    checked = cross_validate("piecewise_linear", ANGLE, wave(ANGLE), sigma)
+    for i in (1, 20, 39):
+        others = np.arange(41) != i
+        weight = fit("piecewise_linear", ANGLE[others], wave(ANGLE[others]), sigma[others]).weights(ANGLE[i : i + 1])[0]
+        assert checked.variance[i - 1] == pytest.approx(sigma[i] ** 2 + weight**2 @ sigma[others] ** 2, rel=1e-9)
 
 
 def test_cross_validation_excess_is_the_misfit() -> None:

@@ -78,25 +78,18 @@ def test_exact_data_and_readings_return_everything():
 def test_what_the_monitor_does_not_tell_is_named():
     drift = drifts(np.random.default_rng(2), 2)
     fields = [measured(view(i, d), name=f"F{i}") for i, d in enumerate(drift)]
-    with pytest.raises(RankError) as caught:
+    with pytest.raises(RankError, match=r"(?s)d_f [+-].*arcsec|arcsec.*d_f [+-]") as caught:
         adjust(fields, LABORATORY, NOISE, unknowns=DRIFTS, gauge=HOLD_XY)
-    together = [set(c.names) for c in caught.value.open]
-    named = set().union(*together)
+    named = set().union(*(c.names for c in caught.value.open))
     for line in LINES:  # drift of both fields against the interior
         assert {f"{line} f", f"F0 {line} d_f", f"F1 {line} d_f"} <= named
-        assert any({f"F0 {line} d_f", f"{line} f"} <= c or {f"F1 {line} d_f", f"{line} f"} <= c for c in together)
     for field in ("F0", "F1"):  # drift of all lines against the bias
-        assert {f"{field} {line} d_alpha" for line in LINES} | {f"{field} pitch"} <= named
-        assert {f"{field} {line} d_beta" for line in LINES} | {f"{field} roll"} <= named
-    text = str(caught.value)
-    assert "d_alpha" in text
-    assert "arcsec" in text
-    assert "d_f +" in text or "d_f -" in text
+        assert {f"{field} {line} {n}" for line in LINES for n in ("d_alpha", "d_beta")} <= named
+        assert {f"{field} pitch", f"{field} roll"} <= named
     # a monitor on two lines only: the third one's drift stays open against bias and interior
     some = [p for p in told(drift) if not any("nadir" in n for n in p.weights)]
-    with pytest.raises(RankError) as caught:
+    with pytest.raises(RankError, match="nadir d_f"):
         solve(fields, unknowns=DRIFTS, priors=some)
-    assert any("nadir d_f" in n for c in caught.value.open for n in c.names)
 
 
 def test_a_drift_of_the_bias_goes_into_the_outer_lines_unless_it_is_told():

@@ -149,21 +149,6 @@ def test_points_are_distinct_and_spread(texture, frame, points):
     refuses(ValueError, "leaves nothing", distinct_points, frame, 5, spacing=5, border=400)
 
 
-def test_strong_texture_takes_no_points_from_the_weak(texture):
-    """A third of the image with four times the contrast, four of twelve columns of cells: it has a third of the points,
-    but for cells that a stronger neighbour leaves empty. First comes one of each cell, then a second one.
-    """
-    strong = np.arange(400) < 140
-    grey = texture.grid(np.arange(400), np.arange(400))
-    image = detected(np.where(strong, 800 + 4 * (grey - 800), grey).clip(0), 2)
-    points = distinct_points(image, 144, spacing=8, border=20)
-    cells = np.unique((points - 20) // 30, axis=0, return_inverse=True)[1]
-    occupied = int(cells.max()) + 1
-    assert 0.95 * 144 < occupied <= len(points) == 144
-    assert np.array_equal(np.sort(cells[:occupied]), np.arange(occupied))
-    assert (points[:, 1] < 140).sum() == pytest.approx(48, abs=144 - occupied)
-
-
 def test_points_apart_are_those_of_all_pairs():
     """One after the other, each kept unless one that was kept before lies within the reach along both axes."""
     place = np.random.default_rng(5).integers(0, 60, (400, 2))

@@ -164,14 +164,3 @@ def test_bad_input():
     for offset in (np.zeros(2), np.zeros((3, 3)), [np.nan, 0.0, 0.0]):
         refuses(ResectionError, "offset", ObservedLine.of, lines["nadir"].strip, SCENE.tangents["nadir"], offset=offset)
     refuses(ResectionError, "sigma", ObservedLine.of, lines["nadir"].strip, SCENE.tangents["nadir"], -1.0)
-
-
-def test_the_unit_of_length_does_not_matter():
-    """Points less than one unit of length ahead of the camera are in front of it as well."""
-    unit = 1e6
-    small = {
-        name: replace(line, strip=Strip.of(line.strip.points / unit, 1.5 / unit))
-        for name, line in observed(SCENE).items()
-    }
-    result = resect(Station.of(np.asarray(SCENE.station) / unit), small)
-    assert np.abs(result.angles(PAIRS) - LOOK).max() < 1e-7 * ARCSEC

@@ -174,14 +174,6 @@ def test_a_jump_is_told_and_counts_as_if_it_had_been_known() -> None:
     assert np.allclose(found.filtered.total[after], known.filtered.total[after], rtol=1e-6)
 
 
-@pytest.mark.second
-def test_no_jump_is_told_where_none_is() -> None:
-    """40 series of 30 readings at a chance of one in a thousand each."""
-    for seed in range(40):
-        told, times, shifts = jumped(0.0, seed)
-        assert not follow(SeriesFilter(told, life_s=30.0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), []).jumps
-
-
 def heated(sigma: float) -> tuple[Disturbances, HeatInputs]:
     """Two bodies that wander in temperature, with a sensor each, beside a mount that drifts."""
     told = stated((TimeLaw(drift_s=30.0), TimeLaw(drift_s=200.0)), seed=9, each=2)

@@ -150,12 +150,6 @@ def test_frequencies_along_the_axis_are_lower_by_the_cosine():
     np.testing.assert_allclose(edge.frequency_along_axis / edge.frequency.clip(1e-9), [0] + [math.cos(edge.angle)] * 64)
 
 
-def test_levels_and_scale_do_not_matter():
-    image = edge_image(6)
-    edge, other = measure_edge(image), measure_edge(1e-3 * image - 7.0)
-    np.testing.assert_allclose(other.mtf, edge.mtf, atol=1e-9)
-
-
 def test_spread_functions():
     edge = measure_edge(edge_image(5))
     truth = edge_spread(math.radians(5), 6 + math.ceil(64 / math.sqrt(2)), PAN, 0.0)

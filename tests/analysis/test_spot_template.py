@@ -62,19 +62,6 @@ def test_returns_the_calibration_image_and_moves_down_for_a_larger_row():
     assert np.unravel_index(value[0].argmax(), (48, 48)) == (30, 20)
 
 
-def test_stack_keeps_each_shape():
-    one = SpotTemplate.from_image(airy(40, 40, (80, 80)), 40, 40, (48, 48))
-    two = SpotTemplate.from_image(airy(40, 40, (80, 80), 9.0), 40, 40, (48, 48))
-    both = SpotTemplate.stack([one, two])
-    place = np.array([23.4, 25.1, 22.2])
-    value, _, _ = both.evaluate(place, place)
-    assert np.allclose(value[0], one.evaluate(23.4, 23.4)[0][0], rtol=0, atol=1e-15)
-    assert np.allclose(value[1], two.evaluate(25.1, 25.1)[0][0], rtol=0, atol=1e-15)
-    assert np.allclose(value[2], one.evaluate(22.2, 22.2)[0][0], rtol=0, atol=1e-15)
-    chosen, _, _ = both.evaluate([25.1], [25.1], np.array([1]))
-    assert np.allclose(chosen[0], value[1], rtol=0, atol=1e-15)
-
-
 def test_range_is_tight_and_explained():
     template = SpotTemplate.from_image(airy(40, 40, (80, 80)), 40, 40, (48, 48))
     (low, high), columns = template.supported()

@@ -294,23 +294,6 @@ def test_intersection_covariance_holds():
     assert abs(np.sum(found.chi_square) - 1200) < 5 * np.sqrt(2400)  # 2 x 3 - 3 degrees of freedom each
 
 
-def test_one_arcsecond_of_intersection_angle_is_metres_of_height():
-    """Look angles of fore and backward 1 arcsec larger each lower the point by h / (tan a cos^2 a) da on a flat Earth.
-
-    That is 6.3 m for 500 km, 3.2 m for each arcsec of the whole angle. The curved Earth makes the rays a few per cent
-    flatter than 25 degrees at the ground: the tolerance of a tenth.
-    """
-    seen = observe(field_points(np.random.default_rng(3), 30, 2.4), 2.4, cameras())
-    wrong = cameras()
-    for line, sign in (("forward", 1), ("backward", -1)):
-        turn = Rotation.from_rotvec([0, sign * ARCSEC, 0]).as_matrix()
-        wrong[line] = replace(wrong[line], to_body=turn @ wrong[line].to_body)
-    rays = {k: v for k, v in make_rays(seen).items() if k != "nadir"}
-    errors = check_errors(intersect(rays, wrong, Noise(PITCH)).ground, seen.points)
-    tangent, cosine = np.tan(np.radians(25)), np.cos(np.radians(25))
-    assert errors.error[:, 2].mean() == pytest.approx(500e3 / (tangent * cosine**2) * ARCSEC, rel=0.1)
-
-
 def test_bad_input_is_told():
     rays = make_rays(SEEN)["nadir"]
     with pytest.raises(ValueError, match="image of ray 3 is not finite"):
