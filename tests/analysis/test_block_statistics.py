@@ -11,10 +11,10 @@ from analysis.block.block import Term
 from analysis.block.block_adjustment import adjust_block
 from analysis.block.law_tests import law_tests
 from analysis.block.network import datum_test, network_of, open_combinations
-from analysis.block.processes import BlockError, Law
-from analysis.orbit.ground_errors import circle_of_points, interval_of_points, predicted, realised
+from analysis.block.processes import BlockError, Law, Support
 from optics.numerics.threads import one_blas_thread
 from tests.analysis.drawn_blocks import ARCSEC, EAST, PITCH, Plan, draw, without_errors_in_images
+from tests.analysis.refusals import refuses
 from tests.tiers import quick
 
 WHITE = Law("attitude", "white", (0.7 * ARCSEC,) * 3, 0.5)
@@ -167,19 +167,21 @@ def test_variance_components_find_a_wrong_image_sigma():
     assert found.p_value > 1e-3
 
 
-def test_circular_and_linear_errors_of_known_normals():
-    # a circle: 2.1460 sigma; a line: 1.6449 sigma in both
-    assert circle_of_points(np.eye(2)[None] * 4.0) == pytest.approx(2 * 2.145966, rel=1e-5)
-    assert circle_of_points(np.diag([1.0, 1e-9])[None]) == pytest.approx(1.644854, rel=1e-6)
-    assert interval_of_points(np.array([9.0])) == pytest.approx(3 * 1.644854, rel=1e-5)
-    random = np.random.default_rng(1)
-    spread = np.diag([4.0, 1.0, 9.0])
-    error = random.standard_normal((40_000, 3)) * np.sqrt(np.diag(spread))
-    # at the pole of x, where up is x and east is y
-    place = np.tile([6378137.0, 0.0, 0.0], (len(error), 1))
-    found, said = realised(place, error), predicted(place[:1], spread[None])
-    assert found.ce90 == pytest.approx(said.ce90, rel=0.02)
-    assert found.le90 == pytest.approx(said.le90, rel=0.02)
+def test_spread_of_laws_and_laws_that_make_no_sense():
+    """A walk is a sum of independent steps: its variance grows with time, a rate's deviation does, others stay."""
+    for seconds in (-9.0, 0.25, 4.0):
+        for kind, grown in (("walk", abs(seconds) ** 0.5), ("rate", abs(seconds)), ("white", 1.0), ("constant", 1.0)):
+            assert Law("a", kind, (1.0, 2.0, 3.0)).spread(seconds) == pytest.approx(grown * np.array([1.0, 2.0, 3.0]))
+    for law, said in (
+        (Law("a", "brown", (1.0,) * 3), "a law is one of"),
+        (Law("a", "white", (1.0, -1.0, 1.0)), "three sigmas that are finite and not negative"),
+        (Law("a", "walk", (1.0,) * 3, 0.0), "the interval must be positive"),
+        (Law("a", "jitter", (1.0,) * 3, 1.0, 5.0), "the frequency must be positive"),
+        (Law("a", "slow", (1.0,) * 3, 1.0), "correlation time or period must be positive"),
+    ):
+        refuses(BlockError, said, law.check)
+    refuses(BlockError, "no observation meets it", Support.of, WHITE, np.zeros(0))
+    refuses(BlockError, "the interval is too short", Support.of, WHITE, np.array([0.0, 1e9]))
 
 
 @pytest.mark.second

@@ -49,13 +49,13 @@ class Pass:
         return Observations.of_disparities(first, second, moved, self.noise, pair)
 
 
-@pytest.mark.parametrize("passes", [20, pytest.param(60, marks=pytest.mark.slow)])
-def test_lines_are_recovered_within_their_sigmas(passes: int) -> None:
+@pytest.mark.second
+def test_lines_are_recovered_within_their_sigmas() -> None:
     """0.65 Hz of 0.5 to 1.5 px as ZY-3 shows it, and a smaller line: over all passes the errors over sigma are those of
-    a standard normal number, by their chi-square. The limits follow from the number of passes: sigmas wrong by a third
-    are found in 20, by a fifth in 60.
+    a standard normal number, by their chi-square: sigmas wrong by a third are found.
     """
     off: list[list[float]] = []
+    passes = 20
     for seed in range(passes):
         truth = ((0.65, 0.5 + seed / (passes - 1.0), 0.1 * seed), (3.4, 0.12, 1.0))
         found = search(Pass(truth).observed(seed), 0.1, 6.0, RATE).lines
@@ -73,9 +73,9 @@ def test_lines_are_recovered_within_their_sigmas(passes: int) -> None:
     assert low < chi < high
 
 
-@pytest.mark.parametrize("passes", [12, pytest.param(40, marks=pytest.mark.slow)])
-def test_the_phase_counts_from_the_epoch_and_the_course_has_a_covariance_that_holds(passes: int) -> None:
+def test_the_phase_counts_from_the_epoch_and_the_course_has_a_covariance_that_holds() -> None:
     at, square = np.linspace(0.5, 9.5, 40), []
+    passes = 12
     for seed in range(passes):
         one = Pass(((0.65, 1.0, 2.0), (4.0, 0.3, 5.0)))
         lines = search(one.observed(seed), 0.1, 6.0, RATE).lines
@@ -115,16 +115,14 @@ def test_the_response_is_that_of_a_difference() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("gaps", "passes"),
-    [(GAPS[:1], 150), *(pytest.param(gaps, 400, marks=pytest.mark.slow) for gaps in (GAPS[:1], GAPS))],
-    ids=["one", "one of many", "two"],
-)
-def test_the_false_alarm_rate_is_a_bound_and_close(gaps: tuple[float, ...], passes: int) -> None:
+@pytest.mark.second
+@pytest.mark.parametrize("gaps", [GAPS[:1], GAPS], ids=["one", "two"])
+def test_the_false_alarm_rate_is_a_bound_and_close(gaps: tuple[float, ...]) -> None:
     """Passes of noise: the highest power of all frequencies exceeds each level at most as often as is said, and not
-    much more rarely. By the numbers of passes 0.05 is told from 0.12 in 150, and from 0.09 in 400.
+    much more rarely: in 150 passes 0.05 is told from 0.12.
     """
     chances = []
+    passes = 150
     for seed in range(passes):
         found = periodogram(Pass(gaps=gaps, count=120).observed(seed), 0.5, 12.0)
         chances.append(float(found.chance(found.power[found.best])))
@@ -265,10 +263,9 @@ def test_the_noise_of_each_line_is_estimated() -> None:
     np.testing.assert_allclose(both.factors(), alone.factors()[0], rtol=1e-9)
 
 
-@pytest.mark.parametrize("passes", [40, pytest.param(200, marks=pytest.mark.slow)])
-def test_a_noisy_line_gives_no_false_alarms(passes: int) -> None:
+def test_a_noisy_line_gives_no_false_alarms() -> None:
     """One of three lines with twice the noise that is stated: alarms keep to a rate of 0.1, at the limit of 1e-3."""
     alarms = sum(
-        len(search(three_lines(seed, (2.0, 1.0, 1.0)), 0.5, 9.0, 0.1).lines.frequency) > 0 for seed in range(passes)
+        len(search(three_lines(seed, (2.0, 1.0, 1.0)), 0.5, 9.0, 0.1).lines.frequency) > 0 for seed in range(40)
     )
-    assert alarms <= stats.binom.ppf(1.0 - LIMIT, passes, 0.1)
+    assert alarms <= stats.binom.ppf(1.0 - LIMIT, 40, 0.1)

@@ -91,50 +91,45 @@ def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpnes
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("seed", quick(1, [21, 22]))
-def test_covariance_with_noise(clean, templates, seed):
+def test_covariance_with_noise(clean, templates):
     """Shot noise and 20 electrons of read noise on contrast 120; spline errors are a tenth of the sigma."""
-    fits = least_squares(detected(clean, seed), templates, started())
+    fits = least_squares(detected(clean, 21), templates, started())
     assert np.all(fits.reason == Reason.ACCEPTED)
     low, high = limits(2 * len(PLACES))
-    error = fits.place - PLACES
-    assert low < chi_square(error, fits.spread.covariance(fits.reason == Reason.ACCEPTED)) < high
+    error, noise, whole = fits.place - PLACES, fits.spread.covariance(fits.reason == 0), fits.covariance()
+    assert low < chi_square(error, noise) < high
     # relief that these points cannot exclude, a fifth of the variance at one sigma, makes sigmas larger, never smaller
-    assert low / 1.4 < chi_square(error, fits.covariance()) < high
-    assert 0.01 < np.sqrt(np.median(fits.covariance()[:, 0, 0])) < 0.03
+    assert low / 1.4 < chi_square(error, whole) < high
+    assert 1.0 <= np.median(whole[:, 0, 0] / noise[:, 0, 0]) < 1.15
     assert fits.sigma.mean() == pytest.approx(np.sqrt(800 + 400), rel=0.02)
 
 
-@pytest.mark.slow
 def test_scatter_reaches_the_bound(texture, clean, templates):
     """Cramer-Rao bound for place, affine change, offset, gain and sharpness from the texture's exact derivatives and
     the known noise of each pixel. Equal weights lose a per cent to it; the noise's estimate has 4 per cent a point.
     """
-    image = detected(clean, 41)
-    fits = least_squares(image, templates, started())
-    half = 12
-    offset = np.arange(-half, half + 1)
-    bounds = []
-    for row, column in PLACES:
+    some = np.s_[:: len(PLACES) // 80]
+    fits = least_squares(detected(clean, 41), templates[some], started()[some])
+    offset, bounds = np.arange(-12, 13), []
+    for row, column in PLACES[some]:
         r, c = np.rint(row) + offset, np.rint(column) + offset
-        part = {order: texture.grid(r, c, order=order) for order in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))}
+        grey, by_row, by_column, bend_row, bend_column = (
+            texture.grid(r, c, order=order) for order in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
+        )
         dr, dc = np.meshgrid(r - row, c - column, indexing="ij")
-        by_row, by_column = part[1, 0], part[0, 1]
         columns = [by_row, by_column, by_row * dr, by_row * dc, by_column * dr, by_column * dc]
-        columns += [np.ones_like(by_row), part[0, 0], part[2, 0], part[0, 2]]
-        design = np.stack([x.ravel() for x in columns]) / np.sqrt(part[0, 0].ravel() + 400.0 + 1 / 12)
+        columns += [np.ones_like(grey), grey, bend_row, bend_column]
+        design = np.stack([x.ravel() for x in columns]) / np.sqrt(grey.ravel() + 400.0 + 1 / 12)
         scale = np.linalg.norm(design, axis=1)
-        design /= scale[:, None]
-        inverse = np.linalg.inv(design @ design.T)[:2, :2] / np.outer(scale[:2], scale[:2])
-        bounds.append(inverse)
-    bound = np.array(bounds)
-    low, high = limits(2 * len(PLACES))
-    assert low < chi_square(fits.place - PLACES, bound) < 1.03 * high
-    # of noise alone: interpolation and relief are not in the bound
+        unit = design / scale[:, None]
+        bounds.append(np.linalg.inv(unit @ unit.T)[:2, :2] / np.outer(scale[:2], scale[:2]))
+    bound, error = np.array(bounds), fits.place - PLACES[some]
+    low, high = limits(error.size)
+    assert low < chi_square(error, bound) < 1.03 * high
+    # of noise alone: interpolation and relief are not in the bound; 81 points of some 10 per cent each
     noise = fits.spread.covariance(fits.reason == Reason.ACCEPTED)
     claimed = np.trace(noise, axis1=1, axis2=2) / np.trace(bound, axis1=1, axis2=2)
-    # 324 points of some 10 per cent each: 0.6 per cent for the mean
-    assert 0.96 < claimed.mean() < 1.06
+    assert 0.95 < claimed.mean() < 1.07
 
 
 def test_spline_and_its_derivatives_follow_the_texture():

@@ -333,3 +333,24 @@ def test_a_link_is_not_followed(where: str, soft: bool, tmp_path: Path) -> None:
             file.move(where, "kept")
         file[where] = h5py.SoftLink("/kept") if soft else h5py.ExternalLink("other.h5", where)
     refuses(MapError, "is a link to another place", read_map, whole)
+
+
+def test_a_surface_that_is_stored_in_another_file_is_refused(tmp_path: Path) -> None:
+    """External storage and virtual data sets: HDF5 reads bytes of any file that they name, or fills in what is not
+    there."""
+    whole, name = tmp_path / "whole.datx", "Data/Surface/{A1}"
+    (tmp_path / "secret.bin").write_bytes(np.ones((4, 5)).tobytes())
+    for kind in ("external", "virtual"):
+        write.datx(whole, WAVE)
+        with h5py.File(whole, "a") as file:
+            said = dict(file[name].attrs)
+            del file[name]
+            if kind == "external":
+                surface = file.create_dataset(name, (4, 5), "f8", external=[(str(tmp_path / "secret.bin"), 0, 160)])
+            else:
+                layout = h5py.VirtualLayout((4, 5), "f8")
+                layout[...] = h5py.VirtualSource(str(tmp_path / "other.h5"), "there", (4, 5))
+                surface = file.create_virtual_dataset(name, layout)
+            for key in ("Unit", "Wavelength", "Interferometric Scale Factor", "Obliquity Factor"):
+                surface.attrs[key] = said[key]
+        refuses(MapError, "its surface lies in another file", read_map, whole)
