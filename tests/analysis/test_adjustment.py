@@ -150,17 +150,6 @@ def test_open_combinations_are_named():
     assert adjust(two, LABORATORY, NOISE, gauge=HOLD_X).chi_square < 1e-10
 
 
-def test_free_orbit_offsets_open_three_more_and_priors_close_them():
-    for terrain in ({}, {"relief": 0.0}, {"relief": 0.0, "plane": True}):
-        with pytest.raises(RankError) as caught:
-            adjust([measured(seen(1, **terrain))], LABORATORY, NOISE, unknowns=OFFSETS, gauge=HOLD_X)
-        assert len(caught.value.open) == 3
-        for axis in ("along", "across", "down"):
-            assert any(f"Beijing offset {axis}" in c.names for c in caught.value.open)
-    found = adjust([measured(VIEW)], LABORATORY, NOISE, unknowns=OFFSETS, priors=priors("Beijing"), gauge=HOLD_X)
-    assert found.values == pytest.approx(truth(found.names), rel=1e-6, abs=1e-9)
-
-
 def test_stepwise_ends_where_the_simultaneous_one_does_and_as_slowly_as_predicted():
     rng = np.random.default_rng(8)
     field = measured(VIEW, rng)
@@ -239,62 +228,6 @@ def test_variance_components_find_wrong_sigmas():
         assert found.sigma[name] == pytest.approx(right.sigma[name], rel=0.15)
 
 
-def gross(rng, fields, share):
-    """A share of the image points moved by 5 to 30 px anywhere; field and line -> which."""
-    wrong = {}
-    for field in fields:
-        for line, rays in field.rays.items():
-            bad = wrong[field.name, line] = rng.random(len(rays.point)) < share
-            angle, size = rng.uniform(0, 2 * np.pi, len(bad)), PITCH * rng.uniform(5, 30, len(bad))
-            push = size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-            rays.image[:] += np.where(bad[:, None], push, 0.0)
-    return wrong
-
-
-def with_gross_errors(seed, share, robust, actual, views):
-    """Mahalanobis square and number of the unknowns of passes with gross errors, everything estimated; the result, and
-    whether every gross error has lost its weight."""
-    rng = np.random.default_rng(seed)
-    noise = replace(NOISE, image=actual * NOISE.image)
-    fields = [measured(view, rng, noise, name=f"F{i}") for i, view in enumerate(views)]
-    wrong = gross(rng, fields, share)
-    found = adjust(fields, LABORATORY, NOISE, gauge=HOLD_X, robust=robust, variance_components=True)
-    known = TRUTH | {f"{f.name} {n}": v for f in fields for n, v in zip(("roll", "pitch", "yaw"), BIAS, strict=True)}
-    free = np.array([n not in HOLD_X.held for n in found.names])
-    error = (found.values - np.array([known[n] for n in found.names]))[free]
-    size = np.sqrt(np.diag(found.covariance))[free]
-    unit = found.covariance[np.ix_(free, free)] / size / size[:, None]
-    # 5 px are seven times the larger noise: Huber's limit of 2.4 over that, and what is left of chance
-    most = 0.0 if robust == "igg" else 0.6
-    lost = all(np.all(found.weight[name][line][bad] <= most) for (name, line), bad in wrong.items())
-    return error / size @ np.linalg.solve(unit, error / size), len(error), found, lost
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("share", quick(1, [0.1, 0.0]))
-@pytest.mark.parametrize("robust", quick(1, ["huber", "igg"]))
-def test_robust_weights_and_variance_components_go_together(robust, share):
-    """Two passes with gross errors of 5 to 30 px, of 0.3 px and of twice the noise that is claimed. Two-sided false
-    alarm of 1e-4; what the variance factors of 300 redundant observations add to it is a hundredth."""
-    squares, sizes = [], []
-    for seed, actual in enumerate((1.0, 2.0)):
-        square, size, found, lost = with_gross_errors(seed, share, robust, actual, (VIEW,))
-        squares.append(square)
-        sizes.append(size)
-        assert lost
-        # the noise of the attitude, 0.24 px, is in the claim: 0.3 and 0.24 px against 0.6 and 0.24 px make 2.8
-        assert 0.6 < found.factors["image"] / (1.0 if actual == 1.0 else 2.8) < 1.6
-    assert 5e-5 < stats.chi2.sf(sum(squares), sum(sizes)) < 1 - 5e-5
-
-
-def test_tie_points_check_nothing_as_control():
-    """Redundancies add up to the degrees of freedom; only control has one of its own, three coordinates each."""
-    field = measured(VIEW, np.random.default_rng(42), control=np.arange(60) % 4 == 0)
-    found = adjust([field], LABORATORY, NOISE, gauge=HOLD_X, variance_components=True)
-    assert sum(found.redundancy.values()) == pytest.approx(found.degrees_of_freedom, abs=1e-6)
-    assert 0 < found.redundancy["control"] < 3 * 15
-
-
 def test_variance_factors_are_bounded():
     """Exact data: no noise at all is found, and the factors end where they must."""
     found = adjust([measured(VIEW)], LABORATORY, NOISE, gauge=HOLD_XY, variance_components=True)
@@ -323,25 +256,33 @@ def test_priors_pull_as_their_weight_says():
 
 
 def test_bad_input_is_told():
-    field = measured(VIEW)
-    few = measured(seen(1, 2))
-    with pytest.raises(CalibrationError, match="3 image points are too few for 11 unknowns"):
-        adjust([measured(seen(1, 1))], LABORATORY, NOISE, gauge=HOLD_X)
-    with pytest.raises(RankError):
-        adjust([few], LABORATORY, NOISE)
-    refuses(CalibrationError, "no fields", adjust, [], LABORATORY, NOISE)
-    refuses(CalibrationError, "two fields have one name", adjust, [field, field], LABORATORY, NOISE)
-    with pytest.raises(CalibrationError, match="no unknown is called 'nadir z'"):
-        adjust([field], LABORATORY, NOISE, gauge=Gauge(held=("nadir z",)))
-    with pytest.raises(CalibrationError, match="no camera is called 'backward'"):
-        adjust([field], {k: v for k, v in LABORATORY.items() if k != "backward"}, NOISE)
-    refuses(CalibrationError, "sigmas must be finite", adjust, [field], LABORATORY, Noise(np.nan))
-    with pytest.raises(CalibrationError, match="positive sigma"):
-        adjust([field], LABORATORY, NOISE, priors=[Prior({"nadir f": 1.0}, 0.65, 0.0)])
-    with pytest.raises(CalibrationError, match="attitude and of the interior"):
-        stepwise([field], LABORATORY, NOISE, held=tuple(f"{field.name} {n}" for n in ("roll", "pitch", "yaw")))
-    refuses(CalibrationError, "robust must be", adjust, [field], LABORATORY, NOISE, gauge=HOLD_X, robust="tukey")
+    field, few = measured(VIEW), measured(seen(1, 2))
+    bias = tuple(f"{field.name} {n}" for n in ("roll", "pitch", "yaw"))
+    two = {k: v for k, v in LABORATORY.items() if k != "backward"}
+    zero = [Prior({"nadir f": 1.0}, 0.65, 0.0)]
+    for error, said, fields, lines, noise, options in (
+        (
+            CalibrationError,
+            "3 image points are too few for 11",
+            [measured(seen(1, 1))],
+            LABORATORY,
+            NOISE,
+            {"gauge": HOLD_X},
+        ),
+        (RankError, "Hold or weight", [few], LABORATORY, NOISE, {}),
+        (CalibrationError, "no fields", [], LABORATORY, NOISE, {}),
+        (CalibrationError, "two fields have one name", [field, field], LABORATORY, NOISE, {}),
+        (CalibrationError, "called 'nadir z'", [field], LABORATORY, NOISE, {"gauge": Gauge(held=("nadir z",))}),
+        (CalibrationError, "no camera is called 'backward'", [field], two, NOISE, {}),
+        (CalibrationError, "sigmas must be finite", [field], LABORATORY, Noise(np.nan), {}),
+        (CalibrationError, "positive sigma", [field], LABORATORY, NOISE, {"priors": zero}),
+        (CalibrationError, "robust must be", [field], LABORATORY, NOISE, {"gauge": HOLD_X, "robust": "tukey"}),
+    ):
+        refuses(error, said, adjust, fields, lines, noise, **options)
+    refuses(CalibrationError, "attitude and of the interior", stepwise, [field], LABORATORY, NOISE, held=bias)
     assert not stepwise([field], LABORATORY, NOISE, rounds=3).converged
+    refuses(CalibrationError, "rate must be", Unknowns, rate="fields")
+    refuses(ValueError, "huber, igg or accept", robust_weights, np.zeros((2, 2)), "tukey")
 
 
 def sharply_measured(claimed, actual, outliers):
@@ -391,12 +332,3 @@ def test_standardised_residuals_do_not_depend_on_the_own_weight():
     # rounding of the covariances, and the little that the system bends over a millionth of a radian
     for one in sizes[1:]:
         assert one == pytest.approx(sizes[0], rel=1e-3, abs=1e-3)
-
-
-def test_a_word_that_is_no_unknown_is_refused() -> None:
-    """It would count as none."""
-    refuses(CalibrationError, "rate must be", Unknowns, rate="fields")
-
-
-def test_weights_of_no_known_kind_are_refused() -> None:
-    refuses(ValueError, "huber, igg or accept", robust_weights, np.zeros((2, 2)), "tukey")

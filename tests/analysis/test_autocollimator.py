@@ -25,17 +25,6 @@ def test_equation_1() -> None:
     np.testing.assert_allclose(mirror_rotation(0.5 * np.tan(2 * angle), 0.5), angle, rtol=1e-14, atol=1e-18)
 
 
-@pytest.mark.parametrize("between", [math.radians(30), math.radians(60)])
-@pytest.mark.parametrize("axis", ["X", "Y", "Z"])
-def test_relations_are_the_first_order_of_exact_turns(axis: str, between: float) -> None:
-    step = 1e-6
-    for unit in (1, 2):
-        slope = (exact_reading(axis, step, unit, between) - exact_reading(axis, -step, unit, between)) / (2 * step)
-        wanted = np.zeros(2)
-        wanted[column_component(axis)] = relation_factor(axis, unit, between)
-        np.testing.assert_allclose(slope, wanted, atol=1e-11)
-
-
 @pytest.mark.parametrize("axis", ["X", "Y", "Z"])
 def test_exact_turns_by_another_way(axis: str) -> None:
     # the normal turned by matrices in frame 1 and then seen from frame 2, against the closed form

@@ -58,22 +58,6 @@ def test_small_motions_are_left_as_they_are() -> None:
     assert np.all(told.off < BEYOND)
 
 
-def test_states_near_the_nominal_one_are_not_traced() -> None:
-    asked = []
-
-    def counted(states):
-        asked.append(len(states))
-        return Retraced(spots(states), parameters(states))
-
-    near = replace(model(counted), near_px=0.1)
-    x = np.stack([1e-3 * np.ones(4), 0.5 * np.ones(4), 2e-3 * np.ones(4)])
-    _, found, told = read(x, near)
-    assert asked[0] == 1
-    assert told.beyond.tolist() == [False, True, False]
-    assert found[1] == pytest.approx(parameters(x)[1], rel=1e-4)
-    assert told.off[0] == pytest.approx(0.0, abs=1e-9)
-
-
 def test_large_motions_are_read_as_they_are() -> None:
     """The linear reading is off by tens of sigmas; Gauss and Newton's steps end within a hundredth of one."""
     x = 0.5 * np.sign(np.random.default_rng(2).standard_normal((5, 4)))

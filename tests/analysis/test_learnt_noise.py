@@ -87,23 +87,6 @@ def test_influence_of_the_image_before_is_the_derivative_of_the_shift(case):
     assert np.all(left < (0.1 if case == "holes" else 0.05)), left
 
 
-def test_pattern_of_the_pixels_is_no_light_when_a_shape_is_learnt():
-    """Where response differs from pixel to pixel by 1 % a shape with its noise of all frequencies drew the fit half way
-    between pixels, by half a sigma at a quarter of a pixel; with the frequencies of light alone it does not.
-    """
-    rough = replace(NOISE, prnu=0.01)
-    rng = np.random.default_rng(5)
-    error, sigma = [], []
-    for _ in range(12):
-        pattern = np.sqrt(rough.fixed_variance_dn2(spot(FIRST)))
-        before = screened(spot(FIRST) + pattern * rng.standard_normal(SHAPE))
-        learnt = learn_template(before, rough)
-        ends = [fitted(screened(spot(FIRST + by)), learnt).positions for by in (0.0, 0.25)]
-        error.append((ends[1].position - ends[0].position)[0] - 0.25)
-        sigma.append(np.sqrt(np.trace(ends[1].covariance[0]) / 2.0))
-    assert np.sqrt(np.mean(np.square(error))) < 0.1 * np.mean(sigma)
-
-
 def test_noise_of_a_series_is_that_of_its_shifts():
     """Of three images against the same one before, of which two show the spot at one place: the covariance of each
     shift is its own, and in the difference of those two the image before cancels, and the pattern with it.

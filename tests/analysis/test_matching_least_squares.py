@@ -11,8 +11,8 @@ from tests.analysis.refusals import refuses
 from tests.analysis.texture_image import Texture, detected, lattice
 from tests.tiers import quick
 
-SIZE = 570
-PLACES = lattice(18, 28, 47, seed=3)  # windows of 25 px do not overlap: errors are independent
+SIZE = 346
+PLACES = lattice(10, 28, 47, seed=3)  # windows of 25 px do not overlap: errors are independent
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_affine_change_without_noise(texture, templates):
     grey = texture.grid(np.arange(SIZE), np.arange(SIZE), matrix=matrix, shift=shift)
     inside = np.linalg.solve(matrix, (PLACES - shift).T).T
     used = np.all((inside > 15) & (inside < SIZE - 16), axis=1)
-    assert used.sum() > 250
+    assert used.sum() > 60
     fits = least_squares(0.6 * grey + 40.0, templates[used], inside[used] + 0.4)
     assert np.all(fits.reason == Reason.ACCEPTED)
     assert np.abs(fits.place - inside[used]).max() < 0.006
@@ -108,10 +108,9 @@ def test_scatter_reaches_the_bound(texture, clean, templates):
     """Cramer-Rao bound for place, affine change, offset, gain and sharpness from the texture's exact derivatives and
     the known noise of each pixel. Equal weights lose a per cent to it; the noise's estimate has 4 per cent a point.
     """
-    some = np.s_[:: len(PLACES) // 80]
-    fits = least_squares(detected(clean, 41), templates[some], started()[some])
+    fits = least_squares(detected(clean, 41), templates, started())
     offset, bounds = np.arange(-12, 13), []
-    for row, column in PLACES[some]:
+    for row, column in PLACES:
         r, c = np.rint(row) + offset, np.rint(column) + offset
         grey, by_row, by_column, bend_row, bend_column = (
             texture.grid(r, c, order=order) for order in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
@@ -123,10 +122,10 @@ def test_scatter_reaches_the_bound(texture, clean, templates):
         scale = np.linalg.norm(design, axis=1)
         unit = design / scale[:, None]
         bounds.append(np.linalg.inv(unit @ unit.T)[:2, :2] / np.outer(scale[:2], scale[:2]))
-    bound, error = np.array(bounds), fits.place - PLACES[some]
+    bound, error = np.array(bounds), fits.place - PLACES
     low, high = limits(error.size)
     assert low < chi_square(error, bound) < 1.03 * high
-    # of noise alone: interpolation and relief are not in the bound; 81 points of some 10 per cent each
+    # of noise alone: interpolation and relief are not in the bound; 100 points of some 10 per cent each
     noise = fits.spread.covariance(fits.reason == Reason.ACCEPTED)
     claimed = np.trace(noise, axis1=1, axis2=2) / np.trace(bound, axis1=1, axis2=2)
     assert 0.95 < claimed.mean() < 1.07

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from analysis.matching.consensus import consensus
 from analysis.matching.correlation import _apart, _second, distinct_points, search
 from analysis.matching.matches import Matches, MatchOptions, Reason, match
 from tests.analysis.refusals import refuses
 from tests.analysis.texture_image import Texture, detected
-from tests.tiers import quick
 
 SIZE = 800
 
@@ -26,24 +24,6 @@ def frame(texture):
 @pytest.fixture(scope="module")
 def points(frame):
     return distinct_points(frame, 500, spacing=12, border=60)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize(("slope", "contrast", "lost"), quick(1, [(2.0, 120.0, 0.1), (1.0, 40.0, 0.1)]))
-def test_wrong_patches_in_worse_texture(slope, contrast, lost):
-    """Noise of 0.9 times the contrast; and a soft texture in which other places correlate by 0.8."""
-    texture = Texture(11, slope=slope, contrast=contrast)
-    image = detected(texture.grid(np.arange(500), np.arange(500)), 12)
-    places = distinct_points(image, 200, spacing=16, border=60)
-    wrong = np.random.default_rng(13).random(len(places)) < 0.3
-    other = Texture(14, slope=slope, contrast=contrast)
-    patches = np.where(wrong[:, None, None], other.patches(places), texture.patches(places))
-    found = match(image, patches, places - [18.3, -14.6], reach=30)
-    used = found.accepted
-    agreed = consensus((places - [18.3, -14.6])[used], found.place[used], covariance=found.covariance[used], degree=1)
-    kept = np.flatnonzero(used)[agreed.accepted]
-    assert wrong[kept].sum() == 0
-    assert len(kept) > (1 - lost) * (~wrong).sum()
 
 
 def test_reasons(texture):

@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 
 from analysis.matching.matches import Reason
-from tests.analysis.matching_regimes import REGIMES, RegimePair, pair_of
+from tests.analysis.matching_regimes import REGIMES, pair_of
+from tests.analysis.stereo_pairs import Pair
 from tests.tiers import quick
 
 MOST = 1.5
 """Mean half of chi-square of the accepted points; 1 where covariances are those of the errors."""
 
 
-def squares(pair: RegimePair) -> np.ndarray:
+def squares(pair: Pair) -> np.ndarray:
     """Return halves of chi-square of the accepted points."""
     found = pair.matched()
-    error, used = pair.error(found.place, found.covariance), found.accepted
+    used, error = found.accepted, found.place - pair.true
     return 0.5 * np.einsum("ni,nij,nj->n", error[used], np.linalg.inv(found.covariance[used]), error[used])
 
 

@@ -82,24 +82,6 @@ def test_total_sigmas_of_every_estimator_are_those_of_the_linear_model():
         np.testing.assert_allclose(split.sigma_before**2, np.diag(before), rtol=1e-12)
 
 
-def test_with_the_papers_family_alone_the_posterior_is_the_model():
-    """As many motions as coordinates, of huge sigmas: both invert the same square matrix. The posterior inverts A A',
-    whose condition is A's squared: some 1e6, which leaves ten digits of 1e-16."""
-    cameras = some_cameras()
-    spots, parameters = np.zeros((8, 8)), np.zeros((8, 8))
-    for k, camera in enumerate(cameras.values()):
-        own = slice(4 * k, 4 * k + 4)
-        spots[own, own], parameters[own, own] = camera.spot_jacobian, camera.parameter_jacobian
-    template = a_statement(count=8, correlated=False)
-    stated = replace(template, spots=1e3 * spots, parameters=1e3 * parameters)
-    still = np.zeros((1, 4, 2))
-    for noise, tolerance in ((np.zeros((8, 8)), 1e-9), (a_noise(size=1e-3), 1e-9)):
-        shifts = Shifts(still, still, noise[None], cameras, stated)
-        found = {name: one.gain(shifts)[0] for name, one in applicable(cameras, stated).items()}
-        scale = np.abs(found["model"]).max(axis=1, keepdims=True)
-        np.testing.assert_allclose(found["posterior"] / scale, found["model"] / scale, atol=tolerance)
-
-
 def test_motions_of_no_size_change_nothing():
     stated, noise, rows = a_statement(correlated=False), a_noise(), np.eye(8)
     some = stated.scaled([0.0 if k < 5 else 1.0 for k in range(24)])

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.linalg import subspace_angles
 
 from analysis.calibration.adjustment import adjust
@@ -18,7 +17,6 @@ from analysis.orbit.three_line_model import LineModel
 from tests.analysis.refusals import refuses
 from tests.analysis.test_adjustment import BIAS, INNER, LABORATORY, NOISE, PITCH, measured
 from tests.analysis.test_three_line_model import ARCSEC, cameras, field_points, mounting, observe
-from tests.tiers import quick
 
 FREE = Gauge(start=WORST)
 HOLD_SIX = Gauge(held=("nadir x", "forward f", "nadir f", "backward f", "nadir y", "Beijing yaw"))
@@ -139,35 +137,6 @@ def long_camera(focal=5.5):
     half = 6000 * PITCH
     models = {k: LineModel.of(mounting(k), (focal, 0.0, 0.0), half_length=half) for k in LABORATORY}
     return models, 0.8 * half / focal * 500e3
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("count", quick(1, [6, 200]))
-def test_a_long_camera_is_calibrated_and_what_launch_tells_is_marked(count):
-    """f of 5.5 m is known to 0.2 mm by 200 points, a quarter of a pixel at the ends of the line: refused as open when f
-    counted as much as a principal point. With launch values as priors the errors have the sigmas they are given; false
-    alarm 1e-4 for the chi-square of all unknowns in 12 passes whose launch changes are drawn, too."""
-    models, wide = long_camera()
-    rng, total, size = np.random.default_rng(count), 0.0, 0
-    noise = Noise(0.3 * PITCH, 0.5 * ARCSEC)
-    for _ in range(12):
-        change = {k: 100e-6 * rng.standard_normal(3) * (k != "nadir" or np.array([1, 0, 0])) for k in models}
-        true = {k: m.with_interior(m.interior + change[k]) for k, m in models.items()}
-        bias = 40.0 * ARCSEC * rng.standard_normal(3)
-        view = observe(field_points(rng, count, 2.4, half=wide), 2.4, true, bias)
-        found = adjust([measured(view, rng, noise)], models, noise, gauge=LAUNCH)
-        known = {f"{k} {n}": v for k, m in true.items() for n, v in zip(("f", "x", "y"), m.interior, strict=True)}
-        known |= {f"Beijing {n}": v for n, v in zip(("roll", "pitch", "yaw"), bias, strict=True)}
-        free = np.array([n not in LAUNCH.held for n in found.names])
-        error = (found.values - [known[n] for n in found.names])[free]
-        scale = np.sqrt(np.diag(found.covariance))[free]
-        unit = found.covariance[np.ix_(free, free)] / scale / scale[:, None]
-        total, size = total + error / scale @ np.linalg.solve(unit, error / scale), size + len(error)
-    assert 5e-5 < stats.chi2.sf(total, size) < 1 - 5e-5
-    share = dict(zip(found.names, found.from_start, strict=True))
-    assert found.sigma["forward f"] < 100e-6
-    assert share["forward f"] > (0.9 if count == 6 else 0.1)
-    assert share["Beijing pitch"] < 0.01
 
 
 def test_noise_distance_and_rank_are_three_messages():

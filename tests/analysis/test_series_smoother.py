@@ -9,7 +9,6 @@ import pytest
 
 from analysis.monitor import series_smoother
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.estimators import Posterior, Shifts
 from analysis.monitor.series_smoother import smooth
 from analysis.spots.spot_positions import NoiseParts, SeriesNoise
 from tests.analysis.refusals import refuses
@@ -123,21 +122,6 @@ def test_as_conditioning_all_times_together(reference) -> None:
         close(found.filtered.values[k], values[0], prior)
         close(found.filtered.total[k], spread[0], prior)
         close(found.filtered.noise[k], by_noise[0], prior)
-
-
-def test_one_measurement_is_the_posterior() -> None:
-    rng = np.random.default_rng(4)
-    stated = some(rng)
-    own, shared = random_noise(rng, 1)
-    shifts = rng.standard_normal((1, 4))
-    found = smooth(stated, [7.0], shifts, noise_of(own, shared), [7.0])
-    spread = own + shared
-    gain = Posterior().gain(Shifts(np.zeros((1, 2, 2)), shifts.reshape(1, 2, 2), spread, {}, stated))
-    prior = stated.parameter_covariance
-    for one in (found.filtered, found.smoothed):
-        close(one.values[0], gain[0] @ shifts[0], prior)
-        close(one.noise[0], gain[0] @ spread[0] @ gain[0].T, prior)
-        close(one.total[0], gain[0] @ spread[0] @ gain[0].T + stated.misfit(gain)[0], prior)
 
 
 def test_what_has_to_stay() -> None:

@@ -11,7 +11,6 @@ from analysis.calibration.normal_equations import State, Weights, assemble
 from analysis.calibration.plausibility import single_ray
 from analysis.calibration.shared_noise import SharedNoise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters
-from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.ray_noise import reading_variance
 from analysis.orbit.three_line_model import Partials, Rays, misclosure, partials
 from tests.analysis.refusals import refuses
@@ -27,7 +26,7 @@ from tests.analysis.test_adjustment import (
     priors,
     seen,
 )
-from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, make_rays, orbit
+from tests.analysis.test_three_line_model import ARCSEC, PITCH, orbit
 
 NOISE = Noise(0.3 * PITCH, 0.5 * ARCSEC, 0.05, attitude_interval=0.125, station_interval=1.0)
 
@@ -159,18 +158,6 @@ def test_sparse_elimination_is_the_dense_covariance_of_all_image_points():
     assert np.sqrt(np.diag(found.covariance))[free] == pytest.approx(sigma[: len(free)], rel=1e-5)
     points = np.sqrt(found.ground_covariance["F0"][:, [0, 1, 2], [0, 1, 2]]).ravel()
     assert points == pytest.approx(sigma[len(free) :], rel=1e-5)
-
-
-def test_single_points_have_the_variance_of_the_interpolated_attitude():
-    """Forward intersection of 400 points, each by itself: mean Mahalanobis square 3. Neighbours share errors, a pass of
-    7 s has 56 readings on each line: as if of 56 independent points at least, 5 sigmas."""
-    rng = np.random.default_rng(26)
-    view = seen(30, 400, bias=(0.0, 0.0, 0.0))
-    noise = replace(NOISE, image=0.05 * PITCH)
-    found = intersect(make_rays(view, rng, noise), cameras(), noise)
-    error = found.ground - view.points
-    mean = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance), error).mean()
-    assert mean == pytest.approx(3.0, abs=5 * np.sqrt(6 / 56))
 
 
 def test_bad_noise_is_told():

@@ -181,24 +181,6 @@ def test_every_spot_needs_a_template_that_exists(template):
         refuses(ValueError, "index must be", maximum_likelihood_fit, mean, FRAMES, NOISE, template, np.array(wrong))
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("elliptical", quick(1, [True, False]))
-def test_a_gaussian_fits_in_chi_square(elliptical):
-    """100 Gaussian spots of about 100 degrees of freedom each, in a window whose soft edge is a third of its pixels: 5
-    sigma of the mean is a false alarm of 6e-7. The Airy rings of a larger window do not fit.
-    """
-    rows, columns = np.indices((48, 48))
-    places = np.random.default_rng(7).uniform(20, 27, (100, 2))
-    bell = [np.exp(-0.5 * ((rows - r) ** 2 + (columns - c) ** 2) / 3.0**2) for r, c in places]
-    rng = np.random.default_rng(8)
-    fixed = 1 + PRNU * rng.standard_normal((100, 48, 48)), DSNU_E * rng.standard_normal((100, 48, 48))
-    mean = record(PEAK_E * np.stack(bell) + SKY_E, fixed, 9)
-    good = gaussian_fit(mean, FRAMES, NOISE, elliptical=elliptical).reduced_chi_square
-    assert abs(good.mean() - 1) < 5 * np.sqrt(2 / (100 * 100))
-    rings = OFFSET + GAIN * PEAK_E * np.stack([airy(r, c, (48, 48)) for r, c in places])
-    assert np.all(gaussian_fit(rings, FRAMES, NOISE, 12.0, elliptical).reduced_chi_square > 2)
-
-
 def test_influence_maps_predict_small_changes(template, light):
     """Position change from a small random disturbance against the maps; the rest is of second order."""
     clean = (GAIN * light + OFFSET)[:3]

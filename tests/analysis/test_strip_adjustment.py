@@ -8,7 +8,6 @@ from scipy import stats
 
 from analysis.calibration.strip_adjustment import adjust_strip
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
-from analysis.orbit.forward_intersection import check_errors, intersect
 from tests.analysis.refusals import refuses
 from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, make_rays, observe, orbit
 
@@ -34,10 +33,6 @@ def adjusted(rays, noise):
     return adjust_strip(rays, cameras(), noise, bias=BIAS)
 
 
-def alone(rays, noise):
-    return intersect(rays, cameras(), noise, bias=BIAS)
-
-
 def test_exact_rays_are_left_alone():
     """1e-15 m of rounding in an image of 0.3 px is 1e-9 of a sigma; coordinates of 6.4e6 m are rounded to 1e-9 m."""
     view = strip(1, 60, 7.0)
@@ -61,29 +56,6 @@ def test_sigmas_are_right():
         fit += (found.chi_square, found.degrees_of_freedom)
     for square, degrees in (total, fit):
         assert 5e-7 < stats.chi2.sf(square, degrees) < 1 - 5e-7
-
-
-@pytest.mark.second
-def test_corrections_take_the_errors_out_of_other_rays():
-    """Ties from half of the points, the others intersected from corrected rays: both keep the same slow errors.
-
-    Heights of 500 points from one set of slow errors: 0.3 px of the others count 1.5 m of image noise, of some 10 m.
-    """
-    view, squares = strip(3, 1000, 20.0), []
-    for seed in range(3):
-        rays = make_rays(view, np.random.default_rng(30 + seed), SLOW)
-        found = adjusted({k: r.taken(np.arange(1000) < 500) for k, r in rays.items()}, SLOW)
-        others = {k: r.taken(np.arange(1000) >= 500) for k, r in rays.items()}
-        others = {k: replace(r, point=r.point - 500) for k, r in others.items()}
-        before = check_errors(alone(others, SLOW).ground, view.points[500:])
-        after = check_errors(alone({k: found.corrected(r) for k, r in others.items()}, SLOW).ground, view.points[500:])
-        tied = check_errors(found.ground[:500], view.points[:500])
-        assert np.hypot(after.plan_rms, after.height_rms) == pytest.approx(
-            np.hypot(tied.plan_rms, tied.height_rms), rel=0.1
-        )
-        squares.append([e.plan_rms**2 + e.height_rms**2 for e in (before, after)])
-    assert np.sqrt(np.mean(squares, axis=0)[1] / np.mean(squares, axis=0)[0]) < 0.9
-    refuses(CalibrationError, "no times", found.corrected, replace(rays["backward"], time=None))
 
 
 @pytest.mark.second

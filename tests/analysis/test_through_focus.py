@@ -5,7 +5,6 @@ of the 7 um and 28 um pixels, never the formula that is fitted.
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.optimize import minimize_scalar
 
 from analysis.focal_plane import through_focus as module
 from analysis.focal_plane.through_focus import FocusError, focus_vertex, focus_vertices
@@ -78,25 +77,6 @@ def test_bias_over_sampling_phases(monkeypatch, frequency, step, low, high, midd
     assert lobe_um < plain.max() < parabola_um
 
 
-@pytest.mark.parametrize(("aberration", "limit_um"), [({"coma": 0.3}, 0.3), ({"spherical": 0.2}, 3.0)])
-def test_bias_with_aberrations(aberration, limit_um):
-    """Against the maximum of the aberrated curve itself. Coma (0.3 waves, 0.035 rms) leaves it even in defocus;
-    spherical aberration (0.2 waves, 0.015 rms as the camera's whole error) makes it lopsided, which shifts the mean of
-    the upper half against the maximum.
-    """
-    z = steps(50 * UM, -0.6e-3, 0.6e-3)
-    top = minimize_scalar(
-        lambda at: -float(through_focus(at, PAN, **aberration)), bounds=(-2e-4, 2e-4), method="bounded",
-        options={"xatol": 1e-9},
-    ).x  # fmt: skip
-    focus = np.linspace(-0.5, 0.5, 11) * 50 * UM
-    value = curve(z, focus, PAN, 0.2, **aberration)
-    error = focus_vertices(z, value, 0.004).position - focus - top
-    assert np.abs(error).max() < limit_um * UM
-    if "spherical" in aberration:
-        assert abs(top) > 20 * UM  # the test has something to find
-
-
 @pytest.mark.parametrize(
     ("frequency", "step", "half", "noise"),
     [(PAN, 50 * UM, 0.6e-3, 0.02), (PAN, 50 * UM, 0.6e-3, 0.05), (MS, 50 * UM, 1e-3, 0.02), (MS, 100 * UM, 6e-4, 0.02)],
@@ -119,16 +99,6 @@ def test_sigma_agrees_with_scatter(frequency, step, half, noise):
     # what the form misses (up to 0.5% of the peak) adds little to the residuals at these noise levels
     total, freedom = found.chi_square.sum(), found.degrees_of_freedom.sum()
     assert stats.chi2.sf(total, freedom) > FALSE_ALARM / 2
-
-
-def test_the_best_measured_points_are_not_the_peak():
-    """Ten times the precision beyond the dark zeros, where the contrast is a tenth: sigmas tell values, not heights."""
-    z = steps(25 * UM, -0.6e-3, 0.6e-3)
-    sigma = np.where(np.abs(z) > 0.3e-3, 0.0002, 0.002)
-    value = curve(z, [20 * UM], PAN, 0.2)[0] + sigma * np.random.default_rng(6).standard_normal(z.size)
-    found = focus_vertex(z, value, sigma)
-    assert found.position == pytest.approx(20 * UM, abs=5 * found.sigma + 0.1 * UM)
-    assert np.abs(z[found.used]).max() < 0.25e-3
 
 
 def test_batch_agrees_with_single_curves():

@@ -149,19 +149,6 @@ def test_structure_is_not_seen_in_noise():
     assert not any(measure_edge(noisy(image, 1.0, rng)).doubt for _ in range(60))
 
 
-def test_pages_that_move_are_laid_over_each_other_with_bow_and_light():
-    rng = np.random.default_rng(3)
-    offsets = rng.uniform(-0.6, 0.6, 6)
-    pages = [noisy(edge(64, 72, 6, 0.6, (o, 0.7), plane(0.05, 0.05)), 0.5, rng) for o in offsets]
-    found = measure_pages(np.array(pages), step=1.0)
-    assert found.pages.aligned
-    assert found.order == 2
-    value, sigma = np.array([found.at(f) for f in FREQUENCIES]).T
-    assert np.all(np.abs(value - truth(FREQUENCIES, 6, 0.6)) < 4.0 * sigma)
-    moved = found.pages.position - found.pages.position.mean()
-    np.testing.assert_allclose(moved, offsets - offsets.mean(), atol=0.01)
-
-
 @pytest.mark.skipif(not REAL.is_dir(), reason="measured data is not here: ../shared/real, or the folder of TWIN_REAL")
 @pytest.mark.parametrize("name", ["Test_edge1.tif", "Test_edge1_mono.tif"])
 def test_a_photograph_against_sfrmat5(name):

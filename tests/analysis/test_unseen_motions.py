@@ -5,9 +5,7 @@ import pytest
 from scipy.linalg import null_space
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.unseen_motions import floor, unseen_modes
-from tests.analysis.followed_series import of_shifts
 from tests.analysis.stated_motions import correlation_of, disturbances
 
 MOTIONS, SPOTS, PARAMETERS = 14, 4, 3
@@ -63,19 +61,3 @@ def test_motions_that_spots_see_in_full_leave_nothing() -> None:
     seen = np.arange(MOTIONS) < SPOTS
     only = one.scaled(seen.astype(float))
     assert np.abs(floor(only, np.eye(PARAMETERS))).max() < 1e-12
-
-
-def test_no_filter_goes_below_the_floor_and_with_many_readings_it_comes_to_it() -> None:
-    """With laws that many readings tell apart, each motion's share of the spots becomes known."""
-    one, rows = stated(5, (SWING,) * 8 + (TimeLaw(),) * 6, correlated=False), np.eye(PARAMETERS)
-    how = SeriesFilter(one, None, window=0)
-    belief = how.start(0.0)
-    least = np.diag(floor(one, rows))
-    ratios = []
-    for reading in of_shifts(np.arange(400) * 600.0, np.zeros((400, SPOTS)), 1e-8 * np.eye(SPOTS)):
-        belief, _ = how.update(belief, reading)
-        spread = np.diag(how.parameters(belief, reading.time)[1])
-        assert np.all(spread > least * (1.0 - 1e-6))
-        ratios.append((spread / least).max())
-    assert ratios[0] > 1.05
-    assert ratios[-1] < 1.02
