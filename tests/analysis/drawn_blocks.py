@@ -13,17 +13,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from analysis.block.block import (
-    Block,
-    CameraKnowledge,
-    Footprints,
-    Pass,
-    Points,
-    Scene,
-    Term,
-    Terrain,
-    TrackerAngle,
-)
+from analysis.block.block import Block, CameraKnowledge, Footprints, Pass, Points, Scene, Term, Terrain, TrackerAngle
 from analysis.block.processes import Law
 from analysis.orbit.three_line_model import LineModel, Rays
 

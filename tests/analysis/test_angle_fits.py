@@ -12,7 +12,7 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import minimize
 
 from analysis.turntable import angle_network
-from analysis.turntable.angle_fits import FITS, GAP_ORDER, angles_left, cross_validate, fewest, fit
+from analysis.turntable.angle_fits import FITS, angles_left, cross_validate, fewest, fit
 from analysis.turntable.angle_network import NotConvergedError
 from analysis.turntable.dividing_error import CalibrationSeries, choose
 from tests.analysis.refusals import refuses
@@ -74,26 +74,6 @@ def test_smoothing_spline_is_scipys() -> None:
     weight = sigma**-2 / np.mean(sigma**-2)
     peer = make_smoothing_spline(ANGLE / step, value, weight, lam=made.settings["smoothing"])
     np.testing.assert_allclose(made(BETWEEN), peer(BETWEEN / step), rtol=0.0, atol=1e-7)
-
-
-@pytest.mark.parametrize("name", ["piecewise_linear", "cubic_spline"])
-def test_error_between_points_falls_with_the_step(name: str) -> None:
-    """h^2 and h^4, which the compensation relies on. In the middle of the range, away from the natural ends."""
-    inside = BETWEEN[(BETWEEN > np.radians(97.0)) & (BETWEEN < np.radians(107.0))]
-    rms = []
-    for count in (41, 81):
-        angle = np.linspace(ANGLE[0], ANGLE[-1], count)
-        left = fit(name, angle, wave(angle), 1e-9)(inside) - wave(inside)
-        rms.append(float(np.sqrt(np.mean(left**2))))
-    # next order of the step, and where the 60 angles fall in their steps: 20%
-    assert rms[0] / rms[1] == pytest.approx(2.0 ** GAP_ORDER[name], rel=0.2)
-
-
-def test_fourier_series_needs_no_closed_curve() -> None:
-    """The ends of the ramp differ by 2: a series of the range's own period would miss by about half of it there."""
-    made = fit("fourier", ANGLE, wave(ANGLE), 1e-3)
-    assert made.settings["period_deg"] > 20.0
-    assert np.max(np.abs(made(BETWEEN) - wave(BETWEEN))) < 0.02
 
 
 def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.MonkeyPatch) -> None:

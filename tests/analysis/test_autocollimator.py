@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from analysis.monitor.autocollimator import (
     ReadingMap,
@@ -22,7 +23,7 @@ ARCSEC = math.pi / 648000
 
 def test_equation_1() -> None:
     angle = np.array([-1e-3, 0.0, 3e-3])
-    np.testing.assert_allclose(mirror_rotation(0.5 * np.tan(2 * angle), 0.5), angle, rtol=1e-14, atol=1e-18)
+    assert_allclose(mirror_rotation(0.5 * np.tan(2 * angle), 0.5), angle, rtol=1e-14, atol=1e-18)
 
 
 @pytest.mark.parametrize("axis", ["X", "Y", "Z"])
@@ -33,9 +34,7 @@ def test_exact_turns_by_another_way(axis: str) -> None:
     between, angle = math.radians(40), 0.02
     frame = Rotation.from_euler("x", between).as_matrix()
     turned = Rotation.from_euler(axis.lower(), angle).as_matrix() @ (-frame[:, 2])
-    np.testing.assert_allclose(
-        exact_reading(axis, angle, 2, between), reading_of_normal(frame.T @ turned), rtol=1e-13, atol=1e-16
-    )
+    assert_allclose(exact_reading(axis, angle, 2, between), reading_of_normal(frame.T @ turned), rtol=1e-13, atol=1e-16)
 
 
 @pytest.mark.parametrize(("axis", "unit"), [("x", 1), ("X", 3), ("", 2)])
@@ -55,7 +54,7 @@ def test_a_reading_map_recovers_a_distorting_lens() -> None:
     known = np.stack(np.meshgrid(turns, turns), -1).reshape(-1, 2)
     reading_map = ReadingMap.fit(spot(known), known)
     fresh = rng.uniform(-5e-3, 5e-3, (50, 2))
-    np.testing.assert_allclose(reading_map(spot(fresh)), fresh, atol=1e-4 * ARCSEC)
+    assert_allclose(reading_map(spot(fresh)), fresh, atol=1e-4 * ARCSEC)
     assert reading_map.residual < 1e-4 * ARCSEC
     # eq. (1) alone is off by the distortion, so the map is needed
     plain = mirror_rotation(spot(fresh)[..., ::-1] - [1560.0, 1603.0], 290_000)
@@ -64,7 +63,7 @@ def test_a_reading_map_recovers_a_distorting_lens() -> None:
     where = spot(fresh[0])
     scatter = reading_map(where + 0.02 * rng.standard_normal((20_000, 2)))
     wanted = reading_map.covariance(where, 0.02**2 * np.eye(2))
-    np.testing.assert_allclose(np.cov(scatter.T), wanted, atol=0.05 * wanted.max())
+    assert_allclose(np.cov(scatter.T), wanted, atol=0.05 * wanted.max())
 
 
 def test_a_reading_map_needs_enough_spots() -> None:

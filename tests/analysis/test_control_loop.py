@@ -5,14 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.monitor.control_loop import (
-    common_margin,
-    limit_cycle,
-    margins,
-    open_loop,
-    rejection,
-    spectral_radius,
-)
+from analysis.monitor.control_loop import common_margin, limit_cycle, margins, open_loop, rejection, spectral_radius
 
 DELAYS = (0, 1, 2, 3, 7)
 
@@ -38,13 +31,6 @@ def test_just_below_the_limit_errors_decay_and_just_above_they_grow(delay: int) 
     assert above[-100:].max() > 1e6
     assert margins(0.99 * limit, delay).stable
     assert not margins(1.01 * limit, delay).stable
-
-
-@pytest.mark.parametrize("delay", DELAYS)
-def test_the_recursion_of_many_loops_has_the_limit_of_one(delay: int) -> None:
-    limit = 2.0 * math.sin(math.pi / (4 * delay + 2))
-    assert common_margin([[1.0]], [0.25], [delay]) == pytest.approx(limit / 0.25, rel=1e-9)
-    assert spectral_radius([[1.0]], [0.999 * limit], [delay]) < 1.0 < spectral_radius([[1.0]], [1.001 * limit], [delay])
 
 
 @pytest.mark.parametrize(("gain", "delay"), [(0.5, 0), (0.8, 1), (0.3, 2)])

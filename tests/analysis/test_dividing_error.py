@@ -59,14 +59,6 @@ def test_few_or_equal_readings_stay() -> None:
     refuses(ValueError, "finite", chauvenet, [0.0, np.nan, 1.0])
 
 
-def test_many_series_at_once() -> None:
-    readings = np.random.default_rng(1).standard_t(2, (4, 6, 10))
-    whole = chauvenet(readings)
-    assert not whole.all()
-    alone = [[chauvenet(row) for row in block] for block in readings]
-    assert np.array_equal(whole, np.array(alone))
-
-
 @pytest.mark.parametrize("n", [5, 10, 20])
 def test_what_normal_noise_loses(n: int) -> None:
     """Formulas for the single pass against 20 000 series: 4 sigma of the counts; the variance within 1%."""

@@ -6,17 +6,13 @@ from itertools import product
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from analysis.instrument_state.known_combinations import combinations
 from analysis.instrument_state.next_move import Actuators, best_move, measurement_worth, truncated_move
-from analysis.instrument_state.state_estimate import (
-    MeasuredGroup,
-    StateEstimate,
-    StatePrior,
-    estimate_state,
-)
+from analysis.instrument_state.state_estimate import MeasuredGroup, StateEstimate, StatePrior, estimate_state
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.disturbances import TimeLaw
 from tests.analysis.refusals import refuses
@@ -102,10 +98,8 @@ def test_linear_models_have_the_closed_form(free: bool) -> None:
     found = model.estimate(groups)
     mean, covariance = closed_form(model.prior, model.table, groups[0], 1e4)
     scale = model.prior.sigma
-    np.testing.assert_allclose(found.mean / scale, mean / scale, atol=1e-6 if free else 1e-10)
-    np.testing.assert_allclose(
-        found.covariance / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=1e-6
-    )
+    assert_allclose(found.mean / scale, mean / scale, atol=1e-6 if free else 1e-10)
+    assert_allclose(found.covariance / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=1e-6)
     assert found.converged
 
 
@@ -121,9 +115,9 @@ def test_spots_alone_are_the_monitors_posterior() -> None:
     group = MeasuredGroup("spots", "spots", ("x",) * 8, shift, noise, np.zeros((8, 0)), np.zeros(0), tuple("aabbccdd"))
     found = estimate_state(prior, [group], lambda x: x @ spots.T, lambda x: spots, false_alarm=1e-300)
     gain = stated.best_gain(noise)
-    np.testing.assert_allclose(parameters @ found.mean, gain @ shift, rtol=1e-9, atol=1e-9 * np.abs(gain @ shift).max())
+    assert_allclose(parameters @ found.mean, gain @ shift, rtol=1e-9, atol=1e-9 * np.abs(gain @ shift).max())
     total = stated.misfit(gain) + gain @ noise @ gain.T
-    np.testing.assert_allclose(parameters @ found.covariance @ parameters.T, total, atol=1e-9 * np.abs(total).max())
+    assert_allclose(parameters @ found.covariance @ parameters.T, total, atol=1e-9 * np.abs(total).max())
 
 
 def test_agreements_are_predictions_from_all_others() -> None:
@@ -164,7 +158,7 @@ def test_a_gross_error_is_left_out() -> None:
     fewer = MeasuredGroup("one", "n", labels, one.values[kept], spread, one.biases[kept], one.bias_sigmas, blocks)
     table = model.table[np.concatenate([kept, np.ones(8, dtype=bool)])]
     other = estimate_state(model.prior, [fewer, two], lambda x: x @ table.T, lambda x: table)
-    np.testing.assert_allclose(found.mean / model.prior.sigma, other.mean / model.prior.sigma, atol=1e-9)
+    assert_allclose(found.mean / model.prior.sigma, other.mean / model.prior.sigma, atol=1e-9)
 
 
 def test_a_curved_instrument_settles_at_the_mode() -> None:
@@ -216,12 +210,12 @@ def test_combinations_are_independent_and_keep_their_prior_where_nothing_is_meas
     found = model.estimate(groups)
     known = combinations(found)
     assert [one.known for one in known[3:]] == [False] * 4
-    np.testing.assert_allclose([one.sigma for one in known[3:]], 1.0, atol=1e-9)
+    assert_allclose([one.sigma for one in known[3:]], 1.0, atol=1e-9)
     scale = model.prior.sigma
     rows = np.stack([one.weights for one in known]) / scale
-    np.testing.assert_allclose(rows @ model.prior.covariance @ rows.T, np.eye(M), atol=1e-8)
-    np.testing.assert_allclose(rows @ found.covariance @ rows.T, np.diag([one.sigma**2 for one in known]), atol=1e-8)
-    np.testing.assert_allclose(rows @ found.mean, [one.value for one in known], atol=1e-8)
+    assert_allclose(rows @ model.prior.covariance @ rows.T, np.eye(M), atol=1e-8)
+    assert_allclose(rows @ found.covariance @ rows.T, np.diag([one.sigma**2 for one in known]), atol=1e-8)
+    assert_allclose(rows @ found.mean, [one.value for one in known], atol=1e-8)
 
 
 def actuators(count: int, step: float = 0.5, reach: float = 2.0, relative: float = 0.02) -> Actuators:
@@ -252,7 +246,7 @@ def test_the_best_move_is_the_best_of_all(seed: int) -> None:
     # what a fixed error of any move costs is not searched for
     assert cost(found.amounts) <= best * (1.0 + 2e-3) + 3 * 0.03**2 * np.sum(length**2)
     assert found.expected == pytest.approx(cost(found.amounts))
-    np.testing.assert_allclose(found.amounts, 0.5 * np.round(found.amounts / 0.5), atol=1e-12)
+    assert_allclose(found.amounts, 0.5 * np.round(found.amounts / 0.5), atol=1e-12)
 
 
 def test_no_range_no_move_and_free_amounts_solve_the_equations() -> None:
@@ -263,8 +257,8 @@ def test_no_range_no_move_and_free_amounts_solve_the_equations() -> None:
     assert not np.any(best_move(residual, slope, still).amounts)
     wide = Actuators(("a", "b"), np.full(2, -99.0), np.full(2, 99.0), np.zeros(2), np.zeros(2), np.zeros(2))
     found = best_move(residual, slope, wide).amounts
-    np.testing.assert_allclose(found, np.linalg.lstsq(slope, -residual, rcond=None)[0], atol=1e-9)
-    np.testing.assert_allclose(truncated_move(residual, slope, wide, 2), found, atol=1e-9)
+    assert_allclose(found, np.linalg.lstsq(slope, -residual, rcond=None)[0], atol=1e-9)
+    assert_allclose(truncated_move(residual, slope, wide, 2), found, atol=1e-9)
 
 
 def test_the_worth_of_a_measurement_is_what_it_saves() -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import stats
 
 from analysis.orbit.jitter_lines import search, splined
@@ -110,9 +111,7 @@ def test_two_gaps_together_see_what_each_is_blind_for() -> None:
 
 def test_the_response_is_that_of_a_difference() -> None:
     found = periodogram(Pass(count=800).observed(3), 2.0, 12.0)
-    np.testing.assert_allclose(
-        found.response[:, 0], 2.0 * np.abs(np.sin(np.pi * found.frequency * GAPS[0])), rtol=0, atol=0.06
-    )
+    assert_allclose(found.response[:, 0], 2.0 * np.abs(np.sin(np.pi * found.frequency * GAPS[0])), rtol=0, atol=0.06)
 
 
 @pytest.mark.second
@@ -147,7 +146,7 @@ def test_the_variance_of_the_noise_need_not_be_known() -> None:
     quiet = Pass(((2.0, 0.4, 0.0),)).observed(6)
     loud = Observations.of(10.0 * quiet.value, quiet.group, quiet.time, 10.0 * quiet.weight, quiet.nuisance)
     a, b = (search(one, 0.1, 6.0, RATE) for one in (quiet, loud))
-    np.testing.assert_allclose(a.lines.amplitude_sigma, b.lines.amplitude_sigma, rtol=1e-6)
+    assert_allclose(a.lines.amplitude_sigma, b.lines.amplitude_sigma, rtol=1e-6)
     assert b.factors[0] == pytest.approx(100.0 * a.factors[0])
     none = Pass().observed(7)
     assert not len(
@@ -251,16 +250,16 @@ def test_the_noise_of_each_line_is_estimated() -> None:
     five times that is allowed.
     """
     given = three_lines(1, (2.0, 1.0, 1.0), 1500)
-    np.testing.assert_allclose(given.factors() - [4.0, 1.0, 1.0], 0.0, atol=0.6)
+    assert_allclose(given.factors() - [4.0, 1.0, 1.0], 0.0, atol=0.6)
     even = given.evened(given.factors())
-    np.testing.assert_allclose(even.factors(), 1.0, atol=0.05)
+    assert_allclose(even.factors(), 1.0, atol=0.05)
     assert np.var(even.rest(even.value)) == pytest.approx(1.0, abs=0.15)
     # two lines that are only seen against each other are one noise
     alone = Pass(count=200).observed(2)
     both = Observations.of(
         alone.value, alone.group, alone.time, alone.weight, alone.nuisance, mix=np.full((200, 2, 1), 0.5**0.5)
     )
-    np.testing.assert_allclose(both.factors(), alone.factors()[0], rtol=1e-9)
+    assert_allclose(both.factors(), alone.factors()[0], rtol=1e-9)
 
 
 def test_a_noisy_line_gives_no_false_alarms() -> None:

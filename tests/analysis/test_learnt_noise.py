@@ -118,22 +118,6 @@ def test_noise_of_a_series_is_that_of_its_shifts():
     np.testing.assert_allclose(found[0].covariance, still, rtol=2e-2, atol=2e-2 * still.max())
 
 
-def test_a_part_of_the_detector_has_the_noise_of_all_of_it():
-    """The image after is a window of the detector: places in it count from its corner, noise is the same."""
-    before = screened(spot(FIRST))
-    learnt = learn_template(before, NOISE)
-    first, place = fitted(before, learnt), FIRST + np.array([1.4, 2.3])
-    mean = spot(place)
-    whole = learnt_shift(learnt, first, fitted(screened(mean), learnt), NOISE, SHAPE)
-    part = np.s_[3:60, 5:61]
-    cut = ScreenedFrames(mean[part], np.full((57, 56), 9.0), np.ones((57, 56), bool), 9, 9, np.zeros((2, 2)), ())
-    found = learnt_shift(learnt, first, fitted(cut, learnt, (3, 5)), NOISE, SHAPE)
-    # pixels of the dark edge say a little of level
-    np.testing.assert_allclose(found.covariance, whole.covariance, rtol=1e-2, atol=1e-2 * whole.covariance.max())
-    # the dark pixels draw as well, of which a fifth is not in the window
-    np.testing.assert_allclose(found.lean / whole.lean, 57 * 56 / 64**2, rtol=0.1)
-
-
 @pytest.mark.parametrize(("width", "narrow"), [(0.6, True), (0.75, True), (1.2, False)])
 def test_a_spot_that_pixels_do_not_sample_is_refused(width, narrow):
     """What is finer than two pixels folds into other frequencies, and no interpolation can bring it back."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.matching.correlation import _apart, _second, distinct_points, search
+from analysis.matching.correlation import _second, distinct_points, search
 from analysis.matching.matches import Matches, MatchOptions, Reason, match
 from tests.analysis.refusals import refuses
 from tests.analysis.texture_image import Texture, detected
@@ -127,18 +127,6 @@ def test_points_are_distinct_and_spread(texture, frame, points):
     for even in (7.0, np.nan):
         assert len(distinct_points(np.full((100, 100), even), 20, spacing=5, border=5)) == 0
     refuses(ValueError, "leaves nothing", distinct_points, frame, 5, spacing=5, border=400)
-
-
-def test_points_apart_are_those_of_all_pairs():
-    """One after the other, each kept unless one that was kept before lies within the reach along both axes."""
-    place = np.random.default_rng(5).integers(0, 60, (400, 2))
-    for reach in (0, 1, 4):
-        kept = []
-        for one in place:
-            if all(np.abs(one - other).max() > reach for other in kept):
-                kept.append(one)
-        assert 10 < len(kept) < 400
-        assert np.array_equal(_apart(place, reach), kept)
 
 
 def test_second_peaks_count_from_four_pixels_on():

@@ -123,20 +123,3 @@ def test_observability_outside_a_small_family():
     assert any("leaves a residual" in line for line in report.statements)
     refuses(ValueError, "family", observability, NAMES, SPOTS, PARAMETERS, SIZES, COVARIANCE, [0, 0])
     refuses(ValueError, "positive scales", observability, NAMES, SPOTS, PARAMETERS, SIZES[:2], COVARIANCE, [0])
-
-
-def test_more_spots_than_a_pair():
-    """Eight coordinates: every motion of the family is found, weighted by the noise; two equal pairs are one with half
-    of the variance, and a pair without light says nothing.
-    """
-    motions = np.array([2e-6, -1e-6, 3e-6, 4e-6])
-    twice = np.vstack([SPOTS, SPOTS])
-    for share in (1.0, 1e12):
-        spread = np.block([[COVARIANCE, np.zeros((4, 4))], [np.zeros((4, 4)), share * COVARIANCE]])
-        found = fit(twice @ motions, spread, twice, PARAMETERS)
-        one = fit(SPOTS @ motions, COVARIANCE, SPOTS, PARAMETERS)
-        np.testing.assert_allclose(found.vector, one.vector, rtol=1e-9)
-        # weights of two measurements add up
-        np.testing.assert_allclose(found.covariance, one.covariance / (1.0 + 1.0 / share), rtol=1e-9, atol=1e-30)
-    with pytest.raises(ValueError, match="8 spot coordinates cannot fix 9"):
-        fit(np.zeros(8), np.eye(8), np.ones((8, 9)), np.ones((4, 9)))

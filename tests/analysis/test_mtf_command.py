@@ -222,22 +222,6 @@ def test_a_tiff_of_8_bits_with_a_colour_profile_gives_a_warning(tmp_path):
         assert ("its 8-bit pages have a colour profile" in warning(tmp_path / "one.tiff", *EDGE)) == warned
 
 
-def test_a_jpeg_may_have_its_tables_before_its_frame(tmp_path):
-    """The order of segments before the scan is free but for the tables that it needs."""
-    cv2.imwrite(str(tmp_path / "plain.jpg"), np.round(edge_frame() / 60.0).astype(np.uint8))
-    data = (tmp_path / "plain.jpg").read_bytes()
-    segments, place = [], 2
-    while data[place + 1] != 0xDA:  # start of scan
-        end = place + 2 + int.from_bytes(data[place + 2 : place + 4], "big")
-        segments.append(data[place:end])
-        place = end
-    turned = sorted(segments, key=lambda one: one[1] == 0xC0)
-    assert turned != segments
-    (tmp_path / "turned.jpg").write_bytes(data[:2] + b"".join(turned) + data[place:])
-    plain, other = (run_json(tmp_path / f"{name}.jpg", *EDGE, "--gamma", "1") for name in ("plain", "turned"))
-    assert other["mtf"] == plain["mtf"]
-
-
 def test_a_png_that_names_its_curve_gives_a_warning_and_one_of_no_known_colour_type_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "plain.png"), edge_frame())
     data = (tmp_path / "plain.png").read_bytes()

@@ -163,25 +163,6 @@ def test_coefficients_solve_the_papers_least_squares():
         assert fit.coefficients[:2] == pytest.approx(expected, rel=1e-10)
 
 
-def test_sigma_by_hand():
-    """Station exact, n points: the pitch of a plane is known to sigma / (range sqrt n), so alpha to the root of two."""
-    angles = intersection_angles(*fits(SCENE, noise=1.5, sigma_station=0.0))
-    nadir, oblique = (1.5 / (np.linalg.norm(SCENE.points[k] - SCENE.station, axis=1).mean() * np.sqrt(20))
-                      for k in ("nadir", "forward"))  # fmt: skip
-    # points are not quite even about the middle, so their yaw error leaks a little into the pitch of each plane
-    assert angles.sigma[0] == pytest.approx(np.hypot(nadir, oblique), rel=0.1)
-    assert angles.covariance[0, 1] == pytest.approx(-(nadir**2), rel=0.1)
-    # the station alone, with exact points: vectors n_f / R_f - n_n / H, so 1 m gives 1 / H at least across one plane
-    # (not much better than 1 m: exact points on relief would fix the planes without the station)
-    planes = fits(SCENE, noise=0.05, sigma_station=1.0)
-    both = intersection_angles(*planes)
-    slope = [SCENE.body @ rotation([0, look, 0])[:, 0] for look in LINES.values()]
-    reach = [1 / np.linalg.norm(p - SCENE.station, axis=1).mean() for p in SCENE.points.values()]
-    forward, down, backward = (s * r for s, r in zip(slope, reach, strict=True))
-    assert both.sigma[0] == pytest.approx(np.linalg.norm(forward - down), rel=0.02)
-    assert both.covariance[0, 1] == pytest.approx((forward - down) @ (down - backward), rel=0.05)
-
-
 def test_alpha_and_beta_share_the_error_of_the_station():
     """The station moved by each of its sigmas and fitted anew changes both angles together; the covariance is the sum
     of these products beside that of the points. 1.5 m at 500 km are 3e-6 rad: the second order is as small."""
@@ -235,23 +216,6 @@ def test_both_ways_of_total_least_squares_agree():
     iterated = fit_plane(Station.of(scene.station, 0.5), Strip.of(scene.points["backward"], nearly))
     direct = fit_plane(Station.of(scene.station, 0.5), Strip.of(scene.points["backward"], 1.5))
     assert iterated.normal == pytest.approx(direct.normal, abs=1e-13)
-
-
-def test_frames_agree_for_total_least_squares_only():
-    """One noisy pass in ECEF, in a local frame 5 deg away and in the nearly orbital frame. Explicit forms minimise
-    another distance in each frame: they differ by far more than the 1e-6 arcsec that total least squares keeps.
-    """
-    scene = noisy(SCENE, np.random.default_rng(8), 2.0, 0.5)
-    turns = [np.eye(3), enu(120 * DEG, 44 * DEG), orbital(scene)]
-    tls = [intersection_angles(*fits(scene, "tls", 2.0, turn=turn)) for turn in turns]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NearVerticalWarning)
-        explicit = [intersection_angles(*fits(scene, "corrected", 2.0, turn=turn)) for turn in turns]
-    assert max(np.abs(a.values - tls[0].values).max() for a in tls) < 1e-6 * ARCSEC
-    assert max(np.abs(a.covariance / tls[0].covariance - 1).max() for a in tls) < 1e-9
-    difference = [np.abs(a.values - tls[0].values).max() / ARCSEC for a in explicit]
-    assert 1e-5 < difference[0] < 0.05  # ECEF: harmless beside a sigma of 0.2 arcsec, but not zero
-    assert difference[2] > 1.0
 
 
 def test_nearly_vertical_plane_is_announced():
@@ -323,24 +287,6 @@ def test_small_angles_keep_all_digits():
         a, side = np.linalg.qr(rng.standard_normal((3, 2)))[0].T
         # components of b are rounded to 1e-16
         assert np.abs(look_angle(a, np.cos(angle) * a + np.sin(angle) * side) - angle) < 4e-16
-
-
-def test_off_axis_angle_of_another_line():
-    """The outlook: a high-resolution line 0.3 deg and a multispectral line 2 deg off the nadir line."""
-    looks = {"forward": 0.3 * DEG, "nadir": 0.0, "backward": -2 * DEG}
-    high, nadir, multispectral = fits(descending_pass(looks=looks))
-    assert off_axis_angle(high, nadir).values[0] == pytest.approx(0.3 * DEG, abs=1e-13)
-    assert off_axis_angle(multispectral, nadir).values[0] == pytest.approx(2 * DEG, abs=1e-13)
-    # near to each other the station's error nearly drops out
-    assert fits_sigma(descending_pass(looks=looks)) < 0.02 * fits_sigma(SCENE)
-    # an angle within its own noise is folded at zero
-    close = descending_pass(looks={"forward": 0.1 * ARCSEC, "nadir": 0.0})
-    assert off_axis_angle(*fits(close)).folded
-
-
-def fits_sigma(scene):
-    """Sigma of alpha from a station wrong by 1 m and exact points, planes through the station as in the paper."""
-    return intersection_angles(*fits(scene, "corrected", noise=1e-3, sigma_station=1.0)).sigma[0]
 
 
 @pytest.mark.parametrize("twist", [0.0, 10 / 60 * DEG, 1 * DEG])

@@ -114,29 +114,6 @@ def test_coupling_of_focus_and_line_level(angle):
     assert np.linalg.norm(drift - plan.mount.normal * (drift @ plan.mount.normal)) < 1e-9
 
 
-@pytest.mark.parametrize(("angle", "rotation_vector"), [(0, [0, 5, 0]), (0, [5, 0, 0]), (20 * DEG, [5, 0, 0])])
-def test_no_coupling(angle, rotation_vector):
-    """A surface that is not inclined, and a tilt about the axis of the inclination itself."""
-    plan = shim_plan(RigidMotion.of(np.array(rotation_vector) * ARCMIN, [0, 0, 0]), make_mount(angle))
-    assert abs(plan.level_coupling) < 1e-9
-    assert abs(plan.turn) < 1e-9
-
-
-def test_level_turn_is_made_by_hand():
-    """A pure turn about Z' on a flat mount needs no shim, only sliding: r times the angle at each hole."""
-    mount = make_mount()
-    plan = shim_plan(RigidMotion.of([0, 0, 4 * ARCMIN], [0, 0, 0]), mount)
-    assert np.abs(plan.change).max() < 1e-17
-    radius = np.linalg.norm(mount.holes[:, :2], axis=1)
-    assert np.linalg.norm(plan.slide, axis=1) == pytest.approx(2 * np.sin(2 * ARCMIN) * radius, rel=1e-12)
-    assert plan.turn == pytest.approx(4 * ARCMIN, rel=1e-12)
-    assert plan.level_coupling == pytest.approx(-4 * ARCMIN, rel=1e-9)
-    # on an inclined surface a piston along Z' slides: 0.3 mm sin 20 deg
-    piston = shim_plan(RigidMotion.of([0, 0, 0], [0, 0, 0.3 * MM]), make_mount(20 * DEG))
-    assert np.linalg.norm(piston.slide, axis=1) == pytest.approx(np.full(4, 0.3 * MM * np.sin(20 * DEG)), rel=1e-12)
-    assert piston.change == pytest.approx(np.full(4, 0.3 * MM * np.cos(20 * DEG)), rel=1e-12)
-
-
 def test_three_pads_are_met_exactly_after_rounding():
     rng = np.random.default_rng(7)
     mount = make_mount(20 * DEG, 30 * DEG, 3)

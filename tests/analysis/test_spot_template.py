@@ -76,27 +76,10 @@ def test_range_is_tight_and_explained():
 
 @pytest.mark.parametrize(
     ("image", "words"),
-    [
-        (np.ones((40, 40)), "margin"),
-        (np.full((80, 80), np.nan), "finite"),
-        (np.zeros((80, 80)), "no flux"),
-    ],
+    [(np.ones((40, 40)), "margin"), (np.full((80, 80), np.nan), "finite"), (np.zeros((80, 80)), "no flux")],
 )
 def test_bad_calibration_images(image, words):
     refuses(ValueError, words, SpotTemplate.from_image, image, 20, 20, (48, 48))
-
-
-@pytest.mark.parametrize("oversampling", [1, 2])
-def test_the_smallest_calibration_image_has_one_place(oversampling):
-    """Quintic splines take six samples: five more than from the first pixel to the last. One fewer is refused."""
-    rows, columns = 9 * oversampling + 6, 7 * oversampling + 6
-    image = airy(rows // 2, columns // 2, (rows, columns))
-    template = SpotTemplate.from_image(image, rows // 2, columns // 2, (10, 8), oversampling)
-    for low, high in template.supported():
-        assert 0 <= high - low <= 1 / oversampling
-    template.evaluate(*(low for low, _ in template.supported()))
-    for less in (image[:-1], image[:, :-1]):
-        refuses(ValueError, "margin", SpotTemplate.from_image, less, rows // 2, columns // 2, (10, 8), oversampling)
 
 
 # --- smeared ----------------------------------------------------------------------------------------------------------

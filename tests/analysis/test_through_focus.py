@@ -101,24 +101,6 @@ def test_sigma_agrees_with_scatter(frequency, step, half, noise):
     assert stats.chi2.sf(total, freedom) > FALSE_ALARM / 2
 
 
-def test_batch_agrees_with_single_curves():
-    rng = np.random.default_rng(5)
-    z = steps(50 * UM, -0.6e-3, 0.6e-3)
-    focus = rng.uniform(-2e-4, 2e-4, (2, 3))
-    value = curve(z, focus, PAN, 0.2) + rng.normal(0, 0.004, (2, 3, z.size))
-    many = focus_vertices(z, value, 0.004)
-    assert many.position.shape == (2, 3)
-    one, same = focus_vertex(z, value[1, 2], 0.004), many.at(1, 2)
-    # the batch iterates until all curves rest: the same fixed point to the convergence of Gauss-Newton
-    assert one.position == pytest.approx(same.position, abs=1e-9 * 1e-3)
-    assert one.sigma == pytest.approx(same.sigma, rel=1e-6)
-    assert one.degrees_of_freedom == same.degrees_of_freedom == same.used.sum() - 3
-    # the curvature is the second derivative: compare with the exact curve's central difference over 20 um
-    d = 20 * UM
-    bend = np.diff(curve(np.array([-d, 0, d]), [0.0], PAN, 0.2)[0], 2)[0] / d**2
-    assert one.curvature == pytest.approx(bend, rel=0.15)
-
-
 def test_unmeasured_points_are_left_out():
     z = steps(50 * UM, -0.6e-3, 0.6e-3)
     value = curve(z, [30 * UM], PAN, 0.2)[0]

@@ -147,17 +147,6 @@ def test_sigmas_hold_for_correlated_noise(length, light, low, high):
     assert np.mean(independent) == pytest.approx(expected, rel=0.35)
 
 
-def test_sigmas_of_coefficients_share_what_looks_alike():
-    """Over half of the disk, coefficients are much worse than parts, and their covariance says how they go together."""
-    x, y = disk(150, 75.0, 74.0, 70.0)
-    lit = (np.hypot(x, y) <= 1.0) & (y < 0.0)
-    values = np.where(lit, 1e-8 * noise_map(np.random.default_rng(4), 150, 0.0), np.nan)
-    found = fit_map(map_of(values), range(1, 12), Pupil(75.0, 74.0, 70.0))
-    assert np.max(found.sigma) > 4.0 * np.sqrt(np.max(np.diag(found.parts_covariance)))
-    back = found.factor @ found.covariance @ found.factor.T
-    np.testing.assert_allclose(back, found.parts_covariance, rtol=0, atol=1e-9 * np.abs(back).max())
-
-
 def test_terms_that_the_light_does_not_tell_apart():
     x, y = disk(100, 50.0, 50.0, 45.0)
     values = np.where((np.abs(y) < 1e-9) & (np.abs(x) <= 1.0), 0.0, np.nan)
