@@ -10,13 +10,11 @@ from analysis.monitor.autocollimator import (
     ReadingMap,
     column_component,
     exact_reading,
-    mean_difference,
     mirror_rotation,
     reading_of_normal,
     relation_factor,
 )
 from tests.analysis.refusals import refuses
-from twin.validation.paper_001 import table2 as printed
 
 ARCSEC = math.pi / 648000
 
@@ -70,18 +68,3 @@ def test_a_reading_map_needs_enough_spots() -> None:
     with pytest.raises(ValueError, match="do not settle a polynomial of degree 5"):
         ReadingMap.fit(np.random.default_rng(0).uniform(0, 9, (20, 2)), np.zeros((20, 2)))
     refuses(ValueError, r"must both be \(P, 2\)", ReadingMap.fit, np.zeros((30, 2)), np.zeros((30, 3)))
-
-
-def test_the_printed_last_line_comes_from_the_printed_rows() -> None:
-    for axis in ("X", "Y"):
-        mean = mean_difference(printed.MIRROR_1[axis], printed.MIRROR_2[axis])
-        assert mean == pytest.approx(printed.MEAN_DIFFERENCE[axis], abs=6e-7)
-    # about Z it is another difference: mirror 2 against the turntable
-    assert mean_difference(printed.ANGLES, printed.MIRROR_2["Z"]) == pytest.approx(
-        printed.MEAN_DIFFERENCE["Z"], abs=6e-7
-    )
-    assert mean_difference(printed.MIRROR_1["Z"], printed.MIRROR_2["Z"]) == pytest.approx(48.21, abs=0.01)
-    # and the one of X and Y would not be that against the turntable
-    for axis in ("X", "Y"):
-        for mirror in (printed.MIRROR_1, printed.MIRROR_2):
-            assert abs(mean_difference(printed.ANGLES, mirror[axis]) - printed.MEAN_DIFFERENCE[axis]) > 0.07

@@ -93,18 +93,6 @@ def test_motions_of_no_size_change_nothing():
     np.testing.assert_allclose(limits.known_sigma(rows, stated, noise, [stated.labels[:5]])[0], left, rtol=1e-9)
 
 
-def test_a_known_motion_is_one_that_is_measured_without_error():
-    """Also what goes with it is then known better: a further spot that sees that motion alone, without noise."""
-    stated, noise, rows = a_statement(), a_noise(), np.eye(8)
-    sees = np.zeros((1, 24))
-    sees[0, 7] = 1e6
-    more = limits.extended(stated, sees, [False] * 24)
-    wider = np.zeros((9, 9))
-    wider[:8, :8], wider[8, 8] = noise, 1.0
-    left = limits.posterior_sigma(rows, more, wider)
-    np.testing.assert_allclose(limits.known_sigma(rows, stated, noise, [stated.labels[7:8]])[0], left, rtol=1e-6)
-
-
 def test_the_motions_that_hide_change_the_quantity_by_what_is_left():
     stated, noise = a_statement(), a_noise()
     row = np.zeros(8)

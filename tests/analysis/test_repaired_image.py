@@ -111,16 +111,3 @@ def test_the_influence_of_every_pixel_is_the_change_it_makes(template, measure, 
         scale = np.sqrt(np.einsum("ahw,ahw->a", found.gain_maps[0], found.gain_maps[0]))
         np.testing.assert_array_less(np.abs(change - expected), 0.01 * scale)
     assert np.all(found.gain_maps[0][:, ~dirty.good] == 0.0)
-
-
-@pytest.mark.parametrize("measure", MEASURES)
-def test_nothing_to_repair_is_nothing_repaired(template, measure):
-    """The centroid's own numbers, but that its noise is that of the fit, and of 20 pixels of one frame less."""
-    clean = bench(template, "clean")
-    found, cost = clean.place(clean.image, measure)
-    own = measure(clean.image[None], NOISE)
-    np.testing.assert_array_equal(found.position, own.position)
-    np.testing.assert_array_equal(found.gain_maps, own.gain_maps)
-    size = float(np.max(own.covariance))
-    np.testing.assert_allclose(found.covariance, own.covariance, rtol=0, atol=0.02 * size)
-    assert 0.0 < cost < 0.02

@@ -61,17 +61,6 @@ def test_linear_derivative_agrees_with_recomputation(method):
         assert np.abs(row.change[:, 1] - row.slope).max() < 1e-3 * 2e-6
 
 
-def test_any_lines_and_angles():
-    """Two lines and one angle have the same numbers as among three; a third line that no angle needs is no matter."""
-    strips = dict(zip(SCENE.points, SCENE.strips(1.5), strict=True))
-    two = {name: strips[name] for name in ("backward", "nadir")}
-    for given in (two, strips):
-        for row in sensitivity(Station.of(SCENE.station, 0.5), given, {"off_axis": ("backward", "nadir")}):
-            assert set(row.to_dict()) == {"what", "axis", "off_axis_arcsec_per_10m"}
-            among_three = ROWS[row.what, row.axis]
-            assert row.slope == pytest.approx(among_three.slope[among_three.angles.index("beta")], abs=1e-20)
-
-
 @pytest.mark.parametrize("amounts", [[0, 1], [1, 2, 3], [0, 2, 1], [0, 1, np.nan], np.zeros((3, 3))])
 def test_bad_amounts(amounts):
     refuses(ValueError, "rising numbers", table, amounts=amounts)

@@ -31,16 +31,16 @@ MIDDLE = (0.13, 0.21)
 ACCURACY = 5e-4
 
 
-def transfer(f, angle, pitch=PAN, smear=0.0):
-    """OTF at f cycles/pixel along the normal of an edge tilted by angle; smear in pixels along the columns."""
+def transfer(f, angle, pitch=PAN):
+    """OTF at f cycles/pixel along the normal of an edge tilted by angle."""
     s = np.minimum(f / pitch * WAVELENGTH * F_NUMBER, 1.0)
     along, across = f * math.cos(angle), f * math.sin(angle)
     pupil = 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
-    return pupil * np.sinc(along) * np.sinc(across) * np.sinc(smear * across)
+    return pupil * np.sinc(along) * np.sinc(across)
 
 
 @cache
-def edge_spread(angle, reach, pitch, smear):
+def edge_spread(angle, reach, pitch):
     """E(d) = 1/2 + int_0^fc Im(H exp(2 pi i f d)) / (pi f) df on a grid of 0.01 px, as a spline."""
     cutoff = pitch / (WAVELENGTH * F_NUMBER)
     x, w = np.polynomial.legendre.leggauss(32)
@@ -49,17 +49,17 @@ def edge_spread(angle, reach, pitch, smear):
     half, mid = np.diff(panels)[:, None] / 2, (panels[1:] + panels[:-1])[:, None] / 2
     f, weight = (mid + half * x).ravel(), (half * w).ravel()
     step, fine, whole = 0.01, 100, np.arange(-reach - 1, reach + 2)
-    coarse = np.exp(2j * np.pi * np.outer(whole, f)) * (weight * transfer(f, angle, pitch, smear) / (np.pi * f))
+    coarse = np.exp(2j * np.pi * np.outer(whole, f)) * (weight * transfer(f, angle, pitch) / (np.pi * f))
     table = coarse @ np.exp(2j * np.pi * np.outer(f, np.arange(fine) * step))
     return CubicSpline((whole[:, None] + np.arange(fine) * step).ravel(), 0.5 + table.imag.ravel())
 
 
-def edge_image(degrees, rows=64, columns=None, pitch=PAN, smear=0.0, bend=0.0):
+def edge_image(degrees, rows=64, columns=None, pitch=PAN, bend=0.0):
     """Noise-free grey values of a near-vertical edge through (row, column) = middle + MIDDLE, bright on the right."""
     angle, columns = math.radians(degrees), columns or rows
     row = np.arange(rows)[:, None] - (rows - 1) / 2 - MIDDLE[0]
     column = np.arange(columns) - (columns - 1) / 2 - MIDDLE[1] - bend * row**2 / 2
-    spread = edge_spread(angle, 6 + math.ceil(math.hypot(rows, columns) / 2), pitch, smear)
+    spread = edge_spread(angle, 6 + math.ceil(math.hypot(rows, columns) / 2), pitch)
     return DARK + (BRIGHT - DARK) * spread(column * math.cos(angle) - row * math.sin(angle))
 
 
@@ -116,17 +116,6 @@ def test_perfect_pupil(degrees, size, pitch):
         assert (edge.dark, edge.bright) == pytest.approx((DARK, BRIGHT), abs=levels)
 
 
-def test_smear_along_the_columns():
-    """TDI smear of two pixels: at 10 deg it takes 1% of the MTF at Nyquist of a near-vertical edge."""
-    image = edge_image(10, smear=2.0)
-    with_smear, without = (
-        transfer(np.array([0.5]), math.radians(10), smear=2.0),
-        transfer(np.array([0.5]), math.radians(10)),
-    )
-    assert 1 - (with_smear / without)[0] > 0.01
-    assert error_of(measure_edge(image), 10, smear=2.0)[0] < ACCURACY
-
-
 def test_all_ways_round():
     """Bright left, right, up, down, tilted either way: the same MTF; the angle's sign and the position follow."""
     image = edge_image(5)
@@ -152,7 +141,7 @@ def test_frequencies_along_the_axis_are_lower_by_the_cosine():
 
 def test_spread_functions():
     edge = measure_edge(edge_image(5))
-    truth = edge_spread(math.radians(5), 6 + math.ceil(64 / math.sqrt(2)), PAN, 0.0)
+    truth = edge_spread(math.radians(5), 6 + math.ceil(64 / math.sqrt(2)), PAN)
     near = np.abs(edge.place) < 20
     assert_allclose(edge.esf[near], DARK + (BRIGHT - DARK) * truth(edge.place[near]), atol=5e-4 * (BRIGHT - DARK))
     assert_allclose(edge.lsf[near], truth(edge.place[near], 1), atol=0.005)

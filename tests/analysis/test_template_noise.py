@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from scipy import ndimage, stats
 
-from analysis.matching.least_squares import least_squares
-from analysis.matching.matches import MatchOptions
 from analysis.matching.spline import SplineStack, low_passed
 from analysis.matching.template_noise import noise_energy, template_noise
-from tests.analysis.stereo_pairs import Pair, textured
+from tests.analysis.stereo_pairs import Pair
 
 HALF, REACH = 15, 12
 SHIFT = np.array([0.37, -0.21])
@@ -116,16 +114,3 @@ def test_places_on_edges_keep_in_their_covariances():
     assert np.sqrt(np.linalg.cond(found.covariance[used])).min() > 3.0
     bare = edges(150, noise=2.0, faint=0.0, seed=4).matched()
     assert bare.accepted.sum() <= stats.binom.isf(1e-3, 150, 11 / 800)
-
-
-def test_templates_without_noise_lose_nothing():
-    """Curvature and normal matrix are the same, and there is no lean: the covariance is the usual one."""
-    pair = textured(6, noise=0.0)
-    rng = np.random.default_rng(5)
-    noisy = pair.second + 0.1 * rng.standard_normal(pair.second.shape)
-    fits = least_squares(noisy, pair.templates(), pair.true, MatchOptions())
-    good = np.isfinite(fits.template.lean).all(axis=1)
-    assert good.all()
-    lean = fits.template.covariance(good)
-    noise, _relief = fits.covariances(good)
-    assert np.median(np.trace(lean, axis1=1, axis2=2) / np.trace(noise, axis1=1, axis2=2)) < 0.05

@@ -10,7 +10,7 @@ from analysis.measurement_error import UndeterminedError
 from analysis.wavefront_maps.map_files import read_map
 from analysis.wavefront_maps.pupil_fit import Pupil, find_pupil, fit_map
 from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
-from analysis.wavefront_maps.zernike_terms import annular_terms, circle_terms
+from analysis.wavefront_maps.zernike_terms import circle_terms
 from tests.analysis.refusals import refuses
 from tests.analysis.wavefront_files import real_file
 from tests.tiers import quick
@@ -77,18 +77,6 @@ def test_coefficients_come_back_exactly(light):
     assert found.points == np.count_nonzero(lit)
     assert found.beyond == 0
     assert found.residual_rms < 1e-20
-
-
-def test_over_a_ring_parts_are_mahajans_coefficients():
-    """Up to the pixels at the edges: a few thousandths with a radius of 200."""
-    x, y = disk(420, 209.7, 210.2, 200.0)
-    r = np.hypot(x, y)
-    lit = (r <= 1.0) & (r >= 0.4)
-    truth = np.random.default_rng(2).normal(size=15) * 1e-7
-    values = np.full(x.shape, np.nan)
-    values[lit] = annular_terms(15, x[lit], y[lit], 0.4) @ truth
-    found = fit_map(map_of(values), range(1, 16), Pupil(209.7, 210.2, 200.0))
-    np.testing.assert_allclose(found.parts, truth, rtol=0, atol=3e-3 * np.abs(truth).max())
 
 
 def test_distortion_of_the_picture_of_the_pupil():
