@@ -19,10 +19,8 @@ STATIONARY = (
     TimeLaw(period_s=90.0),
     TimeLaw(drift_s=200.0, period_s=70.0),
 )
-TREND, GROWING = TimeLaw(trend_s=80.0, since_s=10.0), TimeLaw(trend_s=80.0, period_s=30.0)
+TREND = TimeLaw(trend_s=80.0, since_s=10.0)
 RELAXATION, EVENT = TimeLaw(relaxation_s=25.0, since_s=20.0), TimeLaw(event=((30.0, 1.0),))
-UNSURE = TimeLaw(event=((20.0, 0.0), (30.0, 0.7), (45.0, 0.7), (50.0, 1.0)))
-SETS_IN = TimeLaw(event=((30.0, 1.0),), drift_s=40.0, period_s=60.0)
 
 
 def stated(laws, seed: int = 0, spots: int = 3) -> Disturbances:

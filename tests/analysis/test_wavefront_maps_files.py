@@ -276,7 +276,7 @@ def test_spoilt_files_are_read_or_refused_in_one_sentence(kind, tmp_path):
                 assert np.isfinite(numbers).any(), seed
             except MapError as error:
                 told.append(str(error))
-    assert 0 < len(told) < 40
+    assert len(told) > 5
     assert all(str(other) in text and "\n" not in text for text in told)
 
 
