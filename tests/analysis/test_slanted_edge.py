@@ -17,6 +17,7 @@ from scipy import stats
 from scipy.interpolate import CubicSpline
 
 from analysis.mtf.edge_location import EdgeError, _direction, locate_edge, pixel_noise
+from analysis.mtf.rice import rice_sigma, signal_modulus
 from analysis.mtf.slanted_edge import measure_edge
 from analysis.spots.noise import NoiseModel
 from tests.analysis.refusals import refuses
@@ -185,6 +186,18 @@ def test_sigma_agrees_with_the_scatter(contrast_e, use_model):
         assert low < np.sum((value - value.mean()) ** 2) / np.mean(sigma**2) < high
     # no sigma at zero frequency, where the normalisation makes 1
     assert all(edge.sigma[0] < 1e-9 for edge in edges)
+
+
+def test_the_angle_enters_the_sigma():
+    """A slope that is wrong by d shifts row v by v d cos: 1 - mean cos(2 pi f v d cos) is k z^2 of a normal z, whose
+    mean square is 3 k^2. The angle's sigma is that of d times cos^2. Even in this noise it counts for little."""
+    for edge in repeats(200)[:3]:
+        cosine, rows = math.cos(edge.angle), np.arange(64) - 31.5
+        k = 0.5 * (2 * np.pi * edge.frequency * edge.angle_sigma / cosine) ** 2 * np.mean(rows**2)
+        signal = signal_modulus(edge.mtf, edge.sigma_along, edge.sigma_across)
+        noise = rice_sigma(signal, edge.sigma_along, edge.sigma_across)
+        assert edge.sigma**2 == pytest.approx(noise**2 + 3 * (k * edge.mtf) ** 2, rel=1e-9)
+        assert np.any(edge.sigma[:33] > 1.00001 * noise[:33])
 
 
 def test_frames_and_fixed_pattern_enter_the_sigma():
