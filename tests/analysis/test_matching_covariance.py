@@ -46,6 +46,14 @@ def test_errors_keep_in_their_covariances(changes) -> None:
 
 
 @pytest.mark.second
+def test_covariances_are_neither_too_large_nor_too_small() -> None:
+    """400 points of even texture: the mean half of chi-square is 1, with a standard deviation of 1/20; 3.3 of it."""
+    used, _, square, _ = judged(textured(20, **EASY | {"noise": 0.25}))
+    assert used.mean() > 0.95
+    assert abs(square.mean() - 1.0) < 3.3 / np.sqrt(len(square))
+
+
+@pytest.mark.second
 def test_windows_over_edges_between_layers_are_refused() -> None:
     """Two textures, the near one 1.5 px before the far one and hiding some of it: half of the windows hold an edge.
     Those without one are used, and what is used is right within its covariance.
