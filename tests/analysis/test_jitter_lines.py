@@ -74,6 +74,7 @@ def test_lines_are_recovered_within_their_sigmas() -> None:
     assert low < chi < high
 
 
+@pytest.mark.second
 def test_the_phase_counts_from_the_epoch_and_the_course_has_a_covariance_that_holds() -> None:
     at, square = np.linspace(0.5, 9.5, 40), []
     passes = 12
@@ -262,6 +263,7 @@ def test_the_noise_of_each_line_is_estimated() -> None:
     assert_allclose(both.factors(), alone.factors()[0], rtol=1e-9)
 
 
+@pytest.mark.second
 def test_a_noisy_line_gives_no_false_alarms() -> None:
     """One of three lines with twice the noise that is stated: alarms keep to a rate of 0.1, at the limit of 1e-3."""
     alarms = sum(

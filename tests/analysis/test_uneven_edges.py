@@ -78,6 +78,7 @@ def drawn(seed):
     return (image if rng.random() < 0.5 else image.T), degrees, blur
 
 
+@pytest.mark.second
 def test_errors_are_those_of_sigma():
     """Bow 0 to 2 px, light 0 to 20 % along and across, 2 to 44 deg, blur 0.3 to 2 px, noise, 8 and 16 bit."""
     scores, refused, warned = [], [], 0
@@ -143,6 +144,7 @@ def test_light_that_is_no_plane_is_named(light):
     assert "does not explain" in measure_edge(image).doubt
 
 
+@pytest.mark.second
 def test_structure_is_not_seen_in_noise():
     """At a rate of 1e-4 for 60 regions, and noise-free diffraction leaves less than what is reported."""
     rng, image = np.random.default_rng(6), edge(64, 64, 5, 0.6, (0.0, 0.3), plane(0.1, -0.1))
