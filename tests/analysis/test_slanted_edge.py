@@ -191,7 +191,7 @@ def test_sigma_agrees_with_the_scatter(contrast_e, use_model):
 def test_the_angle_enters_the_sigma():
     """A slope that is wrong by d shifts row v by v d cos: 1 - mean cos(2 pi f v d cos) is k z^2 of a normal z, whose
     mean square is 3 k^2. The angle's sigma is that of d times cos^2. Even in this noise it counts for little."""
-    for edge in repeats(200)[:3]:
+    for edge in repeats(200, 3):
         cosine, rows = math.cos(edge.angle), np.arange(64) - 31.5
         k = 0.5 * (2 * np.pi * edge.frequency * edge.angle_sigma / cosine) ** 2 * np.mean(rows**2)
         signal = signal_modulus(edge.mtf, edge.sigma_along, edge.sigma_across)
