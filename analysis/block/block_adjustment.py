@@ -220,6 +220,7 @@ def adjust_block(
     Raises:
         BlockError: input that cannot be used, points that are not what was photographed, no convergence.
     """
+    block.check()
     block = pruned(block)
     check_places(block)
     assembly = assembled(block, datum)

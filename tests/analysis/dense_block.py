@@ -7,46 +7,12 @@ and points east, north and up. Derivatives are central differences through the t
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from tests.analysis.drawn_blocks import BEYOND, EAST, LOOKS, NORTH, UP, project
+from tests.analysis.drawn_blocks import EAST, LOOKS, NORTH, UP, basis, project
 
 FRAME = np.stack([EAST, NORTH, UP])
 ZERO = np.zeros(3)
-
-
-def _basis(law, times, moments):
-    """Values at times from unknowns: matrix (n, k), and covariance (k, k) at unit sigma."""
-    first, last = float(moments.min()), float(moments.max())
-    middle = 0.5 * (first + last)
-    if law.kind == "constant":
-        return np.ones((len(times), 1)), np.eye(1)
-    if law.kind == "rate":
-        return (times - middle)[:, None], np.eye(1)
-    if law.kind == "orbital":
-        phase = 2 * np.pi * times / law.time
-        return np.stack([np.cos(phase), np.sin(phase)], axis=1), np.eye(2)
-    h = law.interval
-    if law.kind == "white":
-        number = np.arange(np.floor(first / h) - BEYOND, np.floor(last / h) + BEYOND + 1)
-        return make_interp_spline(h * number, np.eye(len(number)), k=3)(times), np.eye(len(number))
-    knots = np.unique(np.concatenate([np.floor(moments / h), np.floor(moments / h) + 1]))
-    number = np.arange(knots[0], knots[-1] + 1)
-    line = make_interp_spline(h * number, np.eye(len(number)), k=1)(times)
-    alike = np.exp(-h * np.abs(number[:, None] - number) / law.time) if law.time else None
-    if law.kind == "slow":
-        return line, alike
-    if law.kind == "jitter":
-        # amplitude and phase as a cosine and a sine, each by itself a slow process
-        phase = 2 * np.pi * law.frequency * times[:, None]
-        return np.concatenate([line * np.cos(phase), line * np.sin(phase)], axis=1), np.kron(np.eye(2), alike)
-    pin = np.round(middle / h)
-    away = h * (number - pin)
-    same = np.sign(away)[:, None] * np.sign(away) > 0
-    keep = number != pin
-    spread = np.where(same, np.minimum(np.abs(away)[:, None], np.abs(away)), 0.0)
-    return line[:, keep], spread[np.ix_(keep, keep)]
 
 
 class DenseBlock:
@@ -108,7 +74,7 @@ class DenseBlock:
                     scopes.setdefault(scope, []).append(one.name)
                 for scope, names in scopes.items():
                     moments = np.concatenate([self._moments(n) for n in names])
-                    _, spread = _basis(term.law, moments[:1], moments)
+                    _, spread = basis(term.law, moments[:1], moments)
                     columns = [self._new(s**2 * spread) if s > 0 else None for s in term.law.sigma]
                     if term.scope == "tracker" and term.law.kind == "constant":
                         self.constants[scope] = np.array([c[0] for c in columns])
@@ -128,10 +94,10 @@ class DenseBlock:
         """(n, 3, size) of the process values by the unknowns."""
         found = np.zeros((len(times), 3, self.size))
         for law, moments, columns in parts:
-            basis, _ = _basis(law, times, moments)
+            own, _ = basis(law, times, moments)
             for axis, where in enumerate(columns):
                 if where is not None:
-                    found[:, axis, where] += basis
+                    found[:, axis, where] += own
         return found
 
     def turns(self, name, times):

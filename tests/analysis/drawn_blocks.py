@@ -13,17 +13,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from analysis.block.block import (
-    Block,
-    CameraKnowledge,
-    Footprints,
-    Pass,
-    Points,
-    Scene,
-    Term,
-    Terrain,
-    TrackerAngle,
-)
+from analysis.block.block import Block, CameraKnowledge, Footprints, Pass, Points, Scene, Term, Terrain, TrackerAngle
 from analysis.block.processes import Law
 from analysis.orbit.three_line_model import LineModel, Rays
 
@@ -98,52 +88,43 @@ class Drawn:
     change: dict
 
 
-def drawn_process(law: Law, times: np.ndarray, random: np.random.Generator):
-    """A function of time (n,) -> (n, 3): one draw of a law over a span of times."""
-    sigma, first, last = np.array(law.sigma), float(times.min()), float(times.max())
+def basis(law: Law, times: np.ndarray, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values of a law at times from unknowns: matrix (n, k), and the unknowns' covariance (k, k) at unit sigma."""
+    first, last = float(moments.min()), float(moments.max())
     middle = 0.5 * (first + last)
     if law.kind == "constant":
-        value = sigma * random.standard_normal(3)
-        return lambda t: np.broadcast_to(value, (len(t), 3))
+        return np.ones((len(times), 1)), np.eye(1)
     if law.kind == "rate":
-        value = sigma * random.standard_normal(3)
-        return lambda t: (t - middle)[:, None] * value
+        return (times - middle)[:, None], np.eye(1)
     if law.kind == "orbital":
-        a, b = sigma * random.standard_normal((2, 3))
-        phase = 2 * np.pi / law.time
-        return lambda t: np.cos(phase * t)[:, None] * a + np.sin(phase * t)[:, None] * b
-    if law.kind == "jitter":
-        # a rotating arrow that forgets itself: amplitude and phase in one complex number
-        number = np.arange(np.floor(first / law.interval) - 1, np.floor(last / law.interval) + 3)
-        arrow = np.zeros((len(number), 3), complex)
-        kept = np.exp(-law.interval / law.time)
-        for k in range(len(number)):
-            new = random.standard_normal(3) + 1j * random.standard_normal(3)
-            arrow[k] = new if k == 0 else kept * arrow[k - 1] + np.sqrt(1 - kept**2) * new
-
-        def swinging(t):
-            place = t / law.interval - number[0]
-            low = np.floor(place).astype(int)
-            share = (place - low)[:, None]
-            amplitude = (1 - share) * arrow[low] + share * arrow[low + 1]
-            return sigma * np.real(np.exp(-2j * np.pi * law.frequency * t)[:, None] * amplitude)
-
-        return swinging
-    number = np.arange(np.floor(first / law.interval) - BEYOND, np.floor(last / law.interval) + BEYOND + 1)
+        phase = 2 * np.pi * times / law.time
+        return np.stack([np.cos(phase), np.sin(phase)], axis=1), np.eye(2)
+    h = law.interval
     if law.kind == "white":
-        return make_interp_spline(law.interval * number, sigma * random.standard_normal((len(number), 3)), k=3)
-    steps = random.standard_normal((len(number), 3))
-    values = np.zeros_like(steps)
-    if law.kind == "walk":
-        values = np.cumsum(steps, axis=0) * np.sqrt(law.interval)
-        # the knot next to the middle is zero
-        values = values - values[np.flatnonzero(number == np.round(middle / law.interval))[0]]
-    else:
-        kept = np.exp(-law.interval / law.time)
-        values[0] = steps[0]
-        for k in range(1, len(number)):
-            values[k] = kept * values[k - 1] + np.sqrt(1 - kept**2) * steps[k]
-    return make_interp_spline(law.interval * number, sigma * values, k=1)
+        number = np.arange(np.floor(first / h) - BEYOND, np.floor(last / h) + BEYOND + 1)
+        return make_interp_spline(h * number, np.eye(len(number)), k=3)(times), np.eye(len(number))
+    knots = np.unique(np.concatenate([np.floor(moments / h), np.floor(moments / h) + 1]))
+    number = np.arange(knots[0], knots[-1] + 1)
+    line = make_interp_spline(h * number, np.eye(len(number)), k=1)(times)
+    alike = np.exp(-h * np.abs(number[:, None] - number) / law.time) if law.time else None
+    if law.kind == "slow":
+        return line, alike
+    if law.kind == "jitter":
+        # amplitude and phase as a cosine and a sine, each by itself a slow process
+        phase = 2 * np.pi * law.frequency * times[:, None]
+        return np.concatenate([line * np.cos(phase), line * np.sin(phase)], axis=1), np.kron(np.eye(2), alike)
+    # a walk: sums of steps, zero at the knot next to the middle; its variance is sigma^2 of the time from there
+    away = h * (number - np.round(middle / h))
+    same = np.sign(away)[:, None] * np.sign(away) > 0
+    spread = np.where(same, np.minimum(np.abs(away)[:, None], np.abs(away)), 0.0)
+    return line[:, away != 0], spread[np.ix_(away != 0, away != 0)]
+
+
+def drawn_process(law: Law, times: np.ndarray, random: np.random.Generator):
+    """A function of time (n,) -> (n, 3): one draw of a law over a span of times."""
+    _, spread = basis(law, times[:1], times)
+    values = np.linalg.cholesky(spread) @ random.standard_normal((len(spread), 3)) * np.array(law.sigma)
+    return lambda t: basis(law, t, times)[0] @ values
 
 
 def project(look: float, change: np.ndarray, arm_body: np.ndarray) -> np.ndarray:

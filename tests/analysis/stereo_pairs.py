@@ -2,10 +2,8 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy import ndimage
-from sklearn.datasets import load_sample_image
 
 from analysis.matching.correlation import search
 from analysis.matching.matches import Matches, MatchOptions, match, resampled
@@ -55,30 +53,6 @@ def textured(side, *, slope=1.0, noise=0.1, relief=0.0, length=12.0, radiometry=
         noise,
         _relief(size, relief, length, seed),
         radiometry,
-        seed,
-    )
-
-
-def photographed(*, noise=0.0, relief=1.0, step=0.0, seed=0) -> Pair:
-    """A photograph of a palace by the water (427 x 640, grey values 0 to 255), points where it is distinct or not.
-
-    step: px by which what lies right of every second stretch of 120 columns is nearer, with an edge of depth.
-    """
-    grey = load_sample_image("china.jpg").astype(float) @ [0.299, 0.587, 0.114]
-    # what an exact resampling takes: detail below the sampling limit
-    surface = ndimage.spline_filter(ndimage.gaussian_filter(grey, 0.7), 5)
-    smooth = _relief(380, relief, 12.0, seed)
-
-    def disparity(row, column):
-        return smooth(row, column) + step * (np.floor(column / 120.0) % 2)
-
-    return _pair(
-        lambda row, column: _at(surface, row + 24.0, column + 120.0),
-        380,
-        lattice(12, 30, 25, seed + 3),
-        noise,
-        disparity,
-        "same",
         seed,
     )
 
@@ -156,46 +130,3 @@ def _pair(shown, size, places, noise, disparity, radiometry, seed) -> Pair:
 def parabola(pair: Pair) -> np.ndarray:
     """Errors (n, 2) of normalised cross-correlation with a parabola through its peak."""
     return search(pair.second, pair.templates(), pair.predicted(), 4).place - pair.true
-
-
-def rivals(pair: Pair) -> dict[str, np.ndarray]:
-    """Errors (n, 2) of other methods from the whole pixel of the correlation's peak; NaN where one fails."""
-    peaks = pair.true + parabola(pair)
-    templates = pair.templates().astype(np.float32)
-    start = np.nan_to_num(np.rint(peaks), nan=HALF).astype(int)
-    out = {"NCC, parabola": peaks - pair.true}
-    for name, method in (("phase correlation", _phase), ("upsampled correlation", _upsampled), ("ECC", _ecc)):
-        error = np.full(peaks.shape, np.nan)
-        for k, (row, column) in enumerate(start):
-            if np.isfinite(peaks[k]).all():
-                window = pair.second[row - HALF : row + HALF + 1, column - HALF : column + HALF + 1]
-                error[k] = start[k] + method(templates[k], window.astype(np.float32)) - pair.true[k]
-        out[name] = error
-    return out
-
-
-def _phase(template, window):
-    hann = cv2.createHanningWindow(template.shape, cv2.CV_32F)
-    (x, y), _ = cv2.phaseCorrelate(template - template.mean(), window - window.mean(), hann)
-    return np.array([y, x])
-
-
-def _upsampled(template, window):
-    """Peak of the cross-correlation on a grid of a hundredth of a pixel by matrix Fourier transforms."""
-    hann = np.outer(np.hanning(template.shape[0] + 2)[1:-1], np.hanning(template.shape[0] + 2)[1:-1])
-    a, b = (np.fft.fft2(hann * (x - x.mean())) for x in (template, window))
-    shift, frequency = np.arange(-1.0, 1.005, 0.01), np.fft.fftfreq(template.shape[0])
-    kernel = np.exp(2j * np.pi * np.outer(shift, frequency))
-    height = (kernel @ (b * a.conj()) @ kernel.T).real
-    return shift[np.array(np.unravel_index(np.argmax(height), height.shape))]
-
-
-def _ecc(template, window):
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
-    try:
-        _, warp = cv2.findTransformECC(
-            template, window, np.eye(2, 3, dtype=np.float32), cv2.MOTION_AFFINE, stop, None, 1
-        )
-    except cv2.error:
-        return np.full(2, np.nan)
-    return (warp @ [HALF, HALF, 1.0] - HALF)[::-1]

@@ -5,7 +5,6 @@ whole series that knows which these are, and nothing jumps where nothing did.
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pytest
 from scipy.stats import binom
 
 from analysis.chi_square import limit_of
@@ -14,6 +13,7 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.series_filter import SeriesFilter
 from tests.analysis.followed_series import follow, of_shifts
+from tests.analysis.stated_motions import disturbances
 
 NOISE, COUNT, EVERY, DAYS = 0.001, 6, 900.0, 30
 DRIFT = 60.0
@@ -50,12 +50,9 @@ def toy(jumping: bool) -> Disturbances:
                 column[3 * body : 3 * body + 3] = size * ((1.0 if k == 0 else 0.0) + 0.02 * rng.normal(size=3))
                 spots.append(column)
                 parameters.append(size * rng.normal(size=2))
-                names.append(f"body{body}")
-    labels = tuple(f"{name} shift {k}" for k, name in enumerate(names))
+                names.append(f"body{body} shift {len(names)}")
     every = tuple(law for law in laws for _ in range(6))
-    units, size = ("um",) * len(names), np.ones(len(names))
-    columns = np.array(spots).T, np.array(parameters).T
-    return Disturbances("toy", labels, tuple(names), labels, size, units, *columns, np.eye(len(names)), every)
+    return disturbances(every, np.array(spots).T, np.array(parameters).T, names)
 
 
 def drawn(told: Disturbances, seed: int, bad: int, jumps: int) -> Series:
@@ -128,49 +125,6 @@ def test_the_state_is_that_of_the_good_readings() -> None:
             assert np.all(np.abs(course.values[0] - mean) < 1e-6 * sigma)
             assert np.allclose(course.total[0], covariance, rtol=1e-6, atol=1e-9 * sigma.min() ** 2)
     assert left >= 30  # of 36; an error of 0.05 px is within what both bodies' motions make of a coordinate
-
-
-def lives(seeds: range) -> tuple[np.ndarray, list[int], list[int], int]:
-    """Return (n, 2) errors over sigma after each reading, delays of true jumps with bad readings and without, and how
-    many jumps were told that did not come.
-    """
-    told = toy(True)
-    how = SeriesFilter(told, life_s=10.0 * DAYS)
-    off, delays, plain, false = [], [], [], 0
-    for seed in seeds:
-        one = drawn(told, seed, seed % 6, seed % 3)
-        for series, out in ((one, delays), (drawn(told, seed, 0, seed % 3), plain)):
-            belief = how.start(0.0)
-            for k, reading in enumerate(read_of(series)):
-                belief, found = how.update(belief, reading)
-                if found.jump is not None:
-                    came = [at for at in series.jumps.values() if found.jump.after < series.times[at] + 1.0]
-                    came = [at for at in came if series.times[at] - 1.0 <= found.jump.until and at <= k]
-                    out += [k - came[0] + 1] if came else []
-                    false += not came
-                if series is one:
-                    mean, covariance = how.parameters(how.blended(belief), reading.time)
-                    off.append((mean - one.truth[k]) / np.sqrt(np.diag(covariance)))
-    return np.array(off), delays, plain, false
-
-
-def judge(off: np.ndarray, delays: list[int], plain: list[int], false: int, count: int) -> None:
-    """Times of one life go together: coverage may be as far below its share as by chance of one number of each life."""
-    assert false <= binom.ppf(0.999, 2 * count, 1e-3)
-    assert np.abs(off).max() < 10.0
-    for limit, share in ((1.0, 0.683), (1.96, 0.95)):
-        assert np.mean(np.abs(off) < limit) > binom.ppf(1e-3, count, share) / count
-    assert len(delays) >= 0.8 * len(plain)
-    assert np.median(delays) == np.median(plain)
-
-
-def test_lives_with_bad_readings_and_jumps() -> None:
-    judge(*lives(range(18)), 18)
-
-
-@pytest.mark.slow
-def test_two_hundred_lives_with_bad_readings_and_jumps() -> None:
-    judge(*lives(range(200)), 200)
 
 
 def test_a_jump_that_looks_bad_counts_with_both_until_the_next_reading() -> None:

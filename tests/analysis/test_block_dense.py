@@ -55,11 +55,3 @@ def test_every_law_as_one_dense_matrix_has_it(law):
     plan = Plan(ties=20, control=3, check=3, attitude=attitude, station=STATION)
     results = compared(draw(plan, np.random.default_rng(3)).block)
     assert max(results.values()) < 1e-3, results
-
-
-@pytest.mark.slow
-def test_four_scenes_three_hundred_ties_and_ten_controls():
-    attitude = (TRACKER, *(Term(law, "block" if law.kind == "orbital" else "pass") for law in LAWS.values()))
-    plan = Plan(ties=300, control=10, check=0, attitude=attitude, station=STATION)
-    results = compared(draw(plan, np.random.default_rng(5)).block)
-    assert max(results.values()) < 1e-3, results

@@ -10,6 +10,7 @@ from analysis.block.block_adjustment import adjust_block
 from analysis.block.processes import Law
 from optics.numerics.threads import one_blas_thread
 from tests.analysis.drawn_blocks import ARCSEC, PITCH, Plan, draw, without_errors_in_images
+from tests.analysis.refusals import refuses
 from twin.orbit.block.point_workers import point_workers
 from twin.run.cluster import ClusterError
 
@@ -68,7 +69,7 @@ def test_shares_that_went_through_bytes_give_the_same_adjustment():
     same(adjust_block(block, robust="reject", pool=Posted(3)), whole)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 @one_blas_thread()
 def test_workers_of_the_engine_of_studies_give_the_same_adjustment():
     block = spoilt()
@@ -76,8 +77,7 @@ def test_workers_of_the_engine_of_studies_give_the_same_adjustment():
         assert pool.count == 2
         same(adjust_block(block, robust="reject", pool=pool), adjust_block(block, robust="reject"))
         # what fails on a worker is told, and that a worker is gone, too
-        with pytest.raises(ClusterError, match="division"):
-            pool.results(_divided, [(0,)])
+        refuses(ClusterError, "division", pool.results, _divided, [(0,)])
 
 
 def _divided(given):

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from analysis.calibration.adjustment import adjust
 from analysis.orbit.calibration_parameters import CalibrationError, Noise, Prior, Unknowns, monitor_priors
-from analysis.orbit.forward_intersection import check_errors, intersect
+from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.null_space import RankError
 from analysis.orbit.three_line_model import DRIFT
-from tests.analysis.test_adjustment import BIAS, HOLD_X, HOLD_XY, INNER, LABORATORY, SEVEN_NODES, TRUTH, measured
-from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, field_points, make_rays, observe
+from tests.analysis.refusals import refuses
+from tests.analysis.test_adjustment import BIAS, HOLD_X, HOLD_XY, LABORATORY, SEVEN_NODES, TRUTH, measured
+from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, field_points, observe
 
 NOISE = Noise(0.3 * PITCH, 0.5 * ARCSEC)
 DRIFTS = Unknowns(drift=True)
@@ -56,14 +56,6 @@ def known(drift):
     return found
 
 
-def square(found, truth):
-    free = np.array([n not in HOLD_X.held for n in found.names])
-    error = (found.values - np.array([truth[n] for n in found.names]))[free]
-    scale = np.sqrt(np.diag(found.covariance))[free]
-    unit = found.covariance[np.ix_(free, free)] / scale / scale[:, None]
-    return np.array([error / scale @ np.linalg.solve(unit, error / scale), len(error)])
-
-
 def test_exact_data_and_readings_return_everything():
     """1e-6 of each value; zeros of nadir to 1e-6 of a monitor's sigma (rounding of 1e-15 m over f is 3e-10 arcsec)."""
     drift = drifts(np.random.default_rng(1), 2)
@@ -86,71 +78,18 @@ def test_exact_data_and_readings_return_everything():
 def test_what_the_monitor_does_not_tell_is_named():
     drift = drifts(np.random.default_rng(2), 2)
     fields = [measured(view(i, d), name=f"F{i}") for i, d in enumerate(drift)]
-    with pytest.raises(RankError) as caught:
+    with pytest.raises(RankError, match=r"(?s)d_f [+-].*arcsec|arcsec.*d_f [+-]") as caught:
         adjust(fields, LABORATORY, NOISE, unknowns=DRIFTS, gauge=HOLD_XY)
-    together = [set(c.names) for c in caught.value.open]
-    named = set().union(*together)
+    named = set().union(*(c.names for c in caught.value.open))
     for line in LINES:  # drift of both fields against the interior
         assert {f"{line} f", f"F0 {line} d_f", f"F1 {line} d_f"} <= named
-        assert any({f"F0 {line} d_f", f"{line} f"} <= c or {f"F1 {line} d_f", f"{line} f"} <= c for c in together)
     for field in ("F0", "F1"):  # drift of all lines against the bias
-        assert {f"{field} {line} d_alpha" for line in LINES} | {f"{field} pitch"} <= named
-        assert {f"{field} {line} d_beta" for line in LINES} | {f"{field} roll"} <= named
-    text = str(caught.value)
-    assert "d_alpha" in text
-    assert "arcsec" in text
-    assert "d_f +" in text or "d_f -" in text
+        assert {f"{field} {line} {n}" for line in LINES for n in ("d_alpha", "d_beta")} <= named
+        assert {f"{field} pitch", f"{field} roll"} <= named
     # a monitor on two lines only: the third one's drift stays open against bias and interior
     some = [p for p in told(drift) if not any("nadir" in n for n in p.weights)]
-    with pytest.raises(RankError) as caught:
+    with pytest.raises(RankError, match="nadir d_f"):
         solve(fields, unknowns=DRIFTS, priors=some)
-    assert any("nadir d_f" in n for c in caught.value.open for n in c.names)
-
-
-@pytest.mark.slow
-def test_the_monitor_brings_heights_back():
-    """Seven fields with drifts of 3 arcsec (1 sigma). One arcsec of the intersection angle is 3.2 m of height: the
-    difference of two d_alpha of 3 arcsec each is 4.2 arcsec, 13.5 m RMS over passes; seven passes give it to 27%, and
-    each field's bias takes none of it. With the monitor, 0.07 arcsec or 0.2 m are left, beside the noise of 3.4 m."""
-    rng = np.random.default_rng(3)
-    drift, none = drifts(rng, 7), drifts(rng, 7, np.zeros(4))
-    heights, inner, chi = {}, {}, {}
-    for case, true in (("still", none), ("blind", drift), ("told", drift)):
-        noise = np.random.default_rng(4)
-        fields = [measured(view(i, d, 60), noise, NOISE, name=f"F{i}") for i, d in enumerate(true)]
-        options = {"unknowns": DRIFTS, "priors": told(true, noise)} if case == "told" else {}
-        found = solve(fields, **options)
-        wrong = []
-        for i, d in enumerate(true):
-            check = view(i, d, 100, seed=500)
-            points = intersect(
-                make_rays(check, noise, NOISE), found.cameras_of(f"F{i}"), NOISE, bias=found.bias(f"F{i}")
-            )
-            wrong.append(check_errors(points.ground, check.points).height_rms ** 2)
-        heights[case] = np.sqrt(np.mean(wrong))
-        inner[case] = max(abs(found.value(n) - TRUTH[n]) / found.sigma[n] for n in INNER if n not in HOLD_X.held)
-        chi[case] = found.p_value
-    assert heights["blind"] > 2.0 * heights["still"]
-    assert heights["told"] == pytest.approx(heights["still"], rel=0.1)  # an RMS of 700 heights, 0.027 each: 2.6 sigmas
-    assert chi["blind"] < 1e-10
-    assert inner["blind"] > 5 > inner["told"]
-    assert min(chi["still"], chi["told"]) > 1e-4
-
-
-@pytest.mark.slow
-def test_sigmas_with_a_monitor_are_right():
-    """20 campaigns of three fields, false alarm 1e-3 to both sides together."""
-    rng = np.random.default_rng(5)
-    total, fit = np.zeros(2), np.zeros(2)
-    drift = drifts(rng, 3)
-    views = [view(i, d) for i, d in enumerate(drift)]
-    for _ in range(20):
-        fields = [measured(v, rng, NOISE, name=f"F{i}") for i, v in enumerate(views)]
-        found = solve(fields, unknowns=DRIFTS, priors=told(drift, rng))
-        total += square(found, known(drift))
-        fit += (found.chi_square, found.degrees_of_freedom)
-    assert 5e-4 < stats.chi2.sf(*total) < 1 - 5e-4
-    assert 5e-4 < stats.chi2.sf(*fit) < 1 - 5e-4
 
 
 def test_a_drift_of_the_bias_goes_into_the_outer_lines_unless_it_is_told():
@@ -191,7 +130,6 @@ def test_a_drift_of_the_bias_goes_into_the_outer_lines_unless_it_is_told():
 
 
 def test_bad_readings_are_told():
-    with pytest.raises(CalibrationError, match=r"must be \(4,\)"):
-        monitor_priors("F0", "backward", np.zeros(3), SIGMA)
+    refuses(CalibrationError, r"must be \(4,\)", monitor_priors, "F0", "backward", np.zeros(3), SIGMA)
     two = monitor_priors("F0", "backward", np.zeros(4), [1e-7, 1e-7, np.inf, np.inf])
     assert [next(iter(p.weights)) for p in two] == ["F0 backward d_alpha", "F0 backward d_beta"]

@@ -6,6 +6,8 @@ from scipy.stats import chi2
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw, consistency
 from analysis.monitor.estimators import ESTIMATORS, applicable, judged
+from tests.analysis.refusals import refuses
+from tests.analysis.stated_motions import disturbances
 
 COUNT, MOTIONS = 8, 12
 
@@ -13,19 +15,9 @@ COUNT, MOTIONS = 8, 12
 @pytest.fixture(scope="module")
 def stated() -> Disturbances:
     rng = np.random.default_rng(11)
-    names = tuple(f"body{k // 3} shift {'xyz'[k % 3]}" for k in range(MOTIONS))
-    return Disturbances(
-        name="toy",
-        labels=names,
-        bodies=tuple(name.partition(" ")[0] for name in names),
-        causes=("mounts",) * MOTIONS,
-        sigmas=np.ones(MOTIONS),
-        units=("um",) * MOTIONS,
-        spots=rng.standard_normal((COUNT, MOTIONS)),
-        parameters=1e-6 * rng.standard_normal((COUNT, MOTIONS)),
-        correlation=np.eye(MOTIONS),
-        laws=(TimeLaw(),) * MOTIONS,
-    )
+    names = [f"body{k // 3} shift {'xyz'[k % 3]}" for k in range(MOTIONS)]
+    see, tell = rng.standard_normal((2, COUNT, MOTIONS))
+    return disturbances((TimeLaw(),) * MOTIONS, see, 1e-6 * tell, names)
 
 
 @pytest.mark.parametrize("rate", [1e-3, 1e-3 / 21, 0.05])
@@ -58,5 +50,4 @@ def test_judged_is_the_best_that_stands_in_the_results(stated) -> None:
     assert judged(applicable({}, stated)) == "posterior"
     assert judged(applicable({}, None)) == "model"
     assert judged(reversed(list(ESTIMATORS))) == "posterior"
-    with pytest.raises(ValueError, match="results without posterior or model: there are derived"):
-        judged(["derived"])
+    refuses(ValueError, "results without posterior or model: there are derived", judged, ["derived"])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.monitor.curvature import BEYOND, Curvature, LinearReading, MotionModel, Retraced, read_again
+from analysis.monitor.curvature import BEYOND, LinearReading, MotionModel, Retraced, read_again
 
 RNG = np.random.default_rng(4)
 A = RNG.standard_normal((4, 4)) + 3.0 * np.eye(4)
@@ -56,22 +56,6 @@ def test_small_motions_are_left_as_they_are() -> None:
     assert not told.beyond.any()
     assert told.holds.all()
     assert np.all(told.off < BEYOND)
-
-
-def test_states_near_the_nominal_one_are_not_traced() -> None:
-    asked = []
-
-    def counted(states):
-        asked.append(len(states))
-        return Retraced(spots(states), parameters(states))
-
-    near = replace(model(counted), near_px=0.1)
-    x = np.stack([1e-3 * np.ones(4), 0.5 * np.ones(4), 2e-3 * np.ones(4)])
-    _, found, told = read(x, near)
-    assert asked[0] == 1
-    assert told.beyond.tolist() == [False, True, False]
-    assert found[1] == pytest.approx(parameters(x)[1], rel=1e-4)
-    assert told.off[0] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_large_motions_are_read_as_they_are() -> None:
@@ -128,10 +112,3 @@ def test_estimators_that_trace_alike_are_traced_together_and_keep_their_own() ->
         np.testing.assert_array_equal(together[name][1].off, alone[1].off)
         assert together[name][1].rests.tolist() == alone[1].rests.tolist()
     assert not together["none"][1].beyond.any()
-
-
-def test_states_of_a_series_stay_in_their_order() -> None:
-    one, two = (Curvature(np.full((2, 3), v), np.array([v > 3, False]), np.array([True, v < 3])) for v in (1.0, 5.0))
-    both = Curvature.joined([one, two])
-    assert both.beyond.tolist() == [False, False, True, False]
-    assert both.at(slice(2, 4)).rests.tolist() == [True, False]

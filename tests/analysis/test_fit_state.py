@@ -12,6 +12,7 @@ from analysis.spots.centroid import SpotError, energy_centroid, gaussian_fit, ma
 from analysis.spots.fit_state import fit_states, require_rest, widened
 from analysis.spots.spot_template import SpotTemplate
 from tests.analysis import test_spot_centroids as spots
+from tests.analysis.refusals import refuses
 from tests.analysis.test_spot_centroids import FRAMES, GAIN, OFFSET, SHAPE, airy, electrons, pattern, record
 
 PLACES = np.random.default_rng(8).uniform(44, 51, (40, 2))
@@ -147,5 +148,4 @@ def test_a_fit_that_does_not_come_to_rest_is_started_anew_then_refused(template,
     monkeypatch.setattr(likelihood, "_MOST_DAMPED", 1)
     found = maximum_likelihood_fit(clean[:1], FRAMES, spots.NOISE, template, max_iterations=1)
     assert not found.converged.any()
-    with pytest.raises(SpotError, match="does not come to rest"):
-        require_rest(found)
+    refuses(SpotError, "does not come to rest", require_rest, found)

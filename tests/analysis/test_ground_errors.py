@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from analysis.orbit.ground_errors import circle_of_points, circular_error, linear_error
+from analysis.orbit.ground_errors import (
+    circle_of_points,
+    circular_error,
+    interval_of_points,
+    linear_error,
+    predicted,
+    realised,
+)
+from tests.analysis.refusals import refuses
 
 
 def test_closed_forms() -> None:
@@ -38,8 +46,15 @@ def test_a_set_of_points_holds_its_share_of_draws() -> None:
 
 
 def test_what_is_no_covariance_or_share() -> None:
-    with pytest.raises(ValueError, match="negative"):
-        circular_error(np.diag([1.0, -1.0]))
+    refuses(ValueError, "negative", circular_error, np.diag([1.0, -1.0]))
     for share in (0.0, 1.0, 90.0):
-        with pytest.raises(ValueError, match="share"):
-            circular_error(np.eye(2), share)
+        refuses(ValueError, "share", circular_error, np.eye(2), share)
+
+
+def test_shares_of_errors_are_those_of_their_prediction() -> None:
+    """Errors at the pole of x, where up is x and east is y: shares of draws against the prediction."""
+    assert interval_of_points(np.array([9.0])) == pytest.approx(3 * 1.644854, rel=1e-5)
+    error = np.random.default_rng(1).standard_normal((40_000, 3)) * [2.0, 1.0, 3.0]
+    place = np.tile([6378137.0, 0.0, 0.0], (len(error), 1))
+    found, said = realised(place, error), predicted(place[:1], np.diag([4.0, 1.0, 9.0])[None])
+    assert (found.ce90, found.le90) == pytest.approx((said.ce90, said.le90), rel=0.02)

@@ -59,32 +59,6 @@ def solved_for(field, sigma=1e3 * ARCSEC, noise=NOISE):
     return adjust([field], LABORATORY, noise, gauge=HOLD_XY, unknowns=Unknowns(rate="field"), priors=priors)
 
 
-def test_a_rate_with_a_prior_is_told_and_its_sigma_is_in_x_of_the_outer_lines():
-    """0.1 arcsec/s, 14 sigma of x where nothing is said of it. False alarm 1e-6 of an error beyond 5 sigma."""
-    rng = np.random.default_rng(2)
-    field = turned(measured(VIEW, rng), lambda t: t[:, None] * 0.1 * ARCSEC * np.ones(3))
-    blind, told = adjust([field], LABORATORY, NOISE, gauge=HOLD_XY), solved_for(field, 0.1 * ARCSEC)
-    known = dict(zip(blind.names, truth(blind.names), strict=True))
-    for name in ("forward x", "backward x"):
-        assert abs(blind.value(name) - known[name]) > 10 * blind.sigma[name]
-        assert abs(told.value(name) - known[name]) < 5 * told.sigma[name]
-        assert told.sigma[name] > 5 * blind.sigma[name]
-    assert told.rates is None
-
-
-@pytest.mark.second
-def test_false_alarms_of_rates_and_courses_are_those_of_chance():
-    """30 passes of 12 points: probabilities are even; 1e-4 of this test's own (Kolmogorov, two of them)."""
-    rng, rates, courses = np.random.default_rng(5), [], []
-    view = seen(3, 12)
-    for _ in range(30):
-        found = adjust([measured(view, rng)], LABORATORY, NOISE, gauge=HOLD_XY)
-        rates.append(found.rates.p_value)
-        courses.append(found.courses.p_value)
-    for chances in (rates, courses):
-        assert stats.kstest(chances, "uniform").pvalue > 5e-5
-
-
 @pytest.mark.second
 def test_a_random_walk_shows_in_the_residuals_and_stated_it_is_in_the_sigmas():
     """Ten passes, 1 arcsec in a root of a second: silent sigmas are 10 wrong, residuals tell every time; stated, the

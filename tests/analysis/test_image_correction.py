@@ -1,12 +1,12 @@
 """Corrections of an image's model by control points: known ones come back, within covariances that are true."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from analysis.orbit.image_correction import ImageCorrection, image_correction
+from analysis.orbit.image_correction import image_correction
+from tests.analysis.refusals import refuses
 
 SIZE = np.array([12_000.0, 20_000.0])
 TRUE = {
@@ -29,54 +29,31 @@ def drawn(kind: str, place: np.ndarray, spread: np.ndarray, seed: int) -> np.nda
 
 
 @pytest.mark.parametrize("kind", ["shift", "affine"])
-def test_two_hundred_draws_keep_to_their_covariances(kind: str) -> None:
-    """Errors of the estimate at four corners, and what is left, have the chi-square of their freedoms.
-
-    Bounds have a false alarm of 1e-4 in all. Nothing is screened: screening cuts the tails by what it should.
-    """
+def test_estimate_and_covariances_are_those_of_dense_least_squares(kind: str) -> None:
+    """All lines and samples as one vector with its whole covariance; what is left, and at corners of the image."""
     place, spread = points(14)
+    seen = drawn(kind, place, spread, 3)
+    found = image_correction(place, seen, spread, kind, screened=False)
+    whole = block_diag(*spread)
+
+    def rows(at):
+        basis = np.ones((len(at), 1)) if kind == "shift" else np.column_stack([np.ones(len(at)), at / SIZE])
+        return np.kron(basis, np.eye(2))
+
+    weight = np.linalg.inv(whole)
+    known = np.linalg.inv(rows(place).T @ weight @ rows(place))
+    value = known @ rows(place).T @ weight @ (seen - place).ravel()
     corner = np.array([[0.0, 0.0], [SIZE[0], 0.0], [0.0, SIZE[1]], SIZE])
-    error, left, freedom, each = 0.0, 0.0, 0, []
-    own = {"shift": 2, "affine": 6}[kind]
-    for seed in range(DRAWS):
-        found = image_correction(place, drawn(kind, place, spread, seed), spread, kind, screened=False)
-        away = found.at(*place.T) - TRUE[kind](place)
-        # the errors at three places that are no line determine those of the coefficients
-        rows = away[: own // 2].ravel()
-        known = _joint(found, place[: own // 2])
-        error += float(rows @ np.linalg.solve(known, rows))
-        left += found.chi_square
-        freedom += found.freedom
-        each.append(np.einsum("ni,nij,nj->n", found.residual, np.linalg.inv(found.variance), found.residual))
-        single = found.covariance_at(*corner.T)
-        off = found.at(*corner.T) - TRUE[kind](corner)
-        assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(single), off).max() < chi2.isf(1e-8, 2)
-    # residuals of one point over all draws are independent, each with the covariance that is told
-    assert chi2.ppf(1e-5, 2 * DRAWS) < np.sum(each, axis=0).min()
-    assert np.sum(each, axis=0).max() < chi2.isf(1e-5, 2 * DRAWS)
-    assert freedom == DRAWS * (2 * len(place) - own)
-    for value, count in ((error, DRAWS * own), (left, freedom)):
-        assert chi2.ppf(2.5e-5, count) < value < chi2.isf(2.5e-5, count)
-
-
-def _joint(found: ImageCorrection, place: np.ndarray) -> np.ndarray:
-    """Covariance of the corrections at several places together, by finite differences of the coefficients."""
-    start = found.at(*place.T).ravel()
-    columns = []
-    for k in range(found.coefficients.size):
-        moved = found.coefficients.copy().ravel()
-        moved[k] += 1.0
-        columns.append(replace(found, coefficients=moved.reshape(2, -1)).at(*place.T).ravel() - start)
-    slope = np.stack(columns, axis=1)
-    return slope @ found.covariance @ slope.T
-
-
-def test_wrong_covariances_are_told() -> None:
-    """Sigmas three times too small: chi-square is nine times its freedom, and its probability nothing."""
-    place, spread = points(30)
-    found = image_correction(place, drawn("affine", place, spread, 3), spread / 9.0, "affine", screened=False)
-    assert found.factor == pytest.approx(9.0, rel=0.6)  # 54 degrees of freedom: 3 sigma of chi-square
-    assert found.probability < 1e-6
+    np.testing.assert_allclose(found.at(*corner.T).ravel(), rows(corner) @ value, rtol=1e-9)
+    there = rows(corner) @ known @ rows(corner).T
+    np.testing.assert_allclose(block_diag(*found.covariance_at(*corner.T)), there * (block_diag(*np.ones((4, 2, 2)))))
+    left = (seen - place).ravel() - rows(place) @ value
+    np.testing.assert_allclose(found.residual.ravel(), left, atol=1e-9)
+    rest = (whole - rows(place) @ known @ rows(place).T) * block_diag(*np.ones((14, 2, 2)))
+    np.testing.assert_allclose(block_diag(*found.variance), rest, atol=1e-12)
+    assert found.chi_square == pytest.approx(left @ weight @ left, rel=1e-9)
+    assert found.freedom == 28 - rows(place).shape[1]
+    assert found.probability == pytest.approx(chi2.sf(found.chi_square, found.freedom))
 
 
 @pytest.mark.parametrize("kind", ["shift", "affine"])
@@ -117,12 +94,8 @@ def test_one_point_and_three() -> None:
 def test_what_points_do_not_determine() -> None:
     place, spread = points(8)
     for count, kind, message in ((0, "shift", "do not determine"), (2, "affine", "3 or more")):
-        with pytest.raises(ValueError, match=message):
-            image_correction(place[:count], place[:count], spread[:count], kind)
+        refuses(ValueError, message, image_correction, place[:count], place[:count], spread[:count], kind)
     line = np.stack([np.linspace(0.0, 1e4, 8), np.linspace(5.0, 2e4, 8)], axis=-1)
-    with pytest.raises(ValueError, match="one line"):
-        image_correction(line, line, spread, "affine")
-    with pytest.raises(ValueError, match="not finite"):
-        image_correction(place, np.where(place > 1e4, np.nan, place), spread, "shift")
-    with pytest.raises(ValueError, match="not above zero"):
-        image_correction(place, place, np.zeros((8, 2, 2)), "shift")
+    refuses(ValueError, "one line", image_correction, line, line, spread, "affine")
+    refuses(ValueError, "not finite", image_correction, place, np.where(place > 1e4, np.nan, place), spread, "shift")
+    refuses(ValueError, "not above zero", image_correction, place, place, np.zeros((8, 2, 2)), "shift")

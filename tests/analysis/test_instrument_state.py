@@ -6,18 +6,17 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.stats import binom, chi2, kstest
+from numpy.testing import assert_allclose
+from scipy.linalg import block_diag
+from scipy.stats import chi2
 
 from analysis.instrument_state.known_combinations import combinations
 from analysis.instrument_state.next_move import Actuators, best_move, measurement_worth, truncated_move
-from analysis.instrument_state.state_estimate import (
-    MeasuredGroup,
-    StateEstimate,
-    StatePrior,
-    estimate_state,
-)
+from analysis.instrument_state.state_estimate import MeasuredGroup, StateEstimate, StatePrior, estimate_state
 from analysis.measurement_error import UndeterminedError
-from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.disturbances import TimeLaw
+from tests.analysis.refusals import refuses
+from tests.analysis.stated_motions import disturbances
 
 M = 7
 
@@ -99,10 +98,8 @@ def test_linear_models_have_the_closed_form(free: bool) -> None:
     found = model.estimate(groups)
     mean, covariance = closed_form(model.prior, model.table, groups[0], 1e4)
     scale = model.prior.sigma
-    np.testing.assert_allclose(found.mean / scale, mean / scale, atol=1e-6 if free else 1e-10)
-    np.testing.assert_allclose(
-        found.covariance / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=1e-6
-    )
+    assert_allclose(found.mean / scale, mean / scale, atol=1e-6 if free else 1e-10)
+    assert_allclose(found.covariance / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=1e-6)
     assert found.converged
 
 
@@ -110,104 +107,58 @@ def test_spots_alone_are_the_monitors_posterior() -> None:
     """One group of spots on a linear instrument is the best linear unbiased prediction of the monitor, to 1e-9."""
     rng = np.random.default_rng(5)
     prior = random_prior(rng)
-    spots, parameters = rng.normal(size=(8, M)) / prior.sigma, rng.normal(size=(4, M)) / prior.sigma
     safe = prior.sigma
-    stated = Disturbances(
-        "stated",
-        prior.labels,
-        prior.labels,
-        ("cause",) * M,
-        safe,
-        ("um",) * M,
-        spots * safe,
-        parameters * safe,
-        prior.covariance / np.outer(safe, safe),
-        (TimeLaw(white=True),) * M,
-    )
-    noise = 0.01 * np.eye(8) + 0.003
-    shift = rng.normal(size=8)
+    spots, parameters = rng.normal(size=(8, M)) / safe, rng.normal(size=(4, M)) / safe
+    laws, correlation = (TimeLaw(white=True),) * M, prior.covariance / np.outer(safe, safe)
+    stated = disturbances(laws, spots * safe, parameters * safe, prior.labels, correlation, safe)
+    noise, shift = 0.01 * np.eye(8) + 0.003, rng.normal(size=8)
     group = MeasuredGroup("spots", "spots", ("x",) * 8, shift, noise, np.zeros((8, 0)), np.zeros(0), tuple("aabbccdd"))
     found = estimate_state(prior, [group], lambda x: x @ spots.T, lambda x: spots, false_alarm=1e-300)
-    wanted = stated.best_gain(noise) @ shift
-    np.testing.assert_allclose(parameters @ found.mean, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
-    total = stated.misfit(stated.best_gain(noise)) + stated.best_gain(noise) @ noise @ stated.best_gain(noise).T
-    own = parameters @ found.covariance @ parameters.T
-    np.testing.assert_allclose(own, total, atol=1e-9 * np.abs(total).max())
+    gain = stated.best_gain(noise)
+    assert_allclose(parameters @ found.mean, gain @ shift, rtol=1e-9, atol=1e-9 * np.abs(gain @ shift).max())
+    total = stated.misfit(gain) + gain @ noise @ gain.T
+    assert_allclose(parameters @ found.covariance @ parameters.T, total, atol=1e-9 * np.abs(total).max())
 
 
-def test_chi_squares_and_coverage_are_those_of_the_model() -> None:
-    """Of 400 drawn instruments the chi-square of all together, of each measurement about its prediction by all others
-    and of each block is distributed as it is said, and standardised errors are normal (each tested at 1e-3).
-    """
+def test_agreements_are_predictions_from_all_others() -> None:
+    """Of each measurement and block: its mean and covariance by one joint normal of all other numbers."""
     rng = np.random.default_rng(7)
-    groups = [random_group(rng, "one", 9, 1, True, 3), random_group(rng, "two", 5, 1), random_group(rng, "three", 4)]
+    groups = [random_group(rng, "one", 9, 1, False, 3), random_group(rng, "two", 5, 1)]
     model = Linear(rng, random_prior(rng), groups)
-    whole, single, block, errors, out = [], [], [], [], 0
-    for _ in range(400):
-        state, measured = model.drawn()
-        found = model.estimate(measured)
-        out += bool(found.left_out)
-        whole.append(chi2.cdf(found.whole.chi_square, found.whole.degrees))
-        single.append(chi2.cdf(found.measurements[0].chi_square, found.measurements[0].degrees))
-        block.append(chi2.cdf(found.blocks["one"][1].chi_square, found.blocks["one"][1].degrees))
-        direction = model.table[3]
-        error = direction @ (state - found.mean)
-        errors.append(error / np.sqrt(direction @ found.covariance @ direction))
-    for values in (whole, single, block):
-        assert kstest(values, "uniform").pvalue > 1e-3
-    assert kstest(errors, "norm").pvalue > 1e-3
-    # a false alarm in a thousand instruments
-    assert out <= binom.ppf(1.0 - 1e-4, 400, 1e-3)
+    _, measured = model.drawn()
+    found = model.estimate(measured)
+    value = np.concatenate([group.values for group in measured])
+    noise = block_diag(*(g.covariance + (g.biases * g.bias_sigmas**2) @ g.biases.T for g in measured))
+    whole = model.table @ model.prior.covariance @ model.table.T + noise
+    assert found.whole.chi_square == pytest.approx(value @ np.linalg.solve(whole, value), rel=1e-8)
+    assert found.whole.degrees == 14
+    block = np.arange(14) // 3 == 1
+    # a block that is left out takes what its own measurement's bias tells with it
+    for own, agreement in ((np.arange(14) < 9, found.measurements[0]), (block, found.blocks["one"][1])):
+        across = whole[np.ix_(own, ~own)] @ np.linalg.inv(whole[np.ix_(~own, ~own)])
+        off = value[own] - across @ value[~own]
+        spread = whole[np.ix_(own, own)] - across @ whole[np.ix_(~own, own)]
+        assert agreement.chi_square == pytest.approx(off @ np.linalg.solve(spread, off), rel=1e-6)
+        assert agreement.degrees == own.sum()
+        assert agreement.chance == pytest.approx(chi2.sf(agreement.chi_square, own.sum()))
 
 
 def test_a_gross_error_is_left_out() -> None:
     """A block that is far off leaves the estimate as if it had not been measured, and is named."""
     rng = np.random.default_rng(11)
     model = Linear(rng, random_prior(rng), [random_group(rng, "one", 24, 0, False, 8), random_group(rng, "two", 8)])
-    _, groups = model.drawn()
-    clean = model.estimate(groups)
-    assert not clean.left_out
-    values = groups[0].values.copy()
-    values[6:9] += 300.0
-    found = model.estimate([groups[0].with_values(values), groups[1]])
+    _, (one, two) = model.drawn()
+    assert not model.estimate([one, two]).left_out
+    values = one.values + 300.0 * (np.arange(24) // 3 == 2)
+    found = model.estimate([one.with_values(values), two])
     assert [(name, block) for name, block, _ in found.left_out] == [("one", "block 2")]
-    kept = np.array([block != "block 2" for block in groups[0].blocks])
-    rows = np.concatenate([kept, np.ones(8, dtype=bool)])
-    fewer = MeasuredGroup(
-        "one",
-        "numbers",
-        tuple(np.array(groups[0].labels)[kept]),
-        groups[0].values[kept],
-        groups[0].covariance[np.ix_(kept, kept)],
-        groups[0].biases[kept],
-        groups[0].bias_sigmas,
-        tuple(np.array(groups[0].blocks)[kept]),
-    )
-    table = model.table[rows]
-    other = estimate_state(model.prior, [fewer, groups[1]], lambda x: x @ table.T, lambda x: table)
-    np.testing.assert_allclose(found.mean / model.prior.sigma, other.mean / model.prior.sigma, atol=1e-9)
-
-
-def test_order_and_units_do_not_matter_and_more_data_never_hurt() -> None:
-    """Groups in another order, numbers in another unit: the same estimate. A group more: no variance grows."""
-    rng = np.random.default_rng(13)
-    groups = [random_group(rng, "one", 6, 1, True), random_group(rng, "two", 5)]
-    model = Linear(rng, random_prior(rng), groups)
-    _, measured = model.drawn()
-    found = model.estimate(measured)
-    turned = np.concatenate([model.table[6:], model.table[:6] * 1e6])
-    one = measured[0]
-    scaled = MeasuredGroup(
-        "one", "numbers", one.labels, 1e6 * one.values, 1e12 * one.covariance, one.biases, one.bias_sigmas, one.blocks
-    )
-    other = estimate_state(model.prior, [measured[1], scaled], lambda x: x @ turned.T, lambda x: turned)
-    scale = model.prior.sigma
-    np.testing.assert_allclose(found.mean / scale, other.mean / scale, atol=1e-9)
-    np.testing.assert_allclose(found.sigma / scale, other.sigma / scale, atol=1e-9)
-    table = model.table[6:]
-    few = estimate_state(model.prior, [measured[1]], lambda x: x @ table.T, lambda x: table)
-    gain = (few.covariance - found.covariance) / np.outer(scale, scale)
-    assert np.linalg.eigvalsh(gain)[0] > -1e-9
+    kept = np.array([block != "block 2" for block in one.blocks])
+    labels, blocks = (tuple(np.array(each)[kept]) for each in (one.labels, one.blocks))
+    spread = one.covariance[np.ix_(kept, kept)]
+    fewer = MeasuredGroup("one", "n", labels, one.values[kept], spread, one.biases[kept], one.bias_sigmas, blocks)
+    table = model.table[np.concatenate([kept, np.ones(8, dtype=bool)])]
+    other = estimate_state(model.prior, [fewer, two], lambda x: x @ table.T, lambda x: table)
+    assert_allclose(found.mean / model.prior.sigma, other.mean / model.prior.sigma, atol=1e-9)
 
 
 def test_a_curved_instrument_settles_at_the_mode() -> None:
@@ -236,24 +187,19 @@ def test_a_curved_instrument_settles_at_the_mode() -> None:
 
 def test_nothing_and_impossible_errors_are_refused() -> None:
     """No measurement, a covariance that is none, and an instrument without light have messages of their own."""
-    prior = StatePrior.of("ab", np.eye(2))
-    with pytest.raises(UndeterminedError, match="nothing was measured"):
-        estimate_state(prior, [], lambda x: x, lambda x: np.eye(2))
-    bad = MeasuredGroup(
-        "one",
-        "n",
-        ("a", "b"),
-        np.zeros(2),
-        np.array([[1.0, 2.0], [2.0, 1.0]]),
-        np.zeros((2, 0)),
-        np.zeros(0),
-        ("a", "b"),
-    )
-    with pytest.raises(UndeterminedError, match="one: its covariance is not positive definite"):
-        estimate_state(prior, [bad], lambda x: x, lambda x: np.eye(2))
-    good = MeasuredGroup("one", "n", ("a", "b"), np.zeros(2), np.eye(2), np.zeros((2, 0)), np.zeros(0), ("a", "b"))
-    with pytest.raises(UndeterminedError, match="no light"):
-        estimate_state(prior, [good], lambda x: x * np.nan, lambda x: np.eye(2))
+    prior, still = StatePrior.of("ab", np.eye(2)), (lambda x: x, lambda x: np.eye(2))
+
+    def group(spread):
+        return MeasuredGroup("one", "n", ("a", "b"), np.zeros(2), spread, np.zeros((2, 0)), np.zeros(0), ("a", "b"))
+
+    refuses(UndeterminedError, "nothing was measured", estimate_state, prior, [], *still)
+    for spread, said in (
+        (np.ones((2, 2)) + np.eye(2)[::-1], "not positive definite"),
+        (0.0 * np.eye(2), "error of zero"),
+    ):
+        refuses(UndeterminedError, said, estimate_state, prior, [group(spread)], *still)
+    refuses(UndeterminedError, "no light", estimate_state, prior, [group(np.eye(2))], lambda x: x * np.nan, still[1])
+    refuses(ValueError, "are not those of 2 numbers", group, np.eye(3))
 
 
 def test_combinations_are_independent_and_keep_their_prior_where_nothing_is_measured() -> None:
@@ -264,12 +210,12 @@ def test_combinations_are_independent_and_keep_their_prior_where_nothing_is_meas
     found = model.estimate(groups)
     known = combinations(found)
     assert [one.known for one in known[3:]] == [False] * 4
-    np.testing.assert_allclose([one.sigma for one in known[3:]], 1.0, atol=1e-9)
+    assert_allclose([one.sigma for one in known[3:]], 1.0, atol=1e-9)
     scale = model.prior.sigma
     rows = np.stack([one.weights for one in known]) / scale
-    np.testing.assert_allclose(rows @ model.prior.covariance @ rows.T, np.eye(M), atol=1e-8)
-    np.testing.assert_allclose(rows @ found.covariance @ rows.T, np.diag([one.sigma**2 for one in known]), atol=1e-8)
-    np.testing.assert_allclose(rows @ found.mean, [one.value for one in known], atol=1e-8)
+    assert_allclose(rows @ model.prior.covariance @ rows.T, np.eye(M), atol=1e-8)
+    assert_allclose(rows @ found.covariance @ rows.T, np.diag([one.sigma**2 for one in known]), atol=1e-8)
+    assert_allclose(rows @ found.mean, [one.value for one in known], atol=1e-8)
 
 
 def actuators(count: int, step: float = 0.5, reach: float = 2.0, relative: float = 0.02) -> Actuators:
@@ -300,7 +246,7 @@ def test_the_best_move_is_the_best_of_all(seed: int) -> None:
     # what a fixed error of any move costs is not searched for
     assert cost(found.amounts) <= best * (1.0 + 2e-3) + 3 * 0.03**2 * np.sum(length**2)
     assert found.expected == pytest.approx(cost(found.amounts))
-    np.testing.assert_allclose(found.amounts, 0.5 * np.round(found.amounts / 0.5), atol=1e-12)
+    assert_allclose(found.amounts, 0.5 * np.round(found.amounts / 0.5), atol=1e-12)
 
 
 def test_no_range_no_move_and_free_amounts_solve_the_equations() -> None:
@@ -311,8 +257,8 @@ def test_no_range_no_move_and_free_amounts_solve_the_equations() -> None:
     assert not np.any(best_move(residual, slope, still).amounts)
     wide = Actuators(("a", "b"), np.full(2, -99.0), np.full(2, 99.0), np.zeros(2), np.zeros(2), np.zeros(2))
     found = best_move(residual, slope, wide).amounts
-    np.testing.assert_allclose(found, np.linalg.lstsq(slope, -residual, rcond=None)[0], atol=1e-9)
-    np.testing.assert_allclose(truncated_move(residual, slope, wide, 2), found, atol=1e-9)
+    assert_allclose(found, np.linalg.lstsq(slope, -residual, rcond=None)[0], atol=1e-9)
+    assert_allclose(truncated_move(residual, slope, wide, 2), found, atol=1e-9)
 
 
 def test_the_worth_of_a_measurement_is_what_it_saves() -> None:

@@ -11,6 +11,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, fit_screened
 from analysis.spots.spot_positions import SeriesNoise, SpotError
 from analysis.spots.spot_template import SpotTemplate
+from tests.analysis.refusals import refuses
 from tests.tiers import quick
 
 NOISE = NoiseModel(0.16, 12.0, 0.5, 100.0, 0.005, 5.0, 16100.0)
@@ -86,23 +87,6 @@ def test_influence_of_the_image_before_is_the_derivative_of_the_shift(case):
     assert np.all(left < (0.1 if case == "holes" else 0.05)), left
 
 
-def test_pattern_of_the_pixels_is_no_light_when_a_shape_is_learnt():
-    """Where response differs from pixel to pixel by 1 % a shape with its noise of all frequencies drew the fit half way
-    between pixels, by half a sigma at a quarter of a pixel; with the frequencies of light alone it does not.
-    """
-    rough = replace(NOISE, prnu=0.01)
-    rng = np.random.default_rng(5)
-    error, sigma = [], []
-    for _ in range(12):
-        pattern = np.sqrt(rough.fixed_variance_dn2(spot(FIRST)))
-        before = screened(spot(FIRST) + pattern * rng.standard_normal(SHAPE))
-        learnt = learn_template(before, rough)
-        ends = [fitted(screened(spot(FIRST + by)), learnt).positions for by in (0.0, 0.25)]
-        error.append((ends[1].position - ends[0].position)[0] - 0.25)
-        sigma.append(np.sqrt(np.trace(ends[1].covariance[0]) / 2.0))
-    assert np.sqrt(np.mean(np.square(error))) < 0.1 * np.mean(sigma)
-
-
 def test_noise_of_a_series_is_that_of_its_shifts():
     """Of three images against the same one before, of which two show the spot at one place: the covariance of each
     shift is its own, and in the difference of those two the image before cancels, and the pattern with it.
@@ -134,22 +118,6 @@ def test_noise_of_a_series_is_that_of_its_shifts():
     np.testing.assert_allclose(found[0].covariance, still, rtol=2e-2, atol=2e-2 * still.max())
 
 
-def test_a_part_of_the_detector_has_the_noise_of_all_of_it():
-    """The image after is a window of the detector: places in it count from its corner, noise is the same."""
-    before = screened(spot(FIRST))
-    learnt = learn_template(before, NOISE)
-    first, place = fitted(before, learnt), FIRST + np.array([1.4, 2.3])
-    mean = spot(place)
-    whole = learnt_shift(learnt, first, fitted(screened(mean), learnt), NOISE, SHAPE)
-    part = np.s_[3:60, 5:61]
-    cut = ScreenedFrames(mean[part], np.full((57, 56), 9.0), np.ones((57, 56), bool), 9, 9, np.zeros((2, 2)), ())
-    found = learnt_shift(learnt, first, fitted(cut, learnt, (3, 5)), NOISE, SHAPE)
-    # pixels of the dark edge say a little of level
-    np.testing.assert_allclose(found.covariance, whole.covariance, rtol=1e-2, atol=1e-2 * whole.covariance.max())
-    # the dark pixels draw as well, of which a fifth is not in the window
-    np.testing.assert_allclose(found.lean / whole.lean, 57 * 56 / 64**2, rtol=0.1)
-
-
 @pytest.mark.parametrize(("width", "narrow"), [(0.6, True), (0.75, True), (1.2, False)])
 def test_a_spot_that_pixels_do_not_sample_is_refused(width, narrow):
     """What is finer than two pixels folds into other frequencies, and no interpolation can bring it back."""
@@ -159,8 +127,7 @@ def test_a_spot_that_pixels_do_not_sample_is_refused(width, narrow):
     if not narrow:
         assert learn_template(screened(mean), NOISE).light > 0.0
         return
-    with pytest.raises(SpotError, match="too narrow"):
-        learn_template(screened(mean), NOISE)
+    refuses(SpotError, "too narrow", learn_template, screened(mean), NOISE)
 
 
 def test_a_shape_that_is_mostly_noise_is_refused():

@@ -7,11 +7,12 @@ from scipy import stats
 from analysis.matching.least_squares import least_squares
 from analysis.matching.matches import MatchOptions, Reason, resampled
 from analysis.matching.spline import SplineStack
+from tests.analysis.refusals import refuses
 from tests.analysis.texture_image import Texture, detected, lattice
 from tests.tiers import quick
 
-SIZE = 570
-PLACES = lattice(18, 28, 47, seed=3)  # windows of 25 px do not overlap: errors are independent
+SIZE = 346
+PLACES = lattice(10, 28, 47, seed=3)  # windows of 25 px do not overlap: errors are independent
 
 
 @pytest.fixture(scope="module")
@@ -42,24 +43,6 @@ def limits(freedom):
     return stats.chi2.ppf([0.5e-4, 1 - 0.5e-4], freedom)
 
 
-@pytest.mark.slow
-def test_shift_without_noise_and_pixel_locking(clean, templates):
-    """What is left is the spline's error for detail up to 0.45 cycles a pixel; it has the period of a pixel."""
-    fits = least_squares(clean, templates, started())
-    assert np.all(fits.reason == Reason.ACCEPTED)
-    error = fits.place - PLACES
-    assert np.abs(error).max() < 0.005
-    phase = PLACES - np.rint(PLACES)
-    for axis in range(2):
-        bins = np.digitize(phase[:, axis], np.linspace(-0.5, 0.5, 11)[1:-1])
-        means = [error[bins == k, axis].mean() for k in range(10)]
-        assert np.abs(means).max() < 0.004
-    # without detail above 0.3 cycles a pixel the spline is better; left is the rim of the template, which it must guess
-    smooth = Texture(5, top=0.3)
-    fits = least_squares(smooth.grid(np.arange(SIZE), np.arange(SIZE)), smooth.patches(PLACES), started())
-    assert np.abs(fits.place - PLACES).max() < 1e-3
-
-
 def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
     """Whole pixels, so that the window ends on the first or last row or column, or one beyond it."""
     first = 15 - MatchOptions().margin
@@ -75,30 +58,13 @@ def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
     assert np.all(np.isnan(fits.place[5:]))
 
 
-@pytest.mark.second
-def test_as_many_steps_as_were_counted_are_enough(clean, templates):
-    """Each limit refuses the fits that need more. Where the smoothing is chosen anew the steps begin anew, too, and the
-    limit holds for either."""
-    free = least_squares(clean, templates[:32], started()[:32])
-    needed = np.zeros(32, int)
-    for limit in range(1, int(free.iterations.max()) + 1):
-        fits = least_squares(clean, templates[:32], started()[:32], MatchOptions(iterations=limit))
-        rests = fits.reason == Reason.ACCEPTED
-        assert np.all(rests | (fits.reason == Reason.DIVERGED))
-        assert np.array_equal(fits.place[rests], free.place[rests])
-        needed[rests & (needed == 0)] = limit
-    assert needed.min() > 0
-    assert np.all((needed <= free.iterations) & (free.iterations <= 2 * needed))
-    assert np.mean(needed == free.iterations) > 0.3
-
-
 def test_affine_change_without_noise(texture, templates):
     matrix = np.array([[1.03, 0.02], [-0.04, 0.98]])
     shift = np.array([12.3, 20.7])
     grey = texture.grid(np.arange(SIZE), np.arange(SIZE), matrix=matrix, shift=shift)
     inside = np.linalg.solve(matrix, (PLACES - shift).T).T
     used = np.all((inside > 15) & (inside < SIZE - 16), axis=1)
-    assert used.sum() > 250
+    assert used.sum() > 60
     fits = least_squares(0.6 * grey + 40.0, templates[used], inside[used] + 0.4)
     assert np.all(fits.reason == Reason.ACCEPTED)
     assert np.abs(fits.place - inside[used]).max() < 0.006
@@ -124,90 +90,45 @@ def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpnes
     assert np.abs(error.mean(axis=0)).max() < 0.001
 
 
-@pytest.mark.slow
-def test_reference_of_finer_pixels(texture, clean):
-    """Templates resampled from half the pixel, with an MTF of its own, about half a fine pixel off the coarse grid."""
-    fine = 0.5 * texture.grid(
-        np.arange(2 * SIZE), np.arange(2 * SIZE), matrix=0.5 * np.eye(2), shift=(-0.25, -0.25), sharp=(0.7, 0.6)
-    )
-    offset = np.arange(-15, 16.0)
-    rows, columns = np.broadcast_arrays(PLACES[:, 0, None, None] + offset[:, None], PLACES[:, 1, None, None] + offset)
-    other = resampled(fine, 2.0 * (rows + 0.25), 2.0 * (columns + 0.25), smoothing=0.7)
-    fits = least_squares(detected(clean, 11), other, started())
-    plain = least_squares(clean, other, started())
-    assert np.abs(plain.place - PLACES).max() < 0.01
-    assert limits(2 * len(PLACES))[0] < chi_square(fits.place - PLACES, fits.covariance()) < limits(2 * len(PLACES))[1]
-
-
 @pytest.mark.second
-@pytest.mark.parametrize("seed", quick(1, [21, 22]))
-def test_covariance_with_noise(clean, templates, seed):
+def test_covariance_with_noise(clean, templates):
     """Shot noise and 20 electrons of read noise on contrast 120; spline errors are a tenth of the sigma."""
-    fits = least_squares(detected(clean, seed), templates, started())
+    fits = least_squares(detected(clean, 21), templates, started())
     assert np.all(fits.reason == Reason.ACCEPTED)
     low, high = limits(2 * len(PLACES))
-    error = fits.place - PLACES
-    assert low < chi_square(error, fits.spread.covariance(fits.reason == Reason.ACCEPTED)) < high
+    error, noise, whole = fits.place - PLACES, fits.spread.covariance(fits.reason == 0), fits.covariance()
+    assert low < chi_square(error, noise) < high
     # relief that these points cannot exclude, a fifth of the variance at one sigma, makes sigmas larger, never smaller
-    assert low / 1.4 < chi_square(error, fits.covariance()) < high
-    assert 0.01 < np.sqrt(np.median(fits.covariance()[:, 0, 0])) < 0.03
+    assert low / 1.4 < chi_square(error, whole) < high
+    assert 1.1 < np.median(whole[:, 0, 0] / noise[:, 0, 0]) < 1.3
     assert fits.sigma.mean() == pytest.approx(np.sqrt(800 + 400), rel=0.02)
 
 
-@pytest.mark.slow
-def test_covariance_with_a_noisy_template(texture, clean, templates):
-    """Image against image: both are noisy, the second is resampled at other phases, and errors keep in their sigmas."""
-    shift = np.array([0.37, -0.21])
-    second = detected(texture.grid(np.arange(SIZE), np.arange(SIZE), shift=shift), 32)
-    offset = np.arange(-15, 16.0)
-    at = PLACES - shift
-    rows, columns = np.broadcast_arrays(at[:, 0, None, None] + offset[:, None], at[:, 1, None, None] + offset)
-    noisy = resampled(second, rows, columns)
-    image = detected(clean, 31)
-    fits = least_squares(image, noisy, started())
-    low, high = limits(2 * len(PLACES))
-    error = fits.place - PLACES
-    assert low < chi_square(error, fits.covariance()) < high
-    # twice the noise: sqrt(2) times the sigma, a little more for what is not used
-    ratio = np.median(fits.covariance()[:, 0, 0]) / np.median(
-        least_squares(image, templates, started()).covariance()[:, 0, 0]
-    )
-    assert 1.6 < ratio < 3.0
-    # pull towards whole pixels, with its own standard error of 0.0025 px
-    phase = PLACES - np.rint(PLACES)
-    assert np.abs(2 * np.mean(error * np.sin(2 * np.pi * phase), axis=0)).max() < 0.01
-
-
-@pytest.mark.slow
 def test_scatter_reaches_the_bound(texture, clean, templates):
     """Cramer-Rao bound for place, affine change, offset, gain and sharpness from the texture's exact derivatives and
     the known noise of each pixel. Equal weights lose a per cent to it; the noise's estimate has 4 per cent a point.
     """
-    image = detected(clean, 41)
-    fits = least_squares(image, templates, started())
-    half = 12
-    offset = np.arange(-half, half + 1)
-    bounds = []
+    fits = least_squares(detected(clean, 41), templates, started())
+    offset, bounds = np.arange(-12, 13), []
     for row, column in PLACES:
         r, c = np.rint(row) + offset, np.rint(column) + offset
-        part = {order: texture.grid(r, c, order=order) for order in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))}
+        grey, by_row, by_column, bend_row, bend_column = (
+            texture.grid(r, c, order=order) for order in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
+        )
         dr, dc = np.meshgrid(r - row, c - column, indexing="ij")
-        by_row, by_column = part[1, 0], part[0, 1]
         columns = [by_row, by_column, by_row * dr, by_row * dc, by_column * dr, by_column * dc]
-        columns += [np.ones_like(by_row), part[0, 0], part[2, 0], part[0, 2]]
-        design = np.stack([x.ravel() for x in columns]) / np.sqrt(part[0, 0].ravel() + 400.0 + 1 / 12)
+        columns += [np.ones_like(grey), grey, bend_row, bend_column]
+        design = np.stack([x.ravel() for x in columns]) / np.sqrt(grey.ravel() + 400.0 + 1 / 12)
         scale = np.linalg.norm(design, axis=1)
-        design /= scale[:, None]
-        inverse = np.linalg.inv(design @ design.T)[:2, :2] / np.outer(scale[:2], scale[:2])
-        bounds.append(inverse)
-    bound = np.array(bounds)
-    low, high = limits(2 * len(PLACES))
-    assert low < chi_square(fits.place - PLACES, bound) < 1.03 * high
-    # of noise alone: interpolation and relief are not in the bound
+        unit = design / scale[:, None]
+        bounds.append(np.linalg.inv(unit @ unit.T)[:2, :2] / np.outer(scale[:2], scale[:2]))
+    bound, error = np.array(bounds), fits.place - PLACES
+    low, high = limits(error.size)
+    assert low < chi_square(error, bound) < 1.03 * high
+    # of noise alone: interpolation and relief are not in the bound; 100 points of some 10 per cent each
     noise = fits.spread.covariance(fits.reason == Reason.ACCEPTED)
     claimed = np.trace(noise, axis1=1, axis2=2) / np.trace(bound, axis1=1, axis2=2)
-    # 324 points of some 10 per cent each: 0.6 per cent for the mean
-    assert 0.96 < claimed.mean() < 1.06
+    assert 0.95 < claimed.mean() < 1.07
 
 
 def test_spline_and_its_derivatives_follow_the_texture():
@@ -246,15 +167,9 @@ def test_bad_input_is_told():
     image, patch = np.zeros((50, 50)), np.zeros((3, 15, 15))
     with pytest.raises(ValueError, match=r"one band.*|plane of real grey values"):
         least_squares(np.zeros((5, 5, 3)), patch, np.zeros((3, 2)))
-    with pytest.raises(ValueError, match=r"k odd.*\(3, 14, 14\)"):
-        least_squares(image, np.zeros((3, 14, 14)), np.zeros((3, 2)))
-    with pytest.raises(ValueError, match=r"need \(3, 2\) places.*\(2, 2\)"):
-        least_squares(image, patch, np.zeros((2, 2)))
-    with pytest.raises(ValueError, match="take 17 px or more"):
-        least_squares(image, patch, np.zeros((3, 2)), MatchOptions(margin=5))
-    with pytest.raises(ValueError, match="largest_sigma must be positive"):
-        MatchOptions(largest_sigma=0.0)
-    with pytest.raises(ValueError, match="does not hold"):
-        MatchOptions(largest_move=3.0)
-    with pytest.raises(ValueError, match=r"grids of one shape"):
-        resampled(image, np.zeros((3, 3)), np.zeros((3, 4)))
+    refuses(ValueError, r"k odd.*\(3, 14, 14\)", least_squares, image, np.zeros((3, 14, 14)), np.zeros((3, 2)))
+    refuses(ValueError, r"need \(3, 2\) places.*\(2, 2\)", least_squares, image, patch, np.zeros((2, 2)))
+    refuses(ValueError, "take 17 px or more", least_squares, image, patch, np.zeros((3, 2)), MatchOptions(margin=5))
+    refuses(ValueError, "largest_sigma must be positive", MatchOptions, largest_sigma=0.0)
+    refuses(ValueError, "does not hold", MatchOptions, largest_move=3.0)
+    refuses(ValueError, r"grids of one shape", resampled, image, np.zeros((3, 3)), np.zeros((3, 4)))

@@ -1,15 +1,12 @@
 """Search, verdicts and consensus: right matches found far off, wrong ones recognised, reasons given."""
 
-import time
-
 import numpy as np
 import pytest
 
-from analysis.matching.consensus import consensus
-from analysis.matching.correlation import _apart, _second, distinct_points, search
+from analysis.matching.correlation import _second, distinct_points, search
 from analysis.matching.matches import Matches, MatchOptions, Reason, match
+from tests.analysis.refusals import refuses
 from tests.analysis.texture_image import Texture, detected
-from tests.tiers import quick
 
 SIZE = 800
 
@@ -27,61 +24,6 @@ def frame(texture):
 @pytest.fixture(scope="module")
 def points(frame):
     return distinct_points(frame, 500, spacing=12, border=60)
-
-
-def way(places):
-    """A smooth error of prediction, up to 28 px along an axis and 35 px in all."""
-    row, column = ((places - SIZE / 2) / (SIZE / 2)).T
-    return np.stack([22 + 5 * row + 3 * column**2, -20 + 2 * row * column - 8 * column], axis=1)
-
-
-@pytest.mark.slow
-def test_thirty_per_cent_wrong_patches(texture, frame, points):
-    """500 points some 30 px off, 30 per cent replaced by another texture; the whole in seconds."""
-    assert len(points) == 500
-    places = points + np.random.default_rng(2).uniform(-0.5, 0.5, points.shape)
-    wrong = np.random.default_rng(3).random(500) < 0.3
-    patches = np.where(wrong[:, None, None], Texture(2).patches(places), texture.patches(places))
-    predicted = places - way(places)
-    assert np.abs(way(places)).max() > 28
-    begin = time.process_time()
-    found = match(frame, patches, predicted, reach=40)
-    # 1.2 s of processor time on an idle machine
-    assert time.process_time() - begin < 10.0
-    # thresholds alone are nearly enough
-    assert (found.accepted & wrong).sum() <= 0.01 * wrong.sum()
-    used = found.accepted
-    agreed = consensus(predicted[used], found.place[used], covariance=found.covariance[used])
-    kept = np.zeros(500, bool)
-    kept[used] = agreed.accepted
-    assert (kept & wrong).sum() < 0.01 * wrong.sum()
-    assert (~kept & ~wrong).sum() < 0.1 * (~wrong).sum()
-    assert np.abs(found.place[kept] - places[kept]).max() < 0.12  # 6 sigma of 0.02 px
-    assert agreed.field(predicted[kept]) == pytest.approx(way(places[kept]), abs=0.05)
-    assert found.text.startswith(f"{used.sum()} of 500 accepted; ")
-    # and consensus alone, without any threshold
-    some = np.isfinite(found.place).all(axis=1)
-    alone = consensus(predicted[some], found.place[some])
-    assert (alone.accepted & wrong[some]).sum() < 0.01 * wrong.sum()
-    assert (~alone.accepted & ~wrong[some]).sum() < 0.02 * (~wrong).sum()
-
-
-@pytest.mark.second
-@pytest.mark.parametrize(("slope", "contrast", "lost"), quick(1, [(2.0, 120.0, 0.1), (1.0, 40.0, 0.1)]))
-def test_wrong_patches_in_worse_texture(slope, contrast, lost):
-    """Noise of 0.9 times the contrast; and a soft texture in which other places correlate by 0.8."""
-    texture = Texture(11, slope=slope, contrast=contrast)
-    image = detected(texture.grid(np.arange(500), np.arange(500)), 12)
-    places = distinct_points(image, 200, spacing=16, border=60)
-    wrong = np.random.default_rng(13).random(len(places)) < 0.3
-    other = Texture(14, slope=slope, contrast=contrast)
-    patches = np.where(wrong[:, None, None], other.patches(places), texture.patches(places))
-    found = match(image, patches, places - [18.3, -14.6], reach=30)
-    used = found.accepted
-    agreed = consensus((places - [18.3, -14.6])[used], found.place[used], covariance=found.covariance[used], degree=1)
-    kept = np.flatnonzero(used)[agreed.accepted]
-    assert wrong[kept].sum() == 0
-    assert len(kept) > (1 - lost) * (~wrong).sum()
 
 
 def test_reasons(texture):
@@ -144,8 +86,7 @@ def test_search_is_good_to_tenths(texture, frame, points):
     assert peaks.ratio.max() < 0.7
     short = search(frame, texture.patches(places), places + np.array([30.0, -30.0]), 10)
     assert short.value.max() < 0.8
-    with pytest.raises(ValueError, match="improve the prediction"):
-        search(frame, texture.patches(places), places, 0)
+    refuses(ValueError, "improve the prediction", search, frame, texture.patches(places), places, 0)
 
 
 def test_sigma_is_that_of_the_worst_direction():
@@ -185,35 +126,7 @@ def test_points_are_distinct_and_spread(texture, frame, points):
     assert len(distinct_points(np.random.default_rng(4).poisson(800, (300, 300)), 200, spacing=10, border=10)) < 5
     for even in (7.0, np.nan):
         assert len(distinct_points(np.full((100, 100), even), 20, spacing=5, border=5)) == 0
-    with pytest.raises(ValueError, match="leaves nothing"):
-        distinct_points(frame, 5, spacing=5, border=400)
-
-
-def test_strong_texture_takes_no_points_from_the_weak(texture):
-    """A third of the image with four times the contrast, four of twelve columns of cells: it has a third of the points,
-    but for cells that a stronger neighbour leaves empty. First comes one of each cell, then a second one.
-    """
-    strong = np.arange(400) < 140
-    grey = texture.grid(np.arange(400), np.arange(400))
-    image = detected(np.where(strong, 800 + 4 * (grey - 800), grey).clip(0), 2)
-    points = distinct_points(image, 144, spacing=8, border=20)
-    cells = np.unique((points - 20) // 30, axis=0, return_inverse=True)[1]
-    occupied = int(cells.max()) + 1
-    assert 0.95 * 144 < occupied <= len(points) == 144
-    assert np.array_equal(np.sort(cells[:occupied]), np.arange(occupied))
-    assert (points[:, 1] < 140).sum() == pytest.approx(48, abs=144 - occupied)
-
-
-def test_points_apart_are_those_of_all_pairs():
-    """One after the other, each kept unless one that was kept before lies within the reach along both axes."""
-    place = np.random.default_rng(5).integers(0, 60, (400, 2))
-    for reach in (0, 1, 4):
-        kept = []
-        for one in place:
-            if all(np.abs(one - other).max() > reach for other in kept):
-                kept.append(one)
-        assert 10 < len(kept) < 400
-        assert np.array_equal(_apart(place, reach), kept)
+    refuses(ValueError, "leaves nothing", distinct_points, frame, 5, spacing=5, border=400)
 
 
 def test_second_peaks_count_from_four_pixels_on():
@@ -231,20 +144,6 @@ def test_second_peaks_count_from_four_pixels_on():
     corner = np.full((9, 9), -0.5, np.float32)
     corner[0, 1] = 0.8
     assert _second(corner, 0, 1) == 0.0
-
-
-def test_missing_pixels_have_no_points_around_them_and_leave_the_others(frame, points):
-    """A tenth of the image missing in one block: the best points elsewhere stay, but for cells at its rim."""
-    holed = frame.astype(float)
-    holed[300:550, 200:450] = np.nan
-    found = distinct_points(holed, 500, spacing=12, border=60)
-    away = np.maximum(np.abs(found[:, 0] - 424.5), np.abs(found[:, 1] - 324.5)) - 125
-    assert away.min() > 0
-    assert len(found) == 500
-    strongest = distinct_points(frame, 100, spacing=12, border=60)
-    outside = np.maximum(np.abs(strongest[:, 0] - 424.5), np.abs(strongest[:, 1] - 324.5)) > 145
-    same = (strongest[outside, None] == distinct_points(holed, 100, spacing=12, border=60)).all(axis=2).any(axis=1)
-    assert same.mean() > 0.9
 
 
 def test_thresholds_are_options(texture, frame, points):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.spots.noise import NoiseModel
+from tests.analysis.refusals import refuses
 
 NOISE = NoiseModel(
     gain_dn_per_e=0.5,
@@ -29,12 +30,10 @@ def test_by_hand():
 def test_only_temporal_noise_averages_down():
     level = np.array([[50.0, 200.0], [1000.0, 4000.0]])
     assert np.allclose(NOISE.temporal_variance_dn2(level, 9) * 9, NOISE.temporal_variance_dn2(level, 1), rtol=1e-14)
-    with pytest.raises(ValueError, match="frames"):
-        NOISE.temporal_variance_dn2(level, 0)
+    refuses(ValueError, "frames", NOISE.temporal_variance_dn2, level, 0)
 
 
 @pytest.mark.parametrize(("field", "value"), [("prnu", -0.1), ("gain_dn_per_e", 0.0), ("saturation_dn", 50.0)])
 def test_impossible_values_name_the_field(field, value):
     values = {name: getattr(NOISE, name) for name in NOISE.__dataclass_fields__}
-    with pytest.raises(ValueError, match=field):
-        NoiseModel(**{**values, field: value})
+    refuses(ValueError, field, NoiseModel, **{**values, field: value})

@@ -8,16 +8,11 @@ import pytest
 from scipy import stats
 
 from analysis.spots import rounding
-from analysis.spots.centroid import difference_covariance, gaussian_fit, maximum_likelihood_fit
 from analysis.spots.frame_screening import FramesError, noise_ratio, screen_frames
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import photon_transfer, pixel_correction
 from analysis.spots.spot_template import SpotTemplate
 from tests.analysis.test_spot_centroids import SHAPE, airy
-from tests.tiers import quick
-
-FALSE_ALARM = 1e-6
-FRAMES = 100
 
 
 def coarse(gain=0.0025, read=12.0, offset=10.3, **changes):
@@ -81,33 +76,6 @@ def test_rounding_is_a_twelfth_in_all_and_fine_detectors_are_as_ever():
 @pytest.fixture(scope="module")
 def shape():
     return SpotTemplate.from_image(airy(73.7, 73.2, (148, 148)), 73.7, 73.2, SHAPE)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("peak", quick(1, [2000.0, 50000.0]))
-def test_shifts_of_coarse_spots_have_the_stated_sigma(shape, peak):
-    """8 bits, 0.03 DN of noise, 100 frames, spots of 125 and of 5 DN: chi-square was 5 and 74 times its degrees of
-    freedom, 17 sigma the worst.
-    """
-    draws, total = 8, {}
-    rng = np.random.default_rng(4)
-    for _ in range(draws):
-        noise = coarse(offset=10.0 + rng.uniform())
-        first, moved = rng.uniform(44, 51, 2), rng.uniform(-8, 8, 2)
-        images = [mean_of(FRAMES, peak * airy(*place) + 3.0, noise, rng) for place in (first, first + moved)]
-        for name in ("likelihood", "gauss"):
-            found = [measured(name, image[None], noise, shape) for image in images]
-            error = (found[1].position - found[0].position)[0] - moved
-            square = error @ np.linalg.solve(difference_covariance(*found, noise)[0], error)
-            total[name] = total.get(name, 0.0) + float(square)
-    for chi_square in total.values():
-        assert 0.05 * draws < chi_square < stats.chi2.isf(FALSE_ALARM, 2 * draws)
-
-
-def measured(name, mean, noise, shape):
-    if name == "gauss":
-        return gaussian_fit(mean, FRAMES, noise)
-    return maximum_likelihood_fit(mean, FRAMES, noise, shape)
 
 
 def stack(noise, electrons, frames, rng, prnu=0.005, shape=(64, 64)):

@@ -13,6 +13,7 @@ from analysis.monitor.series_following import jointly
 from analysis.monitor.series_smoother import smooth
 from analysis.monitor.state_space import HeatInputs, StateSpace
 from tests.analysis.followed_series import follow, forecast, of_shifts
+from tests.analysis.stated_motions import SpotNoise, correlation_of, disturbances
 
 LAWS = (
     TimeLaw(),
@@ -34,35 +35,12 @@ NOISE, REFERENCE = 0.05, 0.02
 
 def stated(laws, seed: int = 0, each: int = 3) -> Disturbances:
     """Three motions of each law that go together."""
-    rng = np.random.default_rng(seed)
-    count = each * len(laws)
-    correlation = np.eye(count)
-    for k in range(0, count, each):
-        root = rng.normal(size=(each, each))
-        own = root @ root.T + np.eye(each)
-        size = np.sqrt(np.diag(own))
-        correlation[k : k + each, k : k + each] = own / size[:, None] / size
-    names = tuple(f"body{k} shift x" for k in range(count))
-    return Disturbances(
-        "laws",
-        names,
-        tuple(name.split()[0] for name in names),
-        names,
-        np.ones(count),
-        ("um",) * count,
-        rng.normal(size=(SPOTS, count)),
-        1e-6 * rng.normal(size=(PARAMETERS, count)),
-        correlation,
-        tuple(law for law in laws for _ in range(each)),
-    )
+    rng, every = np.random.default_rng(seed), tuple(law for law in laws for _ in range(each))
+    correlation, spots = correlation_of(rng, every), rng.normal(size=(SPOTS, len(every)))
+    return disturbances(every, spots, 1e-6 * rng.normal(size=(PARAMETERS, len(every))), correlation=correlation)
 
 
-class Noise:
-    """Of each shift alone, and one error of the reference in all."""
-
-    def covariance(self, images: np.ndarray) -> np.ndarray:
-        together = REFERENCE**2 * np.eye(SPOTS)
-        return np.kron(np.eye(len(images)), NOISE**2 * np.eye(SPOTS)) + np.kron(np.ones((len(images),) * 2), together)
+BOTH = SpotNoise(NOISE**2 * np.eye(SPOTS), REFERENCE**2 * np.eye(SPOTS))
 
 
 def series(count: int, size: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +56,7 @@ def test_the_same_as_the_joint_normal_of_the_series(laws) -> None:
     """Values to 1e-9 of sigma and covariances to 1e-9 of themselves, at readings, between, before and after them."""
     told, (times, shifts) = stated(laws), series(40, NOISE)
     wanted = np.concatenate([times, np.random.default_rng(2).uniform(-3.0, 70.0, 25)])
-    whole = smooth(told, times, shifts, Noise(), wanted)
+    whole = smooth(told, times, shifts, BOTH, wanted)
     how = SeriesFilter(told, REFERENCE**2 * np.eye(SPOTS), window=0)
     found = follow(how, of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), wanted)
     for one, two in ((whole.filtered, found.filtered), (whole.smoothed, found.smoothed)):
@@ -109,7 +87,7 @@ def test_times_together_are_those_of_the_joint_normal() -> None:
             together = both[:, own] @ told.correlation[np.ix_(own, own)] @ both[:, own].T
             prior += np.einsum("tu,ij->tiuj", law.covariance(every[:, None], every), together)
         seen, sought = np.s_[: len(times), :SPOTS], np.s_[len(times) :, SPOTS:]
-        spread = prior[seen][:, :, : len(times), :SPOTS].reshape((shifts.size,) * 2) + Noise().covariance(shifts)
+        spread = prior[seen][:, :, : len(times), :SPOTS].reshape((shifts.size,) * 2) + BOTH.covariance(shifts)
         across = prior[sought][:, :, : len(times), :SPOTS].reshape(-1, shifts.size)
         before = prior[sought][:, :, len(times) :, SPOTS:].reshape((mean.size,) * 2)
         gain = np.linalg.solve(spread, across.T).T
@@ -129,12 +107,6 @@ def test_pieces_do_not_matter(monkeypatch) -> None:
     sigma = np.sqrt(np.diagonal(whole.smoothed.total, 0, 1, 2))
     assert np.all(np.abs(whole.smoothed.values - pieces.smoothed.values) < 1e-9 * sigma)
     assert np.allclose(whole.smoothed.total, pieces.smoothed.total, rtol=1e-9, atol=0.0)
-
-
-def test_states_are_no_more_than_outputs() -> None:
-    """40 motions of one law move five spots and six parameters: eleven states."""
-    assert StateSpace(stated((LAWS[2],), each=40)).size == SPOTS + PARAMETERS
-    assert StateSpace(stated((LAWS[3],), each=40)).size == 2 * (SPOTS + PARAMETERS)
 
 
 JUMPING = (TimeLaw(drift_s=30.0), TimeLaw(), TimeLaw(jump=True))
@@ -202,28 +174,6 @@ def test_a_jump_is_told_and_counts_as_if_it_had_been_known() -> None:
     assert np.allclose(found.filtered.total[after], known.filtered.total[after], rtol=1e-6)
 
 
-@pytest.mark.second
-def test_no_jump_is_told_where_none_is() -> None:
-    """40 series of 30 readings at a chance of one in a thousand each."""
-    for seed in range(40):
-        told, times, shifts = jumped(0.0, seed)
-        assert not follow(SeriesFilter(told, life_s=30.0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), []).jumps
-
-
-def test_more_readings_never_hurt() -> None:
-    """Of what is at work at all times: every further reading, of spots or of a parameter, leaves no sigma larger."""
-    told, (times, shifts) = stated(LAWS[:6]), series(12, 1.0)
-    how = SeriesFilter(told, window=0, parameters_read=True)
-    read = of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS))
-    row = np.eye(PARAMETERS)[:1]
-    one = Observed(30.0, np.array([1e-6]), np.array([[1e-14]]), parameters=row)
-    more = sorted([*read, one], key=lambda each: each.time)
-    few, many = (follow(how, which, times).smoothed.total for which in (read, more))
-    gained = np.linalg.eigvalsh((few - many) / 1e-12)
-    assert gained.min() > -1e-8
-    assert gained.max() > 1e-3
-
-
 def heated(sigma: float) -> tuple[Disturbances, HeatInputs]:
     """Two bodies that wander in temperature, with a sensor each, beside a mount that drifts."""
     told = stated((TimeLaw(drift_s=30.0), TimeLaw(drift_s=200.0)), seed=9, each=2)
@@ -278,3 +228,6 @@ def test_motions_of_a_state_are_those_of_one_joint_normal() -> None:
     gain = told.correlation @ told.spots.T @ np.linalg.inv(told.spot_covariance + NOISE**2 * np.eye(SPOTS))
     assert np.allclose(found, gain @ shift, atol=1e-9)
     assert np.allclose(spread, told.correlation - gain @ told.spots @ told.correlation, atol=1e-9)
+    # as many states as outputs, where many motions share a law; twice as many of a swing
+    assert StateSpace(stated((LAWS[2],), each=40)).size == SPOTS + PARAMETERS
+    assert StateSpace(stated((LAWS[3],), each=40)).size == 2 * (SPOTS + PARAMETERS)

@@ -5,6 +5,7 @@ import pytest
 from scipy.special import j1
 
 from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
+from tests.analysis.refusals import refuses
 
 FIRST_ZERO_PX = 7.0
 
@@ -61,19 +62,6 @@ def test_returns_the_calibration_image_and_moves_down_for_a_larger_row():
     assert np.unravel_index(value[0].argmax(), (48, 48)) == (30, 20)
 
 
-def test_stack_keeps_each_shape():
-    one = SpotTemplate.from_image(airy(40, 40, (80, 80)), 40, 40, (48, 48))
-    two = SpotTemplate.from_image(airy(40, 40, (80, 80), 9.0), 40, 40, (48, 48))
-    both = SpotTemplate.stack([one, two])
-    place = np.array([23.4, 25.1, 22.2])
-    value, _, _ = both.evaluate(place, place)
-    assert np.allclose(value[0], one.evaluate(23.4, 23.4)[0][0], rtol=0, atol=1e-15)
-    assert np.allclose(value[1], two.evaluate(25.1, 25.1)[0][0], rtol=0, atol=1e-15)
-    assert np.allclose(value[2], one.evaluate(22.2, 22.2)[0][0], rtol=0, atol=1e-15)
-    chosen, _, _ = both.evaluate([25.1], [25.1], np.array([1]))
-    assert np.allclose(chosen[0], value[1], rtol=0, atol=1e-15)
-
-
 def test_range_is_tight_and_explained():
     template = SpotTemplate.from_image(airy(40, 40, (80, 80)), 40, 40, (48, 48))
     (low, high), columns = template.supported()
@@ -88,29 +76,10 @@ def test_range_is_tight_and_explained():
 
 @pytest.mark.parametrize(
     ("image", "words"),
-    [
-        (np.ones((40, 40)), "margin"),
-        (np.full((80, 80), np.nan), "finite"),
-        (np.zeros((80, 80)), "no flux"),
-    ],
+    [(np.ones((40, 40)), "margin"), (np.full((80, 80), np.nan), "finite"), (np.zeros((80, 80)), "no flux")],
 )
 def test_bad_calibration_images(image, words):
-    with pytest.raises(ValueError, match=words):
-        SpotTemplate.from_image(image, 20, 20, (48, 48))
-
-
-@pytest.mark.parametrize("oversampling", [1, 2])
-def test_the_smallest_calibration_image_has_one_place(oversampling):
-    """Quintic splines take six samples: five more than from the first pixel to the last. One fewer is refused."""
-    rows, columns = 9 * oversampling + 6, 7 * oversampling + 6
-    image = airy(rows // 2, columns // 2, (rows, columns))
-    template = SpotTemplate.from_image(image, rows // 2, columns // 2, (10, 8), oversampling)
-    for low, high in template.supported():
-        assert 0 <= high - low <= 1 / oversampling
-    template.evaluate(*(low for low, _ in template.supported()))
-    for less in (image[:-1], image[:, :-1]):
-        with pytest.raises(ValueError, match="margin"):
-            SpotTemplate.from_image(less, rows // 2, columns // 2, (10, 8), oversampling)
+    refuses(ValueError, words, SpotTemplate.from_image, image, 20, 20, (48, 48))
 
 
 # --- smeared ----------------------------------------------------------------------------------------------------------

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.disturbances import TimeLaw
 from analysis.monitor.limits import elasticities, heavy_tails, posterior_sigma, stated_numbers, unseen
+from tests.analysis.refusals import refuses
+from tests.analysis.stated_motions import disturbances
 
 RNG = np.random.default_rng(11)
 WHAT = ("rotate x", "rotate y", "shift x", "shift y", "figure Z4", "figure Z5")
@@ -15,17 +17,12 @@ COUNT = len(WHAT) * len(BODIES)
 SIGMAS = np.tile([2.0, 2.0, 1.0, 3.0, 5.0, 5.0], 2)
 CORRELATION = np.eye(COUNT)
 CORRELATION[0, 6] = CORRELATION[6, 0] = 0.6
-STATED = Disturbances(
-    name="made up",
-    labels=tuple(f"{body} {what}" for body in BODIES for what in WHAT),
-    bodies=tuple(body for body in BODIES for _ in WHAT),
-    causes=("mounts",) * COUNT,
-    sigmas=SIGMAS,
-    units=("um",) * COUNT,
-    spots=RNG.standard_normal((4, COUNT)),
-    parameters=RNG.standard_normal((4, COUNT)),
-    correlation=CORRELATION,
-    laws=(TimeLaw(),) * COUNT,
+STATED = disturbances(
+    (TimeLaw(),) * COUNT,
+    *RNG.standard_normal((2, 4, COUNT)),
+    [f"{body} {what}" for body in BODIES for what in WHAT],
+    CORRELATION,
+    SIGMAS,
 )
 NOISE = 0.01 * np.eye(4)
 ROWS = np.eye(4)
@@ -88,8 +85,7 @@ def test_many_degrees_of_freedom_are_the_normal_statement() -> None:
     for k in range(3):
         assert tail.held[k] == pytest.approx((k + 1) * sigma, rel=2e-3)
     assert tail.beyond == pytest.approx(np.full(4, 0.0027), rel=0.02)
-    with pytest.raises(ValueError, match="above 2 degrees"):
-        heavy_tails(ROWS, STATED, NOISE, GAIN, 2.0)
+    refuses(ValueError, "above 2 degrees", heavy_tails, ROWS, STATED, NOISE, GAIN, 2.0)
 
 
 def test_a_body_that_moves_no_spot_is_found() -> None:

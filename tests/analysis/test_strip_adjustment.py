@@ -8,7 +8,7 @@ from scipy import stats
 
 from analysis.calibration.strip_adjustment import adjust_strip
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
-from analysis.orbit.forward_intersection import check_errors, intersect
+from tests.analysis.refusals import refuses
 from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, make_rays, observe, orbit
 
 BIAS = np.array([40.0, -60.0, 90.0]) * ARCSEC
@@ -33,10 +33,6 @@ def adjusted(rays, noise):
     return adjust_strip(rays, cameras(), noise, bias=BIAS)
 
 
-def alone(rays, noise):
-    return intersect(rays, cameras(), noise, bias=BIAS)
-
-
 def test_exact_rays_are_left_alone():
     """1e-15 m of rounding in an image of 0.3 px is 1e-9 of a sigma; coordinates of 6.4e6 m are rounded to 1e-9 m."""
     view = strip(1, 60, 7.0)
@@ -49,68 +45,17 @@ def test_exact_rays_are_left_alone():
         assert np.abs(corrected.station - row.station).max() < 1e-6 * SLOW.station
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_sigmas_are_right():
-    """40 passes: the errors of one point of each, and the residuals of all; two-sided false alarm 1e-3 each."""
-    rng, view, total, fit = np.random.default_rng(2), strip(2, 40, 3.0), np.zeros(2), np.zeros(2)
-    for k in range(40):
+    """30 passes: the errors of one point of each, and the residuals of all; two-sided false alarm 1e-6 each."""
+    rng, view, total, fit = np.random.default_rng(2), strip(2, 30, 3.0), np.zeros(2), np.zeros(2)
+    for k in range(30):
         found = adjusted(make_rays(view, rng, SLOW), SLOW)
         error = found.ground[k] - view.points[k]
         total += (error @ np.linalg.solve(found.covariance[k], error), 3)
         fit += (found.chi_square, found.degrees_of_freedom)
-    assert 5e-4 < stats.chi2.sf(*total) < 1 - 5e-4
-    assert 5e-4 < stats.chi2.sf(*fit) < 1 - 5e-4
-
-
-@pytest.mark.second
-def test_corrections_take_the_errors_out_of_other_rays():
-    """Ties from half of the points, the others intersected from corrected rays: both keep the same slow errors.
-
-    Heights of 500 points from one set of slow errors: 0.3 px of the others count 1.5 m of image noise, of some 10 m.
-    """
-    view, squares = strip(3, 1000, 20.0), []
-    for seed in range(3):
-        rays = make_rays(view, np.random.default_rng(30 + seed), SLOW)
-        found = adjusted({k: r.taken(np.arange(1000) < 500) for k, r in rays.items()}, SLOW)
-        others = {k: r.taken(np.arange(1000) >= 500) for k, r in rays.items()}
-        others = {k: replace(r, point=r.point - 500) for k, r in others.items()}
-        before = check_errors(alone(others, SLOW).ground, view.points[500:])
-        after = check_errors(alone({k: found.corrected(r) for k, r in others.items()}, SLOW).ground, view.points[500:])
-        tied = check_errors(found.ground[:500], view.points[:500])
-        assert np.hypot(after.plan_rms, after.height_rms) == pytest.approx(
-            np.hypot(tied.plan_rms, tied.height_rms), rel=0.1
-        )
-        squares.append([e.plan_rms**2 + e.height_rms**2 for e in (before, after)])
-    assert np.sqrt(np.mean(squares, axis=0)[1] / np.mean(squares, axis=0)[0]) < 0.9
-    with pytest.raises(CalibrationError, match="no times"):
-        found.corrected(replace(rays["backward"], time=None))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("noise", "least", "most"), [(WHITE, 0.02, 0.15), (SLOW, 0.2, 0.9)])
-def test_gain_in_height_is_large_for_slow_errors_only(noise, least, most):
-    """The gain that the covariances predict, and the one that is met over five passes.
-
-    White readings of 0.5 arcsec and 0.3 px: almost all of the error is what all rays of a place have in common. Errors
-    of a place are common to its neighbours, within one reading (480 in five passes) or one slow error (10): 4 sigmas.
-    """
-    rng, view = np.random.default_rng(4), strip(4, 450, 12.0)
-    squares, expected = [], []
-    up = view.points / np.linalg.norm(view.points, axis=1, keepdims=True)
-    for _ in range(5):
-        rays = make_rays(view, rng, noise)
-        before, after = alone(rays, noise), adjusted(rays, noise)
-        squares.append([check_errors(g.ground, view.points).height_rms ** 2 for g in (before, after)])
-        heights = [np.einsum("ni,nij,nj->n", up, g.covariance, up).mean() for g in (before, after)]
-        expected.append(heights)
-    ratio = np.sqrt(np.mean(squares, axis=0)[1] / np.mean(squares, axis=0)[0])
-    predicted = np.sqrt(np.mean(expected, axis=0)[1] / np.mean(expected, axis=0)[0])
-    assert 1 - most < predicted < 1 - least
-    independent = 480 if noise is WHITE else 10
-    assert np.sqrt(np.mean(squares, axis=0)) == pytest.approx(
-        np.sqrt(np.mean(expected, axis=0)), rel=4 * np.sqrt(0.5 / independent)
-    )
-    assert ratio < 1.0
+    for square, degrees in (total, fit):
+        assert 5e-7 < stats.chi2.sf(square, degrees) < 1 - 5e-7
 
 
 @pytest.mark.second
@@ -144,7 +89,5 @@ def test_points_of_one_line_and_bad_input():
     assert np.isnan(found.ground[3]).all()
     assert np.isfinite(np.delete(found.ground, 3, axis=0)).all()
     assert found.degrees_of_freedom == 2 * 29 * 3 - 3 * 29
-    with pytest.raises(CalibrationError, match="needs the times"):
-        adjusted(rays, Noise(PITCH, ARCSEC))
-    with pytest.raises(CalibrationError, match="needs the times"):
-        adjusted({k: replace(r, time=None) for k, r in rays.items()}, WHITE)
+    refuses(CalibrationError, "needs the times", adjusted, rays, Noise(PITCH, ARCSEC))
+    refuses(CalibrationError, "needs the times", adjusted, {k: replace(r, time=None) for k, r in rays.items()}, WHITE)

@@ -5,11 +5,10 @@ of the 7 um and 28 um pixels, never the formula that is fitted.
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.optimize import minimize_scalar
 
 from analysis.focal_plane import through_focus as module
 from analysis.focal_plane.through_focus import FocusError, focus_vertex, focus_vertices
-from tests.tiers import quick
+from tests.analysis.refusals import refuses
 
 FALSE_ALARM = 1e-6
 WAVELENGTH, F_NUMBER = 650e-9, 9.2
@@ -52,23 +51,6 @@ def steps(step, low, high):
     return np.arange(round(low / step), round(high / step) + 1) * step
 
 
-def test_curves_of_the_tests_are_physical():
-    """In focus the closed form of the diffraction MTF; the pan curve's first zero and its bounce beyond."""
-    for frequency in (PAN, MS):
-        s = frequency * WAVELENGTH * F_NUMBER
-        exact = 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
-        # Gauss quadrature on a kink at the middle of the overlap: 48 nodes reach 1e-4
-        assert through_focus(0.0, frequency) == pytest.approx(exact, abs=2e-4)
-    z = np.linspace(0, 0.6e-3, 601)
-    pan = through_focus(z, PAN)
-    dark = int(np.argmax(pan < 0.01 * pan[0]))
-    assert 0.25e-3 < z[dark] < 0.32e-3
-    assert pan[dark:].max() > 0.08 * pan[0]
-    # geometrical blur disc: first zero of 2 J1(x)/x at defocus 1.22 F / frequency; diffraction adds to it
-    wide = through_focus(np.linspace(0, 1e-3, 501), MS)
-    assert 1.22 * F_NUMBER / MS < np.linspace(0, 1e-3, 501)[np.argmin(wide)] < 1.3 * 1.22 * F_NUMBER / MS
-
-
 @pytest.mark.parametrize(
     ("frequency", "step", "low", "high", "middle", "lobe_um", "parabola_um"),
     [
@@ -95,25 +77,6 @@ def test_bias_over_sampling_phases(monkeypatch, frequency, step, low, high, midd
     assert lobe_um < plain.max() < parabola_um
 
 
-@pytest.mark.parametrize(("aberration", "limit_um"), [({"coma": 0.3}, 0.3), ({"spherical": 0.2}, 3.0)])
-def test_bias_with_aberrations(aberration, limit_um):
-    """Against the maximum of the aberrated curve itself. Coma (0.3 waves, 0.035 rms) leaves it even in defocus;
-    spherical aberration (0.2 waves, 0.015 rms as the camera's whole error) makes it lopsided, which shifts the mean of
-    the upper half against the maximum.
-    """
-    z = steps(50 * UM, -0.6e-3, 0.6e-3)
-    top = minimize_scalar(
-        lambda at: -float(through_focus(at, PAN, **aberration)), bounds=(-2e-4, 2e-4), method="bounded",
-        options={"xatol": 1e-9},
-    ).x  # fmt: skip
-    focus = np.linspace(-0.5, 0.5, 11) * 50 * UM
-    value = curve(z, focus, PAN, 0.2, **aberration)
-    error = focus_vertices(z, value, 0.004).position - focus - top
-    assert np.abs(error).max() < limit_um * UM
-    if "spherical" in aberration:
-        assert abs(top) > 20 * UM  # the test has something to find
-
-
 @pytest.mark.parametrize(
     ("frequency", "step", "half", "noise"),
     [(PAN, 50 * UM, 0.6e-3, 0.02), (PAN, 50 * UM, 0.6e-3, 0.05), (MS, 50 * UM, 1e-3, 0.02), (MS, 100 * UM, 6e-4, 0.02)],
@@ -136,53 +99,6 @@ def test_sigma_agrees_with_scatter(frequency, step, half, noise):
     # what the form misses (up to 0.5% of the peak) adds little to the residuals at these noise levels
     total, freedom = found.chi_square.sum(), found.degrees_of_freedom.sum()
     assert stats.chi2.sf(total, freedom) > FALSE_ALARM / 2
-
-
-@pytest.mark.second
-def test_spurious_resolution_is_not_the_peak():
-    """Scans that show several bounces: the main peak is found wherever it lies, with noise, in any order of points."""
-    rng = np.random.default_rng(3)
-    z = steps(40 * UM, -1e-3, 1e-3)
-    focus = rng.uniform(-0.75e-3, 0.75e-3, 40)
-    value = curve(z, focus, PAN, 0.2) + rng.normal(0, 0.006, (40, z.size))
-    order = rng.permutation(z.size)
-    found = focus_vertices(z[order], value[:, order], 0.006)
-    # six sigma: 1e-7 over the 40
-    assert np.all(np.abs(found.position - focus) < 6 * found.sigma)
-    assert found.sigma.max() < 10 * UM
-    assert np.all(found.used.sum(axis=1) <= 10)
-    assert np.array_equal(found.position, focus_vertices(z, value, 0.006).position)
-    for k in (0, 7):
-        taken = np.sort(z[order][found.used[k]])
-        assert np.all(np.diff(taken) < 41 * UM)  # one run of neighbours
-
-
-def test_the_best_measured_points_are_not_the_peak():
-    """Ten times the precision beyond the dark zeros, where the contrast is a tenth: sigmas tell values, not heights."""
-    z = steps(25 * UM, -0.6e-3, 0.6e-3)
-    sigma = np.where(np.abs(z) > 0.3e-3, 0.0002, 0.002)
-    value = curve(z, [20 * UM], PAN, 0.2)[0] + sigma * np.random.default_rng(6).standard_normal(z.size)
-    found = focus_vertex(z, value, sigma)
-    assert found.position == pytest.approx(20 * UM, abs=5 * found.sigma + 0.1 * UM)
-    assert np.abs(z[found.used]).max() < 0.25e-3
-
-
-def test_batch_agrees_with_single_curves():
-    rng = np.random.default_rng(5)
-    z = steps(50 * UM, -0.6e-3, 0.6e-3)
-    focus = rng.uniform(-2e-4, 2e-4, (2, 3))
-    value = curve(z, focus, PAN, 0.2) + rng.normal(0, 0.004, (2, 3, z.size))
-    many = focus_vertices(z, value, 0.004)
-    assert many.position.shape == (2, 3)
-    one, same = focus_vertex(z, value[1, 2], 0.004), many.at(1, 2)
-    # the batch iterates until all curves rest: the same fixed point to the convergence of Gauss-Newton
-    assert one.position == pytest.approx(same.position, abs=1e-9 * 1e-3)
-    assert one.sigma == pytest.approx(same.sigma, rel=1e-6)
-    assert one.degrees_of_freedom == same.degrees_of_freedom == same.used.sum() - 3
-    # the curvature is the second derivative: compare with the exact curve's central difference over 20 um
-    d = 20 * UM
-    bend = np.diff(curve(np.array([-d, 0, d]), [0.0], PAN, 0.2)[0], 2)[0] / d**2
-    assert one.curvature == pytest.approx(bend, rel=0.15)
 
 
 def test_unmeasured_points_are_left_out():
@@ -247,8 +163,7 @@ def test_other_faults():
     assert not np.any(focus_vertices(fine, curve(fine, np.linspace(0, step, 9), PAN, 0.2), 0.004, strict=False).fault)
     with pytest.raises(FocusError, match="fewer than 5") as caught:
         focus_vertex(np.repeat(z[10:14], 3), np.repeat(value[10:14], 3), 0.004)  # repeats are not positions
-    with pytest.raises(FocusError, match="not finite"):
-        focus_vertex(z, np.where(np.arange(z.size) == 4, np.nan, value), 0.004)
+    refuses(FocusError, "not finite", focus_vertex, z, np.where(np.arange(z.size) == 4, np.nan, value), 0.004)
     batch = np.stack([value, np.full_like(value, 0.1), value])
     with pytest.raises(FocusError, match="curve 1: no curvature") as caught:
         focus_vertices(z, batch, 0.004)
@@ -256,31 +171,6 @@ def test_other_faults():
     told = focus_vertices(z, batch, 0.004, strict=False)
     assert list(told.fault) == ["", "flat", ""]
     assert np.isfinite(told.position[[0, 2]]).all()
-
-
-@pytest.mark.parametrize(("count", "rest"), [(3, []), (5, ["2 more"])])
-def test_three_faults_are_told_and_more_are_counted(count, rest):
-    with pytest.raises(FocusError) as caught:
-        focus_vertices(np.linspace(-1e-3, 1e-3, 25), np.full((count, 25), 0.2), 0.01)
-    assert str(caught.value).count("no curvature above the noise") == 3
-    assert str(caught.value).split("; and ")[1:] == rest
-    assert list(caught.value.faults) == [(k,) for k in range(count)]
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("unit", quick(1, [1e6, 1e3]))
-def test_the_unit_of_length_does_not_matter(unit):
-    """Metres, millimetres, micrometres: the same vertices and the same faults, of clear and of faint curves."""
-    z = steps(50 * UM, -0.6e-3, 0.6e-3)
-    noise = np.random.default_rng(4).normal(0, 0.02, (200, z.size))
-    value = curve(z, np.linspace(-0.7e-3, 0.7e-3, 200), PAN, 0.2) + noise
-    metres = focus_vertices(z, value, 0.02, strict=False)
-    other = focus_vertices(unit * z, value, 0.02, strict=False)
-    assert np.array_equal(other.fault, metres.fault)
-    assert np.array_equal(other.used, metres.used)
-    assert 20 < np.sum(metres.fault == "") < 180
-    for name, power in (("position", 1), ("sigma", 1), ("peak", 0), ("peak_sigma", 0), ("curvature", -2)):
-        assert getattr(other, name) == pytest.approx(unit**power * getattr(metres, name), rel=1e-9, nan_ok=True), name
 
 
 @pytest.mark.parametrize(
@@ -294,15 +184,4 @@ def test_the_unit_of_length_does_not_matter(unit):
 )
 def test_bad_arguments(change, message):
     given = {"position": np.linspace(-1, 1, 9), "value": np.ones(9), "sigma": 0.1} | change
-    with pytest.raises(ValueError, match=message):
-        focus_vertex(**given)
-
-
-def test_the_unit_of_the_mtf_does_not_matter():
-    """Weights are 1/sigma^2: of an MTF in units of 1e-4 they are far below one, and count as much."""
-    z = steps(50 * UM, -0.6e-3, 0.6e-3)
-    value = curve(z, [30 * UM], PAN, 0.2)[0] + np.random.default_rng(3).normal(0, 0.004, z.size)
-    one, other = focus_vertex(z, value, 0.004), focus_vertex(z, 1e4 * value, 40.0)
-    np.testing.assert_array_equal(one.used, other.used)
-    assert other.position == pytest.approx(one.position, abs=1e-9 * 1e-3)
-    assert other.sigma == pytest.approx(one.sigma, rel=1e-6)
+    refuses(ValueError, message, focus_vertex, **given)

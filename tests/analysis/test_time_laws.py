@@ -9,7 +9,8 @@ import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.limits import calibrated_sigma
-from analysis.monitor.series_smoother import SmoothedSeries, smooth
+from analysis.monitor.series_smoother import smooth
+from tests.analysis.stated_motions import SpotNoise, disturbances
 
 STATIONARY = (
     TimeLaw(white=True),
@@ -18,106 +19,25 @@ STATIONARY = (
     TimeLaw(period_s=90.0),
     TimeLaw(drift_s=200.0, period_s=70.0),
 )
-TREND, GROWING = TimeLaw(trend_s=80.0, since_s=10.0), TimeLaw(trend_s=80.0, period_s=30.0)
+TREND = TimeLaw(trend_s=80.0, since_s=10.0)
 RELAXATION, EVENT = TimeLaw(relaxation_s=25.0, since_s=20.0), TimeLaw(event=((30.0, 1.0),))
-UNSURE = TimeLaw(event=((20.0, 0.0), (30.0, 0.7), (45.0, 0.7), (50.0, 1.0)))
-SETS_IN = TimeLaw(event=((30.0, 1.0),), drift_s=40.0, period_s=60.0)
-CHANGING = (TREND, GROWING, RELAXATION, EVENT, UNSURE, SETS_IN, TimeLaw(jump=True))
 
 
-class Gaps(TimeLaw):
-    """The laws of stationary motions, as they follow from the gap alone."""
-
-    def covariance(self, one, two):  # type: ignore[no-untyped-def]
-        away = np.abs(np.asarray(np.subtract(one, two), np.float64))
-        if self.white:
-            return np.asarray(away == 0.0, np.float64)
-        out = np.ones_like(away)
-        if self.drift_s is not None:
-            out = out * np.exp(-away / self.drift_s)
-        if self.period_s is not None:
-            out = out * np.cos(2.0 * math.pi * away / self.period_s)
-        return out
-
-
-class White:
-    """Noise of each shift alone."""
-
-    def __init__(self, variance: float, width: int) -> None:
-        self.variance, self.width = variance, width
-
-    def covariance(self, images: np.ndarray) -> np.ndarray:
-        return self.variance * np.eye(self.width * len(images))
-
-
-def stated(laws, seed: int = 0, spots: int = 3, **more) -> Disturbances:
+def stated(laws, seed: int = 0, spots: int = 3) -> Disturbances:
     """A motion for each law, seen by all spots."""
-    rng, names = np.random.default_rng(seed), tuple(f"b{k} shift x" for k in range(len(laws)))
-    a, b = rng.standard_normal((spots, len(laws))), rng.standard_normal((4, len(laws)))
-    bodies = tuple(name.split()[0] for name in names)
-    count = len(laws)
-    return Disturbances(
-        "toy", names, bodies, names, np.ones(count), ("um",) * count, a, b, np.eye(count), tuple(laws), **more
-    )
+    rng = np.random.default_rng(seed)
+    return disturbances(laws, rng.standard_normal((spots, len(laws))), rng.standard_normal((4, len(laws))))
 
 
-@pytest.mark.parametrize("law", [*STATIONARY, *CHANGING])
-def test_positive_semidefinite_at_random_times(law: TimeLaw) -> None:
-    rng = np.random.default_rng(1)
-    for count in (2, 5, 20, 60):
-        times = np.concatenate([rng.uniform(-100.0, 300.0, count), [20.0, 30.0, 30.0]])
-        every = law.covariance(times[:, None], times)
-        assert np.array_equal(every, every.T)
-        size = max(1.0, np.abs(every).max())
-        assert np.linalg.eigvalsh(every).min() > -1e-12 * size * len(times)
-        # since a reference, too
-        since = law.covariance(times, 37.0)
-        counted = every - since[:, None] - since + law.covariance(37.0, 37.0)
-        assert np.linalg.eigvalsh(counted).min() > -1e-12 * 4.0 * size * len(times)
-
-
-@pytest.mark.parametrize("reference", [None, 25.0])
-def test_stationary_laws_give_the_very_bits_of_their_correlations(reference: float | None) -> None:
-    rng = np.random.default_rng(2)
-    new = stated(STATIONARY)
-    old = stated([Gaps(one.white, one.drift_s, one.period_s) for one in STATIONARY])
-    measured, times = np.sort(rng.uniform(0.0, 200.0, 30)), np.append(rng.uniform(-20.0, 220.0, 40), 25.0)
-    shifts = rng.standard_normal((30, 3))
-    found, expected = (smooth(one, measured, shifts, White(1e-4, 3), times, reference) for one in (new, old))
-    for which in ("filtered", "smoothed"):
-        for name in ("values", "noise", "total"):
-            assert np.array_equal(getattr(getattr(found, which), name), getattr(getattr(expected, which), name))
-    assert np.array_equal(found.innovations, expected.innovations)
-    assert found.jumps is None
-    for gap in (0.0, 7.0, 90.0):
-        kept = np.array([float(one.covariance(gap, 0.0)) for one in old.laws])
-        assert np.array_equal(new.between(25.0, 25.0 + gap).sigmas, np.sqrt(2.0 * (1.0 - kept)))
-
-
-def _same(one: SmoothedSeries, two: SmoothedSeries) -> None:
-    for which in ("filtered", "smoothed"):
-        a, b = getattr(one, which), getattr(two, which)
-        sigma = np.sqrt(np.maximum(np.diagonal(b.total, 0, 1, 2), 1e-30))
-        assert np.abs((a.values - b.values) / sigma).max() < 1e-9
-        assert np.abs(a.total - b.total).max() < 1e-9 * np.abs(b.total).max()
-
-
-def test_a_jump_that_is_not_found_and_an_event_to_come_change_nothing() -> None:
-    """To 1e-9 sigma, ten thousand times what float64 rounds here."""
-    rng = np.random.default_rng(3)
-    laws = (TimeLaw(drift_s=50.0), TimeLaw(white=True))
-    plain = stated(laws)
-    measured, times = np.arange(40.0), np.linspace(-5.0, 50.0, 30)
-    root = np.linalg.cholesky(laws[0].covariance(measured[:, None], measured) + 1e-12 * np.eye(40))
-    motions = np.stack([root @ rng.standard_normal(40), rng.standard_normal(40)], axis=1)
-    shifts = motions @ plain.spots.T + 0.1 * rng.standard_normal((40, 3))
-    expected = smooth(plain, measured, shifts, White(0.01, 3), times)
-    for law in (TimeLaw(jump=True), TimeLaw(event=((1e4, 1.0),))):
-        more = stated((*laws, law))
-        more.spots[:, :2], more.parameters[:, :2] = plain.spots, plain.parameters
-        found = smooth(more, measured, shifts, White(0.01, 3), times)
-        assert found.jumps == (() if law.jump else None)
-        _same(found, expected)
+def test_stationary_laws_are_their_correlations_over_the_gap() -> None:
+    gap = np.array([0.0, 7.0, 45.0, 90.0])
+    damped = np.exp(-gap / 200.0) * np.cos(2.0 * np.pi * gap / 70.0)
+    for law, kept in zip(
+        STATIONARY, (gap == 0.0, 1.0 + 0.0 * gap, np.exp(-gap / 50.0), np.cos(gap * np.pi / 45.0), damped), strict=True
+    ):
+        np.testing.assert_allclose(law.covariance(25.0 + gap, 25.0), kept, rtol=0, atol=1e-15)
+        for away, one in zip(gap, kept, strict=True):
+            assert stated([law]).between(25.0, 25.0 + away).sigmas == pytest.approx(np.sqrt(2.0 * (1.0 - one)))
 
 
 @pytest.mark.parametrize(
@@ -137,7 +57,7 @@ def test_a_shape_of_unknown_size_is_the_fit_of_its_size(law: TimeLaw, shape, ref
     zero = 0.0 if reference is None else shape(np.array(reference))
     rows = np.kron((shape(measured) - zero)[:, None], one.spots)
     shifts = rows[:, 0] * 1.3 + 0.1 * rng.standard_normal(len(rows))
-    found = smooth(one, measured, shifts.reshape(26, 3), White(0.01, 3), times, reference)
+    found = smooth(one, measured, shifts.reshape(26, 3), SpotNoise(0.01 * np.eye(3)), times, reference)
     variance = 1.0 / (float(rows[:, 0] @ rows[:, 0]) / 0.01 + 1.0)
     size = variance * float(rows[:, 0] @ shifts) / 0.01
     along = (shape(times) - zero)[:, None] * one.parameters[:, 0]
@@ -153,7 +73,7 @@ def test_a_step_at_an_unsure_moment_is_widened_between_the_readings() -> None:
     one = stated((TimeLaw(event=((40.0, 0.0), (60.0, 1.0))),))
     measured = np.array([20.0, 40.0, 60.0, 80.0])
     shifts = np.outer([0.0, 0.0, 1.0, 1.0], one.spots[:, 0])
-    found = smooth(one, measured, shifts, White(1e-8, 3), [30.0, 45.0, 50.0, 70.0])
+    found = smooth(one, measured, shifts, SpotNoise(1e-8 * np.eye(3)), [30.0, 45.0, 50.0, 70.0])
     share = found.smoothed.values[:, 0] / one.parameters[0, 0]
     spread = found.smoothed.total[:, 0, 0] / one.parameters[0, 0] ** 2
     assert share == pytest.approx([0.0, 0.25, 0.5, 1.0], abs=1e-6)

@@ -5,9 +5,8 @@ import pytest
 from scipy.linalg import null_space
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.unseen_motions import floor, unseen_modes
-from tests.analysis.followed_series import of_shifts
+from tests.analysis.stated_motions import correlation_of, disturbances
 
 MOTIONS, SPOTS, PARAMETERS = 14, 4, 3
 SWING, DRIFT = TimeLaw(period_s=5000.0, drift_s=50_000.0), TimeLaw(drift_s=900.0)
@@ -15,26 +14,9 @@ SWING, DRIFT = TimeLaw(period_s=5000.0, drift_s=50_000.0), TimeLaw(drift_s=900.0
 
 def stated(seed: int, laws: tuple[TimeLaw, ...] = (SWING,) * MOTIONS, correlated: bool = True) -> Disturbances:
     rng = np.random.default_rng(seed)
-    correlation = np.eye(MOTIONS)
-    if correlated:
-        for law in set(laws):
-            own = np.flatnonzero([one == law for one in laws])
-            root = rng.standard_normal((len(own), len(own)))
-            spread = root @ root.T + np.eye(len(own))
-            size = np.sqrt(np.diag(spread))
-            correlation[np.ix_(own, own)] = spread / size[:, None] / size
-    return Disturbances(
-        "some",
-        tuple(f"body{k // 2} shift {'xy'[k % 2]}" for k in range(MOTIONS)),
-        tuple(f"body{k // 2}" for k in range(MOTIONS)),
-        ("cause",) * MOTIONS,
-        np.ones(MOTIONS),
-        ("um",) * MOTIONS,
-        rng.standard_normal((SPOTS, MOTIONS)),
-        rng.standard_normal((PARAMETERS, MOTIONS)),
-        correlation,
-        laws,
-    )
+    labels = [f"body{k // 2} shift {'xy'[k % 2]}" for k in range(MOTIONS)]
+    see, tell = (rng.standard_normal((n, MOTIONS)) for n in (SPOTS, PARAMETERS))
+    return disturbances(laws, see, tell, labels, correlation_of(rng, laws) if correlated else None)
 
 
 def hidden(one: Disturbances, rows: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -79,19 +61,3 @@ def test_motions_that_spots_see_in_full_leave_nothing() -> None:
     seen = np.arange(MOTIONS) < SPOTS
     only = one.scaled(seen.astype(float))
     assert np.abs(floor(only, np.eye(PARAMETERS))).max() < 1e-12
-
-
-def test_no_filter_goes_below_the_floor_and_with_many_readings_it_comes_to_it() -> None:
-    """With laws that many readings tell apart, each motion's share of the spots becomes known."""
-    one, rows = stated(5, (SWING,) * 8 + (TimeLaw(),) * 6, correlated=False), np.eye(PARAMETERS)
-    how = SeriesFilter(one, None, window=0)
-    belief = how.start(0.0)
-    least = np.diag(floor(one, rows))
-    ratios = []
-    for reading in of_shifts(np.arange(400) * 600.0, np.zeros((400, SPOTS)), 1e-8 * np.eye(SPOTS)):
-        belief, _ = how.update(belief, reading)
-        spread = np.diag(how.parameters(belief, reading.time)[1])
-        assert np.all(spread > least * (1.0 - 1e-6))
-        ratios.append((spread / least).max())
-    assert ratios[0] > 1.05
-    assert ratios[-1] < 1.02

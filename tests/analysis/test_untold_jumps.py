@@ -11,6 +11,7 @@ from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.series_following import hinted, smoothed
 from analysis.monitor.state_space import StateSpace
 from tests.analysis.followed_series import follow, of_shifts
+from tests.analysis.stated_motions import disturbances
 from tests.tiers import quick
 
 NOISE, EVERY = 0.3, 400.0
@@ -23,25 +24,12 @@ def toy(seed: int = 2, every: float | None = EVERY) -> Disturbances:
     """Two bodies that jump, of two motions that go together and of one, above a drift and a mounting: four spots, three
     parameters.
     """
-    rng = np.random.default_rng(seed)
-    jump = TimeLaw(jump=True, every_s=every)
-    laws = (DRIFT, TimeLaw(), TimeLaw(), jump, jump, jump)
+    rng, jump, correlation = np.random.default_rng(seed), TimeLaw(jump=True, every_s=every), np.eye(6)
     names = ("drift", "mount x", "mount y", "mirror x", "mirror y", "prism x")
-    correlation = np.eye(6)
     correlation[3, 4] = correlation[4, 3] = 0.6
-    return Disturbances(
-        "toy",
-        names,
-        tuple(name.split()[0] for name in names),
-        names,
-        np.ones(6),
-        ("um",) * 6,
-        rng.normal(size=(4, 6)) * [0.2, 1.0, 1.0, 1.0, 1.0, 1.0],
-        rng.normal(size=(3, 6)),
-        correlation,
-        laws,
-        1e-9,
-    )
+    see, tell = rng.normal(size=(4, 6)) * [0.2, 1.0, 1.0, 1.0, 1.0, 1.0], rng.normal(size=(3, 6))
+    laws = (DRIFT, TimeLaw(), TimeLaw(), jump, jump, jump)
+    return disturbances(laws, see, tell, names, correlation, jump_false_alarm=1e-9)
 
 
 def series(
@@ -158,26 +146,13 @@ def test_what_else_the_body_did_is_not_lost_when_its_jump_is_told() -> None:
     """One motion makes the jump be told, the other one, that does not, counts as free."""
     jump, names = TimeLaw(jump=True), ("mount y", "mount z", "light y", "light z")
     see = np.tile(np.eye(2), 2) * [5.0, 5.0, 4.0, 4.0]
-    told = Disturbances(
-        "two axes",
-        names,
-        tuple(name.split()[0] for name in names),
-        names,
-        np.array([5.0, 5.0, 4.0, 4.0]),
-        ("arcsec",) * 4,
-        see,
-        see.copy(),
-        np.eye(4),
-        (TimeLaw(), TimeLaw(), jump, jump),
-    )
+    told = disturbances((TimeLaw(), TimeLaw(), jump, jump), see, see.copy(), names, sigmas=[5.0, 5.0, 4.0, 4.0])
     truth = np.array([12.0, 2.0])
     times = np.arange(60.0)
     shifts = (times >= 40.0)[:, None] * truth + np.random.default_rng(1).normal(size=(60, 2))
-    wanted = np.array([41.0, 44.0, 59.0])
-    found = follow(SeriesFilter(told, life_s=60.0), of_shifts(times, shifts, np.eye(2)), wanted)
+    found = follow(SeriesFilter(told, life_s=60.0), of_shifts(times, shifts, np.eye(2)), [41.0, 44.0, 59.0])
     (one,) = found.jumps
-    assert one.labels == ("light y",)
-    assert one.after == 39.0
+    assert (one.labels, one.after) == (("light y",), 39.0)
     for state in (found.filtered, found.smoothed):
         sigma = np.sqrt(np.diagonal(state.total, 0, 1, 2))
         assert np.all(np.abs(state.values - truth) < 3.0 * sigma)

@@ -51,17 +51,6 @@ def test_a_step_between_halves_is_found_as_often_as_the_power_says(split):
     assert found > power.mean() - 4 * np.sqrt(0.25 / COUNT)
 
 
-@pytest.mark.second
-def test_one_displacement_of_the_window_is_no_step():
-    """The common fit takes it all; what all windows have of relief raises the chance and lowers the power."""
-    still, variance = halved(3)
-    moved, _ = halved(3, 0.4 * np.ones((SIDE, SIDE)))
-    assert moved.apart == pytest.approx(still.apart, abs=1e-9)
-    plain, rough = still.judged(variance, 0.0), still.judged(variance, 0.2**2)
-    assert np.all(rough[0] >= plain[0])
-    assert np.all(rough[1] <= plain[1])
-
-
 def test_covariance_of_relief_is_that_of_fields_drawn():
     """Displacements of both axes drawn from the field's covariance, hardly any noise: chi-square of the differences in
     the covariance for tau of 1 px has two degrees of freedom, to four sigmas.

@@ -1,0 +1,251 @@
+"""Refusals of input that cannot be used, in tables: what is given, and the words by which it is refused."""
+
+import os
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from analysis.block.block import Term
+from analysis.block.block_adjustment import adjust_block
+from analysis.block.plausible_block import pruned
+from analysis.block.processes import BlockError, Law
+from analysis.images.image_file import ImageError, ImageFile
+from analysis.matching.correlation import distinct_points
+from analysis.matching.matches import MatchOptions, resampled
+from analysis.measurement_error import UndeterminedError
+from analysis.monitor.estimators import Posterior, Shifts
+from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.model_fit import gain, observability
+from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
+from analysis.monitor.state_space import StateSpace
+from analysis.mtf.edge_location import EdgeError
+from analysis.mtf.edge_pages import measure_pages
+from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField
+from analysis.orbit.forward_intersection import (
+    CalibratedLine,
+    IntersectionError,
+    Sightings,
+    check_errors,
+    intersect_pair,
+)
+from analysis.orbit.image_correction import image_correction
+from analysis.orbit.jitter_lines import splined
+from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
+from analysis.orbit.three_line_model import LineModel, Rays
+from analysis.orientation.interior import OrientationError, fit_interior_orientation, line_orientation
+from analysis.spots.centroid import difference_covariance, energy_centroid, gaussian_fit, maximum_likelihood_fit
+from analysis.spots.frame_screening import FramesError
+from analysis.spots.noise import NoiseModel
+from analysis.spots.photon_transfer import photon_transfer, pixel_correction
+from analysis.spots.spot_positions import noise_parts
+from analysis.spots.spot_template import SpotTemplate
+from analysis.turntable.angle_fits import cross_validate, fit
+from analysis.turntable.dividing_error import CalibrationSeries
+from analysis.wavefront_maps.map_files import MapError, read_map
+from analysis.wavefront_maps.zernike_table import read_zernikes
+from analysis.wavefront_maps.zernike_terms import annular_terms
+from tests.analysis import wavefront_files
+from tests.analysis.drawn_blocks import Plan, draw
+from tests.analysis.refusals import refuses
+from tests.analysis.stated_motions import TimeLaw, disturbances
+from tests.analysis.test_spot_centroids import NOISE, SHAPE, airy
+from tests.analysis.test_three_line_model import SEEN, cameras, make_rays
+
+
+def test_blocks():
+    bias = (Term(Law("bias", "constant", (1e-5,) * 3), "tracker"),)
+    block = draw(Plan(ties=4, control=2, check=1, footprints=0, attitude=bias), np.random.default_rng(1)).block
+    adjust_block(block)
+    first, points = block.scenes[0], block.points
+    nowhere = np.where(np.arange(len(points.ids))[:, None] == 3, np.nan, points.start)
+    some = {name: replace(k, covariance=k.covariance[:4, :4]) for name, k in block.known.items()}
+    still = {name: replace(k, covariance=0.0 * k.covariance) for name, k in block.known.items()}
+    white = (Term(Law("attitude", "white", (1e-6,) * 3, 0.5)),)
+
+    def scene(**changes):
+        return {"scenes": (replace(first, **changes), *block.scenes[1:])}
+
+    for said, changes in {
+        "two passes or two scenes have one name": {"scenes": (first, *block.scenes)},
+        "no pass is called 'other'": scene(of="other"),
+        "nothing is known of camera 'other'": scene(camera="other"),
+        "its image points have no times": scene(rays=replace(first.rays, time=None)),
+        "the sigma of image points must be positive, found 0": {"image": 0.0},
+        "a coordinate is not finite": {"points": replace(points, start=nowhere)},
+        "must be positive definite": {"points": replace(points, covariance=0.0 * points.covariance)},
+        r"covariance \(4, 4\) of 2 passes": {"known": some},
+        "needs a standard deviation above zero": {"known": still, "monitored": None},
+        "needs a constant error of each of them": {"attitude": white},
+    }.items():
+        refuses(BlockError, said, adjust_block, replace(block, **changes))
+    refuses(BlockError, "no sensor is called 'radar'; there are", block.without, "radar")
+    lonely = replace(block.without("control"), scenes=(first,), terrain=None)
+    refuses(BlockError, "no point is seen by two scenes, and none is control", pruned, lonely)
+
+
+def test_images(tmp_path):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.zeros((2, 3, 8, 9), np.uint16), photometric="minisblack")
+    refuses(ImageError, "page 9 does not exist", ImageFile.open, path, None, 9, "")
+    os.mkfifo(tmp_path / "pipe")
+    refuses(ImageError, "a device, a pipe or a socket", ImageFile.open, tmp_path / "pipe")
+    refuses(MapError, "a device, a pipe or a socket", read_map, tmp_path / "pipe")
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((8, 9), np.uint8))
+    data = (tmp_path / "a.png").read_bytes()
+    for spoilt in (data[:8] + data[33:], data[:-12]):  # without a header, without an end
+        (tmp_path / "b.png").write_bytes(spoilt)
+        refuses(ImageError, "cut off or damaged", ImageFile.open, tmp_path / "b.png")
+
+
+def test_matching():
+    image = np.random.default_rng(1).uniform(0.0, 1.0, (60, 60))
+    for count, spacing, border in ((0, 5, 5), (5, 0, 5), (5, 5, -1)):
+        more = {"spacing": spacing, "border": border}
+        refuses(ValueError, "count and spacing must be 1 or more", distinct_points, image, count, **more)
+    for name in ("least_correlation", "largest_ratio", "largest_risk"):
+        refuses(ValueError, f"{name} must not exceed 1", MatchOptions, **{name: 1.1})
+    grid = np.mgrid[20:30.0, 20:30.0]
+    for smoothing in (-1.0, np.inf):
+        refuses(ValueError, "smoothing must be 0 or a positive", resampled, image, *grid, smoothing=smoothing)
+
+
+def test_monitor():
+    laws, see = (TimeLaw(), TimeLaw(white=True)), np.ones((4, 2))
+    stated, eye = disturbances(laws, see, see), np.eye(4)
+    for changes in ({"sigmas": np.ones(3)}, {"spots": np.ones((4, 3))}, {"correlation": np.eye(3)}):
+        refuses(ValueError, "for 2 motions, found", replace, stated, **changes)
+    refuses(ValueError, "2 motions need as many bodies", replace, stated, laws=laws[:1])
+    mixed = replace(stated, correlation=np.array([[1.0, 0.5], [0.5, 1.0]]))
+    refuses(ValueError, "motions with different laws in time cannot be correlated", StateSpace, mixed)
+    still = np.zeros((1, 2, 2))
+    refuses(ValueError, "needs stated disturbances", Posterior().gain, Shifts(still, still, eye[None], {}, None))
+    for looks, said in (((1.3, 0.0), "looks past the Earth"), ((0.1, 0.1), "look the same way")):
+        refuses(UndeterminedError, said, GroundGeometry, 5e5, ("a", "b"), looks, (0.01, 0.01))
+    for family in ([], [0, 0], [5]):
+        refuses(ValueError, "family must be", observability, list("ab"), see, see, [1, 1], eye, family)
+    refuses(UndeterminedError, "not positive definite", observability, list("ab"), see, see, [1, 1], 0 * eye, [0])
+    refuses(ValueError, "Jacobians must be finite", gain, eye, np.nan * see, see)
+    for value, said in ((np.nan, "must be finite"), (-1.0, "finite and > 0")):
+        refuses(ValueError, said, MonitorGeometry, value, 0.7, 7e-6)
+    refuses(ValueError, r"need \(..., 4\) and \(..., 4, 4\)", CameraParameters.from_vector, np.zeros(3), eye)
+
+
+def test_orbit():
+    rays, points, line = make_rays(SEEN)["nadir"], SEEN.points, cameras()["nadir"]
+    for said, sigma, control in (
+        (r"control must be \(40,\)", 1.0, np.ones(3, bool)),
+        ("covariances must be", -np.tile(np.eye(3), (40, 1, 1)), None),
+        ("covariances must be", np.eye(3), None),
+        ("sigma must be finite, and positive or zero for all axes", (1.0, 0.0), None),
+        ("sigma must be finite, and positive or zero for all axes", np.nan, None),
+    ):
+        refuses(CalibrationError, said, CalibrationField.of, "Beijing", {"nadir": rays}, points, sigma, control)
+    refuses(CalibrationError, "finite coordinates", check_errors, points, points[:3])
+    refuses(CalibrationError, "none was intersected", check_errors, np.nan * points, points)
+    refuses(ValueError, "a row of whole numbers", Rays.of, rays.point + 0.5, rays.image, rays.station, rays.attitude)
+    refuses(ValueError, "not below zero", LineModel.of, np.eye(3), [0.65, 0, 0], half_length=-1.0)
+    refuses(
+        UndeterminedError, "behind a camera", line.seen, line.axes @ [[0.0], [0.0], [-1.0]] @ [[1.0]], rays.image[:1]
+    )
+    one = CalibratedLine(1, np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)), np.eye(3), 0.65)
+    refuses(ValueError, "principal distance must stay positive", one.corrected, [0.0, 0.0, 0.0, -1.0])
+    refuses(ValueError, "four finite numbers", one.corrected, [0.0, 0.0, np.nan, 0.0])
+    seen = [Sightings(np.zeros(n), np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))) for n in (1, 2)]
+    refuses(IntersectionError, "must see the same points", intersect_pair, one, one, *seen)
+    place = np.zeros((4, 2))
+    refuses(ValueError, "must be", image_correction, place, place[:3], np.tile(np.eye(2), (4, 1, 1)), "shift")
+
+
+def test_jitter():
+    time = np.linspace(0.0, 10.0, 200)
+    given = Observations.of_disparities(time, time + 0.1, 0.0 * time, 0.1)
+    parts = given.value, given.group, given.time, given.weight, given.nuisance
+    refuses(JitterError, "do not match", Observations.of, given.value[:9], *parts[1:])
+    refuses(JitterError, "their groups are mixed", Observations.of, given.value, given.group[::-1], *parts[2:])
+    refuses(JitterError, "do not match mixtures", Observations.of, *parts, mix=np.ones((9, 2, 1)))
+    refuses(JitterError, "moments that lie apart", splined, given, 0.0, 1.0)
+    once = Observations.of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, degree=0)
+    refuses(JitterError, "all observations are of one moment", periodogram, once, 0.5, 6.0)
+
+
+def test_edges_and_angles():
+    refuses(EdgeError, "pages must be planes of real grey values", measure_pages, np.zeros((40, 40)))
+    angle = np.linspace(-0.02, 0.02, 20)
+    three = ("constant", "principal_distance", "principal_point")
+    found = fit_interior_orientation(np.tan(angle), angle, 1e-6, three)
+    refuses(OrientationError, "no line's orientation follows from the terms", line_orientation, found)
+    refuses(ValueError, "take 2 or more", cross_validate, "polynomial", angle, angle, 1.0, folds=1)
+    refuses(ValueError, "must be", fit, "polynomial", angle, angle[:3], 1.0)
+    present = np.arange(60).reshape(20, 3) > 2
+    refuses(ValueError, "needs two comparisons or more", CalibrationSeries, angle, np.zeros((20, 3)), 0.0, present)
+
+
+def test_spots():
+    image = 64.0 + 3000.0 * airy(47.2, 48.1)[None]
+    for call, said in ((energy_centroid, "energy centroid: radius_px"), (gaussian_fit, "gaussian fit: radius_px")):
+        refuses(ValueError, said, call, image, 9, NOISE, 99.0)
+    for call in (energy_centroid, gaussian_fit):
+        refuses(ValueError, "at least 24 x 24 px", call, image[:, :20], 9, NOISE)
+    template = SpotTemplate.from_image(airy(73.7, 73.2, (148, 148)), 73.7, 73.2, SHAPE)
+    refuses(ValueError, "must be >= 1", maximum_likelihood_fit, image, 9, NOISE, template, threads=0)
+    two, three = (gaussian_fit(np.repeat(image, n, axis=0), 9, NOISE) for n in (2, 3))
+    refuses(ValueError, "does not fit after", difference_covariance, two, three, NOISE)
+    bare = maximum_likelihood_fit(image, 9, NOISE, template, keep_maps=False)
+    refuses(ValueError, "need their gain maps", noise_parts, bare, NOISE)
+    square = airy(40, 40, (80, 80))
+    for said, place, options in (
+        ("oversampling must be an integer", (40, 40), {"oversampling": 1.5}),
+        ("lies outside the image", (99, 40), {}),
+        ("tolerance must be in", (40, 40), {"tolerance": 0.5}),
+    ):
+        refuses(ValueError, said, SpotTemplate.from_image, square, *place, (48, 48), **options)
+    refuses(ValueError, "nothing to stack", SpotTemplate.stack, [])
+    small = SpotTemplate.from_image(square, 40, 40, (48, 48))
+    refuses(ValueError, "template 1 has another shape", SpotTemplate.stack, [template, small])
+    refuses(ValueError, r"must all be \(B,\)", template.evaluate, [47.0], [47.0, 48.0])
+
+
+def test_photon_transfer():
+    rng, noise = np.random.default_rng(2), NoiseModel(0.5, 6.0, 0.0, 64.0, 0.0, 0.0, 4095.0)
+    dark, flat = (np.rint(level + 4.0 * rng.standard_normal((4, 32, 32))) for level in (64.0, 900.0))
+    for first, second, said in (
+        (dark[:1], flat, "1 dark frame: its noise cannot be told"),
+        (dark, np.where(flat > 905.0, np.nan, flat), "flat frames hold values that are not finite"),
+        (dark, flat[:, :30], "different sizes"),
+        (dark, dark + 1.0, "DN brighter than the dark ones"),
+    ):
+        refuses(FramesError, said, photon_transfer, first, second)
+        refuses(FramesError, said, pixel_correction, noise, first, second)
+    refuses(FramesError, "not noisier than the dark ones", photon_transfer, dark, flat)
+
+
+@pytest.mark.parametrize(
+    ("said", "head"),
+    [
+        ("is too long for a table", "# unit: nm\nZ4\n" + "1\n" * 5_100_000),
+        ("a coefficient is not a finite number", "# unit: waves\n# wavelength: 1000 m\nZ4\n1e308\n"),
+        ("a length is needed: 632.8 nm", "# unit: nm\n# wavelength: 2 waves\nZ4\n1\n"),
+    ],
+)
+def test_zernike_tables(said, head, tmp_path):
+    path = tmp_path / "z.csv"
+    path.write_text("# order: fringe\n# normalised: peak\n" + head)
+    refuses(MapError, said, read_zernikes, path)
+
+
+def test_wavefront_maps(tmp_path):
+    path, wave = tmp_path / "a.dat", wavefront_files.wave()
+    for place, data, said in (
+        (168, b"\x40\x00\x00\x00", "its header has wavelength 2 m"),
+        (68, b"\xff\xff\xff\xff", "65535 x 65535 points, more than"),
+    ):
+        wavefront_files.metropro(path, wave)
+        whole = path.read_bytes()
+        path.write_bytes(whole[:place] + data + whole[place + 4 :])
+        refuses(MapError, said, read_map, path)
+    wavefront_files.datx(path, wave.ravel())
+    refuses(MapError, "is no map of numbers", read_map, path)
+    refuses(ValueError, "a radius of 0 to 1 of the ring's", annular_terms, 4, np.ones(3), np.ones(3), 1.0)
