@@ -97,20 +97,6 @@ def test_slow_errors_are_taken_out_as_the_covariances_say() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("elsewhere", [False, True])
-def test_what_a_user_gets_is_better_on_average_than_without_ties(elsewhere: bool) -> None:
-    """By covariances, at the example's 2 arcsec: calibrated with ties and adjusted, against calibrated on control alone
-    and not adjusted; in the pass that calibrated and in another. To adjust after a calibration without ties counts the
-    slow errors over the control points twice."""
-    campaign = fly_fields(setup_with(2.0), np.random.SeedSequence(1))
-    one = campaign.passes[0]
-    control, ties = (predicted(campaign, one, by, elsewhere) for by in ("control", "ties"))
-    for new, old in zip(ties.rms(True), control.rms(False), strict=True):
-        assert new < old
-    assert control.rms(True)[0] > control.rms(False)[0]
-
-
-@pytest.mark.slow
 def test_errors_with_ties_are_those_of_the_covariances() -> None:
     """Three passes, each by its own parameters; plan and height, two-sided false alarm 1e-3 each."""
     squares = []

@@ -21,7 +21,6 @@ from scenes.specs.resolved import resolve_distortion
 from tests.tiers import quick
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_numbers import DISTORTION
-from twin.laboratory.distortion_report import distortion_report
 from twin.laboratory.distortion_run import CLOSED_FORMS, SimulatedDistortion, measure, reduce
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import rms
@@ -189,19 +188,6 @@ def test_error_of_the_zero_spoils_the_printed_equations_and_not_the_constant():
     assert r.estimates["eq2"].p - r.estimates["constant"].p == pytest.approx(expected, rel=0.1)
 
 
-def test_report_and_images():
-    result = distortion_report(run())
-    names = {artefact.name for section in result.sections for artefact in section.artefacts}
-    assert {"distortion-curve", "distortion-points", "distortion-spot", "distortion-estimates"} <= names
-    assert {name: frames.shape for name, frames in result.images.items()} == {
-        "spot-01": (4, 32, 32),
-        "spot-28": (4, 32, 32),
-        "spot-55": (4, 32, 32),
-    }
-    assert "not observable" in result.lead[-1]
-    assert "within 3 σ of the truth" in result.verdict
-
-
 @pytest.mark.parametrize(
     ("changes", "key", "text"),
     [
@@ -243,36 +229,6 @@ def test_fewer_points_than_unknowns():
     with pytest.raises(BenchError, match="3 different angles for 4 unknowns") as error:
         measure(b, 1)
     assert error.value.key == ("points",)
-
-
-@pytest.mark.slow
-def test_hundred_tests():
-    """Scatter against sigmas over 100 tests: another table, calibration, zero, axis, detector and noise in each."""
-    count, terms = 100, ("principal_distance", "principal_point")
-    score, radial, pointwise, raw, own = [], [], [], [], []
-    for seed in range(1000, 1000 + count):
-        r = measure(bench(), seed)
-        true, fit = r.true_fit(), r.compensated.fit
-        score.append([(fit.value(term) - true.value(term)) / fit.sigma(term) for term in terms])
-        smooth, exact = r.compensated.smooth, r.true_fit(r.compensated.smooth.terms)
-        radial.append((smooth.value("radial3") - exact.value("radial3")) / smooth.sigma("radial3"))
-        pointwise.append(np.mean((r.error(r.compensated) / r.compensated.sigma) ** 2))
-        raw.append(np.sqrt(np.mean(r.error(r.raw) ** 2)))
-        own.append(np.sqrt(np.mean(r.error(r.compensated) ** 2)))
-    score = np.array(score)
-    low, high = stats.chi2.ppf([FALSE_ALARM, 1 - FALSE_ALARM], count)
-    for values in (*score.T, np.array(radial)):
-        assert low < np.sum(values**2) < high
-        # no bias: the mean of 100 is within 4 of its sigmas
-        assert abs(np.mean(values)) < 4 / np.sqrt(count)
-    # 95.4 % within two sigmas
-    for values in score.T:
-        assert np.sum(np.abs(values) < 2) >= stats.binom.ppf(FALSE_ALARM, count, 0.954)
-    # points of one test share the calibration's noise; the mean square of one test scatters by 0.2 to 0.3
-    assert np.mean(pointwise) == pytest.approx(1.0, abs=4 * np.std(pointwise) / np.sqrt(count) + 0.05)
-    assert np.max(own) < ACCURACY_UM * UM
-    # the paper's 35 % is in the range of what tables of this class give
-    assert 0.2 < np.median(1.0 - np.array(own) / np.array(raw)) < 0.6
 
 
 def turntable_score(setup, seed: int) -> list[float]:

@@ -1,8 +1,6 @@
 """Ground points and maps from files: systems, geoids, covariances, what is refused; what is written comes back."""
 
-import contextlib
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,6 @@ from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.simulate_report import map_facts
-from twin.orbit.measured.geotiff import open_raster
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
 from twin.orbit.measured.map_part import UserMap
 from twin.run.data_files import tiff
@@ -207,16 +204,6 @@ def test_a_gcp_file_that_is_wrong(tmp_path: Path, text: str, told: str) -> None:
     assert error.value.file.endswith("g.gcp")
 
 
-@pytest.mark.slow
-def test_a_million_points_are_read_in_seconds(tmp_path: Path) -> None:
-    rows = np.random.default_rng(1).uniform(-60.0, 60.0, (1_000_000, 3))
-    lines = [f"p{k},{a:.6f},{b:.6f},{c:.3f}" for k, (a, b, c) in enumerate(rows.tolist())]
-    (tmp_path / "g.csv").write_text("\n".join([",".join(HEADS), *lines]))
-    started = time.process_time()
-    assert len(read(tmp_path, **BASE).points) == len(rows)
-    assert time.process_time() - started < 60.0
-
-
 # --- maps -------------------------------------------------------------------------------------------------
 
 FRAME = GroundFrame(np.radians(116.0), np.radians(40.0))
@@ -321,22 +308,6 @@ def test_a_map_that_is_wrong(tmp_path: Path, said: dict[str, Any], told: str) ->
 
     with pytest.raises(InputError, match=told):
         used()
-
-
-def test_a_damaged_map_is_an_error_or_a_map(tmp_path: Path) -> None:
-    utm(tmp_path / "utm.tif")
-    whole = (tmp_path / "utm.tif").read_bytes()
-    rng = np.random.default_rng(2)
-    for k in range(60):
-        content = bytearray(whole)
-        place = int(rng.integers(1200)) if k % 3 else int(rng.integers(len(whole)))
-        if k % 2:
-            content = content[:place]
-        else:
-            content[place : place + 2] = bytes(rng.integers(0, 256, 2).tolist())
-        (tmp_path / "bad.tif").write_bytes(bytes(content))
-        with contextlib.suppress(InputError):
-            open_raster(tmp_path / "bad.tif").read()
 
 
 def test_the_header_of_a_gcp_file_is_its_system(tmp_path: Path) -> None:

@@ -5,9 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-import yaml
 
-import twin.render as command
 from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
@@ -19,14 +17,10 @@ from optics.waves.imaging import aim_collimated
 from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import fit_wavefront, path_difference
 from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.specs.load import LIBRARY, load_detector
-from scenes.specs.resolved import resolve
-from tests.twin.commands import invoke
+from scenes.specs.load import load_detector
 from twin.monitor.image_quality import FIELDS, PLACES, QUALITY, quality_dicts
 from twin.monitor.image_quality import image_quality as quality_of
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
-from twin.study.runs.base_job import Run
-from twin.study.runs.render_base import RenderBase
 from twin.targets.target_path import TargetPath
 
 WAVELENGTH, ARCSEC = 650e-9, np.pi / 180 / 3600
@@ -264,69 +258,10 @@ def test_too_rough_a_wavefront_has_no_mtf_but_an_error(gf7_pair, backend) -> Non
     assert np.isfinite(found.mtf_along_line[1]).all()
 
 
-def test_states_compile_no_kernels(gf7_pair, backend, quality) -> None:
-    import drjit as dr
-
-    def kernels(states) -> set[int]:
-        dr.set_flag(dr.JitFlag.KernelHistory, True)
-        dr.kernel_history_clear()
-        image_quality(gf7_pair, backend, states)
-        found = {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
-        dr.set_flag(dr.JitFlag.KernelHistory, False)
-        return found
-
-    rng = np.random.default_rng(2)
-    states = [{f"{ROOT}/M2": Motion(shift=tuple(rng.normal(0.0, 1e-5, 3)))} for _ in range(6)]
-    first = kernels(states[:3])
-    assert first
-    assert kernels(states[3:]) == first
-
-
 def test_fields_outside_of_the_line_are_refused(gf7_pair, backend) -> None:
     for fields in ((), (0.0, 1.2)):
         with pytest.raises(ValueError, match="fields"):
             image_quality(gf7_pair, backend, [{}], fields)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A run of an instrument with one camera whose M2 moves."""
-    place = tmp_path_factory.mktemp("quality")
-    instrument = yaml.safe_load((LIBRARY / "instruments" / "gf7_pair.yaml").read_text())
-    instrument["name"], instrument["cameras"] = "single", {"one": instrument["cameras"]["forward"]}
-    del instrument["baffles"]
-    (place / "single.yaml").write_text(yaml.safe_dump(instrument))
-    (place / "job.yaml").write_text(
-        "instrument: single.yaml\nperturb:\n  base/one/M2: {shift: [0 um, 0 um, 20 um]}\n"
-        "render: {frames: 1, quality: true}\n"
-    )
-    done = invoke(command.app, place / "job.yaml", "--out", place / "run")
-    assert done.exit_code == 0, done.output
-    return place
-
-
-@pytest.mark.slow
-def test_a_job_and_a_study_with_image_quality(folder, backend) -> None:
-    written = json.loads((folder / "run" / "quality.json").read_text())
-    after, before = (part["cameras"]["one"] for part in (written, written["before"]))
-    assert set(after) == {
-        "wfe_rms_waves", "wfe_rms_waves_focus_removed", "wfe_worst_waves", "defocus_um", "mtf_along_line",
-        "mtf_along_track", "light_lost", "obstructed_by",
-    }  # fmt: skip
-    assert after["wfe_worst_waves"] >= after["wfe_rms_waves"] > 2.0 * before["wfe_rms_waves"]
-    assert list(after["defocus_um"]) == ["left", "centre", "right"]
-    assert after["mtf_along_line"]["centre"] < before["mtf_along_line"]["centre"]
-    page = (folder / "run" / "report.html").read_text()
-    assert f'data-key="quality.one.mtf_along_line.centre.after">{after["mtf_along_line"]["centre"]:.4f}<' in page
-    # the same numbers as a response of a study, whose states are done together
-    job = resolve(folder / "job.yaml")
-    key = ("job", "perturb", "base/one/M2", "shift", 2)
-    runs = [Run(k, ((key, value),), 1) for k, value in enumerate(("20 um", "5 um"))]
-    outcomes = RenderBase().evaluate(job.plain(), runs, backend)
-    found = outcomes[0]["quality"]["cameras"]["one"]
-    assert found["wfe_rms_waves"] == pytest.approx(after["wfe_rms_waves"], abs=1e-9)
-    assert found["mtf_along_track"] == pytest.approx(after["mtf_along_track"], abs=1e-9)
-    assert outcomes[1]["quality"]["cameras"]["one"]["wfe_rms_waves"] < after["wfe_rms_waves"]
 
 
 def test_files_have_each_number_under_its_key(quality) -> None:

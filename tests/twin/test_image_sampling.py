@@ -12,13 +12,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import load_camera, load_instrument
 from tests.hunt.dense_images import DenseImages
 from twin.monitor import image_sampling, monitor_beams, monitor_path
-from twin.monitor.image_sampling import (
-    WRONG,
-    NodeClasses,
-    UncertainImageError,
-    disagreement,
-    lost_or_gained,
-)
+from twin.monitor.image_sampling import WRONG, NodeClasses, UncertainImageError, disagreement, lost_or_gained
 from twin.monitor.monitor_experiment import TEMPLATE_MARGIN
 from twin.monitor.monitor_path import MonitorPath
 

@@ -15,7 +15,7 @@ from optics.raytrace.trace import make_rays, trace
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import InputError
-from scenes.yaml.spec import Spec, validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from twin.orbit.flight.line_camera import (
     along_track_angle,
@@ -34,22 +34,6 @@ def payload(**lines) -> ThreeLineCameraSpec:
     """Lines of 650 mm, otherwise as given in YAML."""
     text = {name: {"principal_distance": "650 mm", **line} for name, line in lines.items()}
     return ThreeLineCameraSpec.model_validate({"name": "own", "pixels": 12000, "pitch": "6.5 um", "lines": text})
-
-
-def test_the_file() -> None:
-    assert list(TH1.lines) == ["forward", "nadir", "backward", "high_resolution", "multispectral"]
-    ground = {"high_resolution": 2.0, "multispectral": 10.0}
-    for (name, line), degrees in zip(TH1.lines.items(), (25, 0, -25, 2, 0), strict=True):
-        pixels, pitch = TH1.pixels_of(name), TH1.pitch_of(name)
-        pixel = ground.get(name, 5.0)
-        assert 500e3 * pitch / line.principal_distance == pytest.approx(pixel, rel=1e-12)
-        assert pixels * pixel == pytest.approx(60e3)
-        assert math.degrees(line.look) == pytest.approx(degrees, abs=1e-12)
-        half = 0.5 * pixels * pitch
-        assert abs(line.k1) * half**3 < 0.5 * pitch  # as the file says
-        assert line_cameras(TH1)[name].pixels == pixels
-    again: Spec = validate(ThreeLineCameraSpec, parse_yaml(dump_yaml(TH1.plain())))
-    assert again == TH1
 
 
 def test_a_wrong_file_is_told_by_line() -> None:

@@ -98,20 +98,6 @@ def same(simulated: dict, measured: dict) -> None:
     assert there == {name: here[name] for name in there}
 
 
-@pytest.mark.slow
-def test_turntable_exported_and_read_back(tmp_path: Path) -> None:
-    simulated, measured = loop("turntable", tmp_path, "turntable.yaml")
-    page = (tmp_path / "measured" / "report.html").read_text("utf-8")
-    assert "truth" not in re.sub("<style>.*?</style>", "", page, flags=re.DOTALL)
-    same(simulated, measured)
-    # the run's own config gives the same from anywhere
-    code, told = run("turntable", tmp_path / "measured" / "config.yaml", "--out", tmp_path / "again", "--quiet")
-    assert code == 0, told
-    assert (tmp_path / "again" / "turntable.json").read_bytes() == (
-        tmp_path / "measured" / "turntable.json"
-    ).read_bytes()
-
-
 @pytest.mark.second
 def test_distortion_exported_and_read_back(tmp_path: Path) -> None:
     simulated, measured = loop("distortion", tmp_path, "distortion.yaml")
@@ -471,33 +457,6 @@ def test_turntable_agrees_with_scipy(folder: Path) -> None:
 
 
 # --- more data -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.second
-def test_more_data_never_raise_a_sigma(folder: Path) -> None:
-    """Known noise: each place and each angle that is added lowers sigmas or leaves them."""
-    head, *body = rows_of(folder / "mtf.csv")
-    last = None
-    for step in (4, 2, 1):  # every fourth position on either side of focus is too few: whole scans are left out
-        places = sorted({(row[0], row[2]) for row in body})[::step]
-        write(folder / "mtf.csv", [head, *(row for row in body if (row[0], row[2]) in places)])
-        run_ = focus_of(folder)
-        design = (
-            np.column_stack([np.ones(len(run_.places)), run_.shimmings[0].plane.place])
-            / run_.states[0].defocus_sigma[:, None]
-        )
-        sigma = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
-        if last is not None:
-            assert np.all(sigma < last)
-        last = sigma
-    # the same repeats once more: half of the variance, but for the limits that depend on their number
-    before = turntable_of(folder).series
-    head, *body = rows_of(folder / "comparisons.csv")
-    write(folder / "comparisons.csv", [head, *body, *([a, str(int(r) + 10), d] for a, r, d in body)])
-    after = turntable_of(folder).series
-    ratio = after.noise_sigma / before.noise_sigma
-    assert np.all(ratio < 0.85)
-    assert np.median(ratio) == pytest.approx(math.sqrt(0.5), rel=0.1)
 
 
 # --- one model for all terms -----------------------------------------------------------------------------

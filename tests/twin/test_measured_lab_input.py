@@ -4,7 +4,6 @@ tables of a million rows.
 
 import csv
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from scenes.yaml.errors import InputError
 from twin.lab import app
 from twin.laboratory.focus_report import focus_report
 from twin.laboratory.focus_run import align_files
-from twin.laboratory.measured_readings import read_comparisons
 
 EXAMPLES = SCENES / "lab" / "measured"
 TABLE = {"turntable": "comparisons.csv", "distortion": "spots.csv", "focus": "mtf.csv"}
@@ -330,28 +328,6 @@ def test_images_without_an_edge_are_told_and_have_no_weight(stack: Path) -> None
 
 
 # --- size, and series of unequal length ------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_a_million_rows(folder: Path) -> None:
-    """The shipped tables, as often as makes a million rows; the limit is that of a slow machine."""
-    rng = np.random.default_rng(1)
-    angle = np.repeat(np.linspace(92.0, 112.0, 41), 24_400)
-    value = rng.normal(0.0, 0.02, angle.size)
-    with (folder / "comparisons.csv").open("w") as stream:
-        stream.write("reading [deg],difference [arcsec]\n")
-        stream.writelines(f"{a},{v}\n" for a, v in zip(angle.tolist(), value.tolist(), strict=True))
-    start = time.process_time()
-    found = read_comparisons(str(folder / "comparisons.csv"), 1e-8)
-    assert time.process_time() - start < 30.0
-    assert found.series.comparisons.shape == (41, 24_400)
-    assert found.series.repeatability == pytest.approx(0.02 * np.pi / 648000, rel=0.01)
-    head_, *body = (folder / "mtf.csv").read_text().splitlines()
-    (folder / "mtf.csv").write_text("\n".join([head_, *body * (1_000_000 // len(body) + 1)]) + "\n")
-    start = time.process_time()
-    run = align_files(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
-    assert time.process_time() - start < 60.0
-    assert len(run.places) == 25
 
 
 def test_series_of_unequal_length() -> None:

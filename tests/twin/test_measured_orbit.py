@@ -2,7 +2,6 @@
 
 import csv
 import json
-import time
 from dataclasses import replace
 from functools import partial
 
@@ -89,90 +88,6 @@ def test_files_give_the_estimates_of_the_simulation(campaign, files) -> None:
     assert again.known_truth is None
     with pytest.raises(AssertionError, match="nobody knows"):
         _ = again.passes[0].bias
-
-
-def example_file(folder, strip: bool):
-    """One field of an example, with few points."""
-    data = dict(read_yaml(SCENES / ORBIT / "calibrate_strip.yaml").data)
-    data["points"] = {"control": 12, "check": 12, "first": 400, "last": 11599, "length": "50 km"}
-    data |= {"fields": {FIELDS[0]: data["fields"][FIELDS[0]]}, "schemes": [[FIELDS[0]]]}
-    data["strip"] = {"ties": 40, "length": "300 km"}
-    if not strip:
-        del data["strip"]
-    file = folder / "small.yaml"
-    file.write_text(dump_yaml(data))
-    return file
-
-
-@pytest.mark.second
-def test_the_command_reads_what_it_exports(tmp_path) -> None:
-    """As a user: --export, and the exported test file; the report knows no truth."""
-    file, data = example_file(tmp_path, False), tmp_path / "data"
-    first = run("calibrate", file, "--out", tmp_path / "one", "--export", data, "--quiet")
-    assert first.exit_code == 0, first.output
-    again = run("calibrate", data / "calibrate.yaml", "--out", tmp_path / "two", "--quiet")
-    assert again.exit_code == 0, again.output
-    one, two = (json.loads((tmp_path / n / "calibration.json").read_text()) for n in ("one", "two"))
-    for name, said in one["parameters"].items():
-        found = two["parameters"][name]
-        assert abs(found["value"] - said["value"]) <= TIGHT * said["sigma"]
-        assert found["sigma"] == pytest.approx(said["sigma"], rel=1e-9)
-        assert said["truth"] is not None
-        assert found["truth"] is None
-    assert one["measured"] is None
-    assert two["measured"][FIELDS[0]]["gsd_m"]["nadir"] == pytest.approx([5.0, 5.0], rel=0.02)
-    report = (tmp_path / "two/report.html").read_text()
-    assert "true change" not in report
-    assert "First pixel sees" in report
-    refused = run("calibrate", file, "--out", tmp_path / "four", "--export", data)
-    assert refused.exit_code != 0
-    assert "exists" in refused.output
-    assert not (tmp_path / "four").exists()
-
-
-@pytest.mark.slow
-def test_strips_close_the_loop(tmp_path) -> None:
-    """With tie points, and once more from the config.yaml of the run on measurements."""
-    file = example_file(tmp_path, True)
-    data = tmp_path / "data"
-    first = run("calibrate", file, "--out", tmp_path / "one", "--export", data, "--json", "--quiet")
-    assert first.exit_code == 0, first.output
-    again = run("calibrate", data / "calibrate.yaml", "--out", tmp_path / "two", "--quiet")
-    assert again.exit_code == 0, again.output
-    config = tmp_path / "two/config.yaml"
-    third = run("calibrate", config, "--out", tmp_path / "three", "--export", tmp_path / "data2", "--quiet")
-    assert third.exit_code == 0, third.output
-    one, two, three = (json.loads((tmp_path / n / "calibration.json").read_text()) for n in ("one", "two", "three"))
-    for name, said in one["parameters"].items():
-        for other in (two, three):
-            found = other["parameters"][name]
-            assert abs(found["value"] - said["value"]) <= TIGHT * said["sigma"]
-            assert found["sigma"] == pytest.approx(said["sigma"], rel=1e-9)
-            assert found["truth"] is None
-    for scheme, said in one["strips"]["schemes"].items():
-        assert two["strips"]["schemes"][scheme]["with_ties"]["height_rms_m"] == pytest.approx(
-            said["with_ties"]["height_rms_m"], rel=1e-6
-        )
-    numbers = two["measured"][FIELDS[0]]
-    assert numbers["control_points"] == 12
-    assert numbers["tie_points"] == 40
-    assert numbers["gsd_m"]["nadir"] == pytest.approx([5.0, 5.0], rel=0.02)
-    assert two["monitoring"] is None
-    # what was exported again is the same data
-    for table in ("orbit", "attitude", "lines", "ground", "image_points", "tie_points"):
-        a, b = ((tmp_path / d / "Beijing" / f"{table}.csv").read_text() for d in ("data", "data2"))
-        if table != "attitude":  # unit quaternions are rounded again
-            assert a == b
-
-
-@pytest.mark.slow
-def test_files_of_image_campaigns_give_the_estimates_of_the_simulation(tmp_path) -> None:
-    """Points measured in rendered images, with covariances of their own and gross errors that screening takes out."""
-    setup = resolve_calibration(SCENES / ORBIT / "calibrate_images.yaml")
-    one = flown(setup)
-    _, again = read_back(export(tmp_path, setup, one))
-    assert {n: r.points for n, r in again.rejected.items()} == {n: r.points for n, r in one.rejected.items()}
-    same(simultaneous(one), simultaneous(again))
 
 
 def _columns(file) -> dict[str, np.ndarray]:
@@ -335,50 +250,6 @@ def test_conventions_units_and_order_do_not_matter(files) -> None:
     same(before, simultaneous(again), 1e-7)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("scalar", "first"),
-        ("turns", "frame_to_body"),
-        ("body_axes", ["back", "left", "down"]),
-        ("first_pixel_sees", "left"),
-    ],
-)
-def test_a_wrong_convention_is_not_fitted_silently(files, key, value) -> None:
-    """Either the points cannot be used at all, or the fit is impossible by its chance."""
-    data = dict(read_yaml(files.parent / "data.yaml").data["conventions"])
-    if key in ("scalar", "turns"):
-        data["quaternion"] = {**data["quaternion"], key: value}
-    else:
-        data[key] = value
-    set_keys(files.parent / "data.yaml", conventions=data)
-    try:
-        _, again = read_back(files)
-        found = simultaneous(again)
-    except ValueError:
-        return
-    assert found.p_value < 1e-9
-
-
-@pytest.mark.second
-def test_more_points_never_raise_a_sigma(files) -> None:
-    """Half of the control points taken away raises every sigma or leaves it."""
-    _, whole = read_back(files)
-    before = simultaneous(whole).sigma
-    for name in FIELDS:
-        gone = {f"c{k}" for k in range(0, 24, 2)}
-        for table, column in (("ground", 0), ("image_points", 0)):
-            edit(
-                files.parent / name / f"{table}.csv",
-                lambda heads, rows, gone=gone, column=column: (heads, [r for r in rows if r[column] not in gone]),
-            )
-    _, half = read_back(files)
-    after = simultaneous(half).sigma
-    # the mean height of fewer points changes the weight along the track by 1e-5
-    assert all(after[name] >= sigma * (1.0 - 1e-4) for name, sigma in before.items())
-    assert sum(after[name] > 1.05 * sigma for name, sigma in before.items()) >= 10
-
-
 def test_two_lines_calibrate(campaign, files) -> None:
     """Forward and backward alone: right to its sigmas, which are larger; the steeper line is held. False alarm 1e-6."""
     for name in FIELDS:
@@ -436,22 +307,6 @@ def test_points_in_a_gap_of_the_readings_are_refused(files) -> None:
         read_back(files)
     assert told.value.file.endswith("image_points.csv")
     assert told.value.line is not None
-
-
-@pytest.mark.slow
-def test_a_table_of_a_million_rows_is_read_in_seconds(files) -> None:
-    """Attitude at 8 kHz: ten times as fine as anybody sends down."""
-    folder = files.parent / "Beijing"
-    with (folder / "attitude.csv").open() as stream:
-        rows = np.loadtxt(stream, delimiter=",", skiprows=1)
-    at = np.linspace(rows[0, 0], rows[-1, 0], 1_000_000)
-    fine = np.column_stack([at, CubicSpline(rows[:, 0], rows[:, 1:])(at)])
-    text = "time [s],q1,q2,q3,q4\n" + "\n".join(",".join(map(repr, row)) for row in fine.tolist()) + "\n"
-    (folder / "attitude.csv").write_text(text)
-    began = time.process_time()
-    _, again = read_back(files)
-    assert time.process_time() - began < 20.0
-    assert len(again.passes[0].measurements.platform.attitude_time) == 1_000_000
 
 
 def _ccds(first_shift, second_shift):
@@ -690,56 +545,3 @@ def test_angles_that_files_cannot_hold_are_not_exported(files, tmp_path) -> None
     assert measured.exit_code == 2
     assert "measurements are files already" in measured.output
     assert not (tmp_path / "other").exists()
-
-
-@pytest.mark.slow
-def test_a_platform_in_files_of_other_formats(tmp_path) -> None:
-    """A pass with an SP3 in GPS time and an AEM in UTC gives what tables of the same numbers give, but for a millimetre
-    of the SP3's last digit and 1e-9 of the AEM's quaternions.
-    """
-    from scenes.specs.measured.orbit_data_setup import resolve_check
-    from tests.twin.orbit_file_bench import aem, check_files, sp3
-    from twin.orbit.conventions.check_run import exported as check_exported
-    from twin.orbit.conventions.check_run import run_check
-
-    spec = check_files(tmp_path)
-    (tmp_path / "check.yaml").write_text(dump_yaml(spec))
-    checked = run_check(resolve_check(tmp_path / "check.yaml"), None, 0)
-    folder = tmp_path / "pass"
-    for name, text in check_exported(checked).items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
-    sp3(folder / "pass.sp3", step=1.0)
-    aem(folder / "pass.aem")
-    (one,) = read_yaml(folder / "data.yaml").data["passes"]
-    data = read_yaml(folder / "data.yaml").data
-    passes = data["passes"][one]
-    for key in ("orbit", "attitude"):
-        del passes[key]
-    passes["platform"] = {
-        "orbit": {"file": "pass.sp3", "satellite": "L51"},
-        "attitude": {"file": "pass.aem", "body_axes": ["forward", "right", "down"]},
-        "earth": {"ut1_utc": "0 s"},
-    }
-    for key in ("quaternion", "body_axes"):
-        del data["conventions"][key]
-    (folder / "other.yaml").write_text(dump_yaml(data))
-    errors = {"gps": {"noise": ["1 m"] * 3}, "star_tracker": {"noise": ["1 arcsec"] * 3}}
-    found = []
-    for file in ("data.yaml", "other.yaml"):
-        test = {"name": "angle", "camera": "./camera.yaml", "data": file, "errors": errors, "time": "0 s"}
-        (folder / "angle.yaml").write_text(dump_yaml(test))
-        found.append(run_measured_angle(resolve_measured_angle(folder / "angle.yaml")).passes[0].estimate.along)
-    assert found[0].values == pytest.approx(found[1].values, abs=0.02 * found[0].sigma.min())
-    # files that are missing are told by their key, with the nearest name
-    passes["platform"]["orbit"]["file"] = "pas.sp3"
-    (folder / "other.yaml").write_text(dump_yaml(data))
-    with pytest.raises(InputError, match=r"no such file(.|\n)*pass\.sp3"):
-        resolve_measured_angle(folder / "angle.yaml")
-    # a table of an attitude without its conventions
-    (folder / "data.yaml").write_text(
-        dump_yaml({**read_yaml(folder / "data.yaml").data, "conventions": data["conventions"]})
-    )
-    (folder / "angle.yaml").write_text(dump_yaml({**test, "data": "data.yaml"}))
-    with pytest.raises(InputError, match="quaternion is missing"):
-        resolve_measured_angle(folder / "angle.yaml")

@@ -120,30 +120,6 @@ def test_published_sun_synchronous_inclinations() -> None:
         sun_synchronous_inclination(20e6)
 
 
-def test_dense_output_is_the_orbit() -> None:
-    """Against classical Runge-Kutta steps of half a second, read only where it stands."""
-    found = orbit(before="0 s", after="10 min")
-    t = np.linspace(0.0, 600.0, 1201)
-    start = np.concatenate(found.equatorial(0.0))
-    state = [start]
-    for _ in t[1:]:
-        # error of a step (n h)^5 / 120 of the orbit's radius: 3e-12 m; 1e-8 m of rounding in all
-        state.append(runge_kutta(state[-1], 0.5))
-    r, v = found.equatorial(t)
-    np.testing.assert_allclose(r, np.array(state)[:, :3], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(v, np.array(state)[:, 3:], rtol=0, atol=1e-9)
-
-
-def runge_kutta(y: np.ndarray, h: float) -> np.ndarray:
-    def slope(y: np.ndarray) -> np.ndarray:
-        return np.concatenate([y[3:], acceleration(y[:3])])
-
-    a = slope(y)
-    b = slope(y + 0.5 * h * a)
-    c = slope(y + 0.5 * h * b)
-    return y + h / 6 * (a + 2 * b + 2 * c + slope(y + h * c))
-
-
 def test_tolerance_does_not_matter() -> None:
     t = np.linspace(-600.0, 600.0, 5001)
     coarse, fine = (orbit(tolerance=tolerance).equatorial(t) for tolerance in (1e-10, 1e-13))

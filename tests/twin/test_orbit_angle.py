@@ -1,8 +1,5 @@
 """Intersection angles from ground points, end to end: against hand calculations, statistics, and as a user runs it."""
 
-import hashlib
-import json
-import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +14,7 @@ from analysis.units import ARCSEC
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
-from tests.twin.commands import files, invoke, refused
+from tests.twin.commands import invoke, refused
 from twin.orbit.angle.angle_flight import AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, frame_rows, run_angle, tls_angles
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
@@ -237,87 +234,12 @@ def test_planes_and_resection_agree(full) -> None:
 # The command
 
 
-@pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    """A run of few passes: its folder and what it printed."""
-    folder = tmp_path_factory.mktemp("orbit")
-    path = write(folder, "passes: 200", "passes: 20")
-    result = run("angle", path, "--out", folder / "run", "--seed", 5, "--json")
-    assert result.exit_code == 0, result.stderr
-    return folder / "run", result
-
-
 def write(folder: Path, old: str, new: str) -> Path:
     text = EXAMPLE.read_text("utf-8")
     assert text.count(old) == 1, old
     path = folder / "small.yaml"
     path.write_text(text.replace(old, new), "utf-8")
     return path
-
-
-def test_contract(done) -> None:
-    folder, result = done
-    data = json.loads(result.stdout)
-    assert result.stderr == ""
-    assert data == json.loads((folder / "angle.json").read_text("utf-8"))
-    values = {"alpha_deg", "beta_deg", "alpha_arcsec_sigma", "beta_arcsec_sigma"}
-    assert set(data["planes"]) == {"printed", "corrected", "tls"}
-    for method in (*data["planes"].values(), data["resection"]):
-        assert values <= set(method)
-        assert abs(method["alpha_deg"] - 25.0) < 0.02
-        assert 0.1 < method["alpha_arcsec_sigma"] < 0.2
-    assert set(data["truth"]) == {"look", "dihedral", "along_track"}
-    assert data["angles"] == {"alpha": ["forward", "nadir"], "beta": ["nadir", "backward"]}
-    assert data["folded"] == {"alpha": False, "beta": False}
-    assert data["change_arcsec"]["truth"] == pytest.approx({"alpha": 4.0, "beta": -3.0}, abs=0.001)
-    assert data["change_arcsec"]["trace"] == {}
-    assert set(data["difference_arcsec"]) == {"alpha", "beta"}
-    planes, resection = data["planes"]["tls"], data["resection"]
-    for name in ("alpha", "beta"):
-        expected = 3600.0 * (planes[f"{name}_deg"] - resection[f"{name}_deg"])
-        assert data["difference_arcsec"][name] == pytest.approx(expected, abs=1e-7)
-    assert [(row["what"], row["axis"]) for row in data["sensitivity"]] == [
-        (what, axis) for what in ("station", *LINES) for axis in "xyz"
-    ]
-    assert {"what", "axis", "alpha_arcsec_per_10m", "beta_arcsec_per_10m"} == set(data["sensitivity"][0])
-    assert [row["what"] for row in data["effects"]] == ["light_time", "aberration", "refraction", "all"]
-    assert data["height_m_per_arcsec"]["alpha"] > 5.0
-
-
-def test_run_folder(done) -> None:
-    folder, _ = done
-    tables = {"methods", "planes", "change", "scatter", "difference", "frames", "effects", "sensitivity"}
-    drawings = {
-        "geometry",
-        "scatter-passes",
-        "sensitivity-station",
-        "sensitivity-alpha-points",
-        "sensitivity-beta-points",
-    }
-    expected = {"manifest.json", "config.yaml", "angle.json", "report.html"}
-    expected |= {f"artefacts/{name}.csv" for name in tables} | {f"artefacts/{name}.svg" for name in drawings}
-    assert files(folder) == expected
-    manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
-    assert (manifest["program"], manifest["test"], manifest["seed"]) == ("twin.orbit", "angle", 5)
-    for name, digest in manifest["sha256"].items():
-        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
-    text = (folder / "report.html").read_text("utf-8")
-    assert "python -m twin.orbit angle config.yaml" in text
-    links = set(re.findall(r'(?:href|src)="([^"]*)"', text))
-    assert {link for link in links if not link.startswith(("#", "data:"))} <= files(folder)
-
-
-@pytest.mark.second
-def test_config_repeats_the_run(done, tmp_path: Path) -> None:
-    folder, _ = done
-    target = tmp_path / "again"
-    result = run("angle", folder / "config.yaml", "--out", target)
-    assert result.exit_code == 0, result.stderr
-    assert (target / "angle.json").read_bytes() == (folder / "angle.json").read_bytes()
-    assert "total least squares" in result.stdout
-    other = run("angle", folder / "config.yaml", "--out", tmp_path / "other", "--seed", 6, "--quiet")
-    assert (other.exit_code, other.stdout) == (0, "")
-    assert (tmp_path / "other" / "angle.json").read_bytes() != (folder / "angle.json").read_bytes()
 
 
 # what is wrong, key, what to do about it

@@ -1,7 +1,5 @@
 """Angles of other cameras from ground points: a traced stereo pair that has changed, and off-axis lines of th1."""
 
-import json
-import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +13,7 @@ from optics.geometry.tree import Motion
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from tests.tiers import quick
-from tests.twin.commands import files, invoke, refused
+from tests.twin.commands import invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, run_angle, values_of
@@ -138,21 +136,6 @@ def test_off_axis_angles_come_back(effects: LightEffects) -> None:
             assert estimate.along.values[k] == pytest.approx(expected, abs=0.01 * ARCSEC)
 
 
-@pytest.mark.slow
-def test_scatter_of_off_axis_angles() -> None:
-    """Chi-square of 200 passes to either side at 1e-4, twelve statements but for one: the dihedral angle of the nearly
-    parallel lines, which is mostly their turn about the look, is some 25 sigmas from the fold and still normal."""
-    full = run_angle(LINES, None, 3)
-    for scatter in (full.planes, full.along, full.resection):
-        assert np.all(scatter.tail > 1e-4)
-    assert not np.any(full.estimate.angles["tls"].folded)
-    few = full.names.index("multispectral")
-    assert full.planes.sigma[few] > 10.0 * full.along.sigma[few]
-    assert np.all(np.abs(full.along.bias) < 3.9 * full.along.sigma / np.sqrt(200))
-    assert full.height["multispectral"] is None
-    assert full.height["high_resolution"] > 50.0
-
-
 @pytest.mark.second
 def test_parallel_lines_are_folded_and_the_report_says_so() -> None:
     """A line turned so that its plane is the nadir line's: unsigned planes are told as folded, the signed angle not."""
@@ -172,15 +155,6 @@ def test_parallel_lines_are_folded_and_the_report_says_so() -> None:
 # The command
 
 
-@pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pair")
-    path = write(folder, "passes: 200", "passes: 12")
-    result = run("angle", path, "--out", folder / "run", "--json")
-    assert result.exit_code == 0, result.stderr
-    return folder / "run", json.loads(result.stdout)
-
-
 def write(folder: Path, old: str, new: str) -> Path:
     """The example, changed; without the gradient, whose finite elements take seconds."""
     text = (SCENES / ORBIT / "angle_gf7.yaml").read_text("utf-8")
@@ -190,37 +164,6 @@ def write(folder: Path, old: str, new: str) -> Path:
     path = folder / "small.yaml"
     path.write_text(text, "utf-8")
     return path
-
-
-def test_contract_of_a_pair(done, gf7_pair, backend) -> None:
-    folder, data = done
-    assert set(data["planes"]["tls"]) == {"alpha_deg", "alpha_arcsec_sigma"}
-    assert set(data["difference_arcsec"]) == {"alpha"}
-    assert [(r["what"], r["axis"]) for r in data["sensitivity"]] == [
-        (what, axis) for what in ("station", "forward", "backward") for axis in "xyz"
-    ]
-    assert set(data["sensitivity"][0]) == {"what", "axis", "alpha_arcsec_per_10m"}
-    change = data["change_arcsec"]
-    # the focal plane alone: warmed as one, the base keeps its angles
-    plane = PAIR.test.perturb["base/backward/focal_plane"]
-    state = {"base/backward/focal_plane": Motion(plane.rotate, plane.shift, plane.pivot)}
-    alone = trace_truth(gf7_pair, backend, [state]).angle_change[0] / ARCSEC
-    assert change["trace"]["alpha"] == pytest.approx(alone, abs=0.01)
-    assert change["truth"]["alpha"] == pytest.approx(change["trace"]["alpha"], abs=1e-6)
-    sigma = data["along_track"]["alpha_arcsec_sigma"]
-    assert abs(change["ground"]["alpha"] - change["trace"]["alpha"]) < 3.9 * sigma
-    text = (folder / "report.html").read_text("utf-8")
-    assert "the trace of the instrument gives" in text
-    assert re.search(r"wrong by 1 arcsec moves intersected heights by 4\.\d\d m for α", text)
-    assert {"artefacts/change.csv", "artefacts/sensitivity-alpha-points.svg"} <= files(folder)
-
-
-@pytest.mark.second
-def test_config_repeats_the_pair(done, tmp_path: Path) -> None:
-    folder, _ = done
-    result = run("angle", folder / "config.yaml", "--out", tmp_path / "again", "--quiet")
-    assert result.exit_code == 0, result.stderr
-    assert (tmp_path / "again" / "angle.json").read_bytes() == (folder / "angle.json").read_bytes()
 
 
 # what is wrong, key, what to do about it

@@ -1,6 +1,5 @@
 """``twin.orbit adjust``: what the command says of blocks that are right, and of blocks that are not."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +13,6 @@ from scenes.specs.load import SCENES
 from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
 from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
 from scenes.yaml.errors import InputError
-from tests.twin.commands import invoke
-from twin.orbit.__main__ import app
 from twin.orbit.block.block_report import block_report
 from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
 from twin.orbit.block.drawn_block import draw_block
@@ -113,19 +110,6 @@ def test_a_wrong_datum_is_told(tmp_path):
     assert found.datum.east == pytest.approx(80.0, abs=4 * found.datum.sigma[0])
     assert found.datum.up == pytest.approx(-20.0, abs=4 * found.datum.sigma[2])
     assert any("another datum" in w for w in block_report(found).warnings)
-
-
-def test_command_writes_its_numbers_and_takes_sensors_away(tmp_path):
-    setup(tmp_path)
-    out = tmp_path / "run"
-    words = ["adjust", tmp_path / "adjust.yaml", "--without", "control", "--out", out, "--json"]
-    result = invoke(app, *words)
-    assert result.exit_code == 0
-    numbers = json.loads((out / "block.json").read_text("utf-8"))
-    assert numbers["check_points"] == json.loads(result.stdout)["check_points"]
-    assert "control" not in numbers["sensors"]
-    assert "without: [control]" in (out / "config.yaml").read_text("utf-8")
-    assert numbers["verdict"].startswith("Nine ground points in ten lie within ")
 
 
 def test_sensors_that_are_not_there_are_refused():

@@ -1,12 +1,10 @@
 """Jitter of a pass, found in what the lines of a camera saw: simulated, exported, read back."""
 
-import json
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
 
 import twin.orbit.__main__ as command
 from analysis.orbit.jitter_lines import Found, search
@@ -145,54 +143,6 @@ def test_an_alias_is_reported_in_words_and_numbers() -> None:
     assert min(abs(f - 21.0) for f in (first["frequency_hz"], *first["aliases_hz"])) < 0.02
     assert first["in_search"] == (first["frequency_hz"] < 4.0)
     assert any("beyond the search" in text or "may as well be" in text for text in jitter_report(found).warnings)
-
-
-@pytest.mark.slow
-def test_a_hundred_passes_without_jitter_in_figures() -> None:
-    """False alarms within the stated rate, at the binomial limit of 1e-3, and no period of the readings."""
-    found = [searched(quiet(), seed) for seed in range(100)]
-    chances = np.array([float(one.before.chance(one.before.power[one.before.best])) for one in found])
-    alarms = [one.lines.frequency for one in found if len(one.lines.frequency)]
-    print(f"{len(alarms)} of 100 alarms at {RATE:g}, {int(np.sum(chances < 0.1))} at 0.1; {alarms}")  # noqa: T201
-    assert len(alarms) <= stats.binom.ppf(1.0 - 1e-3, 100, RATE)
-    for rate in (0.05, 0.1, 0.3):
-        assert np.sum(chances < rate) <= stats.binom.ppf(1.0 - 1e-3, 100, rate)
-    # far sharper than alarms: the power of all passes together at the readings' rate and at half, twice of it
-    for frequency in (0.5 / READINGS, 1.0 / READINGS, 2.0 / READINGS):
-        power = 0.0
-        for one in found:
-            k = int(np.argmin(np.abs(one.before.frequency - frequency)))
-            power += one.before.power[k] / (one.before.total / one.before.freedom)
-        print(f"{frequency:g} Hz: {power:.0f} of {len(found) * one.before.order} expected")  # noqa: T201
-        assert power <= stats.chi2.ppf(1.0 - 1e-3, len(found) * one.before.order), frequency
-
-
-@pytest.mark.slow
-def test_what_is_exported_gives_the_same_oscillations(tmp_path: Path) -> None:
-    path = tmp_path / "pass.yaml"
-    ask = {"highest": "6 Hz", "height": "300 m", "spline": {"interval": "0.2 s", "sigma": "3 arcsec"}}
-    one = setup(attitude=attitude(OSCILLATION), search=ask)
-    path.write_text(dump_yaml({**one.test.plain(), "camera": "ms4"}))
-    out, data = tmp_path / "run", tmp_path / "data"
-    result = run("jitter", path, "--out", out, "--export", data, "--json")
-    assert result.exit_code == 0, result.output
-    first = json.loads(result.stdout)["passes"]["jitter"]
-    again = run("jitter", data / "jitter.yaml", "--out", tmp_path / "again", "--json")
-    assert again.exit_code == 0, again.output
-    second = json.loads(again.stdout)["passes"]["jitter"]
-    assert "true_frequency_hz" not in second["oscillations"][0]
-    there, back = (one["oscillations"][0]["frequency_hz"] for one in (first, second))
-    assert back == pytest.approx(there, rel=1e-7)
-    course = (tmp_path / "again/artefacts/attitude.csv").read_text().splitlines()
-    assert course[0].startswith("time [s],roll [arcsec],σ roll")
-    assert "roll spline [arcsec]" in course[0]
-    values = np.array([line.split(",") for line in course[1:]], float)
-    turn = 2.4 * np.sin(2.0 * np.pi * 0.65 * values[:, 0] + np.radians(40.0))
-    assert np.std(values[:, 1] - turn) < 0.1
-    # a spline has no shape to go by: it follows with its sigma
-    inner = np.abs(values[:, 0]) < 4.0
-    assert np.std((values[:, 5] - turn)[inner]) < 0.5
-    assert (tmp_path / "again/artefacts/frequencies.csv").is_file()
 
 
 def test_steady_readings_are_those_of_a_pass_without_noise() -> None:

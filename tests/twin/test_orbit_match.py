@@ -1,6 +1,5 @@
 """Points measured in a user's images: the simulation's images and maps, through files alone."""
 
-import json
 import shutil
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,6 @@ from scenes.specs.measured.orbit_data_setup import MatchSetup
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.orbit.setup import load_three_line_camera, resolve_simulate
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke
 from twin.orbit.images.simulate_run import Simulation, run_simulation
@@ -120,31 +118,6 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
         a, b = np.array(pairs).T
         np.testing.assert_allclose(there.pixel[b], row.pixel[a], rtol=0, atol=0.02)
         np.testing.assert_allclose(there.line[b] - 10.0, row.line[a], rtol=0, atol=0.02)
-
-
-@pytest.mark.second
-def test_the_command_exports_what_a_calibration_reads(files, tmp_path: Path) -> None:
-    from scenes.specs.measured.orbit_data import OrbitDataSpec
-    from scenes.yaml.spec import validate
-    from scenes.yaml.yaml_file import read_yaml
-    from twin.orbit.measured.measurement_tables import read_pass
-
-    folder, data = files
-    path = folder / "match.yaml"
-    path.write_text(dump_yaml(data))
-    result = run("match", path, "--out", tmp_path / "run", "--export", tmp_path / "data", "--json")
-    assert result.exit_code == 0, result.output
-    numbers = json.loads(result.stdout)
-    assert numbers["control_points"] > 10
-    assert numbers["orthophoto"]["rows"] > 100
-    found = validate(OrbitDataSpec, read_yaml(tmp_path / "data/data.yaml"))
-    assert list(found.passes) == ["pass"]
-    files_of = {key: str(tmp_path / "data" / name) for key, name in found.passes["pass"].files.items()}
-    there = found.passes["pass"].model_copy(update=files_of)
-    read = read_pass("pass", there, found.conventions, load_three_line_camera("th1"))
-    assert int(np.sum(read.ground.role == "control")) == numbers["control_points"]
-    assert int(np.sum(read.ground.role == "tie")) == numbers["tie_points"]
-    assert (tmp_path / "run/artefacts/points.csv").is_file()
 
 
 WRONG = [

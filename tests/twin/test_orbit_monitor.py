@@ -1,6 +1,5 @@
 """From the on-board monitor to heights on the ground, end to end, and as a user runs it."""
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ from analysis.orbit.forward_intersection import CalibratedLine, IntersectionErro
 from optics.geometry.tree import Motion
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from tests.tiers import quick
-from tests.twin.commands import files, invoke, refused
+from tests.twin.commands import invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
 from twin.orbit.monitoring.monitoring_report import monitor_report
@@ -312,53 +311,7 @@ def test_contradictions_stand_in_the_report(stated) -> None:
     assert "contradicts their sigma" in " ".join(told.lead)
 
 
-@pytest.mark.slow
-def test_shifts_that_contradict_the_disturbances_are_told(tmp_path: Path, backend) -> None:
-    """Cameras that turn by an arcsecond where nothing but focal planes and prisms was expected to move."""
-    text = SMALL.replace("points: 60", "points: 10").replace("repeats: 30", "repeats: 8")
-    text += "disturbances: {file: orbit, without: [base_heat, camera_heat, camera_mounts, mirror_mounts]}\n"
-    run = run_monitor(resolve_monitor(write(tmp_path, text)), backend, 3, silent)
-    assert not run.smoothing[1200.0].consistency.agrees
-    told = monitor_report(run)
-    assert any("contradict the prior" in warning for warning in told.warnings)
-
-
 # The command
-
-
-@pytest.mark.second
-def test_command(tmp_path: Path) -> None:
-    import twin.orbit.__main__ as command
-
-    run = partial(invoke, command.app)
-    path = write(tmp_path, SMALL.replace("repeats: 30", "repeats: 8").replace("points: 60", "points: 10"))
-    result = run("monitor", path, "--out", tmp_path / "run", "--seed", 5, "--json")
-    assert result.exit_code == 0, result.stderr
-    data = json.loads(result.stdout)
-    assert data == json.loads((tmp_path / "run" / "monitor.json").read_text("utf-8"))
-    numbers = ("height_rms_m", "height_worst_m", "plan_rms_m", "height_m_per_arcsec", "interval_s")
-    assert all(isinstance(data[key], float) for key in numbers)
-    assert data["height_rms_m"] == data["cases"]["interval"]["height_rms_m"]
-    assert {"none", "monitored", "interval", "smoothed", "parameters", "true"} == set(data["cases"])
-    smoothing = data["smoothing"]
-    assert smoothing["disturbances"] == "orbit"
-    assert [row["interval_s"] for row in smoothing["intervals"]] == [600.0, 1200.0, 2400.0]
-    assert [row["measurements"] for row in smoothing["intervals"]] == [5, 3, 2]
-    assert len(smoothing["height_m_sigma"]) == len(data["propagation"]["height_m_sigma"]) == len(data["times_s"])
-    assert [row["interval_s"] for row in data["intervals"]] == [600.0, 1200.0, 2400.0]
-    count = len(data["times_s"])
-    for name in ("forward", "backward"):
-        camera = data["cameras"][name]
-        assert len(camera["true"]["d_alpha_arcsec"]) == len(camera["monitored"]["d_alpha_arcsec_sigma"]) == count
-    assert len(data["intersection_angle"]["monitored_change_arcsec"]) == count
-    figures = {"angle", "height", "smoothed", "interval", "remainder"}
-    tables = {"cases", "smoothing", "changes-forward", "changes-backward", "intervals", "parts", "causes", "conversion"}
-    expected = {"manifest.json", "config.yaml", "monitor.json", "report.html"}
-    expected |= {f"artefacts/{n}.svg" for n in figures} | {f"artefacts/{n}.csv" for n in tables}
-    assert files(tmp_path / "run") == expected
-    again = run("monitor", tmp_path / "run" / "config.yaml", "--out", tmp_path / "again", "--quiet")
-    assert again.exit_code == 0, again.stderr
-    assert (tmp_path / "again" / "monitor.json").read_bytes() == (tmp_path / "run" / "monitor.json").read_bytes()
 
 
 # what is wrong, key, what to do about it

@@ -1,13 +1,10 @@
 """Orbits and attitudes from files of other people's formats: the same pass from each, clocks, what is refused."""
 
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from scenes.specs.measured.pass_files import PlatformFilesSpec
@@ -362,63 +359,6 @@ def test_a_table_of_earth_orientation_that_is_wrong(tmp_path: Path, text: str, t
     with pytest.raises(InputError, match=told) as error:
         read_earth_orientation(tmp_path / "eop.txt")
     assert error.value.file.endswith("eop.txt")
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("kind", ["oem", "sp3", "aem"])
-def test_files_that_end_anywhere_or_are_damaged_end_in_an_error_or_in_numbers(tmp_path: Path, kind: str) -> None:
-    """No traceback but InputError, whatever byte is missing or changed."""
-    bench.orbit_csv(tmp_path / "orbit.csv", step=10.0)
-    bench.attitude_csv(tmp_path / "attitude.csv", step=10.0)
-    path = tmp_path / f"a.{kind}"
-    getattr(bench, kind)(path, step=10.0)
-    whole = path.read_bytes()
-    rng = np.random.default_rng(7)
-    for k in range(150):
-        content = bytearray(whole)
-        place = int(rng.integers(len(whole)))
-        if k % 2:
-            content = content[:place]
-        else:
-            content[place : place + int(rng.integers(3))] = bytes(rng.integers(32, 127, 2).tolist())
-        path.write_bytes(bytes(content))
-        try:
-            if kind == "aem":
-                read(tmp_path, CSV_ORBIT, {"file": "a.aem", "body_axes": bench.AXES}, earth=EARTH)
-            else:
-                satellite = {"satellite": "L51"} if kind == "sp3" else {}
-                read(tmp_path, {"file": path.name, **satellite}, CSV_ATTITUDE, earth=EARTH)
-        except InputError:
-            continue
-
-
-@pytest.mark.second
-@given(st.text(max_size=60))
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_no_text_breaks_a_clock(text: str) -> None:
-    try:
-        found = Readings.of_texts([text])
-    except Problem:
-        return
-    assert 0.0 <= found.second[0] < 86401.0
-
-
-@pytest.mark.slow
-def test_a_million_rows_are_read_in_seconds(tmp_path: Path) -> None:
-    """1e6 rows of an OEM and of a table of quaternions: less than half a minute of a processor together."""
-    rows = 1_000_000
-    t = np.arange(rows) * 1e-3
-    texts = [f"2011-03-05T03:{int(s) // 60:02d}:{s % 60:09.6f}" for s in t]
-    head = ["CCSDS_OEM_VERS = 2.0", "META_START", "OBJECT_ID = A", "CENTER_NAME = EARTH", "REF_FRAME = ITRF2014"]
-    body = [f"{text} 7000.0 0.0 {0.001 * k:.6f} 0.0 7.5 0.0" for k, text in enumerate(texts)]
-    (tmp_path / "a.oem").write_text("\n".join([*head, "TIME_SYSTEM = UTC", "META_STOP", *body]))
-    lines = ["time [s],q1,q2,q3,q4", *(f"{s:.3f},0,0,0,1" for s in t)]
-    (tmp_path / "attitude.csv").write_text("\n".join(lines))
-    started = time.process_time()
-    attitude = {**CSV_ATTITUDE, "epoch": "2011-03-05T03:00:00"}
-    table = read(tmp_path, {"file": "a.oem"}, attitude)
-    assert time.process_time() - started < 30.0
-    assert len(table.orbit_time) == len(table.attitude_time) == rows
 
 
 def test_a_message_in_xml_is_the_same(tmp_path: Path) -> None:

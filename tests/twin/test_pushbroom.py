@@ -299,22 +299,6 @@ def test_true_points_are_the_inverse() -> None:
         assert height == pytest.approx(patch.terrain.height(east, north), abs=1e-4)
 
 
-@pytest.mark.slow
-def test_control_shows_the_same_ground() -> None:
-    """The nadir image, taken to the orthophoto's grid by the true geometry, is like the orthophoto: half of the texture
-    is fields, of which 15% differ, the light differs as well, and the image is coarser."""
-    patch = fly(4, (160, 160))
-    image, photo = patch.images["nadir"], patch.control.orthophoto
-    row, column = (v.ravel().astype(float) for v in np.meshgrid(np.arange(10, 150), np.arange(10, 150), indexing="ij"))
-    east, north, _ = patch.frame.local(patch.true_point("nadir", row, column))
-    at = [np.rint(v).astype(int) for v in photo.row_column(east, north)]
-    seen = image.frame[row.astype(int), column.astype(int)].astype(float)
-    here = np.corrcoef(seen, photo.values[at[0], at[1]])[0, 1]
-    aside = np.corrcoef(seen, photo.values[at[0] + 25, at[1]])[0, 1]
-    assert here > 0.6
-    assert aside < here - 0.2
-
-
 def test_what_cannot_be_imaged() -> None:
     spec, control, seed = GROUND, ControlSpec(), np.random.SeedSequence(1)
     cases = [

@@ -19,7 +19,6 @@ from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.laboratory.turntable_bench import DividingError, TurntableModel
 from twin.laboratory.turntable_numbers import TURNTABLE
-from twin.laboratory.turntable_report import turntable_report
 from twin.laboratory.turntable_run import TurntableRun, run_turntable
 
 ARCSEC = math.pi / 648000
@@ -176,23 +175,6 @@ def test_contract(run: TurntableRun) -> None:
     kept = np.array(point["comparisons_arcsec"])[point["kept"]]
     assert point["mean_arcsec"] == pytest.approx(np.mean(kept), abs=1e-12)
     assert sum(not k for p in result["points"] for k in p["kept"]) == result["rejected"]
-
-
-@pytest.mark.second
-def test_network_weights_stay_within_the_points(run: TurntableRun) -> None:
-    """A linearisation with more effective parameters than points would be one at no minimum."""
-    for fit in run.fits.values():
-        assert 2.0 < fit.effective_parameters < 41.0 + 1e-6
-
-
-@pytest.mark.second
-def test_report(run: TurntableRun) -> None:
-    parts = turntable_report(run).sections
-    artefacts = [artefact for part in parts for artefact in part.artefacts]
-    assert len({artefact.name for artefact in artefacts}) == len(artefacts) == 7
-    assert all(artefact.content() for artefact in artefacts)
-    text = " ".join(paragraph for part in parts for paragraph in part.text)
-    assert "50 whole periods" in text
 
 
 @pytest.mark.parametrize(
