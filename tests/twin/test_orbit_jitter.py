@@ -1,5 +1,6 @@
 """Jitter of a pass, found in what the lines of a camera saw: simulated, exported, read back."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,8 +22,9 @@ from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.jitter import sights
 from twin.orbit.jitter.jitter_numbers import JITTER, blind_multiples
+from twin.orbit.jitter.jitter_report import _warnings as jitter_warnings
 from twin.orbit.jitter.jitter_report import jitter_report
-from twin.orbit.jitter.jitter_run import fly_strip, run_jitter
+from twin.orbit.jitter.jitter_run import JitterRun, fly_strip, run_jitter
 from twin.orbit.jitter.sights import SightsError, sights_of
 from twin.orbit.jitter.steady_platform import SteadyPlatform
 from twin.run.procedure import BenchError
@@ -58,12 +60,41 @@ def searched(one: JitterSetup, seed: int) -> Found:
     return search(seen.observations, spec.search.lowest, spec.search.highest, spec.search.false_alarm)
 
 
-def test_an_oscillation_of_the_body_is_found_about_its_axes() -> None:
+@pytest.fixture(scope="module")
+def oscillating() -> JitterRun:
     """1 px of roll and 0.4 px of pitch at 0.65 Hz through geometry, light, attitude readings and matching noise."""
-    found = run_jitter(setup(attitude=attitude(OSCILLATION), search={"highest": "12 Hz", "height": "250 m"}), None, 3)
+    return run_jitter(setup(attitude=attitude(OSCILLATION), search={"highest": "12 Hz", "height": "250 m"}), None, 3)
+
+
+def test_every_warning_of_a_search_is_told_when_and_only_when_it_holds(oscillating: JitterRun) -> None:
+    """Too many wrong matches, noise beyond the covariances, and a frequency that may be another."""
+    one = oscillating.passes["jitter"]
+
+    def told(**changes) -> tuple[str, ...]:
+        changed = replace(one, found=replace(one.found, **changes))
+        return jitter_warnings(replace(oscillating, passes={"jitter": changed}))
+
+    lines, used = one.found.lines, np.arange(len(one.found.used)) / len(one.found.used)
+    for nothing in ({}, {"used": used < 0.71}, {"factors": 0.0 * one.found.factors + 1.29**2}):
+        assert told(**nothing) == (), nothing
+    assert any("31% of the observations of jitter were left out as wrong" in text for text in told(used=used < 0.69))
+    assert any(
+        "what remains in jitter is the noise" in text for text in told(factors=0.0 * one.found.factors + 1.31**2)
+    )
+    (text,) = told(lines=replace(lines, aliases=((8.5, 9.1),)))
+    assert "jitter: 0.65 Hz may as well be 8.5, 9.1 Hz" in text.replace(f"{lines.frequency[0]:.4g}", "0.65")
+    (text,) = told(lines=replace(lines, frequency=np.array([21.0])))
+    assert "jitter: 21 Hz lies beyond the search" in text
+
+
+def test_an_oscillation_of_the_body_is_found_about_its_axes(oscillating: JitterRun) -> None:
+    """Frequency, amplitudes, phases and their sigmas, the gaps between the lines and where each pair is blind."""
+    found = oscillating
     one = found.passes["jitter"]
     lines = one.found.lines
     assert one.sights.lines == ("blue", "green", "red", "nir")
+    # no match is wrong here: the oscillation itself must not make any seem so
+    assert one.found.used.mean() > 0.98
     assert len(lines.frequency) == 1
     assert lines.frequency[0] == pytest.approx(0.65, abs=4.0 * lines.frequency_sigma[0])
     away = (lines.amplitude[0] / ARCSEC - [2.4, 1.0]) / (lines.amplitude_sigma[0] / ARCSEC)

@@ -1,9 +1,11 @@
 """The monitor in a loop: commands against a recursion of its own, and rendered courses against the exact trace."""
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.loop.loop_course import Commands, LoopCourse, drifting_states, gone_through, reader
 from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model
 from twin.orbit.loop.loop_numbers import LOOP
+from twin.orbit.loop.loop_report import _warnings as loop_warnings
 from twin.orbit.loop.loop_report import loop_report
 from twin.orbit.loop.loop_run import PHASE_MARGIN_DEG, LoopRun, run_loop
 from twin.run.provenance import negative_verdicts
@@ -207,6 +210,37 @@ def test_a_loop_near_its_limit_or_that_makes_anything_worse_leads_the_verdict(id
     assert told.verdict.startswith("The loop makes angle, d_alpha of forward, ")
     assert "the loop makes angle worse: its error, RMS over the moments, is 1.20 times" in told.warnings[0]
     assert LOOP(worse)["made_worse"] == list(worse.worse)
+
+
+def quiet_loop(**changes) -> SimpleNamespace:
+    """Return the parts of a run that warnings look at, with nothing to warn of."""
+    one = SimpleNamespace(course=SimpleNamespace(times=[0.0, 600.0], jumps=(), agrees=True, evidence=None), images=())
+    model = SimpleNamespace(cameras={}, experiment=SimpleNamespace(path=SimpleNamespace(channels=[])))
+    loops = {"tilt": SimpleNamespace(ends=(), cycle=SimpleNamespace(steps=1))}
+    parts = {"setup": None, "model": model, "loops": loops, "closed": one, "open": deepcopy(one)}
+    return SimpleNamespace(**parts | {"ratios": {"angle": 3.9, "height": 4.0}, "ratio_limit": 4.0} | changes)
+
+
+def test_every_warning_of_a_loop_is_told_when_and_only_when_it_holds() -> None:
+    """Ends of ranges, limit cycles, jumps and doubts of either course, and sigmas that errors exceed."""
+    assert loop_warnings(quiet_loop()) == ()
+    ends, cycle = SimpleNamespace(ends=(1,), cycle=None), SimpleNamespace(ends=(), cycle=SimpleNamespace(steps=2))
+    (told,) = loop_warnings(quiet_loop(loops={"tilt": ends}))
+    assert "the range of tilt ends: held at 1 of the readings, first at 10 min" in told
+    (told,) = loop_warnings(quiet_loop(loops={"tilt": cycle}))
+    assert "tilt can go to and fro by 2 steps" in told
+    (told,) = loop_warnings(quiet_loop(ratios={"angle": 4.1, "height": 3.0}))
+    assert "the posterior's angle is wrong by up to 4.1 of its sigma, limit 4.00" in told
+    jump = SimpleNamespace(body="base/M1", labels=["base/M1 x"], sizes=[2.0], sigmas=[0.1], units=["um"], rivals={})
+    jump = SimpleNamespace(**vars(jump), after=0.0, until=600.0, log_ratio=50.0)
+    doubt = SimpleNamespace(course_doubt=lambda times, spots: f"a doubt at {times[1]}")
+    for label in ("closed", "open"):
+        for key, value, words in (("jumps", (jump,), "base/M1 jumped"), ("evidence", doubt, "a doubt at 10 min")):
+            run = quiet_loop()
+            setattr(getattr(run, label).course, key, value)
+            (told,) = loop_warnings(run)
+            assert told.startswith(f"with the loop {label}"), told
+            assert words in told
 
 
 @pytest.mark.parametrize("delay", range(6))
