@@ -25,7 +25,6 @@ from twin.orbit.calibration.camera_drift import (
 )
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.campaign_adjustment import simultaneous
-from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.schemes import FieldErrors
 from twin.orbit.calibration.schemes import tested as at_checks
 from twin.orbit.flight.line_camera import drifted_payload
@@ -131,19 +130,6 @@ def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
     cameras = {k: alone.cameras[k].drifted(last.readings[k]) for k in LINES}
     errors = at_checks(campaign, last, cameras, alone.bias(KEPT[0]))
     assert FieldErrors.pooled([errors]).height_rms == pytest.approx(abs(height_per_arcsec(campaign)), rel=0.05)
-
-
-@pytest.mark.second
-def test_draws_do_not_change_others() -> None:
-    """Without drift the same campaign as that of a file that has no such section."""
-    setup = setup_with()
-    none = setup.model_copy(update={"test": setup.test.model_copy(update={"drift": FrozenMap({}), "monitor": None})})
-    plain = fly_fields(none, np.random.SeedSequence(7)).passes[1]
-    drifted = fly_fields(setup, np.random.SeedSequence(7)).passes[1]
-    np.testing.assert_array_equal(plain.control_images["nadir"].line, drifted.control_images["nadir"].line)
-    np.testing.assert_array_equal(plain.control_ground, drifted.control_ground)
-    assert np.abs(plain.control_images["backward"].pixel - drifted.control_images["backward"].pixel).max() > 0.01
-    assert not plain.readings
 
 
 def write(folder: Path, *changes: tuple[str, str]) -> Path:

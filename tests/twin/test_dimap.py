@@ -128,17 +128,6 @@ def test_the_rpc_of_the_same_file_agrees(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(back, np.degrees((latitude, longitude)), rtol=0, atol=2e-3 * 1e-5)  # 2e-3 px of 0.7 m
 
 
-def test_an_rpc_that_is_off_is_seen(tmp_path: Path) -> None:
-    """Half a pixel between the conventions of the versions is half a pixel here."""
-    sensor = read_scene(write(tmp_path, PLEIADES)).sensor
-    model = RationalPolynomial.fit(sensor, 0, PLEIADES.pixels, (0.0, 3000.0))
-    (tmp_path / "RPC.XML").write_text(
-        rpc(model, "3.0").replace('version="3.0"', 'version="2.1"').replace("GroundtoImage_Values", "Inverse_Model")
-    )
-    found = read_rpc(tmp_path / "RPC.XML")
-    assert found.offset[0] == pytest.approx(model.offset[0] - 1.0, abs=1e-9)
-
-
 def test_signs_of_the_body(tmp_path: Path) -> None:
     """By the file's own orbit, without any model: pixels count from the right of the track, lines with the flight, and
     a look that is turned forward lies ahead.

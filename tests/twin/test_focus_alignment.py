@@ -138,7 +138,7 @@ def test_json(bench, alignments) -> None:
         assert value == pytest.approx(truth["rounds"][0]["mtf_nyquist"][band], abs=allowed)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_coarse_shims_leave_what_their_rounding_leaves(bench, alignments, coarse) -> None:
     """Steps of 50 um: every hole is off by up to 25 um, and the plan says what that leaves at the CCDs."""
     fine = alignments[SEEDS[0]]

@@ -13,7 +13,6 @@ from scenes.specs.load import load_camera, load_instrument
 from tests.hunt.dense_images import DenseImages
 from twin.monitor import image_sampling, monitor_beams, monitor_path
 from twin.monitor.image_sampling import WRONG, NodeClasses, UncertainImageError, disagreement, lost_or_gained
-from twin.monitor.monitor_experiment import TEMPLATE_MARGIN
 from twin.monitor.monitor_path import MonitorPath
 
 ACCURACY = 3e-6  # of the peak: what classes of blurred spots are chosen for, in double precision
@@ -57,26 +56,6 @@ def test_blurred_images_are_those_of_many_more_nodes(blurred, defocus: float) ->
     chosen = path.class_of(path.coarse_trace(states))
     dense = quadrature.disk_for(2.0 * path.node_classes.phase(int(np.max(chosen))))
     assert largest(got, with_nodes(path, dense).expected_photons(states, single=False)) < ACCURACY
-
-
-@pytest.mark.second
-def test_the_blur_matters(blurred) -> None:
-    """Nodes that are right for sharp spots on the whole CCD are wrong by the peak for these."""
-    path = blurred(DEFOCUS[-1])
-    sharp = path.node_classes.nodes(2)
-    assert path.nodes.count > 1.5 * sharp.count
-    assert (
-        largest(with_nodes(path, path.node_classes.nodes(0)).expected_photons([{}]), path.expected_photons([{}])) > 0.1
-    )
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("defocus", [0.0, *DEFOCUS])
-def test_an_instrument_is_the_same_before_and_after(blurred, defocus: float) -> None:
-    """With the template's margin and without."""
-    path, m = blurred(defocus), TEMPLATE_MARGIN
-    wide = path.expected_photons([{}], margin=m, single=False)[0][:, m:-m, m:-m]
-    assert largest(path.photons_of({}), wide) < ACCURACY
 
 
 def test_the_check_finds_what_the_choice_overlooks(blurred, monkeypatch) -> None:

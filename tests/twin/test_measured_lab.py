@@ -7,7 +7,7 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -79,61 +79,47 @@ def run(*arguments: object) -> tuple[int, str]:
     return done.exit_code, " ".join(done.output.split())
 
 
-def loop(command: str, place: Path, test: str) -> tuple[dict, dict]:
-    """Numbers of a simulated bench and of what it exported."""
-    code, told = run(
-        command, JOBS / f"{command}.yaml", "--out", place / "simulated", "--export", place / "files", "--quiet"
-    )
+def numbers(command: str, test: Path, place: Path, *options: object) -> dict:
+    """Return the numbers of a command's run."""
+    code, told = run(command, test, "--out", place, "--quiet", *options)
     assert code == 0, told
-    code, told = run(command, place / "files" / test, "--out", place / "measured", "--quiet")
-    assert code == 0, told
-    return tuple(json.loads((place / name / f"{command}.json").read_text()) for name in ("simulated", "measured"))  # type: ignore[return-value]
-
-
-def same(simulated: dict, measured: dict) -> None:
-    """Every number that both have, to the bit: exported files have all digits."""
-    assert simulated["truth"]
-    assert "truth" not in measured
-    there, here = ({k: v for k, v in each.items() if k not in ("truth", "verdict")} for each in (simulated, measured))
-    assert there == {name: here[name] for name in there}
+    return json.loads((place / f"{command}.json").read_text())
 
 
 @pytest.mark.second
 def test_distortion_exported_and_read_back(tmp_path: Path) -> None:
-    simulated, measured = loop("distortion", tmp_path, "distortion.yaml")
-    same(simulated, measured)
+    """Every number that both have, to the bit: exported files have all digits."""
+    files = tmp_path / "files"
+    simulated = numbers("distortion", JOBS / "distortion.yaml", tmp_path / "simulated", "--export", files)
+    measured = numbers("distortion", files / "distortion.yaml", tmp_path / "measured")
+    assert simulated["truth"]
+    assert "truth" not in measured
+    there = {k: v for k, v in simulated.items() if k not in ("truth", "verdict")}
+    assert there == {name: measured[name] for name in there}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("table", ["images", "mtf"])
-def test_focus_exported_and_read_back(tmp_path: Path, table: str) -> None:
-    simulated, measured = loop("focus", tmp_path, f"focus_before_{table}.yaml")
-    own = {(one["band"], round(one["y_mm"])): one for one in measured["sites"]}
+@pytest.mark.second
+def test_focus_exported_and_read_back(tmp_path: Path) -> None:
+    """Sites, shims and the correction, from the frames and from the table of MTF that the bench exports."""
+    files = tmp_path / "files"
+    simulated = numbers("focus", JOBS / "focus.yaml", tmp_path / "simulated", "--export", files)
     order = sorted(simulated["initial"]["sites"], key=lambda one: (one["band"], one["field"]))
-    for there, here in zip(order, sorted(own.values(), key=lambda one: (one["band"], one["y_mm"])), strict=True):
-        assert abs(here["defocus_um"] - there["defocus_um"]) < ROUNDING * there["defocus_um_sigma"]
-        assert here["defocus_um_sigma"] == pytest.approx(there["defocus_um_sigma"], rel=1e-9)
     done = simulated["rounds"][0]
-    for hole, shim in done["shim_changes_um"].items():
-        assert measured["shims"][hole]["ground_um"] == shim
-        assert measured["shims"][hole]["shim_um"] == done["shims_um"][hole]
-    for name in ("rotation_arcmin", "shift_um"):
-        np.testing.assert_allclose(measured["correction"][name], done["correction"][name], rtol=1e-9, atol=1e-9)
-    assert measured["correction"]["piston_um_sigma"] == pytest.approx(done["correction"]["piston_um_sigma"], rel=1e-9)
-    # frames are those that the bench recorded, to the bit: their MTF is that of the simulation's own table
-    values = [float(row[-2]) for row in rows_of(tmp_path / "files" / "before_mtf.csv")[1:]]
-    if table == "images":
-        images = align_files(resolve_focus_test(tmp_path / "files" / "focus_before_images.yaml").test)  # type: ignore[arg-type]
-        again = sorted(
-            float(v) for scan in images.states[0].scans for edge in scan.mtf.values() for v in edge if v > 0.0
-        )
-        assert again == sorted(values)
+    for table in ("images", "mtf"):
+        measured = numbers("focus", files / f"focus_before_{table}.yaml", tmp_path / table)
+        own = {(one["band"], round(one["y_mm"])): one for one in measured["sites"]}
+        for there, here in zip(order, sorted(own.values(), key=lambda one: (one["band"], one["y_mm"])), strict=True):
+            assert abs(here["defocus_um"] - there["defocus_um"]) < ROUNDING * there["defocus_um_sigma"]
+            assert here["defocus_um_sigma"] == pytest.approx(there["defocus_um_sigma"], rel=1e-9)
+        for hole, shim in done["shim_changes_um"].items():
+            assert measured["shims"][hole]["ground_um"] == shim
+            assert measured["shims"][hole]["shim_um"] == done["shims_um"][hole]
+        for name in ("rotation_arcmin", "shift_um"):
+            np.testing.assert_allclose(measured["correction"][name], done["correction"][name], rtol=1e-9, atol=1e-9)
+        sigma = measured["correction"]["piston_um_sigma"]
+        assert sigma == pytest.approx(done["correction"]["piston_um_sigma"], rel=1e-9)
     # after the round the assembly stands where the shims were to bring it
-    code, told = run(
-        "focus", tmp_path / "files" / f"focus_round_1_{table}.yaml", "--out", tmp_path / "after", "--quiet"
-    )
-    assert code == 0, told
-    after = json.loads((tmp_path / "after" / "focus.json").read_text())
+    after = numbers("focus", files / "focus_round_1_mtf.yaml", tmp_path / "after")
     assert after["confocal_um_max"] == pytest.approx(done["confocal_um_max"], rel=1e-9)
 
 
@@ -182,22 +168,6 @@ def in_unit(path: Path, old: str, new: str, factor: float) -> None:
     write(path, [head, *body])
 
 
-@pytest.mark.second
-def test_order_of_rows_and_columns_changes_no_bit(folder: Path) -> None:
-    kinds: list[Callable[[], np.ndarray]] = [
-        lambda: turntable_of(folder).series.mean,
-        lambda: distortion_of(folder).compensated.fit.values,
-        lambda: np.concatenate(
-            [focus_of(folder).states[0].defocus, np.diag(focus_of(folder).shimmings[0].plane.covariance)]
-        ),
-    ]
-    before = [kind() for kind in kinds]
-    for k, name in enumerate(("comparisons.csv", "held_out.csv", "spots.csv", "mtf.csv")):
-        shuffled(folder / name, k)
-    for there, kind in zip(before, kinds, strict=True):
-        np.testing.assert_array_equal(kind(), there)
-
-
 def renumbered(path: Path, name: str, seed: int) -> None:
     """Numbers of the stops in the order of a walk to and fro, which is not that of the readings."""
     head, *body = rows_of(path)
@@ -213,17 +183,23 @@ def renumbered(path: Path, name: str, seed: int) -> None:
 
 
 @pytest.mark.second
-def test_stops_in_any_order_change_no_bit(folder: Path) -> None:
-    before, run = distortion_of(folder), turntable_of(folder)
+def test_order_of_rows_columns_and_stops_changes_no_bit(folder: Path) -> None:
+    """Rows and columns shuffled, and stops numbered in an order that is not that of their readings."""
+
+    def found() -> list[np.ndarray]:
+        table, spots, focus = turntable_of(folder), distortion_of(folder), focus_of(folder)
+        fit = spots.compensated.fit
+        curves = [table.series.mean, table.compensation.fit(table.series.angle)]
+        planes = [focus.states[0].defocus, np.diag(focus.shimmings[0].plane.covariance)]
+        return [*curves, fit.values, fit.covariance, spots.compensated.distortion, *planes]
+
+    before = found()
     for k, (name, column) in enumerate((("comparisons", "position"), ("held_out", "position"), ("spots", "point"))):
         renumbered(folder / f"{name}.csv", column, k)
-    again = distortion_of(folder)
-    np.testing.assert_array_equal(again.compensated.fit.values, before.compensated.fit.values)
-    np.testing.assert_array_equal(again.compensated.fit.covariance, before.compensated.fit.covariance)
-    np.testing.assert_array_equal(again.compensated.distortion, before.compensated.distortion)
-    found = turntable_of(folder)
-    np.testing.assert_array_equal(found.tables[0].lines, run.tables[0].lines)
-    np.testing.assert_array_equal(found.compensation.fit(run.series.angle), run.compensation.fit(run.series.angle))
+    for k, name in enumerate(("comparisons.csv", "held_out.csv", "spots.csv", "mtf.csv")):
+        shuffled(folder / name, k)
+    for there, here in zip(before, found(), strict=True):
+        np.testing.assert_array_equal(here, there)
 
 
 @pytest.mark.second

@@ -140,7 +140,7 @@ def test_light_time_is_small_and_odd(flight: AnglePass) -> None:
     assert found[1] == pytest.approx(-found[0], rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_scatter_of_200_passes_matches_sigma(full) -> None:
     """Chi-square of the spread, of both angles together with their covariance, and of the mean; each at 0.1% to either
     side: 15 statements, false alarm 1.5% over seeds. A sigma wrong by a

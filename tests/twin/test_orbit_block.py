@@ -5,10 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.block.block_adjustment import adjust_block
-from analysis.orbit.ground_errors import predicted
 from analysis.orbit.three_line_model import misclosure
-from optics.numerics.threads import one_blas_thread
 from scenes.specs.load import SCENES
 from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
 from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
@@ -150,47 +147,6 @@ def test_covariance_of_changes_holds_all_three_laws():
     assert spread[8, 8] == pytest.approx(lasting + each + 9e-12)
     assert spread[4, 8] == pytest.approx(lasting + 4e-12)
     assert spread[4, 9] == 0.0
-
-
-GF7 = SCENES / "orbit" / "adjust_gf7.yaml"
-OWN = "angles: [0.043 arcsec, 0.021 arcsec, 0.5 arcsec], principal_distance: 6.2 um"
-WATCHED = {
-    "nothing": None,
-    "gf7_pair": OWN,
-    # twelve times better in all four, as its angle is
-    "gf7_pair_two": "angles: [0.0035 arcsec, 0.0017 arcsec, 0.04 arcsec], principal_distance: 0.5 um",
-    "gf7_pair_best": "angles: [0.003 arcsec, 0.0015 arcsec, 0.035 arcsec], principal_distance: 0.4 um",
-}
-
-
-@pytest.mark.second
-@one_blas_thread()
-def test_worth_of_monitor_and_laser_beside_what_gf7_reports(tmp_path):
-    """GF-7 reports 2.15 m in height without and 0.75 m with its laser, a factor of 2.9: the table of docs/block.md."""
-    text = GF7.read_text("utf-8").replace("control: 0, tie: 150", "control: 2, control_sigma: [0.3 m, 0.3 m], tie: 150")
-    (tmp_path / "gf7.yaml").write_text(text.replace("check: 60", "check: 30"), "utf-8")
-    sigma = {}
-    for name, monitor in WATCHED.items():
-        (tmp_path / "one.yaml").write_text((tmp_path / "gf7.yaml").read_text("utf-8").replace(OWN, monitor or OWN))
-        block = draw_block(resolve_adjust(tmp_path / "one.yaml"), np.random.SeedSequence(1)).block
-        if monitor is None:
-            block = block.without("monitor")
-        cases = {"no control": ("laser", "control"), "control": ("laser",), "laser": ("control",)}
-        for case, left_out in cases.items():
-            some = block
-            for sensor in left_out:
-                some = some.without(sensor)
-            where = np.flatnonzero(block.points.role == "check")
-            found = adjust_block(some)
-            heights = predicted(found.ground[where], found.point_covariance(where)).le90 / 1.645
-            sigma[name, case] = heights
-    table = {name: [round(sigma[name, case], 2) for case in ("no control", "control", "laser")] for name in WATCHED}
-    # the digits of the page, of a block with other points: 10%
-    assert table["nothing"] == pytest.approx([4.6, 0.71, 0.62], rel=0.1)
-    for name in ("gf7_pair", "gf7_pair_two", "gf7_pair_best"):
-        assert table[name] == pytest.approx([1.7, 0.70, 0.62], rel=0.1), name
-        assert sigma[name, "no control"] / sigma[name, "laser"] == pytest.approx(2.8, rel=0.12)
-    assert sigma["nothing", "no control"] / sigma["nothing", "laser"] == pytest.approx(7.4, rel=0.12)
 
 
 MEASURED = SCENES / "orbit" / "measured" / "adjust.yaml"

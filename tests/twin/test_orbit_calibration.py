@@ -91,7 +91,7 @@ def test_exact_data_return_everything_that_is_observable() -> None:
     assert "nadir x" in str(found.gauge)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_numbers_say_what_their_sigmas_hold(full) -> None:
     """With the drift of the biases during a pass as the fields tell it, and with what launch leaves of the gauge.
     Errors of the outer lines' x beyond 4 sigmas are a false alarm of 1e-3 with Student's five degrees of freedom."""
@@ -479,7 +479,7 @@ def test_bad_input(case: str, tmp_path: Path) -> None:
     refused(run, "calibrate", path, key, words)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_warnings(tmp_path: Path) -> None:
     """A datum 500 m to the east is said, and so are effects that are left in."""
     path = write(tmp_path, "control: 1 m", "control: 1 m\n  datum: [500 m, 0 m, 0 m]")

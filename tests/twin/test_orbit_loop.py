@@ -295,16 +295,6 @@ def test_a_perfect_loop_leaves_the_sigma_of_the_posterior(model, left_alone, per
 
 
 @pytest.mark.second
-def test_the_order_of_mechanisms_does_not_matter(setup, backend, perfect) -> None:
-    data = dict(reversed(list(setup.test.corrections.items())))
-    turned = setup.model_copy(update={"test": setup.test.model_copy(update={"corrections": data})})
-    assert list(turned.test.corrections) != list(setup.test.corrections)
-    again = course_of(turned, loop_model(turned, MonitorExperiment(setup.resolved, backend)))
-    assert np.array_equal(again.positions, perfect.positions)
-    assert np.array_equal(again.expected, perfect.expected)
-
-
-@pytest.mark.second
 def test_a_mode_that_no_spot_shows_moves_heights_by_the_exact_trace(setup, model, backend) -> None:
     experiment = model.experiment
     angle, first, second = np.zeros(10), np.zeros(10), np.zeros(10)

@@ -15,7 +15,6 @@ from twin.orbit.measured.pass_measurements import duplicates
 from twin.run.procedure import BenchError
 
 
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Exported measurements of two fields of 24 control and 20 check points, screened where they are read."""

@@ -108,24 +108,24 @@ EXACT = 1e-9
 """Rad, 0.2 mas or 0.5 mm on the ground: products of two of 10 arcsec (2e-9), and 1e-9 of the line itself."""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", MOTIONS)
-def test_true_parameters_reproduce_the_traced_line(case: str, quiet, backend, gf7_pair) -> None:
+@pytest.mark.second
+def test_true_parameters_reproduce_the_traced_line(quiet, backend, gf7_pair) -> None:
     """Signs and order of the turns, by the trace. A whole camera's turn is in the four parameters entirely. A line that
     moves in its camera, or one that stays as long while the camera grows, looks through another field, with other
     distortion: 1% of the change is left at most."""
-    state = MOTIONS[case]
-    change = trace_truth(gf7_pair, backend, [state]).cameras["forward"]
-    values = [float(v[0]) for v in (change.d_alpha, change.d_beta, change.d_gamma, change.d_f)]
-    nominal, true = (traced_line_cameras(gf7_pair, backend, s)["forward"] for s in ({}, state))
+    change = trace_truth(gf7_pair, backend, list(MOTIONS.values())).cameras["forward"]
+    nominal = traced_line_cameras(gf7_pair, backend, {})["forward"]
     calibrated = CalibratedLine(
         nominal.pixels, nominal.directions, nominal.origins, gf7_pair.camera_axes("forward"), change.nominal_distance
     )
     pixel = np.linspace(0.0, nominal.pixels - 1.0, 201)
-    moved = np.linalg.norm(true.look(pixel) - nominal.look(pixel), axis=1).max()
-    left = np.linalg.norm(true.look(pixel) - calibrated.corrected(values).look(pixel), axis=1).max()
-    assert moved > 10.0 * EXACT
-    assert left < (EXACT if case.startswith("camera") else 0.01 * moved + EXACT)
+    for k, (case, state) in enumerate(MOTIONS.items()):
+        values = [float(v[k]) for v in (change.d_alpha, change.d_beta, change.d_gamma, change.d_f)]
+        true = traced_line_cameras(gf7_pair, backend, state)["forward"]
+        moved = np.linalg.norm(true.look(pixel) - nominal.look(pixel), axis=1).max()
+        left = np.linalg.norm(true.look(pixel) - calibrated.corrected(values).look(pixel), axis=1).max()
+        assert moved > 10.0 * EXACT, case
+        assert left < (EXACT if case.startswith("camera") else 0.01 * moved + EXACT), case
 
 
 def test_intersection_of_two_rays_is_exact_and_knows_its_limits() -> None:
@@ -207,7 +207,7 @@ def test_longer_intervals_are_worse_and_the_shortest_is_every_time(quiet) -> Non
     assert errors[1] < 0.25 * np.abs(quiet.cases["none"].camera).max()
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_noise_is_as_large_as_its_sigma(noisy) -> None:
     """Repeats with everything drawn anew, and every time's own measurement, each against its own sigma, for all share
     the reference's noise: false alarm 1e-6 each."""
@@ -254,7 +254,7 @@ def test_causes_add_up(noisy) -> None:
 # Stated disturbances
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_without_disturbances_there_is_nothing_to_smooth(noisy, stated) -> None:
     assert (noisy.flight.estimator, stated.flight.estimator) == ("model", "posterior")
     assert "smoothed" not in noisy.cases

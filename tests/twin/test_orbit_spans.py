@@ -1,6 +1,5 @@
 """Spans of orbit, attitude and lines that do not end together, and ends that meet to rounding."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +15,6 @@ from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.yaml.errors import InputError
 from tests.twin import orbit_file_bench as bench
 from tests.twin.orbit_bench import CirclePlatform
-from tests.twin.orbit_files import edit, export, flown, read_back, small
-from twin.orbit.calibration.calibration_run import third_differences
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LinePiece, LineTimes, line_cameras
@@ -127,53 +124,6 @@ def test_times_of_a_course_are_named_in_any_unit() -> None:
     assert number_of(1.1 * 3600.0, course.times) == 1
     with pytest.raises(ValidationError, match="not one of the course's times"):
         CourseSpec.model_validate({"times": times, "temperature": temperature, "detail": "66.1 min"})
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Exported measurements of two fields."""
-    setup = small()
-    return export(tmp_path_factory.mktemp("data"), setup, flown(setup)).parent
-
-
-@pytest.mark.second
-def test_spans_that_do_not_end_together_calibrate(folder: Path, tmp_path: Path) -> None:
-    """The attitude ends 5 ms before and after the exposures, the orbit goes on: third differences and lines that are
-    10 ms late are statistics for the page, and refuse nothing.
-    """
-    shutil.copytree(folder, tmp_path / "data")
-    file = tmp_path / "data" / "calibrate.yaml"
-    _, whole = read_back(file)
-    for one in whole.passes:
-        exposed = np.concatenate([one.data.sensors[k].time(r.line) for k, r in one.control_images.items()])
-        exposed = np.concatenate([exposed, *(one.data.sensors[k].time(r.line) for k, r in one.check_images.items())])
-        begin, end = exposed.min() - 0.005, exposed.max() + 0.005
-        path, table = one.measured, tmp_path / "data" / one.name / "attitude.csv"
-        inner = path.table.attitude_time
-        time = np.array([begin, *inner[(inner > begin + 0.01) & (inner < end - 0.01)], end])
-        turn = Rotation.from_matrix(path.body_to_itrs(time)).as_quat(canonical=False)
-        made = [[repr(float(v)) for v in (t, *q)] for t, q in zip(time, turn, strict=True)]
-        edit(table, lambda heads, _, rows=made: (heads, rows))
-        made = []
-        for name in one.control_images:
-            sensor = one.data.sensors[name]
-            ends = np.array([begin, end]) - sensor.time(np.array([0.0]))
-            ends = np.ceil(ends / sensor.line_time) + np.array([1.0, -2.0])
-            made += [[name, repr(float(n)), repr(float(t))] for n, t in zip(ends, sensor.time(ends), strict=True)]
-        edit(tmp_path / "data" / one.name / "lines.csv", lambda heads, _, rows=made: (heads, rows))
-    _, short = read_back(file)
-    for one, other in zip(short.passes, whole.passes, strict=True):
-        found, before = third_differences(one), third_differences(other)
-        assert found[0].rms == pytest.approx(before[0].rms, rel=1e-9)
-        # of readings of 8 Hz, half of them left
-        assert found[1].rms == pytest.approx(before[1].rms, rel=0.1)
-        # beyond the last reading the motion goes on as it came: 10 ms of an acceleration of 8 m/s^2 and of noise of
-        # 1 m and 0.5 arcsec a reading
-        late, there = one.later(0.01).control.rays, other.later(0.01).control.rays
-        for name in late:
-            assert np.abs(late[name].station - there[name].station).max() < 0.02
-            turned = Rotation.from_matrix(late[name].attitude) * Rotation.from_matrix(there[name].attitude).inv()
-            assert turned.magnitude().max() < np.radians(1.0 / 3600.0)
 
 
 def test_attitude_against_the_orbit_may_be_longer_than_it(tmp_path: Path) -> None:

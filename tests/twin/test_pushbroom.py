@@ -199,7 +199,7 @@ def test_an_edge_on_the_ground_has_the_mtf_of_the_optics(name: str, direction: s
     assert edge.mtf[-1] < 0.35
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_what_stands_before_the_lens_takes_light_and_contrast() -> None:
     """A bar across the middle of the pupil: its area is known, and so is its transfer function along its length."""
     payload = load_three_line_camera("th1")
@@ -272,18 +272,6 @@ GROUND = GroundSpec(terrain=HILLS)
 
 def fly(seed: int, size: tuple[int, int] = (60, 70)):
     return fly_patch(lines(), PLACE, size, GROUND, ControlSpec(), np.random.SeedSequence(seed))
-
-
-@pytest.mark.second
-def test_the_seed_decides() -> None:
-    first, again, other = fly(1), fly(1), fly(2)
-    for name in LINES:
-        one = first.images[name]
-        assert (one.frame.dtype, one.frame.shape) == (np.uint16, (60, 70))
-        assert np.array_equal(one.frame, again.images[name].frame)
-        assert not np.array_equal(one.frame, other.images[name].frame)
-    assert np.array_equal(first.control.orthophoto.values, again.control.orthophoto.values)
-    assert np.array_equal(first.control.dem.values, again.control.dem.values)
 
 
 @pytest.mark.second

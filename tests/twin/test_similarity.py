@@ -15,7 +15,6 @@ from optics.geometry.tree import Motion, State
 from optics.materials.material import MATERIALS, Material, material
 from optics.numerics import quadrature
 from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
 from optics.thermal.heat import Temperature
 from optics.waves.imaging import imaging_rays
 from optics.waves.transfer import polychromatic_transfer
@@ -31,7 +30,6 @@ from twin.monitor.monitor_beams import CcdRays
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
-from twin.pictures.light_paths import trace_light_paths
 from twin.targets.target_path import TargetPath
 
 ARCSEC = np.pi / 648000.0
@@ -135,29 +133,6 @@ def test_motions_do_the_same_to_a_grown_instrument(camera: str, with_camera, bac
     np.testing.assert_allclose(found[:, 1:] - found[:, :1], 0.0, rtol=0, atol=PIXELS)
     coarse = path.coarse_trace(states).place
     np.testing.assert_allclose(coarse[:, 1:] - coarse[:, :1], 0.0, rtol=0, atol=PIXELS)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("camera", ["gf7", "monitor"])
-def test_every_ray_meets_every_mirror_and_face_at_the_grown_place(camera: str, with_camera, backend) -> None:
-    """Not only the means: rays of the nominal instrument, started at grown places, in the grown one."""
-    instrument, grown = with_camera(camera), 1.0 + ALUMINIUM.expansion * WARMER
-    state, path = heated(instrument, ALUMINIUM), MonitorPath(instrument, backend).scout
-    for kind in ("monitor", "outgoing"):
-        names = [f"{channel.key}/{kind}" for channel in path.channels]
-        every = range(len(instrument.assembly.sequences[names[0]]))
-        start, along = np.broadcast_arrays(path.nominal.position, path.nominal.direction)
-        traced = [
-            trace(backend, assemble(instrument.assembly, names, [s]), make_rays(backend, g * start, along), every, True)
-            for s, g in (({}, 1.0), (state, grown))
-        ]
-        for k in every:
-            # a path's rounding, metres, after up to 40 of them
-            np.testing.assert_allclose(traced[1].hit(k), grown * traced[0].hit(k), rtol=0, atol=1e-13)
-        before, after = (t.numpy(t.world) for t in traced)
-        np.testing.assert_allclose(after[1], before[1], rtol=0, atol=ROUNDING)
-        np.testing.assert_allclose(after[2], grown * before[2], rtol=1e-14)
-        np.testing.assert_array_equal(after[3], before[3])
 
 
 def test_the_return_face_has_grown_to_its_edge(with_camera, backend) -> None:
@@ -267,15 +242,6 @@ def test_rendered_spots_stay_on_their_pixels(with_camera, backend) -> None:
         assert np.abs(old).max() > 10.0
         # a pixel grid that did not grow would move the far spots by 6e-3 to 1e-2 pixels
         np.testing.assert_allclose(new, old, rtol=0, atol=3e-4)
-
-
-def test_drawn_beams_grow(with_camera, backend) -> None:
-    instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
-    before, after = (trace_light_paths(instrument, backend, s).beams for s in ({}, heated(instrument, ALUMINIUM)))
-    for one, other in zip(before, after, strict=True):
-        first = 1 if "imaging" in one.name else 0  # where the scene's beam is cut off is not on the instrument
-        # rays are aimed to 1e-9 m
-        np.testing.assert_allclose(other.vertices[:, first:], grown * one.vertices[:, first:], rtol=0, atol=1e-7)
 
 
 def test_detectors_of_the_path_tracer_have_grown_pixels(with_camera, backend) -> None:

@@ -116,16 +116,6 @@ def test_other_software_finds_the_ground(folder: Path) -> None:
     assert checked == 3 * 441
 
 
-@pytest.mark.second
-def test_the_seed_decides(folder: Path, tmp_path: Path) -> None:
-    again = run("simulate", folder / "config.yaml", "--out", tmp_path / "again", "--quiet")
-    assert (again.exit_code, again.stdout) == (0, "")
-    for name in (*LINES, "orthophoto", "dem"):
-        path = f"images/{name}.tiff"
-        assert (tmp_path / "again" / path).read_bytes() == (folder / path).read_bytes()
-    assert (tmp_path / "again" / "simulate.json").read_bytes() == (folder / "simulate.json").read_bytes()
-
-
 # what is wrong, key, what to do about it
 BAD = {
     "no size": (SMALL, "lines: 0, pixels: 80}", "patch.lines", ["16"]),

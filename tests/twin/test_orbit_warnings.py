@@ -1,0 +1,336 @@
+"""Every warning of the reports in orbit and of the laboratory is told when, and only when, it holds.
+
+A run is what its warnings look at, with values at the edge of what needs no warning; each case changes one of them.
+"""
+
+import copy
+from collections.abc import Callable
+from types import SimpleNamespace as Ns
+from typing import Any
+
+import numpy as np
+import pytest
+
+from twin.laboratory import distortion_report, focus_report, turntable_report
+from twin.orbit.angle import angle_report
+from twin.orbit.block import block_report
+from twin.orbit.calibration import calibration_report, influences
+from twin.orbit.conventions import check_report
+from twin.orbit.export import export_report, quality_sections
+from twin.orbit.images import simulate_report
+from twin.orbit.matching import match_report
+from twin.orbit.monitoring import monitoring_report
+
+FAR, NEAR = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]), np.zeros((2, 3))
+IDS = np.array(["a", "b"], object)
+NAMES = [f"p{k}" for k in range(9)]
+
+
+def jump(body: str) -> Ns:
+    """Return a jump of one body."""
+    return Ns(
+        body=body, labels=["x"], sizes=[2.0], sigmas=[0.1], units=["um"], after=0, until=60, log_ratio=9, rivals={}
+    )
+
+
+def fit(**values: float) -> Ns:
+    """Return a fit of an interior orientation whose sigmas are 1e-5 m."""
+    return Ns(value=lambda name: values.get(name, 5.5), sigma=lambda _: 1e-5)
+
+
+BLOCK = Ns(
+    adjustment=Ns(
+        assembly=Ns(block=Ns(points=Ns(ids=IDS, start=FAR))), groups={"gps": Ns(p_value=1e-3, ratio=4.0)}, p_value=1e-3
+    ),
+    rejected=[],
+    datum=Ns(east=1.0, north=-2.0, up=3.0),
+    datum_chance=1e-3,
+    laws=[],
+    network=Ns(empty=[], alone=[], parts=[["A"]], controlled=[True]),
+)
+LAW = type("Law", (), {"p_value": 0.9e-3, "__str__": lambda _: "readings are alike"})()
+CHECK = Ns(wrong={"nadir": ()}, factor=2.0, readings=Ns(ground=Ns(accuracy=0.1), platform=Ns(earth=1)))
+LINE = Ns(accepted=np.ones(1, bool), moved=np.array([10.0, -20.0]))
+MATCH = Ns(
+    setup=Ns(test=Ns(points=Ns(reach=40))), points=Ns(sorts={"c": Ns(kind="map", lines={"nadir": LINE})}), accuracy=0.1
+)
+EXPORT = Ns(
+    source=Ns(scene=Ns(read=Ns(inertial_velocity=False, light_speed=False))),
+    lines={"nadir": Ns(polynomial=Ns(error_px=(0.1, 0.05)), refused="too steep")},
+)
+CORRECTION = Ns(probability=1e-3, factor=4.0, freedom=1, used=np.array([True, True]))
+QUALITY = Ns(products={"nadir": Ns(most=1.0)}, control={})
+CONTROLLED = Ns(names=IDS, polynomial=Ns(correction=CORRECTION))
+REJECTED = Ns(entered=100, left=90, points=(), check_points=(), factors={"nadir": 2.0})
+PASS = Ns(name="P", control_ground=FAR[:1], check_ground=FAR[1:], control_ids=IDS[:1], check_ids=IDS[1:])
+CALIBRATION = Ns(
+    together=Ns(names=["nadir f"], from_start=np.array([0.5])),
+    campaign=Ns(
+        spec=Ns(effects=Ns(corrected=True)), effects=Ns(names=("aberration",)), rejected={"P": REJECTED}, passes=(PASS,)
+    ),
+    surprises=(),
+    drift=None,
+    chip_steps=(),
+    truth=None,
+    fields={"P": Ns(adjustment=None)},
+    meeting=Ns(degrees_of_freedom=30, p_value=1e-3),
+)
+SURPRISES = tuple(Ns(name=n, change=c, ratio=5.0) for n, c in (("P roll", 2e-4), ("nadir f", 1e-4)))
+STRIP = Ns(
+    residual=np.array([0.0, 4.0]), normal=np.array([0.0, 0.0, 1.0]), strip=Ns(covariance=np.tile(np.eye(3), (2, 1, 1)))
+)
+ANGLE = Ns(
+    flight=Ns(spec=Ns(effects=Ns(corrected=False), errors=Ns(datum=(0.0, 0.0, 0.0))), effects=Ns(names=())),
+    passes=(
+        Ns(
+            name="P",
+            pairs=["alpha"],
+            ids={"nadir": NAMES},
+            measurement=Ns(strips=["nadir"]),
+            estimate=Ns(angles={"tls": Ns(folded=[False])}, planes={"tls": [STRIP]}, resection=Ns(p_value=1e-3)),
+        ),
+    ),
+)
+MONITOR = Ns(
+    setup=None,
+    flight=Ns(doubts=(), smoothed={60.0: Ns(jumps=())}, spec=Ns(interval=60.0)),
+    cases={"monitored": Ns(camera_height_rms=1.0), "none": Ns(camera_height_rms=1.0)},
+)
+DISTORTION = Ns(
+    compensated=Ns(fit=fit(constant=0.3e-5), zero=1e-5),
+    truth=Ns(gross=np.array([True]), means=None),
+    means=Ns(keep=np.array([False])),
+    bench=Ns(true_offset=np.array([0.0, 1e-7]), design_offset=np.zeros(2), turn=np.array([0.0, 0.0201])),
+    readings=Ns(file=Ns(doubts=[]), numbered=True),
+    reading=np.zeros((3, 2)),
+    test=Ns(measured=Ns(reversed=False, zero=1.0)),
+    about=5.5 / 1.04999,
+    compensation=1,
+    data={"probability": 1e-3, "noise": {"white_compensated_um": 0.2}},
+)
+FOCUS = Ns(
+    chi_square=(27.87, 9),
+    states=[Ns(skew=(3.2905e-6, 1e-6), level=0)],
+    shimmings=[Ns(vertex_error=1e-6)],
+    readings=Ns(file=Ns(doubts=[]), excluded=(), uneven=()),
+    edges=("along", "track"),
+    data={"plane": {"degrees_of_freedom": 1}},
+)
+ROW = Ns(line=7, file="mtf.csv", reason="far off")
+TABLE = Ns(
+    too_few=(),
+    held_out=1,
+    series=Ns(angle=np.radians(np.arange(90.0, 96.0))),
+    tables=[Ns(file=Ns(doubts=[]))],
+    data={"heldout_chi_square": 27.87, "heldout_degrees_of_freedom": 9, "suspect_angles": 0},
+)
+DRIFT = Ns(
+    assumed=None, seconds=30.0, course_p_value=1e-5, rate_p_value=None, most=("x", 2.0), unseen_sigmas=3.0, seen=None
+)
+
+# run, its warnings, and what changes: path, value, words
+REPORTS: dict[str, tuple[Any, Callable[[Any], Any], list[tuple[str, Any, str]]]] = {
+    "block": (
+        BLOCK,
+        block_report._warnings,
+        [
+            ("adjustment.assembly.block.points.start", NEAR, "a = b; counted twice"),
+            ("rejected", [("p", "A/nadir")], "left out as gross errors: p in A/nadir"),
+            ("datum_chance", 0.9e-3, "+1.00 m east, -2.00 m north and +3.00 m up"),
+            ("laws", [LAW], "readings are alike"),
+            ("adjustment.groups.gps.p_value", 0.9e-3, "gps: residuals are 2 times as large as stated"),
+            ("adjustment.p_value", 0.9e-3, "the block as a whole contradicts"),
+            ("network.empty", ["A"], "scenes without image points: A"),
+            ("network.alone", ["A"], "scenes that share no point with another: A"),
+            ("network", Ns(empty=[], alone=[], parts=[["A"], ["B"]], controlled=[True, False]), "A; B (no control)"),
+        ],
+    ),
+    "check": (
+        CHECK,
+        check_report._warnings,
+        [
+            ("wrong", {"nadir": NAMES}, "gross errors in nadir: p0, p1"),
+            ("factor", 2.01, "residuals are 1.4 times as large"),
+            ("readings.ground.accuracy", None, "is not stated by its authority"),
+            ("readings.ground.accuracy", 0.11, "good to 0.11 m only"),
+            ("readings.platform.earth", None, "no Earth orientation was given"),
+        ],
+    ),
+    "match": (
+        MATCH,
+        match_report._warnings,
+        [
+            ("points.sorts.c.lines.nadir.moved", np.array([0.0, -20.1]), "near the end of the reach"),
+            ("accuracy", None, "is not stated by its authority"),
+            ("accuracy", -1.0, "is not stated by its authority"),
+            ("accuracy", 0.11, "good to 0.11 m only"),
+        ],
+    ),
+    "simulate": (
+        Ns(patch=Ns(images={"nadir": Ns(saturated=0)})),
+        simulate_report._warnings,
+        [("patch.images.nadir.saturated", 1, "saturated pixels in nadir")],
+    ),
+    "export": (
+        EXPORT,
+        export_report._warnings,
+        [
+            ("source.scene.read.inertial_velocity", True, "against the stars"),
+            ("source.scene.read.light_speed", True, "LIGHT_SPEED_SETTING"),
+            ("lines.nadir.polynomial", None, "nadir has no rational polynomials: too steep"),
+            ("lines.nadir.polynomial.error_px", (0.05, 0.11), "off by up to 0.11 pixels"),
+        ],
+    ),
+    "quality": (
+        QUALITY,
+        quality_sections.quality_warnings,
+        [
+            ("products.nadir.most", 1.01, "off the rigorous model of nadir by up to 1"),
+            ("control", {"nadir": CONTROLLED}, "the correction by control points stands in the polynomials"),
+        ],
+    ),
+    "control": (
+        Ns(products={}, control={"nadir": CONTROLLED}),
+        lambda run: quality_sections.quality_warnings(run)[:-1],
+        [
+            ("control.nadir.polynomial.correction.used", np.array([True, False]), "are left out: b"),
+            ("control.nadir.polynomial.correction.probability", 0.9e-3, "scatter by 2.0 times their sigmas"),
+            ("control.nadir.polynomial.correction.freedom", 0, "no control point of nadir is left over"),
+        ],
+    ),
+    "calibration": (
+        CALIBRATION,
+        calibration_report._warnings,
+        [
+            ("surprises", SURPRISES, "P roll has changed by 41.3 arcsec, 5.0 times"),
+            ("surprises", SURPRISES[1:], "nadir f has changed by 100 µm"),
+            ("together.from_start", np.array([0.51]), "nadir f: known from launch.bias"),
+            ("campaign.spec.effects.corrected", False, "are left in the image points"),
+            ("campaign.rejected.P.points", (("p", "nadir"),), "P: left out as gross errors: p in nadir"),
+            ("campaign.rejected.P.check_points", ("c",), "P: left out as gross errors: c"),
+            ("campaign.rejected.P.left", 89, "P: 11 of 100 image points were left out"),
+            ("campaign.rejected.P.factors", {"nadir": 2.1}, "by factors of nadir 2.1"),
+            ("campaign.passes", (Ns(**vars(PASS) | {"check_ground": FAR[:1]}),), "a = b"),
+            ("meeting.p_value", 0.9e-3, "rays of the check points do not meet"),
+        ],
+    ),
+    "drift": (
+        DRIFT,
+        lambda drift: influences.drift_warnings(Ns(spec=Ns(errors=Ns(star_tracker=Ns(drift=None)))), drift),
+        [
+            ("assumed", Ns(rate=np.array([1e-6, 2e-6]), walk=1e-6), "the attitude drifts during the passes"),
+            ("unseen_sigmas", 3.1, "nothing is said of a drift of the attitude"),
+        ],
+    ),
+    "steps": (
+        Ns(all=(Ns(found=False, line="nadir", axis="x", step=2e-6, sigma=1e-7, place=0.01),)),
+        lambda run: influences.step_warnings(run.all),
+        [("all.0.found", True, "nadir x +2.0 ± 0.1 µm at 10.0 mm")],
+    ),
+    "angle": (
+        ANGLE,
+        angle_report._warnings,
+        [
+            ("flight.effects.names", ("aberration",), "the analysis leaves aberration in the points"),
+            ("flight.spec.errors.datum", (0.0, 1.0, 0.0), "the points share a shift"),
+            ("passes.0.estimate.angles.tls.folded", [True], "are parallel within their noise"),
+            ("passes.0.estimate.planes.tls.0.residual", np.array([0.0, -9.0]), "the farthest p1 of nadir, 9 σ"),
+            ("passes.0.estimate.resection.p_value", 0.9e-3, "the resection does not fit"),
+        ],
+    ),
+    "monitor": (
+        MONITOR,
+        monitoring_report._warnings,
+        [
+            ("flight.doubts", ("a doubt",), "a doubt"),
+            ("flight.smoothed", {60.0: Ns(jumps=(jump("base"),))}, "base jumped"),
+            ("cases.none.camera_height_rms", 0.99, "monitoring makes heights worse"),
+        ],
+    ),
+    "distortion": (
+        DISTORTION,
+        lambda run: distortion_report._warnings(run, run.data),
+        [
+            ("means.keep", np.array([True]), "that stay in the means: 1"),
+            ("bench.true_offset", np.array([0.0, 1.1e-7]), "as-built coma that grows over the field"),
+            ("readings.file.doubts", ["copied rows"], "copied rows"),
+            ("readings.numbered", False, "spots of a point have no set numbers"),
+            ("compensated.fit", fit(constant=0.31e-5), "the line's middle is imaged 2.06 arcsec from `zero`"),
+            ("about", 5.5 / 1.0501, "are the units of angles and places right?"),
+            ("about", 5.5 / 0.9499, "are the units of angles and places right?"),
+            ("data.probability", 0.9e-3, "the excess, 0.20 µm"),
+            ("compensation", None, "no calibration of the turntable"),
+        ],
+    ),
+    "focus": (
+        FOCUS,
+        lambda run: focus_report._warnings(run, run.data),
+        [
+            ("chi_square", (27.88, 9), "are too small by about 1.8"),
+            ("states.0.skew", (-3.2906e-6, 1e-6), "all places may stand -3.3 ± 1.0 µm from"),
+            ("readings.excluded", (ROW,), "1 rows do not count (lines 7 of mtf.csv)"),
+            ("readings.uneven", (ROW,), "1 images have a sigma that does not hold"),
+            ("readings.file.doubts", ["copied rows"], "copied rows"),
+            ("edges", ("along",), "one direction only"),
+            ("states.0.level", None, "the line's level was not read"),
+            ("data.plane.degrees_of_freedom", 0, "three places give a plane and nothing to judge it by"),
+        ],
+    ),
+    "turntable": (
+        TABLE,
+        lambda run: turntable_report._warnings(run, run.data),
+        [
+            ("too_few", ("network",), "too few angles for"),
+            ("held_out", None, "no held-out readings"),
+            ("data.heldout_chi_square", 27.88, "by chance once in 100"),
+            ("series.angle", np.radians([90.0, 91.0, 92.0, 93.0, 99.0]), "compensated: 93 to 99 deg"),
+            ("tables.0.file.doubts", ["copied rows"], "copied rows"),
+            ("data.suspect_angles", 2, "more than their number allows: 2"),
+        ],
+    ),
+}
+
+
+def put(run: Any, path: str, value: Any) -> None:
+    """Change the value at a path of attributes, keys and numbers."""
+    *way, last = path.split(".")
+    for name in way:
+        run = run[int(name)] if name.isdigit() else run[name] if isinstance(run, dict) else getattr(run, name)
+    if isinstance(run, dict):
+        run[last] = value
+    else:
+        setattr(run, last, value)
+
+
+@pytest.fixture(autouse=True)
+def any_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kinds of runs are told by their classes, and some parts have tests of their own."""
+    for module, name in (
+        (export_report, "SceneSource"),
+        (angle_report, "SimulatedAngleRun"),
+        (distortion_report, "SimulatedDistortion"),
+        (distortion_report, "MeasuredDistortionSpec"),
+        (influences, "MeasuredCalibrationSpec"),
+    ):
+        monkeypatch.setattr(module, name, Ns)
+    for module, name in ((calibration_report, "CALIBRATION"), (monitoring_report, "MONITOR")):
+        monkeypatch.setattr(module, name, Ns(warnings=lambda run: []))
+    for name in ("drift_warnings", "step_warnings"):
+        monkeypatch.setattr(calibration_report, name, lambda *_: [])
+    monkeypatch.setattr(calibration_report, "any_effect", lambda effects: bool(effects.names))
+    monkeypatch.setattr(calibration_report, "meeting_of", lambda campaign, *_: campaign.meeting)
+
+
+@pytest.mark.parametrize("name", REPORTS)
+def test_every_warning_is_told_when_and_only_when_it_holds(name: str) -> None:
+    """Nothing is told of a run that needs no warning, and one sentence of each that does."""
+    quiet, warnings, cases = REPORTS[name]
+    if name == "calibration":
+        quiet.campaign.meeting = quiet.meeting
+    assert list(warnings(copy.deepcopy(quiet))) == []
+    for path, value, words in cases:
+        run = copy.deepcopy(quiet)
+        put(run, path, value)
+        told = list(warnings(run))
+        assert len(told) == 1, (path, told)
+        assert words in told[0], (path, told)
