@@ -162,17 +162,6 @@ def test_white_noise() -> None:
             assert abs(np.mean(x[1:] * x[:-1])) < 4.9 * sigma**2 / math.sqrt(x.size - 1)
 
 
-def test_noise_between_readings_is_joined_smoothly() -> None:
-    path = trajectory().with_errors(SPEC, 5, ["attitude_noise"])
-    t = np.arange(-500.0, 500.0, 0.25)
-    step = 1e-5
-    ends = differences(path, np.concatenate([t - step, t + step]))[2].reshape(2, -1, 3)
-    # a jump at the readings would be arcseconds
-    assert np.max(np.abs(ends[1] - ends[0])) < 1e-2 * ARCSEC
-    halfway = differences(path, t + 0.125)[2] / ARCSEC
-    assert 0.7 * 2 < np.std(halfway[:, 0]) < 1.0 * 2
-
-
 @pytest.mark.second
 def test_slow_orbit_errors_have_their_deviation_and_correlation_time() -> None:
     kept, count = math.exp(-2.0 / 60.0), 40

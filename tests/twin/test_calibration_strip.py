@@ -14,7 +14,7 @@ from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
-from tests.twin.commands import invoke, refused
+from tests.twin.commands import edited_copy, invoke, refused
 from tests.twin.strip_prediction import predicted
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.schemes import tested as at_checks
@@ -103,8 +103,4 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input(case: str, tmp_path: Path) -> None:
     old, new, key, words = BAD[case]
-    text = EXAMPLE.read_text("utf-8")
-    assert text.count(old) == 1, old
-    path = tmp_path / "small.yaml"
-    path.write_text(text.replace(old, new), "utf-8")
-    refused(run, "calibrate", path, key, words)
+    refused(run, "calibrate", edited_copy(EXAMPLE, tmp_path, (old, new)), key, words)

@@ -9,7 +9,6 @@ from scipy import stats
 
 from analysis.orientation.interior import fit_interior_orientation
 from analysis.orientation.measurement import Spots, locate_spots
-from analysis.spots.centroid import energy_centroid
 from analysis.turntable.dividing_error import choose, compensate
 from analysis.units import ARCSEC
 from optics.numerics.backend import load_backend
@@ -81,21 +80,6 @@ def test_images_are_those_of_the_general_renderer():
     # copies of the spot in the sum give an even level of 1e-6 each; seven wavelengths stand for nine to 1e-5
     assert images == pytest.approx(expected, abs=3e-5)
     assert np.max(images) > 0.9
-
-
-@pytest.mark.second
-def test_pixel_sampling_moves_no_centroid():
-    """Noise-free spots, shifted by a pixel in steps: the pinhole is wide enough for pixels of 7 um."""
-    b = bench()
-    pitch = b.ccd.band.pitch
-    steps = np.linspace(0.0, 1.0, 11)
-    place = np.stack([(15.0 + steps) * pitch, np.full(11, 15.3 * pitch)], axis=-1)
-    images = b.images(0.6 * b.turn[-1], place)
-    spots = energy_centroid(1e4 * images + 100.0, 4, b.noise, b.radius)
-    off = spots.column * pitch - place[:, 0]
-    # 0.001 pixel, a hundredth of what one exposure scatters
-    assert np.ptp(off) < 7 * NM
-    assert np.ptp(spots.column) == pytest.approx(1.0, abs=2e-3)
 
 
 @pytest.mark.second

@@ -3,8 +3,6 @@
 Seeds are fixed, so that a test passes or fails for good. Every chi-square test has a false-alarm rate of 1e-4 per side.
 """
 
-import json
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -15,7 +13,6 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import FocusSetup, resolve_focus
 from twin.laboratory.focus_bench import FocusBench
-from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_run import SimulatedFocus, align, line_turn, misset, mount_of, plan_shims, run_focus
 from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, Standing
 from twin.run.procedure import BenchError, silent
@@ -115,27 +112,6 @@ def test_misset_is_drawn_with_the_files_sizes(bench) -> None:
     low, high = chi2.ppf([FALSE_ALARM, 1.0 - FALSE_ALARM], len(draws))
     sums = np.sum((values / sigma) ** 2, axis=0)
     assert np.all((low < sums) & (sums < high))
-
-
-@pytest.mark.second
-def test_json(bench, alignments) -> None:
-    alignment = alignments[SEEDS[0]]
-    data = json.loads(json.dumps(focus_numbers(alignment), allow_nan=False))
-    assert len(data["rounds"]) == bench.setup.test.rounds == 1
-    end, truth = data["rounds"][0], data["truth"]
-    assert {"confocal_um_max", "line_level_arcmin", "mtf_nyquist", "shims_um"} <= set(end)
-    assert list(end["mtf_nyquist"]) == ["P", "B4"]
-    assert list(end["shims_um"]) == ["hole_1", "hole_2", "hole_3", "hole_4"]
-    mount = bench.setup.test.mount
-    for name, thickness in end["shims_um"].items():
-        assert thickness / (1e6 * mount.step) == pytest.approx(round(thickness / (1e6 * mount.step)), abs=1e-9)
-        assert thickness - end["shim_changes_um"][name] == pytest.approx(1e6 * mount.thickness, abs=1e-6)
-    assert end["confocal_um_max"] == max(abs(site["defocus_um"]) for site in end["sites"])
-    assert truth["rounds"][0]["confocal_um_max"] == max(abs(v) for v in truth["rounds"][0]["defocus_um"])
-    # five sigma of the measured MTF, and what the measurement of an edge leaves
-    for band, value in end["mtf_nyquist"].items():
-        allowed = 5.0 * end["mtf_nyquist_sigma"][band] + 1e-3
-        assert value == pytest.approx(truth["rounds"][0]["mtf_nyquist"][band], abs=allowed)
 
 
 @pytest.mark.second

@@ -14,7 +14,7 @@ from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.specs.orbit.setup import resolve_calibration, resolve_simulate
 from tests.tiers import quick
-from tests.twin.commands import invoke, refused
+from tests.twin.commands import edited_copy, invoke, refused
 from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.campaign_adjustment import simultaneous
@@ -93,16 +93,6 @@ def test_tie_points_are_five_times_better(flown: Simulation, control: MatchedPoi
     assert alone.in_all.sum() >= 10
 
 
-def write(folder: Path, source: Path, *changes: tuple[str, str]) -> Path:
-    text = source.read_text("utf-8")
-    for old, new in changes:
-        assert text.count(old) == 1, old
-        text = text.replace(old, new)
-    path = folder / "changed.yaml"
-    path.write_text(text, "utf-8")
-    return path
-
-
 # what is wrong, key, what to do about it
 BAD = {
     "small patch": (("lines: 1000, pixels: 1000}", "lines: 100, pixels: 100}"), "points", ["no room", "larger patch"]),
@@ -116,7 +106,7 @@ BAD = {
 def test_bad_input(case: str, tmp_path: Path) -> None:
     change, key, words = BAD[case]
     changes = [change] if change[0] == SIZE else [change, (SIZE, "lines: 200, pixels: 200}")]
-    refused(run, "simulate", write(tmp_path, SIMULATE, *changes), key, words)
+    refused(run, "simulate", edited_copy(SIMULATE, tmp_path, *changes), key, words)
 
 
 def two_patches() -> OrbitCalibrationSpec:
@@ -157,17 +147,9 @@ def test_calibration_from_images() -> None:
 
 def test_patches_outside_are_refused(tmp_path: Path) -> None:
     first = "{pixel: 700, track: -22 km}"
-    refused(
-        run,
-        "calibrate",
-        write(tmp_path, CALIBRATE, (first, "{pixel: 12700, track: -22 km}")),
-        "images.patches[0].pixel",
-        ["outside"],
-    )
-    refused(
-        run,
-        "calibrate",
-        write(tmp_path, CALIBRATE, (first, "{pixel: 60, track: -22 km}")),
-        "images.patches",
-        ["Beijing, patch 1"],
-    )
+    for pixel, key, words in (
+        (12700, "images.patches[0].pixel", "outside"),
+        (60, "images.patches", "patch 1"),
+    ):
+        path = edited_copy(CALIBRATE, tmp_path, (first, f"{{pixel: {pixel}, track: -22 km}}"))
+        refused(run, "calibrate", path, key, [words])

@@ -18,7 +18,7 @@ from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import fit_wavefront, path_difference
 from scenes.models.camera_axis import LAUNCH_DISTANCE
 from scenes.specs.load import load_detector
-from twin.monitor.image_quality import FIELDS, PLACES, QUALITY, quality_dicts
+from twin.monitor.image_quality import FIELDS, PLACES, QUALITY
 from twin.monitor.image_quality import image_quality as quality_of
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
@@ -143,42 +143,6 @@ def test_wavefront_error_against_batoid(gf7_pair, backend) -> None:
         assert rms(difference) == pytest.approx(value, abs=1e-6)
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("despace", [30e-6, -80e-6])
-def test_defocus_of_a_moved_secondary_mirror(gf7_pair, backend, despace: float) -> None:
-    moved = {f"{ROOT}/M2": Motion(shift=(0.0, 0.0, despace))}
-    fields = (1.0, 0.0, -1.0)
-    nominal, after = (image_quality(gf7_pair, backend, [s], fields).cameras[CAMERA] for s in ({}, moved))
-    assert np.all(after.wfe > 2.0 * after.wfe_refocused)
-    for k, field in enumerate(fields):
-        # after three mirrors the light goes along the focal plane's Z; where the line is put into its focus none is
-        # left but for the field, which moves a little under the pixel
-        refocused = {**moved, f"{ROOT}/focal_plane": Motion(shift=(0.0, 0.0, float(after.defocus[0, k])))}
-        again = image_quality(gf7_pair, backend, [refocused], (field,)).cameras[CAMERA]
-        assert abs(again.defocus[0, 0]) < 1e-8
-        assert again.wfe[0, 0] == pytest.approx(after.wfe_refocused[0, k], abs=1e-5)
-        # and it is how far the crossing of close rays moves, but for the aberrations that come along
-        change = after.defocus[0, k] - nominal.defocus[0, k]
-        crossing = [close_crossing(gf7_pair, backend, state, field) for state in ({}, moved)]
-        assert change == pytest.approx(crossing[1] - crossing[0], rel=0.02)
-        assert abs(change) > 2.0 * abs(despace)  # magnified along the light
-
-
-def close_crossing(instrument, backend, state, field: float) -> float:
-    """Mean distance downstream of the focal plane at which rays of 1 mm around the chief ray cross it, metres."""
-    direction = light_of(instrument, backend, state, field)
-    launch = launched(instrument, backend, state, direction)[0]
-    system = assemble(instrument.assembly, [f"{CAMERA}/imaging"], [state])
-    side = np.cross(direction, [0.0, 1.0, 0.0])
-    side /= np.linalg.norm(side)
-    other = np.cross(direction, side)
-    around = launch + 1e-3 * np.array([0 * side, side, -side, other, -other])
-    position, leaving, *_ = (a[0] for a in trace(backend, system, make_rays(backend, around, direction)).numpy())
-    slope = leaving[:, :2] / np.abs(leaving[:, 2:])
-    offset, spread = position[1:, :2] - position[0, :2], slope[1:] - slope[0]
-    return float(-np.sum(offset * spread) / np.sum(spread**2))
-
-
 @pytest.mark.parametrize("s", [0, 1])
 def test_mtf_is_that_of_the_path_that_images_edges(gf7_pair, backend, quality, s: int) -> None:
     """Required: 1e-4. Nodes, wavelengths and the solution of the fit are others, 1e-6; a line in its nominal place."""
@@ -279,7 +243,3 @@ def test_files_have_each_number_under_its_key(quality) -> None:
     assert told["wfe_rms_waves"] == camera.wfe[1].mean()
     assert told["wfe_rms_waves_focus_removed"] == camera.wfe_refocused[1].mean()
     assert told["wfe_worst_waves"] == camera.wfe[1].max()
-
-
-def test_nothing_is_worked_out_of_nothing(gf7_pair, backend) -> None:
-    assert quality_dicts(gf7_pair, backend, []) == []

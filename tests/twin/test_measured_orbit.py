@@ -4,6 +4,7 @@ import csv
 import json
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,13 +24,14 @@ from scenes.specs.measured.orbit_data_setup import (
 )
 from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.specs.orbit.angle import EffectsSpec
-from scenes.specs.orbit.setup import resolve_angle, resolve_calibration, resolve_simulate
+from scenes.specs.orbit.setup import resolve_angle, resolve_simulate
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back, scaled, set_keys, small
-from twin.orbit.angle.angle_run import run_angle
+from twin.orbit.angle.angle_run import SimulatedAngleRun, run_angle
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
 from twin.orbit.calibration.calibration_export import simulation_exported
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
@@ -269,35 +271,6 @@ def test_two_lines_calibrate(campaign, files) -> None:
         assert abs(error) < 5.0 * two.sigma[f"{line} f"]
 
 
-@pytest.mark.second
-def test_gross_errors_are_left_out_and_named(campaign, files) -> None:
-    """A tenth of the image points moved by 10 to 30 pixels; the estimates stay within 2 sigmas of the clean ones."""
-    random, wrong = np.random.default_rng(3), {}
-
-    def spoilt(heads, rows, name=""):
-        found = []
-        for row in rows:
-            cells = list(row)
-            if row[0].startswith("c") and random.random() < 0.1:
-                cells[3] = repr(float(row[3]) + float(random.choice([-1, 1]) * random.uniform(10.0, 30.0)))
-                wrong.setdefault(name, set()).add((row[0], row[1]))
-            found.append(cells)
-        return heads, found
-
-    for name in FIELDS:
-        edit(files.parent / name / "image_points.csv", partial(spoilt, name=name))
-    set_keys(files, screening="robust")
-    _, again = read_back(files)
-    for name in FIELDS:
-        assert wrong[name] <= set(again.rejected[name].points)
-        # right ones are lost rarely: a residual beyond the limit has a chance of 1e-3 or so
-        assert len(again.rejected[name].points) <= len(wrong[name]) + 4
-    clean, found = simultaneous(campaign), simultaneous(again)
-    sigma = np.array([found.sigma[n] for n in found.names])
-    free = sigma > 0.0
-    assert np.abs((found.values - clean.values)[free] / sigma[free]).max() < 2.0
-
-
 def test_points_in_a_gap_of_the_readings_are_refused(files) -> None:
     edit(
         files.parent / "Beijing/attitude.csv",
@@ -309,31 +282,17 @@ def test_points_in_a_gap_of_the_readings_are_refused(files) -> None:
     assert told.value.line is not None
 
 
-def _ccds(first_shift, second_shift):
-    return [
-        {"first": 0, "last": 5999, "shift": first_shift, "rotate": "20 arcsec"},
-        {"first": 6000, "last": 11999, "shift": second_shift},
-    ]
-
-
 @pytest.mark.second
 def test_ccds_that_do_not_lie_in_line_are_known_not_estimated(tmp_path) -> None:
     """A nadir line of two CCDs, one a pixel and a half off: flown with them and analysed with them, the calibration is
     right to its sigmas; analysed as one straight line, the fit is impossible. False alarms 1e-6."""
     data = WHOLE.camera.plain()
-    data["lines"]["nadir"]["ccds"] = _ccds(["10 um", "0 um"], ["-10 um", "3 um"])
-    (tmp_path / "camera.yaml").write_text(dump_yaml(data))
-    test = dict(read_yaml(SCENES / ORBIT / "calibrate.yaml").data)
-    test |= {
-        "camera": str(tmp_path / "camera.yaml"),
-        "fields": {name: test["fields"][name] for name in FIELDS},
-        "schemes": [list(FIELDS)],
-        "repeats": 0,
-        "points": {**test["points"], "control": 30, "check": 10},
-    }
-    test["errors"]["star_tracker"].pop("thermal")
-    (tmp_path / "test.yaml").write_text(dump_yaml(test))
-    setup = resolve_calibration(tmp_path / "test.yaml")
+    data["lines"]["nadir"]["ccds"] = [
+        {"first": 0, "last": 5999, "shift": ["10 um", "0 um"], "rotate": "20 arcsec"},
+        {"first": 6000, "last": 11999, "shift": ["-10 um", "3 um"]},
+    ]
+    camera = ThreeLineCameraSpec.model_validate(data)
+    setup = small(**no_thermal(), schemes=(FIELDS,)).model_copy(update={"camera": camera})
     one = flown(setup)
     file = export(tmp_path / "data", setup, one)
     _, again = read_back(file)
@@ -346,8 +305,7 @@ def test_ccds_that_do_not_lie_in_line_are_known_not_estimated(tmp_path) -> None:
     error = np.array([found.value(n) - truth[n] for n in free])
     square = error @ np.linalg.solve(found.covariance[np.ix_(where, where)], error)
     assert 1e-6 < chi2.sf(square, len(free)) < 1.0 - 1e-6
-    straight = WHOLE.camera.plain()
-    (tmp_path / "data/camera.yaml").write_text(dump_yaml(straight))
+    (tmp_path / "data/camera.yaml").write_text(dump_yaml(WHOLE.camera.plain()))
     assert simultaneous(read_back(file)[1]).p_value < 1e-6
 
 
@@ -395,10 +353,10 @@ def no_thermal() -> dict:
 
 @pytest.mark.second
 def test_intersection_angles_of_measured_passes(tmp_path) -> None:
-    """Four campaigns of two passes: alpha and beta against the true camera, whose principal points have moved by 60 um
+    """Two campaigns of two passes: alpha and beta against the true camera, whose principal points have moved by 60 um
     or 19 arcsec; within the sigmas, false alarm 1e-6 to either side."""
     z = []
-    for seed in range(4):
+    for seed in range(2):
         setup = small(**no_thermal())
         file = export(tmp_path / str(seed), setup, flown(setup, seed))
         found = run_measured_angle(resolve_measured_angle(angle_file(file.parent)))
@@ -470,7 +428,7 @@ def test_files_of_simulations_and_of_measurements_are_told_apart() -> None:
     assert resolve_any_angle(folder / "angle.yaml").test.name == "angle"
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_points_of_simulated_images_are_exported_where_they_were_found(tmp_path) -> None:
     """A patch of 400 pixels: control points lie where the true camera sees their given coordinates, but for the errors
     of matching (0.1 px), of the orthophoto and of the elevation model (0.5 m and 2 m of 5 m pixels)."""
@@ -531,17 +489,14 @@ def test_angles_of_a_simulation_and_of_its_exported_files(tmp_path, changes) -> 
     assert two.resection.angle_covariance(pairs) == pytest.approx(spread, rel=1e-8)
 
 
-@pytest.mark.slow
-def test_angles_that_files_cannot_hold_are_not_exported(files, tmp_path) -> None:
-    """Traced lines; and measurements, which are files."""
-    traced = run(
-        "angle", SCENES / ORBIT / "angle_gf7.yaml", "--out", tmp_path / "run", "--export", tmp_path / "other", "--quiet"
-    )
-    assert traced.exit_code == 2
-    assert "the lines of an instrument are traced" in traced.output
-    measured = run(
-        "angle", angle_file(files.parent), "--out", tmp_path / "run", "--export", tmp_path / "other", "--quiet"
-    )
-    assert measured.exit_code == 2
-    assert "measurements are files already" in measured.output
-    assert not (tmp_path / "other").exists()
+def test_angles_that_files_cannot_hold_are_not_exported(files) -> None:
+    """Traced lines, which no payload's file says; and measurements, which are files already."""
+    traced = SimulatedAngleRun.__new__(SimulatedAngleRun)
+    measured = SimpleNamespace(setup=resolve_measured_angle(angle_file(files.parent)))
+    object.__setattr__(traced, "setup", resolve_angle(SCENES / ORBIT / "angle_gf7.yaml"))
+    for run_, key, words in (
+        (traced, "camera", "the lines of an instrument are traced"),
+        (measured, "data", "measurements are files already"),
+    ):
+        with pytest.raises(InputError, match=rf"{key}: {words}"):
+            angle_exported(run_)

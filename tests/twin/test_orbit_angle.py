@@ -14,7 +14,7 @@ from analysis.units import ARCSEC
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
-from tests.twin.commands import invoke, refused
+from tests.twin.commands import edited_copy, invoke, refused
 from twin.orbit.angle.angle_flight import AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, frame_rows, run_angle, tls_angles
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
@@ -158,16 +158,6 @@ def test_scatter_of_200_passes_matches_sigma(full) -> None:
         assert np.abs(scatter.bias).max() < 3.3 * scatter.sigma.max() / np.sqrt(count)
 
 
-def test_sigma_by_hand(full) -> None:
-    """The station's 0.5 m moves both planes of an angle: 0.5 m times the length of the difference of 1/range square to
-    each plane (a triangle of 25 deg); the mean of 60 points of 1.5 m adds twice. 5% for relief and the ends of strips.
-    """
-    h, slant = ABOVE, triangle()[1]
-    station = 0.5**2 * (1 / h**2 + 1 / slant**2 - 2 * np.cos(LOOK) / (h * slant))
-    points = 1.5**2 / 60 * (1 / h**2 + 1 / slant**2)
-    assert full.planes.sigma == pytest.approx(np.sqrt(station + points), rel=0.05)
-
-
 def test_frames(full) -> None:
     """Rounding: 6e6 m times eps is 1e-9 m, over 5e5 m some 1e-15 rad; 1e-7 arcsec is 500 times that."""
     reference = full.estimate.angles["tls"].values
@@ -225,21 +215,7 @@ def test_a_datum_shift_is_the_stations_shift_reversed() -> None:
     assert np.abs(datum.bias).max() > ARCSEC
 
 
-def test_planes_and_resection_agree(full) -> None:
-    """They share station and points, so that they differ by less than the sigma of either."""
-    assert np.abs(full.difference).max() < 5.0 * full.difference_sigma.max()
-    assert full.difference_sigma.max() < 0.25 * full.planes.sigma.min()
-
-
 # The command
-
-
-def write(folder: Path, old: str, new: str) -> Path:
-    text = EXAMPLE.read_text("utf-8")
-    assert text.count(old) == 1, old
-    path = folder / "small.yaml"
-    path.write_text(text.replace(old, new), "utf-8")
-    return path
 
 
 # what is wrong, key, what to do about it
@@ -268,6 +244,6 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input(case: str, tmp_path: Path) -> None:
     old, new, key, words = BAD[case]
-    path = write(tmp_path, old, new)
+    path = edited_copy(EXAMPLE, tmp_path, (old, new))
     line = refused(run, "angle", path, key, words)
     assert key.split(".")[-1] in path.read_text("utf-8").splitlines()[line - 1]

@@ -9,16 +9,13 @@ import pytest
 
 import twin.orbit.__main__ as command
 from analysis.units import ARCSEC
-from optics.geometry.tree import Motion
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from tests.tiers import quick
-from tests.twin.commands import invoke, refused
-from twin.monitor.truth import trace_truth
+from tests.twin.commands import edited_copy, invoke, refused
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, run_angle, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import traced_line_cameras
 
 run = partial(invoke, command.app)
 PAIR, LINES = (resolve_angle(SCENES / ORBIT / f"{name}.yaml") for name in ("angle_gf7", "angle_off_axis"))
@@ -64,45 +61,6 @@ def test_the_ground_tells_the_traced_angle(changed, state: str, effects: LightEf
     assert np.abs(estimate.angles["tls"].values - flight.dihedral["alpha"]).max() < 2e-3 * ARCSEC
 
 
-@pytest.mark.second
-def test_mirrors_and_heat_reach_the_ground(gf7_pair, changed, backend) -> None:
-    """A mirror's turn and figure in one camera, in place of the example's changes."""
-    state = {
-        "base/forward/M1": Motion(rotate=(3 * ARCSEC, 1 * ARCSEC, 0.0), figure={7: 20e-9}),
-        "base/backward/M2": Motion(shift=(1e-6, 0.0, 2e-6)),
-    }
-    camera = replace(changed, cameras=traced_line_cameras(gf7_pair, backend, state))
-    flight = fly(without_errors(PAIR), camera, np.random.SeedSequence(6))
-    change = found(flight, NO_EFFECTS).look[0] - flight.before_launch.look["alpha"]
-    truth = trace_truth(gf7_pair, backend, [state]).angle_change[0]
-    assert abs(truth) > 3.0 * ARCSEC
-    assert abs(change - truth) < 1e-3 * ARCSEC
-
-
-def test_height_of_one_arcsecond(changed) -> None:
-    """Slant range over the sine of the convergence times the cosine of the other ray's zenith angle, on a sphere of the
-    mean curvature. 1.5%: the orbit's height varies by 2 km, and the Earth turns while 41 s pass."""
-    flight = fly(PAIR, changed, np.random.SeedSequence(5))
-    radius, above = 6.37e6, 504.7e3
-    zenith = [np.arcsin((radius + above) / radius * np.sin(np.radians(a))) for a in (26.0, 5.0)]
-    slant = radius * np.sin(zenith[0] - np.radians(26.0)) / np.sin(np.radians(26.0))
-    expected = slant * ARCSEC / np.sin(zenith[0] + zenith[1]) * np.cos(zenith[1])
-    assert flight.height_per_arcsec()["alpha"] == pytest.approx(expected, rel=0.015)
-    # base over height, 0.57: H d(angle) (1 + (B/H)^2 / 4) / (B/H) for a symmetric pair is 5.0 m at 505 km
-    assert 4.5 < expected < 5.5
-
-
-@pytest.mark.second
-def test_scatter_of_the_pair(backend) -> None:
-    """Chi-square of 100 passes to either side at 1e-4: three statements."""
-    changes = {"base/backward/focal_plane": PAIR.test.perturb["base/backward/focal_plane"]}
-    few = PAIR.model_copy(update={"test": PAIR.test.model_copy(update={"passes": 100, "perturb": changes})})
-    full = run_angle(few, backend, 2)
-    for scatter in (full.planes, full.along, full.resection):
-        assert scatter.tail[0] > 1e-4
-        assert np.abs(scatter.bias[0]) < 3.9 * scatter.sigma[0] / np.sqrt(100)
-
-
 # Off-axis lines
 
 
@@ -144,17 +102,6 @@ def test_parallel_lines_are_folded_and_the_report_says_so() -> None:
 # The command
 
 
-def write(folder: Path, old: str, new: str) -> Path:
-    """The example, changed; without the gradient, whose finite elements take seconds."""
-    text = (SCENES / ORBIT / "angle_gf7.yaml").read_text("utf-8")
-    for before, after in ((GRADIENT, ""), (old, new)):
-        assert text.count(before) == 1, before
-        text = text.replace(before, after)
-    path = folder / "small.yaml"
-    path.write_text(text, "utf-8")
-    return path
-
-
 # what is wrong, key, what to do about it
 BAD = {
     "node": (
@@ -185,6 +132,6 @@ BAD = {
 @pytest.mark.parametrize("case", quick(3, BAD))
 def test_bad_input(case: str, tmp_path: Path) -> None:
     old, new, key, words = BAD[case]
-    path = write(tmp_path, old, new)
+    path = edited_copy(SCENES / ORBIT / "angle_gf7.yaml", tmp_path, (GRADIENT, ""), (old, new))
     line = refused(run, "angle", path, key, words)
     assert key.split(".")[-1] in path.read_text("utf-8").splitlines()[line - 1]

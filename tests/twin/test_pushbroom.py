@@ -100,22 +100,6 @@ def test_marks_lie_where_the_sensor_says(name: str) -> None:
         assert np.abs(level[0] - line).max() > 3.0
 
 
-def test_ten_metres_of_height_move_the_forward_image() -> None:
-    """By hand: the look of 25 degrees meets the ground at sin z = (6371 + 500)/6371.6 sin 25; a place that is higher by
-    h is seen where the ground h tan z farther ahead is, which the image reaches later. 2%: the sphere, the attitude."""
-    zenith = np.arcsin((6371.0 + 500.0) / 6371.6 * np.sin(np.radians(25.0)))
-    rows = []
-    for height in (600.0, 610.0):
-        one = lines()["forward"]
-        window = window_of("forward", one.sensor, FRAME, 600.0, (80, 80))
-        done = photograph("forward", Terrain.flat(height), spots(np.zeros(1), np.zeros(1)), window=window)
-        rows.append(centroid(done.photons, 40.0, 40.0)[0])
-    sensor = lines()["forward"].sensor
-    step = sensor.ground(window.middle[0] + np.array([0.0, 1.0]), np.array([6000.0]), 600.0)
-    advance = np.linalg.norm(step[1] - step[0])
-    assert rows[1] - rows[0] == pytest.approx(10.0 * np.tan(zenith) / advance, rel=0.02)
-
-
 def test_an_image_does_not_depend_on_its_window() -> None:
     """Each pixel's value is its own: single-precision transforms of 1e5 samples leave 1e-6 of the brightest."""
     terrain = rough()
@@ -230,21 +214,6 @@ def test_what_stands_before_the_lens_takes_light_and_contrast() -> None:
         assert abs(np.angle(other.transfer(*place, motion)[0])) / (2.0 * np.pi * low[0]) < 1e-4  # pixels
 
 
-def test_motion_of_an_oblique_image() -> None:
-    """By hand: on the ground a pixel of the forward line is 1/cos z longer along the track than across, and a line's
-    time moves the satellite's view by as much as at nadir; 1%."""
-    sensor, zenith = lines()["forward"].sensor, np.arcsin((6371.0 + 500.0) / 6371.3 * np.sin(np.radians(25.0)))
-    window = window_of("forward", sensor, FRAME, 300.0, (100, 100))
-    motion = ImageMotion.of(sensor, *window.middle, 300.0)
-    line, pixel = window.middle
-    points = sensor.ground(line + np.array([0.0, 1.0, 0.0]), pixel + np.array([0.0, 0.0, 1.0]), 300.0)
-    advance, width = (np.linalg.norm(points[k] - points[0]) for k in (1, 2))
-    assert motion.advance == pytest.approx(advance * np.cos(zenith) / width, rel=0.01)
-    assert abs(motion.drift) < 0.01
-    window = window_of("nadir", lines()["nadir"].sensor, FRAME, 300.0, (100, 100))
-    assert ImageMotion.of(lines()["nadir"].sensor, *window.middle, 300.0).advance == pytest.approx(1.0, abs=0.01)
-
-
 def test_steep_terrain_is_refused() -> None:
     """The forward look lies 27 degrees off the vertical: slopes of 63 degrees hide ground, gentler ones do not."""
     one = lines()["forward"]
@@ -313,11 +282,3 @@ def test_light_falls_off_along_the_line_by_the_fourth_power_of_the_cosine() -> N
     light = [render_patch(sensor, one.optics, scene, Window(line, k, 40, 40)).photons.mean(axis=0) for k in (30, 5980)]
     angle = np.arctan(((30 + np.arange(40) + 0.5) * 2.0 / pixels - 1.0) * tangent)
     np.testing.assert_allclose(light[0] / light[1].mean(), np.cos(angle) ** 4, rtol=2e-5)
-
-
-def test_a_wide_line_loses_a_fifth_of_its_light_at_twenty_degrees() -> None:
-    wide = LineCamera(
-        "wide", 2000, np.array([[0.0, 0.0, 1.0], [0.0, -np.tan(np.radians(20.0)), 0.0]]), np.zeros((1, 3))
-    )
-    ends = wide.relative_illumination(np.array([-0.5, 999.5, 1999.5]))
-    np.testing.assert_allclose(ends, [np.cos(np.radians(20.0)) ** 4, 1.0, np.cos(np.radians(20.0)) ** 4], rtol=1e-12)

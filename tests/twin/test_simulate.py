@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import twin.orbit.__main__ as command
 from scenes.specs.load import ORBIT, SCENES
-from tests.twin.commands import files, invoke, refused
+from tests.twin.commands import edited_copy, files, invoke, refused
 
 run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "simulate.yaml"
@@ -24,13 +24,8 @@ LINES = ("forward", "nadir", "backward")
 
 
 def write(folder: Path, *changes: tuple[str, str]) -> Path:
-    text = EXAMPLE.read_text("utf-8")
-    for old, new in ((SIZE, SMALL), (POINTS, ""), *changes):
-        assert text.count(old) == 1, old
-        text = text.replace(old, new)
-    path = folder / "small.yaml"
-    path.write_text(text, "utf-8")
-    return path
+    """Write the example with small images."""
+    return edited_copy(EXAMPLE, folder, (SIZE, SMALL), (POINTS, ""), *changes)
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +125,4 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input(case: str, tmp_path: Path) -> None:
     old, new, key, words = BAD[case]
-    path = write(tmp_path, (old, new)) if old != SMALL else write(tmp_path)
-    if old == SMALL:
-        path.write_text(path.read_text("utf-8").replace(old, new), "utf-8")
-    refused(run, "simulate", path, key, words)
+    refused(run, "simulate", write(tmp_path, (old, new)), key, words)
