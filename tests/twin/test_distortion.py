@@ -135,6 +135,7 @@ def test_noise_of_the_spots_is_as_stated():
     assert low < np.var(rest) * 55 / 51 / np.mean(spots.fixed**2 + spots.temporal**2 / 10) < high
 
 
+@pytest.mark.second
 def test_result_agrees_with_the_truth():
     data = DISTORTION(run())
     truth = data["truth"]

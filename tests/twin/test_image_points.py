@@ -130,7 +130,7 @@ def parameters_fit(campaign: Campaign) -> None:
     assert error @ np.linalg.solve(spread, error) < chi2.isf(1e-4, len(chosen))
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_calibration_from_images() -> None:
     """Two patches of one field."""
     setup = resolve_calibration(CALIBRATE)

@@ -58,6 +58,7 @@ def test_blurred_images_are_those_of_many_more_nodes(blurred, defocus: float) ->
     assert largest(got, with_nodes(path, dense).expected_photons(states, single=False)) < ACCURACY
 
 
+@pytest.mark.second
 def test_the_check_finds_what_the_choice_overlooks(blurred, monkeypatch) -> None:
     """A wavefront whose blur the few rays do not show: more nodes are taken until two rules agree."""
     path = blurred(DEFOCUS[1])
@@ -70,6 +71,7 @@ def test_the_check_finds_what_the_choice_overlooks(blurred, monkeypatch) -> None
     assert largest(got, want) < image_sampling.GOOD
 
 
+@pytest.mark.second
 def test_what_no_nodes_can_do_is_refused(blurred, monkeypatch) -> None:
     path = blurred(0.3)
     path.expected_photons([{}])

@@ -240,6 +240,7 @@ def test_columns_in_pixels_and_readings_that_fall(folder: Path) -> None:
     assert mirrored.value("principal_point") == pytest.approx(-fit.value("principal_point"), abs=1e-6)
 
 
+@pytest.mark.second
 def test_a_moved_focal_plane_and_a_moved_target(folder: Path) -> None:
     there = focus_of(folder).states[0].defocus
     text = (folder / "focus.yaml").read_text()
@@ -280,6 +281,7 @@ def shifted(path: Path, head: str, off: float, circle: bool = False) -> None:
     write(path, rows)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("around", [0.0, 355.0])
 def test_readings_across_the_zero_of_the_circle(folder: Path, around: float) -> None:
     """A table that counts from 0 to 360 deg and is used on both sides of its zero: as if it had counted on."""

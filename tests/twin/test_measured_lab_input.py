@@ -17,6 +17,7 @@ from analysis.turntable.dividing_error import CalibrationSeries, expected_reject
 from scenes.specs.load import SCENES
 from scenes.specs.resolved import resolve_focus_test
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from twin.lab import app
 from twin.laboratory.focus_report import focus_report
 from twin.laboratory.focus_run import align_files
@@ -147,7 +148,7 @@ TABLES = [
 ]
 
 
-@pytest.mark.parametrize(("command", "spoil", "told"), TABLES, ids=[f"{k}-{n}" for n, (k, _, _) in enumerate(TABLES)])
+@pytest.mark.parametrize(("command", "spoil", "told"), quick(16, TABLES))
 def test_bad_tables(folder: Path, tmp_path: Path, command: str, spoil: Callable, told: str | None) -> None:
     edited(folder / TABLE[command], spoil)
     done = CliRunner().invoke(app, [command, str(folder / f"{command}.yaml"), "--out", str(tmp_path / "run")])
@@ -188,7 +189,7 @@ FILES = [
 ]
 
 
-@pytest.mark.parametrize(("command", "old", "new", "told"), FILES, ids=[f"{f[0]}-{k}" for k, f in enumerate(FILES)])
+@pytest.mark.parametrize(("command", "old", "new", "told"), quick(9, FILES))
 def test_bad_files(folder: Path, tmp_path: Path, command: str, old: str, new: str, told: str) -> None:
     file = folder / f"{command}.yaml"
     text = file.read_text()
@@ -246,6 +247,7 @@ def stack(folder: Path, images: Path) -> Path:
     return folder
 
 
+@pytest.mark.second
 def test_a_stack_that_the_twin_did_not_make(stack: Path) -> None:
     run = align_files(resolve_focus_test(stack / "focus.yaml").test)  # type: ignore[arg-type]
     true = np.array([-20e-6, -40e-6, -20e-6, -40e-6])
@@ -260,6 +262,7 @@ def test_a_stack_that_the_twin_did_not_make(stack: Path) -> None:
     assert not run.readings.no_edge
 
 
+@pytest.mark.second
 def test_an_image_in_uneven_light_is_named(stack: Path) -> None:
     """A light that is no plane; one that is costs sigma alone."""
     row, column = np.mgrid[-1:1:64j, -1:1:64j]
@@ -300,7 +303,7 @@ IMAGES = [
 ]
 
 
-@pytest.mark.parametrize(("spoil", "told"), IMAGES, ids=[told.replace(" ", "-") for _, told in IMAGES])
+@pytest.mark.parametrize(("spoil", "told"), quick(3, IMAGES))
 def test_bad_images(stack: Path, tmp_path: Path, spoil: Callable[[Path], object], told: str) -> None:
     spoil(stack)
     done = CliRunner().invoke(app, ["focus", str(stack / "focus.yaml"), "--out", str(tmp_path / "run")])

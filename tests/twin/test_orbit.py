@@ -70,6 +70,7 @@ def test_acceleration_is_the_gradient_of_the_potential() -> None:
     assert np.min(np.linalg.norm(acceleration(r) + GM * r / 6.9e6**3, axis=-1)) > 5e-3
 
 
+@pytest.mark.second
 def test_energy_and_the_polar_component_of_angular_momentum_are_conserved(two_days) -> None:
     _, r, v = two_days
     energy = 0.5 * np.sum(v * v, axis=-1) - potential(r)
@@ -78,6 +79,7 @@ def test_energy_and_the_polar_component_of_angular_momentum_are_conserved(two_da
     assert np.ptp(polar) < 1e-11 * abs(polar[0])
 
 
+@pytest.mark.second
 def test_the_node_follows_the_mean_sun(two_days) -> None:
     t, r, v = two_days
     node, inclination = angles(r, v)

@@ -158,6 +158,7 @@ def test_scatter_of_200_passes_matches_sigma(full) -> None:
         assert np.abs(scatter.bias).max() < 3.3 * scatter.sigma.max() / np.sqrt(count)
 
 
+@pytest.mark.second
 def test_frames(full) -> None:
     """Rounding: 6e6 m times eps is 1e-9 m, over 5e5 m some 1e-15 rad; 1e-7 arcsec is 500 times that."""
     reference = full.estimate.angles["tls"].values

@@ -152,7 +152,7 @@ def test_covariance_of_changes_holds_all_three_laws():
 MEASURED = SCENES / "orbit" / "measured" / "adjust.yaml"
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_measured_passes_as_their_calibration_has_them():
     """The tables of the shipped campaign: two image points of control points were moved by some pixels."""
     found = run_adjustment(resolve_any_adjust(MEASURED), None, 0)

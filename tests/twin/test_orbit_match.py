@@ -17,6 +17,7 @@ from scenes.specs.measured.orbit_data_setup import MatchSetup
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.orbit.setup import load_three_line_camera, resolve_simulate
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke
 from twin.orbit.images.simulate_run import Simulation, run_simulation
@@ -77,7 +78,7 @@ def test_points_in_files_are_where_the_true_sensor_has_them(flown: Simulation, f
     assert np.all(np.isnan(found.measurements.ground.itrs[role == "tie"]))
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, tmp_path: Path) -> None:
     """Columns the other way round, said so: the same points to a hundredth of a pixel."""
     folder, data = files
@@ -132,7 +133,7 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("change", "told"), WRONG)
+@pytest.mark.parametrize(("change", "told"), quick(0, WRONG))
 def test_what_does_not_fit_is_refused(files, change: dict[str, Any], told: str | None) -> None:
     folder, data = files
     if told is None:
@@ -143,6 +144,7 @@ def test_what_does_not_fit_is_refused(files, change: dict[str, Any], told: str |
         matched(folder, {**data, **change})
 
 
+@pytest.mark.second
 def test_heights_that_no_ground_has_are_refused(files, tmp_path: Path) -> None:
     """One of them, as a flipped bit makes it, would put the ground beyond the Earth."""
     folder, data = files

@@ -160,6 +160,7 @@ def test_values_between_measurements() -> None:
 # What monitoring buys
 
 
+@pytest.mark.second
 def test_monitoring_takes_out_nearly_all(quiet) -> None:
     """Without noise and temperatures. The estimator is linear, with the Jacobian of the nominal camera: arcseconds of
     the focal plane's turn about X and Y, which it does not assume, leave 1e-3 of themselves; 1% of all is asked."""
@@ -173,6 +174,7 @@ def test_monitoring_takes_out_nearly_all(quiet) -> None:
     assert quiet.cases["parameters"].camera_height_rms < 2e-3
 
 
+@pytest.mark.second
 def test_height_without_monitoring_is_the_angle_times_metres_per_arcsec(quiet) -> None:
     """Traced metres of each camera's turn predict the height to 2%: the latitude changes the altitude by 1%, the scale
     and d_gamma add millimetres. Of the angle alone it is 5%, for the cameras do not turn by exactly half each."""
@@ -221,6 +223,7 @@ def test_a_prism_looks_like_a_camera_that_has_turned(noisy) -> None:
 # Stated disturbances
 
 
+@pytest.mark.second
 def test_the_noise_is_not_the_whole_error(stated) -> None:
     """Repeats scatter by the noise; the truth is missed by what the spots leave open, as the total sigma says."""
     seen, free = stated.scatter, len(stated.scatter.heights) - 1
@@ -235,6 +238,7 @@ def test_the_noise_is_not_the_whole_error(stated) -> None:
     assert stated.angle[0] == stated.angle_sigma[0] == stated.sigma_total[0] == 0.0
 
 
+@pytest.mark.second
 def test_smoothed_heights(stated) -> None:
     """At every interval no worse than linear between, less sure the fewer the measurements, and sure of the
     reference; with every time measured at least as sure as each measurement alone."""
