@@ -215,19 +215,6 @@ def test_terms_are_switched_one_by_one_and_do_not_touch_each_other() -> None:
     )
 
 
-def test_seeds() -> None:
-    path, t = trajectory(), np.linspace(-10.0, 10.0, 5)
-    one, again, other = (path.with_errors(SPEC, seed) for seed in (3, 3, 4))
-    assert np.array_equal(one.position(t), again.position(t))
-    assert np.array_equal(one.body_to_itrs(t), again.body_to_itrs(t))
-    assert np.min(np.abs(one.position(t) - other.position(t))) > 0.0
-    # errors replace errors, and off they are the truth to the bit
-    assert np.array_equal(other.with_errors(SPEC, 3).position(t), one.position(t))
-    for none in (replace(one, errors=None), path.with_errors(SPEC, 3, []), path.with_errors(ErrorsSpec(), 3)):
-        np.testing.assert_array_equal(none.position(t), path.position(t))
-        np.testing.assert_array_equal(none.body_to_itrs(t), path.body_to_itrs(t))
-
-
 def test_mistakes() -> None:
     with pytest.raises(ValueError, match="no such error: gps_nois; there are gps_noise"):
         trajectory().with_errors(SPEC, 1, ["gps_nois"])

@@ -167,21 +167,13 @@ def test_an_orbit_that_begins_with_the_image_is_carried_on(tmp_path: Path) -> No
     away = found.ground(row, 100.0) - whole.ground(row, 100.0)
     # times with nanoseconds make 4 um of position, which a spline 3 ms beyond its first points enlarges tenfold
     assert np.abs(away).max() < 1e-3
-    for gap, within in ((0.08, 8e-3), (0.2, None)):
-        # gravity alone, and not the axes' turn, bends the path: a seventh of 2.7 cm in 80 ms
-        later = made
-        for t in seconds:
-            later = later.replace(clock(scene, t), clock(scene, t + gap - 0.003), 1)
-        for (p, v), (q, u) in zip(
-            zip(place, speed, strict=True), zip(*scene.orbit(seconds + gap - 0.003), strict=True), strict=True
-        ):
-            later = later.replace(" ".join(map(repr, p.tolist())), " ".join(map(repr, q.tolist())), 1)
-            later = later.replace(" ".join(map(repr, v.tolist())), " ".join(map(repr, u.tolist())), 1)
-        path.write_text(text.replace("".join(points), later))
-        if within is not None:
-            first = read_dimap(path).spanning_orbit()
-            there = scene.orbit(first.clock.second[:1])[0]
-            assert np.abs(first.position[0] - there[0]).max() < within
+    # 200 ms are too much
+    for t, p, v in zip(seconds, place, speed, strict=True):
+        (q,), (u,) = scene.orbit(np.array([t + 0.197]))
+        made = made.replace(clock(scene, t), clock(scene, t + 0.197), 1)
+        for old, new in ((p, q), (v, u)):
+            made = made.replace(" ".join(map(repr, old.tolist())), " ".join(map(repr, new.tolist())), 1)
+    path.write_text(text.replace("".join(points), made))
     with pytest.raises(InputError, match="begins before the ephemeris"):
         read_scene(path)
 
@@ -349,30 +341,3 @@ def test_velocities_of_other_files_are_not_those_against_the_stars() -> None:
                     require_own_velocity(orbit)
             else:
                 require_own_velocity(orbit)
-
-
-def test_an_image_that_spans_ephemeris_and_samples_keeps_its_order(tmp_path: Path) -> None:
-    """Both begin with the first line and end with the last, as of SPOT 6: half a line lies outside at either end."""
-    scene = replace(SPOT, start=80_000.0, lines=6000)
-    whole = read_scene(write(tmp_path, scene)).sensor
-    last = scene.start + (scene.lines - 1) * scene.period
-    t = np.linspace(scene.start, last, 50)
-    place, speed = scene.orbit(t)
-    points = "".join(
-        f"<Point><LOCATION_XYZ>{' '.join(map(repr, p.tolist()))}</LOCATION_XYZ>"
-        f"<VELOCITY_XYZ>{' '.join(map(repr, v.tolist()))}</VELOCITY_XYZ><TIME>{clock(scene, s)}</TIME></Point>"
-        for s, p, v in zip(t, place, speed, strict=True)
-    )
-    turns = "".join(
-        f"<Quaternion>{''.join(f'<Q{k}>{v!r}</Q{k}>' for k, v in enumerate(q.tolist()))}"
-        f"<TIME>{clock(scene, s)}</TIME></Quaternion>"
-        for s, q in zip(t, scene.quaternions(t), strict=True)
-    )
-    text = re.sub(r"<Point_List>.*</Point_List>", f"<Point_List>{points}</Point_List>", dimap(scene), flags=re.DOTALL)
-    made = f"<Quaternion_List>{turns}</Quaternion_List>"
-    text = re.sub(r"<Quaternion_List>.*</Quaternion_List>", made, text, flags=re.DOTALL)
-    (tmp_path / "DIM_SCENE.XML").write_text(text)
-    found = read_scene(tmp_path / "DIM_SCENE.XML").sensor
-    row = np.array([-0.5, 0.0, 3000.0, scene.lines - 0.5])
-    # texts of times have nanoseconds, in which the satellite moves by 7 um; over a sample of 25 ms tenfold
-    assert np.abs(found.ground(row, 10.0) - whole.ground(row, 10.0)).max() < 1e-3

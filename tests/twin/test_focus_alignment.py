@@ -131,19 +131,6 @@ def test_coarse_shims_leave_what_their_rounding_leaves(bench, alignments, coarse
 
 
 @pytest.mark.second
-def test_a_second_round_goes_on_from_the_first(coarse) -> None:
-    assert len(coarse.states) == 3
-    first, second = (s.plan for s in coarse.shimmings)
-    np.testing.assert_allclose(second.thickness - second.rounded_change, first.thickness, rtol=0.0, atol=1e-12)
-    # what is left to do is what rounding left, and what the first plane was wrong by
-    wrong = np.sqrt(np.diag(first.change_covariance))
-    assert np.all(np.abs(second.change) < 25e-6 + 5.0 * wrong)
-    for state in coarse.states[1:]:
-        assert np.max(np.abs(state.true_defocus)) < CONFOCAL
-        assert abs(state.true_level) < LEVEL
-
-
-@pytest.mark.second
 def test_sense_of_the_motion(bench) -> None:
     """A CCD 80 um downstream of best focus sees the edge sharply when the target is moved along the light, which takes
     the image downstream as well, and not when it is moved against it.

@@ -144,13 +144,6 @@ WRONG_CSV = [
 ]
 
 
-@pytest.mark.parametrize(("text", "change", "told"), WRONG_CSV)
-def test_a_table_of_points_that_is_wrong(tmp_path: Path, text: str, change: dict[str, Any], told: str) -> None:
-    (tmp_path / "g.csv").write_text(text)
-    with pytest.raises(InputError, match=told):
-        read(tmp_path, **{k: v for k, v in {**BASE, **change}.items() if v is not None})
-
-
 POINT = {"type": "Feature", "id": "a", "properties": {}, "geometry": {"type": "Point", "coordinates": [116, 40, 1]}}
 WRONG_JSON = [
     ("{", "not JSON"),
@@ -172,14 +165,6 @@ WRONG_JSON = [
 ]
 
 
-@pytest.mark.parametrize(("data", "told"), WRONG_JSON)
-def test_geojson_that_is_wrong(tmp_path: Path, data: Any, told: str) -> None:
-    (tmp_path / "g.geojson").write_text(data if isinstance(data, str) else json.dumps(data))
-    with pytest.raises(InputError, match=told) as error:
-        read(tmp_path, file="g.geojson", sigma=["1 m", "1 m"])
-    assert error.value.file.endswith("g.geojson")
-
-
 WRONG_GCP = [
     ("", "no points"),
     ("1 40 116 10 1 1\n", "not a ground control point"),
@@ -196,12 +181,20 @@ WRONG_GCP = [
 ]
 
 
-@pytest.mark.parametrize(("text", "told"), WRONG_GCP)
-def test_a_gcp_file_that_is_wrong(tmp_path: Path, text: str, told: str) -> None:
-    (tmp_path / "g.gcp").write_text(text)
+WRONG = [
+    *(("csv", text, {**BASE, **change}, told) for text, change, told in WRONG_CSV),
+    *(("geojson", data, {"sigma": ["1 m", "1 m"]}, told) for data, told in WRONG_JSON),
+    *(("gcp", text, {"crs": "EPSG:4979"}, told) for text, told in WRONG_GCP),
+]
+
+
+@pytest.mark.parametrize("case", WRONG, ids=[f"{case[0]}-{k}" for k, case in enumerate(WRONG)])
+def test_a_file_of_points_that_is_wrong(tmp_path: Path, case: tuple[Any, ...]) -> None:
+    kind, data, said, told = case
+    (tmp_path / f"g.{kind}").write_text(data if isinstance(data, str) else json.dumps(data))
     with pytest.raises(InputError, match=told) as error:
-        read(tmp_path, file="g.gcp", crs="EPSG:4979")
-    assert error.value.file.endswith("g.gcp")
+        read(tmp_path, **{k: v for k, v in {**said, "file": f"g.{kind}"}.items() if v is not None})
+    assert kind == "csv" or error.value.file.endswith(f"g.{kind}")
 
 
 # --- maps -------------------------------------------------------------------------------------------------

@@ -144,34 +144,6 @@ def test_third_differences_show_the_white_noise(full) -> None:
         assert np.all(np.abs(orbit.white_sigma - errors.gps.noise[0]) < 5.0 * gps + 5e-3)
 
 
-@pytest.mark.second
-def test_schemes(full) -> None:
-    """Five, each on all fields. With its own parameters a field is left with noise, which scheme 5 tells: at most 2 m
-    in plan (0.3 px of 5 m and 0.5 arcsec, three lines). Of a scheme's mean the bias of a field differs by the season
-    and the latitude, 1 to 2 arcsec, 2.4 to 5 m."""
-    assert list(full.schemes) == ["1", "2", "3", "4", "5"]
-    for errors in full.schemes.values():
-        assert tuple(errors) == FIELDS
-        for one in errors.values():
-            assert one.count == SETUP.test.points.check
-            assert 0.5 < one.plan_rms < 15.0
-            assert 1.0 < one.height_rms < 6.0
-    assert max(e.plan_rms for e in full.schemes["5"].values()) < 2.5
-    assert full.schemes["1"]["Beijing"].plan_rms == pytest.approx(full.schemes["5"]["Beijing"].plan_rms, rel=1e-12)
-    # What a scheme leaves in plan is the difference of its bias from the field's own, over 500 km. Each axis has 0.4 m
-    # of two orbits' offsets and 0.35 m of two estimates of 0.1 arcsec beside it: 4 sigmas.
-    expected, found = [], []
-    own = {p.name: p.bias for p in full.campaign.passes}
-    noise = np.mean([e.plan_rms for e in full.schemes["5"].values()])
-    for scheme, names in zip(full.schemes, SETUP.test.schemes, strict=False):
-        mean = np.mean([own[name] for name in names], axis=0)
-        for name, errors in full.schemes[scheme].items():
-            expected.append(np.hypot(np.linalg.norm((mean - own[name])[:2]) * 500e3, noise))
-            found.append(errors.plan_rms)
-    assert found == pytest.approx(expected, abs=4.0 * np.hypot(0.42, 0.35))
-    assert np.corrcoef(found, expected)[0, 1] > 0.9
-
-
 # Effects on the light
 
 

@@ -15,11 +15,8 @@ from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.yaml.errors import InputError
 from tests.twin import orbit_file_bench as bench
 from tests.twin.orbit_bench import CirclePlatform
-from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.orbit.flight.line_camera import LinePiece, LineTimes, line_cameras
+from twin.orbit.flight.line_camera import LinePiece, line_cameras
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.platform_files import platform_table, read_platform
 
@@ -65,33 +62,6 @@ def platform(orbit: np.ndarray, attitude: np.ndarray, circle: CirclePlatform) ->
     turn = Rotation.from_matrix(circle.body_to_itrs(attitude)).as_quat(canonical=False)
     table = PlatformTable.of("2017-01-01T00:00:00Z", orbit, circle.position(orbit), None, attitude, turn)
     return TabulatedTrajectory(table)
-
-
-@pytest.mark.parametrize("which", ["both", "orbit", "attitude"])
-def test_images_as_long_as_orbit_or_attitude_have_a_sensor(which: str) -> None:
-    """40 passes whose lines fill the span that orbit and attitude share, to their halves, each cut to microseconds."""
-    random = np.random.default_rng({"both": 1, "orbit": 2, "attitude": 3}[which])
-    circle = CirclePlatform(span=(-np.inf, np.inf))
-    camera = line_cameras(load_three_line_camera("th1"))["nadir"]
-    for _ in range(40):
-        first, lines = round(float(random.uniform(-1e4, 1e4)), 6), int(random.integers(2, 20_000))
-        line_time = round(float(random.uniform(1e-4, 1e-3)), 10)
-        last = round(first + lines * line_time, 6)
-        fixes, looks = (np.linspace(first - x, last + x, 16) for x in random.uniform(0.5, 9.0, 2))
-        if which in ("both", "orbit"):
-            fixes = np.linspace(first, last, 16)
-        if which in ("both", "attitude"):
-            looks = np.linspace(first, last, 16)
-        path = platform(fixes, looks, circle)
-        times = LineTimes.even(first + 0.5 * line_time, line_time, lines)
-        sensor = Sensor.of_lines(camera, path, Earth(), times, NO_EFFECTS)
-        ground = sensor.ground(np.array([-0.5, lines - 0.5]), 100.0)
-        # half a microsecond beyond the readings a curve goes on as it came: 1e-6 m of 4 mm
-        whole = platform(np.linspace(first - 9, last + 9, 400), np.linspace(first - 9, last + 9, 400), circle)
-        there = replace(sensor, trajectory=whole).ground(np.array([-0.5, lines - 0.5]), 100.0)
-        assert np.abs(ground - there).max() < 1e-3
-        with pytest.raises(ValueError, match="outside of the readings"):
-            path.position(last + 10.0 if which != "both" else last + 3e-6)
 
 
 def test_a_gap_keeps_its_ends_to_rounding() -> None:

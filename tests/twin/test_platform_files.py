@@ -192,83 +192,59 @@ def edited(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
-OEM = [
-    ("CENTER_NAME = EARTH", "CENTER_NAME = MARS", "another body", 7),
-    ("REF_FRAME = GCRF", "REF_FRAME = MOD", "frame that cannot be read", 8),
-    ("TIME_SYSTEM = UTC", "TIME_SYSTEM = TDB", "time scale that cannot be read", 9),
-    ("TIME_SYSTEM = UTC\n", "", "no TIME_SYSTEM", None),
-    ("META_STOP\n", "", "ends early|key = value", None),
-    ("META_START\n", "", "before META_START|no data", None),
-    ("2011-03-05T03:04:30", "2011-03-05T03:04:61", "not a date and time", None),
-    ("2011-03-05T03:04:30", "2011-13-05T03:04:30", "not a date and time", None),
-    ("2011-03-05T03:04:30", "2011-03-05T03:01:30", "not later", None),
-    ("2011-03-05T03:04:30.000000 ", "2011-03-05T03:04:30.000000 x", "not a number|another length", None),
-    ("2011-03-05T03:04:30.000000 ", "2011-03-05T03:04:30.000000 1 2 ", "another length", None),
-    ("2011-03-05T03:04:30.000000 ", "2011-03-05T03:04:30.000000 nan 1 1 1 1 1\n# ", "not a finite number", None),
-    ("COMMENT states", "COMMENT s\nCOVARIANCE_START", "ends early|no data", None),
-    ("CCSDS_OEM_VERS", "CCSDS_AEM_VERS", "of another kind", 1),
+WRONG = [
+    ("oem", "CENTER_NAME = EARTH", "CENTER_NAME = MARS", "another body", 7),
+    ("oem", "REF_FRAME = GCRF", "REF_FRAME = MOD", "frame that cannot be read", 8),
+    ("oem", "TIME_SYSTEM = UTC", "TIME_SYSTEM = TDB", "time scale that cannot be read", 9),
+    ("oem", "TIME_SYSTEM = UTC\n", "", "no TIME_SYSTEM"),
+    ("oem", "META_STOP\n", "", "ends early|key = value"),
+    ("oem", "META_START\n", "", "before META_START|no data"),
+    ("oem", "2011-03-05T03:04:30", "2011-03-05T03:04:61", "not a date and time"),
+    ("oem", "2011-03-05T03:04:30", "2011-13-05T03:04:30", "not a date and time"),
+    ("oem", "2011-03-05T03:04:30", "2011-03-05T03:01:30", "not later"),
+    ("oem", "2011-03-05T03:04:30.000000 ", "2011-03-05T03:04:30.000000 x", "not a number|another length"),
+    ("oem", "2011-03-05T03:04:30.000000 ", "2011-03-05T03:04:30.000000 1 2 ", "another length"),
+    ("oem", "2011-03-05T03:04:30.000000 ", "2011-03-05T03:04:30.000000 nan 1 1 1 1 1\n# ", "not a finite number"),
+    ("oem", "COMMENT states", "COMMENT s\nCOVARIANCE_START", "ends early|no data"),
+    ("oem", "CCSDS_OEM_VERS", "CCSDS_AEM_VERS", "of another kind", 1),
+    ("aem", "ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = SPIN", "another type"),
+    ("aem", "ATTITUDE_DIR = A2B", "ATTITUDE_DIR = AB", "no such direction"),
+    ("aem", "QUATERNION_TYPE = LAST", "QUATERNION_TYPE = MIDDLE", "no such type"),
+    ("aem", "REF_FRAME_B = SC_BODY_1", "REF_FRAME_B = EME2000", "must be the body's"),
+    ("aem", "REF_FRAME_A = ICRF", "REF_FRAME_A = RTN", "frame that cannot be read"),
+    ("aem", "REF_FRAME_A = ICRF\n", "", "no REF_FRAME_A"),
+    ("aem", "TIME_SYSTEM = UTC", "TIME_SYSTEM = MET", "time scale that cannot be read"),
+    ("aem", "DATA_START\n", "DATA_START\n2011-03-05T03:04:00.000000 0 0 0\n", "another length"),
+    ("aem", "DATA_START\n", "DATA_START\n2011-03-05T03:03:59.000000 1 1 0 0\n", "not a quaternion"),
+    ("aem", "DATA_START\n", "DATA_START\n2011-03-05T03:03:59.000000 a 1 0 0\n", "not a number"),
+    ("aem", "DATA_START\n", "DATA_START\n2011-03-05T03:09:59.000000 0 1 0 0\n", "not later"),
+    ("aem", "DATA_START\n", "DATA_START\n2011-03-05 0 1 0 0\n", "not a date and time"),
+    ("sp3", "%c M  cc GPS", "%c M  cc XYZ", "time scale that cannot be read"),
+    ("sp3", "%c", "%x", "no line %c|time scale"),
+    ("sp3", "ORBIT IGS20", "ORBIT J200Q", "frame that cannot be read"),
+    ("sp3", "*  2011  3  5  3  4 20", "*  2011  3  5  3  x 20", "not an epoch"),
+    ("sp3", "*  2011  3  5  3  4 20", "*  2011  3 35  3  4 20", "not a date and time"),
+    ("sp3", "*  2011  3  5  3  4 20", "*  2010  3  5  3  4 20", "not later"),
+    ("sp3", "PL51", "PL51   abc        ", "not a number"),
+    ("sp3", "PL51", "PL51     12.000000", "no place of a satellite"),
+    ("sp3", "VL51", "VX51", "velocities are missing"),
+    ("sp3", "PL51", "PL51\n", "not a number"),
 ]
+"""Format, text that becomes another one, what is told, and the line where it is that of the text."""
 
 
-@pytest.mark.parametrize(("old", "new", "told", "line"), OEM)
-def test_an_oem_that_is_wrong(tmp_path: Path, old: str, new: str, told: str, line: int | None) -> None:
-    bench.attitude_csv(tmp_path / "attitude.csv")
-    edited(bench.oem(tmp_path / "a.oem"), old, new)
-    with pytest.raises(InputError, match=told) as error:
-        read(tmp_path, {"file": "a.oem"}, CSV_ATTITUDE, earth=EARTH)
-    assert error.value.file.endswith("a.oem")
-    if line is not None:
-        assert error.value.line == line
-    assert "allowed" in str(error.value)
-
-
-AEM = [
-    ("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = SPIN", "another type"),
-    ("ATTITUDE_DIR = A2B", "ATTITUDE_DIR = AB", "no such direction"),
-    ("QUATERNION_TYPE = LAST", "QUATERNION_TYPE = MIDDLE", "no such type"),
-    ("REF_FRAME_B = SC_BODY_1", "REF_FRAME_B = EME2000", "must be the body's"),
-    ("REF_FRAME_A = ICRF", "REF_FRAME_A = RTN", "frame that cannot be read"),
-    ("REF_FRAME_A = ICRF\n", "", "no REF_FRAME_A"),
-    ("TIME_SYSTEM = UTC", "TIME_SYSTEM = MET", "time scale that cannot be read"),
-    ("DATA_START\n", "DATA_START\n2011-03-05T03:04:00.000000 0 0 0\n", "another length"),
-    ("DATA_START\n", "DATA_START\n2011-03-05T03:03:59.000000 1 1 0 0\n", "not a quaternion"),
-    ("DATA_START\n", "DATA_START\n2011-03-05T03:03:59.000000 a 1 0 0\n", "not a number"),
-    ("DATA_START\n", "DATA_START\n2011-03-05T03:09:59.000000 0 1 0 0\n", "not later"),
-    ("DATA_START\n", "DATA_START\n2011-03-05 0 1 0 0\n", "not a date and time"),
-]
-
-
-@pytest.mark.parametrize(("old", "new", "told"), AEM)
-def test_an_aem_that_is_wrong(tmp_path: Path, old: str, new: str, told: str) -> None:
+@pytest.mark.parametrize("case", WRONG, ids=[f"{case[0]}-{k}" for k, case in enumerate(WRONG)])
+def test_a_file_of_another_format_that_is_wrong(tmp_path: Path, case: tuple[Any, ...]) -> None:
+    kind, old, new, told, *line = case
     bench.orbit_csv(tmp_path / "orbit.csv")
-    edited(bench.aem(tmp_path / "a.aem"), old, new)
-    with pytest.raises(InputError, match=told) as error:
-        read(tmp_path, CSV_ORBIT, {"file": "a.aem", "body_axes": bench.AXES}, earth=EARTH)
-    assert error.value.file.endswith("a.aem")
-    assert "allowed" in str(error.value)
-
-
-SP3 = [
-    ("%c M  cc GPS", "%c M  cc XYZ", "time scale that cannot be read"),
-    ("%c", "%x", "no line %c|time scale"),
-    ("ORBIT IGS20", "ORBIT J200Q", "frame that cannot be read"),
-    ("*  2011  3  5  3  4 20", "*  2011  3  5  3  x 20", "not an epoch"),
-    ("*  2011  3  5  3  4 20", "*  2011  3 35  3  4 20", "not a date and time"),
-    ("*  2011  3  5  3  4 20", "*  2010  3  5  3  4 20", "not later"),
-    ("PL51", "PL51   abc        ", "not a number"),
-    ("PL51", "PL51     12.000000", "no place of a satellite"),
-    ("VL51", "VX51", "velocities are missing"),
-    ("PL51", "PL51\n", "not a number"),
-]
-
-
-@pytest.mark.parametrize(("old", "new", "told"), SP3)
-def test_an_sp3_file_that_is_wrong(tmp_path: Path, old: str, new: str, told: str) -> None:
     bench.attitude_csv(tmp_path / "attitude.csv")
-    edited(bench.sp3(tmp_path / "a.sp3"), old, new)
+    edited(getattr(bench, kind)(tmp_path / f"a.{kind}"), old, new)
+    file = {"file": f"a.{kind}", **{"sp3": {"satellite": "L51"}, "aem": {"body_axes": bench.AXES}}.get(kind, {})}
     with pytest.raises(InputError, match=told) as error:
-        read(tmp_path, {"file": "a.sp3", "satellite": "L51"}, CSV_ATTITUDE)
-    assert error.value.file.endswith("a.sp3")
+        read(tmp_path, CSV_ORBIT if kind == "aem" else file, file if kind == "aem" else CSV_ATTITUDE, earth=EARTH)
+    assert error.value.file.endswith(f"a.{kind}")
+    assert line in ([], [error.value.line])
+    assert kind == "sp3" or "allowed" in str(error.value)
 
 
 def test_of_several_satellites_one_must_be_named(tmp_path: Path) -> None:
