@@ -236,6 +236,10 @@ REFUSED = {
         _edit("<DEGREE>3</DEGREE><COEFFICIENTS>", "<DEGREE>3</DEGREE><COEFFICIENTS>1 "),
         r"COEFFICIENTS: another number of",
     ),
+    "looks away": (
+        lambda t: t.replace("Q0>", "Qx>").replace("Q2>", "Q0>").replace("Qx>", "Q2>"),
+        r"the middle of the image does not look at the Earth",
+    ),
     "not unit": (lambda t: re.sub(r"(<Q1><DEGREE>3</DEGREE><COEFFICIENTS>)\S+", r"\g<1>3.5", t), r"not a quaternion"),
     "a coordinate lost": (lambda t: re.sub(r'"m">(-?)(\d+)', r'"m">\1', t), r"no place of a satellite"),
     "offset": (lambda t: re.sub(r"<OFFSET>[^<]*<", "<OFFSET>9e9<", t), r"OFFSET: out of bounds"),

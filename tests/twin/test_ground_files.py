@@ -114,14 +114,19 @@ def test_heights_above_a_geoid(tmp_path: Path, ending: str) -> None:
 
 
 def test_a_geoid_that_does_not_reach(tmp_path: Path) -> None:
-    with rasterio.open(
-        tmp_path / "n.tif", "w", driver="GTiff", width=4, height=4, count=1, dtype="float32", crs="EPSG:4326",
-        transform=from_origin(10.0, 50.0, 1.0, 1.0),
-    ) as file:  # fmt: skip
-        file.write(np.zeros((4, 4), "f4"), 1)
-    table(tmp_path)
-    with pytest.raises(InputError, match="beyond the grid of the geoid"):
-        read(tmp_path, file="g.csv", crs="EPSG:4326", heights="geoid", geoid="n.tif", sigma=["1 m", "1 m"])
+    """Nor one that holds nothing there, nor one of other numbers than undulations."""
+    table(tmp_path, PLACES[:1])
+    for west, value, words in (
+        (10.0, 0.0, "beyond the grid of the geoid"),
+        (114.0, -99.0, "holds nothing"),
+        (114.0, 151.0, "no heights of a geoid"),
+    ):
+        how = {"driver": "GTiff", "width": 4, "height": 4, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+        place = from_origin(west, 42.0, 1.0, 1.0)
+        with rasterio.open(tmp_path / "n.tif", "w", transform=place, nodata=-99.0, **how) as file:
+            file.write(np.full((4, 4), value, "f4"), 1)
+        with pytest.raises(InputError, match=words):
+            read(tmp_path, file="g.csv", crs="EPSG:4326", heights="geoid", geoid="n.tif", sigma=["1 m", "1 m"])
 
 
 BASE = {"file": "g.csv", "crs": "EPSG:4979", "sigma": ["1 m", "1 m"]}
@@ -140,6 +145,11 @@ WRONG_CSV = [
     (GOOD.replace("height [m]", "height"), {}, "without a unit"),
     (GOOD.replace("height [m]", "height [m],x [m]").replace(",10", ",10,1"), {}, "one complete set"),
     (GOOD.replace("point,", "point,role,").replace("a,", "a,boss,"), {}, "no such role"),
+    (
+        GOOD.replace("height [m]", f"height [m],sigma [m],{','.join(SIGMAS)}").replace(",10", ",10,1,1,1,1"),
+        {},
+        "in two ways",
+    ),
     (GOOD.replace("height [m]", "height [m],sigma_up [m]").replace(",10", ",10,1"), {}, "sigmas are not complete"),
 ]
 
@@ -272,7 +282,10 @@ WRONG_MAP = [
     ({"file": "complex.tif", "heights": "ellipsoid"}, "no grey values or heights"),
     ({"file": "high.tif", "heights": "ellipsoid"}, "no heights of ground"),
     ({"file": "far.tif", "heights": "ellipsoid"}, "does not show what the images show"),
-    ({"file": "image.png", "heights": "ellipsoid"}, "not a raster|another format"),
+    ({"file": "image.png", "heights": "ellipsoid"}, "a raster of another format"),
+    ({"file": "tall.tif", "heights": "ellipsoid"}, "no heights of ground"),
+    ({"file": "empty.tif", "heights": "ellipsoid"}, "a map without values"),
+    ({"file": "utm.tif", "heights": "ellipsoid", "crs": "EPSG:99999"}, "no system that PROJ knows"),
 ]
 
 
@@ -282,11 +295,14 @@ def test_a_map_that_is_wrong(tmp_path: Path, said: dict[str, Any], told: str) ->
     (tmp_path / "text.tif").write_text("no TIFF")
     (tmp_path / "cut.tif").write_bytes((tmp_path / "utm.tif").read_bytes()[:3000])
     (tmp_path / "plain.tif").write_bytes(tiff(np.zeros((1, 40, 40), "f4"), map_facts(raster(), "").__class__()))
-    (tmp_path / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    with rasterio.open(tmp_path / "image.png", "w", driver="PNG", width=4, height=4, count=1, dtype="uint8") as file:
+        file.write(np.zeros((4, 4), "u1"), 1)
     how = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "crs": "EPSG:32650"}
     for name, dtype, corner, value in (
         ("complex.tif", "complex64", (499_000.0, 4_429_000.0), 1.0),
         ("high.tif", "float32", (499_700.0, 4_428_400.0), -32768.0),
+        ("tall.tif", "float32", (499_700.0, 4_428_400.0), 15_000.0),
+        ("empty.tif", "float32", (499_700.0, 4_428_400.0), np.nan),
         ("far.tif", "float32", (299_000.0, 4_429_000.0), 1.0),
     ):
         place = from_origin(*corner, 20.0, 20.0)

@@ -145,6 +145,9 @@ GROUND = {
     "negative sigma": (cell(4, 5, "-1.0"), [":4: sigma [m]", "out of range", "0 to 1e+06"]),
     "some exact": (cell(4, 5, "0.0"), [":4: sigma [m]", "some sigmas are zero"]),
     "sigma of a plan alone": (swapped("sigma [m]", "plan_sigma [m]"), ["no column 'height_sigma'"]),
+    "two ways": (lambda t: _with_column(t, "plan_sigma [m]", "1.0"), ["sigmas are given in two ways"]),
+    "no correlation": (lambda t: _with_column(t, "correlation_xy", "0.1"), ["correlations go with x_sigma"]),
+    "no covariance": (lambda t: _correlated(t), [":2: correlation_xy", "these correlations contradict each other"]),
     "nobody controls": (swapped("control", "check"), ["no control point is seen"]),
     "nobody checks": (lambda t: t.replace("check", "control").replace(",0.0\n", ",1.0\n"), ["no check point is seen"]),
     "no name": (cell(3, 0, ""), [":3: point", "an empty cell"]),
@@ -174,6 +177,14 @@ IMAGES = {
 def _with_column(text: str, head: str, value: str) -> str:
     head_row, *rows = text.strip().split("\n")
     return "\n".join([f"{head_row}, {head}", *(f"{row},{value}" for row in rows)]) + "\n"
+
+
+def _correlated(text: str) -> str:
+    """Sigmas along all axes, of which each is against another what the third denies."""
+    text = text.replace("sigma [m]", "x_sigma [m]")
+    for head, value in (("y_sigma [m]", "1"), ("z_sigma [m]", "1"), ("correlation_xy", "1"), ("correlation_xz", "1")):
+        text = _with_column(text, head, value)
+    return _with_column(text, "correlation_yz", "-1")
 
 
 TABLES = {"orbit": ORBIT, "attitude": ATTITUDE, "lines": LINES, "ground": GROUND, "image_points": IMAGES}
@@ -217,6 +228,13 @@ TESTS = {
     "screening": (swapped("screening: none", "screening: maybe"), ["screening", "robust"]),
     "passes as well": (lambda t: t + "passes: {}\n", ["data", "once"]),
 }
+SAID["ties of control"] = (
+    swapped(
+        "    image_points: Beijing/image_points.csv\n",
+        "    image_points: Beijing/image_points.csv\n    tie_points: Beijing/image_points.csv\n",
+    ),
+    ["this point has coordinates in", "another name"],
+)
 SAID["no quaternion"] = (lambda t: re.sub(r"  quaternion:\n(    .*\n)+", "", t), ["quaternion is missing"])
 FILES = {"data": SAID, "calibrate": TESTS}
 

@@ -145,6 +145,9 @@ def test_clocks_across_a_leap_second() -> None:
         Readings.of_texts(["2016-12-30T23:59:60.5"]).instants("UTC")
     with pytest.raises(Problem, match="only UTC has"):
         Readings.of_texts(texts).instants("GPS")
+    for text in ("2011-366T00:00:00", "1960-01-01T00:00:00", "2011-3-05T00:00:00"):
+        with pytest.raises(Problem, match="not a date and time"):
+            Readings.of_texts([text])
     assert epoch_before(utc) == "2016-12-31T23:59:59Z"
     assert tai_minus_utc(57753) == 36.0
     assert tai_minus_utc(57754) == 37.0
@@ -229,6 +232,8 @@ WRONG = [
     ("sp3", "PL51", "PL51     12.000000", "no place of a satellite"),
     ("sp3", "VL51", "VX51", "velocities are missing"),
     ("sp3", "PL51", "PL51\n", "not a number"),
+    ("sp3", "PL51", "PL51   1e200      ", "larger than any quantity"),
+    ("sp3", "*  2011  3  5  3  4 15.00000000\n", "", "a record before the first epoch"),
 ]
 """Format, text that becomes another one, what is told, and the line where it is that of the text."""
 
@@ -269,6 +274,16 @@ CSV = [
     ({}, {"frame": "orbital"}, "which orbital frame"),
     ({}, {"file": "orbit.csv"}, "no such column"),
     ({"file": "attitude.csv"}, {}, "no such column"),
+    ({"file": "a.aem"}, {}, "message of another kind"),
+    ({}, {"file": "a.oem"}, "message of another kind"),
+    ({"file": "p.oem", "frame": "ITRS"}, {}, "said differently by the file"),
+    ({"file": "p.oem", "frame": None, "satellite": "X"}, {}, "no such satellite"),
+    ({"file": "untimed.csv"}, {}, "times are not said once"),
+    ({"file": "seconds.csv"}, {}, "times in seconds without their epoch"),
+    ({"file": "seconds.csv", "epoch": "2099-12-31T23:59:59"}, {}, "outside the years of this time scale"),
+    ({"file": "seconds.csv", "epoch": "2011-03-05T03:05:00"}, {}, "velocities are not complete"),
+    ({"file": "leap.csv", "time_scale": "GPS"}, {}, "only UTC has"),
+    ({}, {"file": "leap.csv"}, "not one complete set of columns|no such column"),
 ]
 
 
@@ -278,6 +293,16 @@ def test_a_table_of_which_something_is_not_said(
 ) -> None:
     bench.orbit_csv(tmp_path / "orbit.csv")
     bench.attitude_csv(tmp_path / "attitude.csv")
+    bench.oem(tmp_path / "p.oem")
+    place = "x [m],y [m],z [m]"
+    for name, text in {
+        "a.aem": "CCSDS_AEM_VERS = 1.0\n",
+        "a.oem": "CCSDS_OEM_VERS = 2.0\n",
+        "untimed.csv": f"{place}\n7e6,0,0\n7e6,0,1\n",
+        "seconds.csv": f"time [s],{place},vx [m/s]\n0,7e6,0,0,1\n9e5,7e6,0,1,1\n",
+        "leap.csv": f"date_time,{place}\n2016-12-31T23:59:59,7e6,0,0\n2016-12-31T23:59:60,7e6,0,1\n",
+    }.items():
+        (tmp_path / name).write_text(text)
     for base, change in ((CSV_ORBIT, orbit), (CSV_ATTITUDE, attitude)):
         change |= {k: v for k, v in base.items() if k not in change}
     asked = [{k: v for k, v in one.items() if v is not None} for one in (orbit, attitude)]
@@ -313,6 +338,7 @@ def test_an_orbit_table_that_is_wrong(tmp_path: Path, old: bytes, new: bytes, to
     assert error.value.line in (1, 12)
 
 
+C04 = "2011   3   5   0  55625.00" + "   0.1   0.1   0.2" + "   0.1" * 12 + " 0.1\n"
 EOP = [
     ("not numbers at all and long enough to hold a date and what not, so that columns exist\n", "not a number|few"),
     ("", "too few days"),
@@ -325,6 +351,8 @@ EOP = [
     ("mjd,ut1_utc [s],x_pole [arcsec],y_pole [arcsec]\n" + "".join(f"{k},0,0,0\n" for k in range(5)), "range"),
     ("2011   3   5   0  55625.00\n" * 5, "few|columns|line|number"),
     ("\xff\n", "few|line"),
+    (C04 * 4 + C04.replace(" 0.1\n", "\n"), "a row of another length"),
+    ("".join(C04.replace("55625", f"5562{k}").replace("0.2", "3.0") for k in range(5)), "not Earth orientation"),
     ("mjd,ut1_utc [s],x_pole [arcsec],y_pole [arcsec]\n" + "".join(f"556{k}5,0,0,0\n" for k in "2468"), "gap"),
 ]
 
