@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from optics.geometry.pose import rotation_vector
 from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec, OrbitSpec
-from twin.orbit.flight.earth import RATE, Earth
+from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
 
@@ -109,21 +109,6 @@ def test_yaw_steering_stops_the_drift_along_the_line(nadir: str, latitude: float
         along, across = nadir_drift(trajectory(nadir, "none", latitude), t)
         # up to 4 degrees at the equator, with cos(latitude); these are below 80 degrees
         assert abs(across / along) > 0.01
-
-
-def test_yaw_angle_at_the_equator() -> None:
-    # inertial velocity (v cos i, v sin i) east and north; the ground takes (omega r, 0) away
-    steered, free = trajectory("geocentric", "yaw", 0.0), trajectory("geocentric", "none", 0.0)
-    turn = rotation_vector(free.body_to_itrs(0.0).T @ steered.body_to_itrs(0.0))
-    position, inertial = free.position(0.0), free.inertial_velocity(0.0)
-    speed, r = np.linalg.norm(inertial), np.linalg.norm(position)
-    inclination = math.acos(np.cross(position, inertial)[2] / (r * speed))
-    drift = math.atan2(math.cos(inclination) - RATE * r / speed, math.sin(inclination)) - math.atan2(
-        math.cos(inclination), math.sin(inclination)
-    )
-    # descending: the track lies to the west of the inertial velocity, right of a satellite going south
-    np.testing.assert_allclose(turn, [0.0, 0.0, -drift], atol=1e-12)
-    assert 3.5 < math.degrees(-drift) < 4.2
 
 
 def test_offset_is_a_turn_of_the_body() -> None:

@@ -100,19 +100,6 @@ def test_line_follows_the_turn_and_the_middle_is_zero():
 
 
 @pytest.mark.second
-def test_spots_are_found_where_the_chief_rays_go():
-    """Centroids, less the design's offset, against chief rays: noise and what the window cuts off."""
-    r = run()
-    off = r.spots.position - r.truth.place[..., 0]
-    off = off - np.mean(off)
-    assert off.size == 550
-    # noise of frames and columns is 20 nm; coma beyond the design and the window's edge leave some 10 nm over the field
-    assert np.std(off) < 40 * NM
-    slope = np.polyfit(np.tan(r.bench.turn), np.mean(off, axis=1), 1)[0]
-    assert abs(slope) < 0.2 * r.compensated.fit.sigma("principal_distance")
-
-
-@pytest.mark.second
 def test_noise_of_the_spots_is_as_stated():
     """The same spots on another day's frames: temporal noise, and columns that stay."""
     b = within(altered(points=55, setting=0.0))

@@ -145,16 +145,6 @@ def test_intersected_points_against_least_squares(sensors) -> None:
         np.testing.assert_allclose(got / np.outer(scale, scale), wanted / np.outer(scale, scale), atol=2e-3)
 
 
-@pytest.mark.second
-def test_three_lines_know_heights_better_than_two(sensors) -> None:
-    only = uncertainty(platform=np.zeros((6, 6)), interior=np.zeros((3, 3)))
-    two = intersected_accuracy({n: sensors[n] for n in ("nadir", "forward")}, only, HEIGHT)
-    three = intersected_accuracy({n: sensors[n] for n in ("nadir", "forward", "backward")}, only, HEIGHT)
-    middle = slice(5, 10)  # lines that all three see
-    assert np.all(three.le90[middle] < 0.6 * two.le90[middle])
-    assert not np.any(two.constant[two.seen])
-
-
 def test_maps_of_a_pass(sensors) -> None:
     places = {name: (s, 0, s.camera.pixels) for name, s in sensors.items()}
     maps = maps_of(places, uncertainty(), HEIGHT)

@@ -12,7 +12,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import load_camera, load_instrument
 from tests.hunt.dense_images import DenseImages
 from twin.monitor import image_sampling, monitor_beams, monitor_path
-from twin.monitor.image_sampling import WRONG, NodeClasses, UncertainImageError, disagreement, lost_or_gained
+from twin.monitor.image_sampling import WRONG, NodeClasses, UncertainImageError, lost_or_gained
 from twin.monitor.monitor_path import MonitorPath
 
 ACCURACY = 3e-6  # of the peak: what classes of blurred spots are chosen for, in double precision
@@ -120,17 +120,6 @@ def test_energy_leaves_room_for_diffraction_alone() -> None:
     # one quarter is surely on the image, one surely not
     for light, expected in ((0.1, -0.07), (0.2, 0.0), (0.8, 0.0), (0.9, 0.07)):
         assert lost_or_gained(np.array([light]), place, share, half, wings)[0] == pytest.approx(expected)
-
-
-@pytest.mark.second
-def test_disagreement_is_of_the_peak(blurred) -> None:
-    path = blurred(DEFOCUS[0])
-    x, y = path.grid(1), path.grid(0)
-    field, dense = (with_nodes(path, n).fields([{}]) for n in (path.nodes, quadrature.disk_for(90.0)))
-    images = monitor_path.image(field, x, y)
-    assert np.max(disagreement(images, dense, x, y)) < ACCURACY
-    images[0] += 1e-3 * images[0].max()
-    assert disagreement(images, dense, x, y)[0] == pytest.approx(1e-3, rel=0.02)
 
 
 def test_classes_grow_to_the_most_phase() -> None:

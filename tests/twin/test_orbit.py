@@ -14,7 +14,6 @@ from twin.orbit.flight.orbit import (
     J2,
     Orbit,
     acceleration,
-    node_rate,
     propagate,
     sun_synchronous_inclination,
 )
@@ -87,30 +86,6 @@ def test_the_node_follows_the_mean_sun(two_days) -> None:
     # 360 deg in a year of 365.2422 days; second-order terms of J2 are a few 1e-3
     assert rate == pytest.approx(0.98565, rel=3e-3)
     assert 97.3 < np.degrees(np.mean(inclination)) < 97.4
-
-
-@pytest.mark.second
-def test_nodes_of_other_inclinations_move_at_the_secular_rate() -> None:
-    # -3/2 n J2 (R/p)^2 cos i by mean elements, themselves averaged over whole revolutions
-    for inclination in (30.0, 63.4, 120.0):
-        found = orbit(
-            before="0 s",
-            after="24 h",
-            elements={
-                "altitude": "600 km",
-                "inclination": f"{inclination} deg",
-                "node": "20 deg",
-                "argument": "10 deg",
-            },
-        )
-        t = np.linspace(0.0, DAY, 8001)
-        r, v = found.equatorial(t)
-        node, tilt = angles(r, v)
-        axis = 1.0 / (2.0 / np.linalg.norm(r, axis=-1) - np.sum(v * v, axis=-1) / GM)
-        known = node_rate(float(np.mean(axis)), 0.0, float(np.mean(tilt)))
-        # the mean over samples leaves short periods to 1e-3, terms of J2^2 are of that size too
-        assert np.polyfit(t, node, 1)[0] == pytest.approx(known, rel=5e-3)
-        assert np.sign(known) == -np.sign(math.cos(math.radians(inclination)))
 
 
 def test_published_sun_synchronous_inclinations() -> None:

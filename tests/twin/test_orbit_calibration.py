@@ -129,21 +129,6 @@ def test_before_calibration_errors_are_of_the_100_m_class(full) -> None:
         assert errors.height_rms == pytest.approx(height, rel=0.1)
 
 
-@pytest.mark.second
-def test_third_differences_show_the_white_noise(full) -> None:
-    """5 sigmas; a circular orbit adds 8 mm to the orbit's, and the drift less than its step of 14 mm in a second."""
-    errors = SETUP.test.errors
-    for field in full.fields.values():
-        attitude, orbit = field.attitude, field.orbit
-        # third differences of white noise correlate, which makes its sigma 1.5 times as uncertain
-        tracker, gps = (
-            1.5 * noise.noise[0] * np.sqrt(0.5 * noise.interval / (2.0 * SETUP.test.span))
-            for noise in (errors.star_tracker, errors.gps)
-        )
-        assert np.all(np.abs(attitude.white_sigma - errors.star_tracker.noise[0]) < 5.0 * tracker)
-        assert np.all(np.abs(orbit.white_sigma - errors.gps.noise[0]) < 5.0 * gps + 5e-3)
-
-
 # Effects on the light
 
 
@@ -271,18 +256,6 @@ def test_latitude_fit_is_as_good_as_it_says() -> None:
     assert np.std(ratios) == pytest.approx(np.sqrt(5.0 / 3.0), rel=5.0 * 0.07)
     # a variance of 5 degrees of freedom: relative sigma sqrt(2 / 5)
     assert np.mean(rests) == pytest.approx(1.5**2, rel=5.0 * np.sqrt(2.0 / 5.0 / 400.0))
-
-
-def test_without_a_season_latitude_is_all() -> None:
-    """Chi-squares of 200 draws add up; false alarm 1e-6 to either side."""
-    random = np.random.default_rng(9)
-    latitude = np.radians([40.0, 32.0, 44.0, 29.6, 46.0, 44.0, 28.0])
-    own = np.diag(np.linspace(0.1, 0.3, 7) ** 2)
-    total = 0.0
-    for _ in range(200):
-        value = -3.0 * np.sin(latitude - 0.7) + np.sqrt(np.diag(own)) * random.standard_normal(7)
-        total += fitted("roll", latitude, value, own).chi_square
-    assert 1e-6 < chi2.sf(total, 200 * 5) < 1.0 - 1e-6
 
 
 # Datum, seam, campaigns

@@ -172,19 +172,6 @@ def idle(setup: LoopSetup, backend) -> LoopRun:
 
 
 @pytest.mark.second
-def test_gain_nothing_is_the_open_loop_to_the_bit(idle: LoopRun) -> None:
-    one, two = idle.closed, idle.open
-    for name in ("positions", "expected", "covariance", "chi_square"):
-        assert np.array_equal(getattr(one.course, name), getattr(two.course, name)), name
-    assert one.course.states == two.course.states
-    assert np.array_equal(one.truth, two.truth)
-    for name, errors in vars(one.heights).items():
-        assert np.array_equal(errors, getattr(two.heights, name)), name
-    assert np.array_equal(one.images[0].errors, two.images[0].errors)
-    assert idle.margin == np.inf
-
-
-@pytest.mark.second
 def test_a_loop_near_its_limit_or_that_makes_anything_worse_leads_the_verdict(idle: LoopRun) -> None:
     """Changes of cameras a fifth larger with the loop closed, and foci half of a percent, of which nobody speaks."""
     told = loop_report(idle)

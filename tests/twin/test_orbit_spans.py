@@ -100,30 +100,18 @@ def test_attitude_against_the_orbit_may_be_longer_than_it(tmp_path: Path) -> Non
     """Angles from 60 s before to 60 s after, an orbit of which 20 s at either end are missing."""
     t = np.arange(-60.0, 60.0 + 1e-9, 0.25)
     angles = np.zeros((3, len(t))).tolist()
-    bench.csv(
-        tmp_path / "a.csv",
-        ("date_time", "roll [deg]", "pitch [deg]", "yaw [deg]"),
-        [bench.calendar(s) for s in t],
-        *angles,
-    )
+    heads = ("date_time", "roll [deg]", "pitch [deg]", "yaw [deg]")
+    bench.csv(tmp_path / "a.csv", heads, [bench.calendar(s) for s in t], *angles)
     bench.orbit_csv(tmp_path / "whole.csv")
     head, *rows = (tmp_path / "whole.csv").read_text().splitlines()
     (tmp_path / "short.csv").write_text("\n".join([head, *rows[20:-20]]) + "\n")
     (tmp_path / "none.csv").write_text("\n".join([head, *rows[:3]]) + "\n")
 
+    turn = {"file": "a.csv", "time_scale": "UTC", "frame": "orbital", "nadir": "geodetic", "steering": "yaw"}
+    turn |= {"sequence": "xyz", "body_axes": ["forward", "right", "down"]}
+
     def read(name: str) -> PlatformTable:
-        data = {
-            "orbit": {"file": name, "frame": "ITRS", "time_scale": "UTC"},
-            "attitude": {
-                "file": "a.csv",
-                "time_scale": "UTC",
-                "frame": "orbital",
-                "nadir": "geodetic",
-                "steering": "yaw",
-                "sequence": "xyz",
-                "body_axes": ["forward", "right", "down"],
-            },
-        }
+        data = {"orbit": {"file": name, "frame": "ITRS", "time_scale": "UTC"}, "attitude": turn}
         return platform_table(*read_platform(PlatformFilesSpec.model_validate(data), tmp_path), bench.EPOCH)
 
     short, whole = (TabulatedTrajectory(read(f"{name}.csv")) for name in ("short", "whole"))

@@ -239,23 +239,6 @@ HILLS = TerrainSpec.model_validate({"kind": "fractal", "relief": "60 m", "height
 GROUND = GroundSpec(terrain=HILLS)
 
 
-def fly(seed: int, size: tuple[int, int] = (60, 70)):
-    return fly_patch(lines(), PLACE, size, GROUND, ControlSpec(), np.random.SeedSequence(seed))
-
-
-@pytest.mark.second
-def test_true_points_are_the_inverse() -> None:
-    """The last step of the way to the terrain is 1e-5 m."""
-    patch = fly(1)
-    row, column = np.array([0.0, 13.2, 59.0]), np.array([69.0, 40.7, 0.0])
-    for name in LINES:
-        points = patch.true_point(name, row, column)
-        line, pixel = patch.images[name].sensor.image(points)
-        assert np.stack([line, pixel]) == pytest.approx(np.stack(patch.images[name].image_point(row, column)), abs=1e-4)
-        east, north, height = patch.frame.local(points)
-        assert height == pytest.approx(patch.terrain.height(east, north), abs=1e-4)
-
-
 def test_what_cannot_be_imaged() -> None:
     spec, control, seed = GROUND, ControlSpec(), np.random.SeedSequence(1)
     cases = [

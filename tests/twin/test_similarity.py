@@ -24,8 +24,6 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.scenery import build_scenery
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.load import load_camera, load_instrument
-from scenes.specs.spectrum import SpectrumSpec
-from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_beams import CcdRays
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.truth import trace_truth
@@ -195,34 +193,6 @@ def test_targets_are_imaged_on_the_same_pixels(with_camera, backend) -> None:
             )
             # what the polynomials leave of both; growth that is left out anywhere is 5e-5
             np.testing.assert_allclose(new, old, rtol=0, atol=1e-7)
-
-
-def redder(instrument: Instrument, size: float) -> Instrument:
-    """The same instrument for light whose wavelengths are ``size`` times as long."""
-    cameras = {}
-    for name, model in instrument.cameras.items():
-        bands = {
-            key: band.model_copy(update={"spectrum": SpectrumSpec.evenly(*(size * w for w in band.spectrum.ends))})
-            for key, band in model.spec.bands.items()
-        }
-        cameras[name] = replace(model, spec=model.spec.model_copy(update={"bands": bands}))
-    return replace(instrument, cameras=cameras)
-
-
-@pytest.mark.second
-def test_image_quality_is_the_same_for_light_that_grows_too(with_camera, backend) -> None:
-    instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
-    state = heated(instrument, ALUMINIUM, motions=MOVED)
-    before = image_quality(instrument, backend, [MOVED])
-    after = image_quality(redder(instrument, grown), backend, [state], wavelength=grown * before.wavelength)
-    for name, old in before.cameras.items():
-        new = after.cameras[name]
-        np.testing.assert_allclose(new.wfe, old.wfe, rtol=1e-7)
-        # 1e-14 m of rounding in a path is 1e-11 m of defocus at F/9
-        np.testing.assert_allclose(new.defocus, grown * old.defocus, rtol=0, atol=3e-11)
-        for key in ("mtf_along_line", "mtf_along_track"):
-            # what polynomials leave; growth that is left out anywhere is 5e-5
-            np.testing.assert_allclose(getattr(new, key), getattr(old, key), rtol=0, atol=1e-7)
 
 
 def test_rendered_spots_stay_on_their_pixels(with_camera, backend) -> None:
