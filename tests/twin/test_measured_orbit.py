@@ -390,6 +390,17 @@ def test_the_angle_command_on_measurements(files) -> None:
     refused = run("angle", angle_file(folder, time="10 min"), "--out", folder / "no")
     assert refused.exit_code == 2
     assert "time: orbit or attitude are not known then" in " ".join(refused.stderr.split())
+    for kept, words in ((2, "which lines the angles lie between is not said"), (0, "too few line cameras")):
+        for name in FIELDS:
+            edit(
+                folder / name / "image_points.csv",
+                lambda heads, rows, kept=kept: (
+                    heads,
+                    [*[r for r in rows if r[1] == "forward"][:kept], *(r for r in rows if r[1] == "nadir")],
+                ),
+            )
+        with pytest.raises(InputError, match=words):
+            run_measured_angle(resolve_measured_angle(angle_file(folder)))
 
 
 @pytest.mark.second

@@ -10,8 +10,9 @@ from scenes.specs.load import SCENES
 from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
 from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
 from scenes.yaml.errors import InputError
+from twin.orbit.block.block_numbers import CHANGE
 from twin.orbit.block.block_report import block_report
-from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
+from twin.orbit.block.block_run import ALL, NOTHING, CameraChange, run_adjustment
 from twin.orbit.block.drawn_block import draw_block
 from twin.orbit.block.measured_block import measured_block
 from twin.orbit.block.pass_knowledge import change_covariance
@@ -139,6 +140,17 @@ def test_scenes_that_share_no_ground_are_an_error_with_a_key(tmp_path):
         run_adjustment(alone, None, 1)
 
 
+def test_changes_of_cameras_have_arcseconds_and_micrometres():
+    """Found, sigma, sigma before the block and truth, each of the four under its own key and unit."""
+    scale = np.array([np.pi / 648000.0] * 3 + [1e-6])
+    rows = [scale * (10.0 * k + np.arange(1.0, 5.0)) for k in range(4)]
+    numbers = CHANGE(CameraChange(*rows))
+    for k, end in enumerate(("", "_sigma", "_sigma_before", "_true")):
+        for j, key in enumerate(("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")):
+            assert numbers[f"{key}{end}"] == pytest.approx(10.0 * k + j + 1.0, rel=1e-12), (key, end)
+    assert CHANGE(CameraChange(*rows[:3], None))["d_f_um_true"] is None
+
+
 def test_ground_points_that_are_none_are_refused():
     """Shapes, names, roles, coordinates and covariances."""
     good = [np.array(["a", "b"], object), np.zeros((2, 3)), np.eye(3), "control"]
@@ -198,6 +210,11 @@ def test_monitor_readings_of_measured_passes_hold_the_cameras(tmp_path):
     file = tmp_path / "adjust.yaml"
     file.write_text(text + monitor, "utf-8")
     block, given = measured_block(resolve_any_adjust(file))
+    setup_ = resolve_any_adjust(file)
+    known = {name: change for name, change in setup_.test.changes.items() if name != "nadir"}
+    setup_ = setup_.model_copy(update={"test": setup_.test.model_copy(update={"changes": known})})
+    with pytest.raises(BenchError, match="it is not said how nadir may have changed"):
+        measured_block(setup_)
     known = block.monitored["nadir"]
     # what lasts is read in one pass and known in both, to the reading's sigma
     assert known.mean[0, 3] == pytest.approx(20e-6, rel=1e-3)

@@ -176,6 +176,14 @@ def test_what_is_exported_is_the_pass_that_was_read() -> None:
         )
 
 
+def test_too_few_points_are_refused(files, tmp_path: Path) -> None:
+    folder, _ = files
+    head, *rows = (folder / "image_points.csv").read_text().splitlines()
+    (tmp_path / "few.csv").write_text("\n".join([head, *rows[:2]]) + "\n")
+    with pytest.raises(InputError, match="too few image points to tell anything"):
+        checked(files, (("image_points", "file"), str(tmp_path / "few.csv")))
+
+
 def test_every_question_is_asked_with_every_other(files) -> None:
     folder, data = files
     del folder, data

@@ -37,6 +37,8 @@ def flown() -> Simulation:
 @pytest.fixture(scope="module")
 def files(flown: Simulation, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("match")
+    tifffile.imwrite(folder / "nan.tiff", np.full((40, 40), np.nan, np.float32))
+    tifffile.imwrite(folder / "complex.tiff", np.zeros((40, 40), np.complex64))
     return folder, bench.match_files(folder, flown)
 
 
@@ -121,6 +123,7 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
         np.testing.assert_allclose(there.line[b] - 10.0, row.line[a], rtol=0, atol=0.02)
 
 
+WIDE = {"row": 0, "column": 0, "rows": 9999, "columns": 9}
 WRONG = [
     ({"images": {"nadir": {"file": "photo.tiff", "first_pixel_sees": "up"}}}, None),
     ({"orthophoto": {"file": "nadir.tiff"}}, "without a place"),
@@ -129,6 +132,9 @@ WRONG = [
     ({"images": {"nadir": {"file": "none.tiff", "first_pixel_sees": "right"}}}, "no such file"),
     ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel": 11_900, "first_pixel_sees": "right"}}}, "wider than"),
     ({"images": {"nadir": {"file": "nadir.tiff", "first_line": 50, "first_pixel_sees": "right"}}}, "longer than its"),
+    ({"images": {"nadir": {"file": "nan.tiff", "first_pixel_sees": "right"}}}, "grey values that are not finite"),
+    ({"images": {"nadir": {"file": "complex.tiff", "first_pixel_sees": "right"}}}, "values that are no grey values"),
+    ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel_sees": "right", "window": WIDE}}}, "a window outside of"),
     ({"images": {"nadir": {"file": "nadir.tiff", "band": 2, "first_pixel_sees": "right"}}}, "no such band"),
 ]
 
