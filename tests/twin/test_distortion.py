@@ -83,23 +83,6 @@ def test_images_are_those_of_the_general_renderer():
 
 
 @pytest.mark.second
-def test_line_follows_the_turn_and_the_middle_is_zero():
-    b, truth = bench(), run().truth
-    middle = b.places(truth.axis, np.zeros(1))[0]
-    assert middle == pytest.approx([0.0, 0.0], abs=1e-12)
-    along = b.places(truth.axis, np.array([-1e-3, 1e-3]))[:, 0]
-    # L = +f tan W with the focal length along the line; mirror figures change it by parts in 1e5
-    assert along == pytest.approx(b.path.model.line_principal_distance * np.tan([-1e-3, 1e-3]), rel=1e-4)
-    # a tilted axis moves spots across the line to first order, along it to second order only
-    straight = b.places(np.array([1.0, 0.0, 0.0]), b.turn)
-    tilted = b.places(np.array([1.0, 1e-4, 0.0]) / np.hypot(1.0, 1e-4), b.turn)
-    assert np.max(np.abs(tilted[:, 0] - straight[:, 0])) < 0.1 * UM
-    slope = np.polyfit(b.turn, tilted[:, 1] - straight[:, 1], 1)[0]
-    # by the tilt times the focal length across the line (conventions: 5.672 m)
-    assert abs(slope) == pytest.approx(1e-4 * 5.672, rel=0.01)
-
-
-@pytest.mark.second
 def test_noise_of_the_spots_is_as_stated():
     """The same spots on another day's frames: temporal noise, and columns that stay."""
     b = within(altered(points=55, setting=0.0))
@@ -175,6 +158,7 @@ def test_bench_that_cannot_be_built(changes, key, text):
     assert error.value.remedy
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("changes", "key", "text"),
     quick(
@@ -194,6 +178,7 @@ def test_test_that_cannot_be_measured(changes, key, text):
     assert error.value.remedy
 
 
+@pytest.mark.second
 def test_fewer_points_than_unknowns():
     b = bench()
     few = [0, 27, 54]

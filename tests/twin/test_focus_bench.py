@@ -215,23 +215,3 @@ def test_budget(middle, budget) -> None:
     by_band = {line.band: line for line in budget if line.edge == TRACK}
     assert by_band["P"].total == pytest.approx(0.20, abs=0.02)
     assert np.mean([by_band[b].total for b in ("B1", "B2", "B3", "B4")]) == pytest.approx(0.3625, abs=0.02)
-
-
-@pytest.mark.second
-def test_diffraction_factor_against_an_unaberrated_circle(middle, budget) -> None:
-    """Hopkins' MTF of a round pupil at the band's frequency and wavelengths, F/9.2 to F/9.45 by direction: the pupil
-    is an ellipse of even light.
-    """
-    for line in budget:
-        site = next(s for s in middle.sites if s.band == line.band)
-        imager = site.imagers[line.edge]
-        wavelength, weight = band_wavelengths(imager.ccd.band)
-        cutoff = imager.optics.cutoff * wavelength.min() / wavelength
-        cutoff *= imager.ccd.band.spectrum.ends[0] / wavelength.min()
-        s = site.nyquist / cutoff
-        circle = 2.0 / np.pi * (np.arccos(s) - s * np.sqrt(1.0 - s * s))
-        expected = float(np.sum(weight * circle) / np.sum(weight))
-        # the pupil is an ellipse of even light to some 1e-3
-        assert line.factors["diffraction"] == pytest.approx(expected, rel=2e-3)
-        # the design's own wavefront of 0.018 waves takes (2 pi 0.018)^2 = 1.3% at most
-        assert 0.98 < line.factors["design"] <= 1.0

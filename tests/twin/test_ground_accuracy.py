@@ -145,6 +145,7 @@ def test_intersected_points_against_least_squares(sensors) -> None:
         np.testing.assert_allclose(got / np.outer(scale, scale), wanted / np.outer(scale, scale), atol=2e-3)
 
 
+@pytest.mark.second
 def test_maps_of_a_pass(sensors) -> None:
     places = {name: (s, 0, s.camera.pixels) for name, s in sensors.items()}
     maps = maps_of(places, uncertainty(), HEIGHT)

@@ -102,6 +102,7 @@ BAD = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("case", quick(1, BAD))
 def test_bad_input(case: str, tmp_path: Path) -> None:
     change, key, words = BAD[case]

@@ -12,7 +12,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import load_camera, load_instrument
 from tests.hunt.dense_images import DenseImages
 from twin.monitor import image_sampling, monitor_beams, monitor_path
-from twin.monitor.image_sampling import WRONG, NodeClasses, UncertainImageError, lost_or_gained
+from twin.monitor.image_sampling import NodeClasses, UncertainImageError, lost_or_gained
 from twin.monitor.monitor_path import MonitorPath
 
 ACCURACY = 3e-6  # of the peak: what classes of blurred spots are chosen for, in double precision
@@ -86,19 +86,6 @@ def test_spots_blurred_beyond_the_last_class_are_refused(blurred) -> None:
         blurred(2.0).expected_photons([{}])
 
 
-@pytest.mark.second
-def test_a_beam_that_an_edge_cuts_gets_the_nodes_it_needs(blurred) -> None:
-    """Against a rule of twice as many nodes that stand elsewhere."""
-    path = blurred(0.0)
-    state: State = {"base/forward/monitor/left/prism_0": Motion(shift=(0.012, 0.0, 0.0))}
-    got = path.photons_of(state)[None]
-    assert 0.7 < got[0, 0].sum() / got[0, 1].sum() < 0.95
-    few = with_nodes(path, path.node_classes.nodes(0)).expected_photons([state], single=False)
-    want = with_nodes(path, quadrature.disk(147, 577, turn=0.3)).expected_photons([state], single=False)
-    assert largest(got, want) < WRONG
-    assert largest(few, want) > 3.0 * WRONG
-
-
 def test_light_is_that_of_the_rays(blurred, monkeypatch) -> None:
     """An image with a fifth more light than its rays bring is refused."""
     path = blurred(0.0)
@@ -150,6 +137,7 @@ def test_figures_with_fine_structure_move_rays_about(blurred) -> None:
     assert np.abs(dense.photons(1, rows, columns) - image[rows, columns]).max() < 1e-5 * image.max()
 
 
+@pytest.mark.second
 def test_figures_that_are_too_rough_are_refused(blurred, monkeypatch) -> None:
     """Spots that are not blurred beyond all nodes do not come so far; the limit is lowered."""
     monkeypatch.setattr(monitor_beams, "TOO_ROUGH", 1e-9)

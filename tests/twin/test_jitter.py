@@ -124,14 +124,6 @@ def test_jitter_has_the_stated_amplitude_phase_and_level() -> None:
     assert np.mean(power[frequency > 30.0]) < 1e-4
 
 
-def test_random_phases_follow_the_seed_and_are_those_of_each_line_alone() -> None:
-    first = {"frequency": "3 Hz", "amplitude": "1 1 1 arcsec"}
-    t = np.linspace(0.0, 1.0, 20)
-    both = stated({"lines": [first, {"frequency": "7 Hz", "amplitude": "0 2 0 arcsec"}]})(t)
-    np.testing.assert_array_equal(both[:, 0], stated({"lines": [first]})(t)[:, 0])
-    assert not np.allclose(both, stated({"lines": [first]}, 2)(t))
-
-
 def test_the_mean_over_a_collection_is_that_of_its_moments() -> None:
     one = stated({"lines": [{"frequency": "60 Hz", "amplitude": "2 1 0 arcsec"}]})
     light, t = Collection(32, STEP), np.linspace(0.0, 0.1, 13)

@@ -303,7 +303,8 @@ IMAGES = [
 ]
 
 
-@pytest.mark.parametrize(("spoil", "told"), quick(3, IMAGES))
+@pytest.mark.second
+@pytest.mark.parametrize(("spoil", "told"), IMAGES)
 def test_bad_images(stack: Path, tmp_path: Path, spoil: Callable[[Path], object], told: str) -> None:
     spoil(stack)
     done = CliRunner().invoke(app, ["focus", str(stack / "focus.yaml"), "--out", str(tmp_path / "run")])

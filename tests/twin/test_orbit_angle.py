@@ -158,26 +158,6 @@ def test_scatter_of_200_passes_matches_sigma(full) -> None:
         assert np.abs(scatter.bias).max() < 3.3 * scatter.sigma.max() / np.sqrt(count)
 
 
-@pytest.mark.second
-def test_frames(full) -> None:
-    """Rounding: 6e6 m times eps is 1e-9 m, over 5e5 m some 1e-15 rad; 1e-7 arcsec is 500 times that."""
-    reference = full.estimate.angles["tls"].values
-    rows = {(row.frame, row.method): row for row in full.frames}
-    for frame in ("Earth-fixed", "local level", "orbital", "nadir line"):
-        tls = rows[frame, "tls"]
-        assert np.abs(tls.values - reference).max() < 1e-7 * ARCSEC
-        assert np.abs(tls.sigma - full.estimate.angles["tls"].sigma).max() < 1e-6 * ARCSEC
-        assert not tls.warned
-        # eq. 5 as printed is the right one after half a turn about z
-        assert rows[frame, "printed"].values == pytest.approx(rows[frame, "corrected"].values, abs=1e-9 * ARCSEC)
-    steep = rows["nadir line", "printed"]
-    assert steep.warned
-    assert np.abs(steep.values - reference).max() > 5.0 * steep.sigma.max()
-    good = rows["Earth-fixed", "printed"]
-    assert not good.warned
-    assert np.abs(good.values - reference).max() < 0.01 * good.sigma.min()
-
-
 def test_a_vertical_plane_without_noise_has_no_form() -> None:
     flight = flown(errors={"station": 0.0, "points": 0.0})
     rows = frame_rows(flight, flight.measure(flight.ground(NO_EFFECTS), None))

@@ -42,7 +42,7 @@ def changed(backend) -> AngleCamera:
     return angle_camera(PAIR, backend)
 
 
-@pytest.mark.parametrize("state", ["nominal", "perturbed"])
+@pytest.mark.parametrize("state", quick(0, ["nominal", "perturbed"]))
 @pytest.mark.parametrize("effects", [NO_EFFECTS, LightEffects()], ids=["no effects", "effects corrected"])
 def test_the_ground_tells_the_traced_angle(changed, state: str, effects: LightEffects) -> None:
     """To 1e-4 arcsec, and its change to 1e-3, also by the trace that knows neither orbit nor ground. What is left is

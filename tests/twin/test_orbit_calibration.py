@@ -26,8 +26,8 @@ from twin.orbit.calibration.campaign_adjustment import GAUGE, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import surprises
 from twin.orbit.calibration.latitude import fitted
-from twin.orbit.calibration.observations import PassData, image_sigma, light_shift
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.calibration.observations import PassData, image_sigma
+from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints
 
 run = partial(invoke, command.app)
@@ -169,24 +169,6 @@ def one_field(position: tuple[float, float, float]) -> PassData:
     camera = SETUP.camera.model_copy(update={"lines": FrozenMap(lines)})
     setup = SETUP.model_copy(update={"test": test, "camera": camera})
     return fly_fields(setup, np.random.SeedSequence(3)).passes[0].data
-
-
-@pytest.mark.second
-def test_light_is_taken_out_of_cameras_anywhere_in_the_body() -> None:
-    """Light time, aberration and refraction move an image point by up to 3 px wherever the camera sits: metres do not
-    matter at 500 km. A lever arm that is forgotten would count as 3 m of 500 km, 0.6 px."""
-    line, pixel, height = np.full(5, 40_000.0), np.linspace(500.0, 11_500.0, 5), np.full(5, 400.0)
-    effects = LightEffects(True, True, True, 650e-9)
-    for name in LINES:
-        shifts = []
-        for position in ((0.0, 0.0, 0.0), (3.0, -2.0, 1.0)):
-            data = one_field(position)
-            assert data.models[name].position == pytest.approx(position)
-            sensor = replace(data.sensors[name], effects=effects)
-            shifts.append(light_shift(sensor, data.models[name], line, pixel, height))
-        assert np.linalg.norm(shifts[0], axis=1).min() > 0.5 * SETUP.camera.pitch
-        # the same line number is seen from elsewhere by 3 m: 1e-5 of the effects
-        assert np.abs(shifts[1] - shifts[0]).max() < 1e-3 * SETUP.camera.pitch
 
 
 def test_covariances_of_line_and_pixel_keep_their_sign_in_the_focal_plane() -> None:

@@ -18,7 +18,7 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke
 from twin.orbit.conventions.check_run import DECIDED, Check, run_check
-from twin.orbit.conventions.pass_readings import QUESTIONS, asked, singles_and_pairs
+from twin.orbit.conventions.pass_readings import QUESTIONS, singles_and_pairs
 
 run = partial(invoke, command.app)
 
@@ -193,21 +193,6 @@ def test_every_question_is_asked_with_every_other(files) -> None:
     assert sum(len(one) == 1 for one in every) == 8
     assert sum(len(one) == 2 for one in every) == 24
     assert len(set(every)) == len(every)
-
-
-def test_values_that_may_be_meant(files) -> None:
-    found = checked_readings(files)
-    assert set(found) == set(QUESTIONS) - {"angle_sequence"}
-    assert len(found["body_axes"]) == 3
-    assert "ITRS" not in found["orbit_frame"]
-
-
-def checked_readings(files: tuple[Path, dict[str, Any]]) -> dict[str, tuple[Any, ...]]:
-    from twin.orbit.conventions.pass_readings import read_pass
-
-    folder, data = files
-    _, stated = read_pass(OrbitCheckSpec.model_validate(data), load_three_line_camera("th1"), folder)
-    return asked(stated, True)
 
 
 @pytest.mark.second

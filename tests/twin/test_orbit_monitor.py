@@ -206,20 +206,6 @@ def test_noise_is_as_large_as_its_sigma(noisy) -> None:
     assert np.abs(noisy.parts["noise"] / noisy.sigma).max() < 4.9
 
 
-@pytest.mark.second
-def test_a_prism_looks_like_a_camera_that_has_turned(noisy) -> None:
-    """The trace of the prism alone explains what the monitor is wrong by, and heights with it."""
-    flight, parts = noisy.flight, noisy.parts
-    error = flight.clean["forward"] - flight.truth["forward"]
-    assert np.abs(flight.prisms["forward"][4, 0]) > 0.01 * ARCSEC
-    assert error[:, 0] == pytest.approx(flight.prisms["forward"][:, 0], abs=0.005 * ARCSEC)
-    assert np.abs(flight.prisms["backward"]).max() < 1e-12
-    assert rms(parts["prisms"]) > 5.0 * rms(parts["noise"])
-    left = noisy.cases["monitored"].camera
-    whole = sum(part for name, part in parts.items() if name != "interpolation")
-    assert left == pytest.approx(whole, abs=1e-3)  # products of two arcseconds
-
-
 # Stated disturbances
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import tests.twin.orbit_file_bench as bench
 from scenes.yaml.errors import InputError
-from tests.twin.test_platform_files import CSV_ATTITUDE, EARTH, edited, read
+from tests.twin.test_platform_files import CSV_ATTITUDE, EARTH, read
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.measured.orbit_files import read_oem, read_sp3
 from twin.orbit.measured.platform_readings import known_frame
@@ -145,9 +145,3 @@ def test_older_and_unfinished_files_of_sp3(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["ECF", "IER97", "ITR97", "IGS14", "IGb08", "IGc20", "WGS84"])
 def test_frames_as_sp3_spells_them(name: str) -> None:
     assert known_frame(name, "a.sp3") == "ITRS"
-
-
-def test_an_edit_is_one(tmp_path: Path) -> None:
-    path = bench.sp3(tmp_path / "a.sp3")
-    edited(path, "IGS20", "ECF  ")
-    assert read_sp3(path, "L51").frame == "ITRS"

@@ -100,16 +100,6 @@ def test_marks_lie_where_the_sensor_says(name: str) -> None:
         assert np.abs(level[0] - line).max() > 3.0
 
 
-def test_an_image_does_not_depend_on_its_window() -> None:
-    """Each pixel's value is its own: single-precision transforms of 1e5 samples leave 1e-6 of the brightest."""
-    terrain = rough()
-    ground = Ground(lambda e, n: 0.2 + 0.1 * np.sin(e / 17.0) * np.cos(n / 23.0))
-    whole = photograph("backward", terrain, ground, 150)
-    part = Window(whole.window.first_line + 31, whole.window.first_pixel + 12, 57, 90)
-    cut = photograph("backward", terrain, ground, window=part)
-    assert cut.photons == pytest.approx(whole.photons[31:88, 12:102], rel=2e-5)
-
-
 def test_grey_ground_has_the_grey_value_of_the_hand() -> None:
     """The Sun as a black body, Lambert's ground, pi/4 F^2, pixel, time, quantum efficiency and gain; quadrature and the
     finite point spread function agree to 1e-4, single precision to 1e-6."""

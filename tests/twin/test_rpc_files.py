@@ -171,6 +171,7 @@ def test_a_known_bias_is_recovered_within_its_sigma(sensor, model: RationalPolyn
         assert chi2.ppf(2.5e-5, count) < value < chi2.isf(2.5e-5, count)
 
 
+@pytest.mark.second
 def test_err_bias_and_err_rand(sensor, model: RationalPolynomial) -> None:
     """Of a shift: its sigma times the pixels on the ground, root mean square of the two horizontal axes (GDAL, RFC 22).
     What scatters beyond the sigmas is the other.

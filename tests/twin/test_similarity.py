@@ -13,10 +13,7 @@ import pytest
 
 from optics.geometry.tree import Motion, State
 from optics.materials.material import MATERIALS, Material, material
-from optics.numerics import quadrature
-from optics.raytrace.system import assemble
 from optics.thermal.heat import Temperature
-from optics.waves.imaging import imaging_rays
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_builder import build_instrument
@@ -133,31 +130,6 @@ def test_motions_do_the_same_to_a_grown_instrument(camera: str, with_camera, bac
     np.testing.assert_allclose(coarse[:, 1:] - coarse[:, :1], 0.0, rtol=0, atol=PIXELS)
 
 
-def test_the_return_face_has_grown_to_its_edge(with_camera, backend) -> None:
-    """Nodes that lie within 2e-4 of the edge, on a face larger by 9e-4."""
-    instrument = with_camera("gf7")
-    path = MonitorPath(instrument, backend, quadrature.disk(60))
-    rim = np.hypot(path.nodes.x, path.nodes.y).max()
-    assert (1.0 + 40.0 * ALUMINIUM.expansion) * rim > 1.0005
-    assert path.rays([heated(instrument, ALUMINIUM, 40.0)]).valid.all()
-
-
-def test_the_light_through_a_grown_stop_is_that_of_its_area(with_camera, backend) -> None:
-    instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
-    stop = instrument.assembly.elements["forward/M2"].aperture
-    axes = instrument.camera_axes("forward")
-    start = instrument.assembly.nominal_pose("base/forward").translation + 3.0 * axes[:, 2]
-    ways, nodes = [["forward/imaging"], ["forward/to_stop"]], quadrature.disk(6)
-    rays = []
-    for state in ({}, heated(instrument, ALUMINIUM)):
-        systems = [assemble(instrument.assembly, way, [state]) for way in ways]
-        rays.append(imaging_rays(backend, *systems, -axes[:, 2], start, stop, nodes))
-    # aimed to 1e-12 m, differences of which at 0.1 m are 1e-11
-    np.testing.assert_allclose(rays[1].launch_area, grown**2 * rays[0].launch_area, rtol=1e-9)
-    # unit power on directions that have not changed
-    np.testing.assert_allclose(rays[1].amplitude, rays[0].amplitude, rtol=1e-9)
-
-
 def test_the_lines_of_the_satellite_keep_their_looks(with_camera, backend) -> None:
     instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
     for motions in ({}, MOVED):
@@ -193,25 +165,6 @@ def test_targets_are_imaged_on_the_same_pixels(with_camera, backend) -> None:
             )
             # what the polynomials leave of both; growth that is left out anywhere is 5e-5
             np.testing.assert_allclose(new, old, rtol=0, atol=1e-7)
-
-
-def test_rendered_spots_stay_on_their_pixels(with_camera, backend) -> None:
-    """Expected images; light does not grow, so that rings are narrower on the pixels by the growth."""
-    instrument = with_camera("gf7")
-    path = MonitorPath(instrument, backend)
-    far = {"base/forward/focal_plane": Motion(shift=(80e-6, -120e-6, 0.0))}
-    still, warm = path.expected_photons([far, heated(instrument, ALUMINIUM, 20.0, far)], single=False)
-    size = 20.0 * ALUMINIUM.expansion
-    assert np.abs(warm - still).max() < 3.0 * size * still.max()
-    np.testing.assert_allclose(warm.sum(axis=(1, 2)), still.sum(axis=(1, 2)), rtol=0.1 * size)
-    axes = [np.arange(n) - 0.5 * (n - 1) for n in path.shape]
-    core = still > 0.05 * still.max(axis=(1, 2), keepdims=True)
-    for k, axis in enumerate(axes):
-        where = np.expand_dims(axis, 1 - k)
-        old, new = (np.sum(f * core * where, axis=(1, 2)) / np.sum(f * core, axis=(1, 2)) for f in (still, warm))
-        assert np.abs(old).max() > 10.0
-        # a pixel grid that did not grow would move the far spots by 6e-3 to 1e-2 pixels
-        np.testing.assert_allclose(new, old, rtol=0, atol=3e-4)
 
 
 def test_detectors_of_the_path_tracer_have_grown_pixels(with_camera, backend) -> None:
