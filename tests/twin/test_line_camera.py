@@ -1,6 +1,7 @@
 """Looks of line cameras: ideal projections against the collinearity equation, traced lines against the trace."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from twin.orbit.flight.line_camera import (
+    LinePiece,
     along_track_angle,
     dihedral_angle,
     line_cameras,
@@ -85,6 +87,23 @@ def test_fifth_order_distortion_and_slope() -> None:
     difference = (camera.look(pixel + 0.25) - camera.look(pixel - 0.25)) / 0.5
     np.testing.assert_allclose(slope, difference, rtol=0, atol=1e-14)  # rounding of unit vectors over half a pixel
     np.testing.assert_allclose(np.sum(look * slope, axis=-1), 0.0, atol=1e-19)
+
+
+def test_looks_of_chips_have_the_slopes_of_their_own_polynomials() -> None:
+    """Two halves that bend differently: a look's derivative, and each half's look at its own pixels."""
+    first, second = (
+        np.array([[0.0, y, 1.0], [0.0, -0.02, 0.0], [x, 1e-3, 0.0]]) for x, y in ((1e-3, 0.02), (-2e-3, -0.02))
+    )
+    whole = line_cameras(TH1)["nadir"]
+    chips = replace(whole, pieces=(LinePiece(0, 5999, first), LinePiece(6000, 11999, second)))
+    pixel = np.array([100.0, 3000.0, 6100.0, 11000.0])
+    look, slope = chips.look_and_slope(pixel)
+    difference = (chips.look(pixel + 0.25) - chips.look(pixel - 0.25)) / 0.5
+    np.testing.assert_allclose(slope, difference, rtol=0, atol=1e-14)
+    for k, terms in enumerate((first, first, second, second)):
+        at = (pixel[k] - (0.0 if k < 2 else 6000.0) + 0.5) / 3000.0 - 1.0
+        vector = terms[0] + terms[1] * at + terms[2] * (2.0 * at**2 - 1.0)
+        np.testing.assert_allclose(look[k], vector / np.linalg.norm(vector), rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("pixel", [-0.51, 11999.51, np.nan])
