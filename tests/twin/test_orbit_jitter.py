@@ -22,6 +22,7 @@ from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.jitter import sights
 from twin.orbit.jitter.jitter_numbers import JITTER, blind_multiples
+from twin.orbit.jitter.jitter_report import _summary as jitter_table
 from twin.orbit.jitter.jitter_report import _warnings as jitter_warnings
 from twin.orbit.jitter.jitter_report import jitter_report
 from twin.orbit.jitter.jitter_run import JitterRun, fly_strip, run_jitter
@@ -109,6 +110,31 @@ def test_an_oscillation_of_the_body_is_found_about_its_axes(oscillating: JitterR
     assert first["green", "red"] == pytest.approx(9.77, abs=0.02)
     numbers = JITTER(found)["passes"]["jitter"]
     assert numbers["oscillations"][0]["true_amplitude_arcsec"] == pytest.approx({"roll": 2.4, "pitch": 1.0})
+
+
+def test_numbers_and_table_of_a_search_have_their_units(oscillating: JitterRun) -> None:
+    """Angles in arcseconds, in pixels and in degrees, times in milliseconds, and chances of what is left."""
+    one = oscillating.passes["jitter"]
+    lines, found = one.found.lines, one.found
+    (row,) = jitter_table(oscillating).rows
+    amplitude, sigma, pixel = lines.amplitude[0], lines.amplitude_sigma[0], one.sights.pixel
+    per_axis = [v for a, s in zip(amplitude, sigma, strict=True) for v in (a / ARCSEC, s / ARCSEC, a / pixel)]
+    expected = [lines.frequency[0], lines.frequency_sigma[0], *per_axis, lines.chance[0], 0.65, 2.4, 1.0]
+    assert row[0] == "jitter"
+    assert row[1:] == pytest.approx(expected, rel=1e-9)
+    told = JITTER(oscillating)["passes"]["jitter"]
+    (first,) = told["oscillations"]
+    for k, axis in enumerate(("roll", "pitch")):
+        assert first["amplitude_arcsec"][axis] == pytest.approx(amplitude[k] / ARCSEC)
+        assert first["amplitude_arcsec_sigma"][axis] == pytest.approx(sigma[k] / ARCSEC)
+        assert first["amplitude_px"][axis] == pytest.approx(amplitude[k] / pixel)
+        assert first["phase_deg"][axis] == pytest.approx(np.degrees(lines.phase[0, k]))
+        seen = found.detectable[~found.before.blind][:, k]
+        assert told["detectable_arcsec"][axis] == pytest.approx(np.median(seen) / ARCSEC)
+    assert told["chance_of_the_next"] == found.after.chance(found.after.power[found.after.best])
+    assert told["pixel_arcsec"] == pytest.approx(pixel / ARCSEC)
+    assert told["gap_ms"]["blue to green"] == pytest.approx(121.6, abs=0.2)
+    assert list(told["noise_factor"].values()) == pytest.approx(np.sqrt(found.factors[:-1]))
 
 
 @pytest.mark.second

@@ -274,3 +274,26 @@ def test_every_warning_is_told_when_and_only_when_it_holds(name: str) -> None:
         told = list(warnings(run))
         assert len(told) == 1, (path, told)
         assert words in told[0], (path, told)
+
+
+def test_tables_of_accuracy_and_control_have_their_units() -> None:
+    """Places in degrees, sigmas as roots of variances, the correction with its sigma, and residuals with theirs."""
+    seen = np.array([True, True, False])
+    places = {"longitude": np.radians([116.0, 117.0, 0.0]), "latitude": np.radians([40.0, 41.0, 0.0]), "height": 300.0}
+    covariance = np.array([np.diag([4.0, 9.0, 16.0])] * 3)
+    errors = {"ce90": np.array([5.0, 7.0, 99.0]), "le90": np.array([2.0, 3.0, 99.0]), "covariance": covariance}
+    numbers = {"line": np.array([1.0, 2.0, 0.0]), "pixel": np.array([3.0, 4.0, 0.0]), "horizontal": lambda: (1.5, 0.5)}
+    maps = {"nadir": Ns(seen=seen, **places, **errors, **numbers)}
+    table, _, grid = quality_sections._map_section(maps).artefacts
+    assert table.rows == [("nadir", 6.0, 7.0, 2.5, 3.0, 1.5, 0.5)]
+    assert grid.rows[0] == pytest.approx(("nadir", 1.0, 3.0, 116.0, 40.0, 300.0, 5.0, 2.0, 2.0, 3.0, 4.0))
+    assert [row[3] for row in grid.rows] == pytest.approx([116.0, 117.0])
+    at, spread = np.array([[3.0, -4.0]]), np.array([np.diag([0.04, 0.25])])
+    correction = Ns(at=lambda *_: at, covariance_at=lambda *_: spread, middle=(0.0, 0.0), chi_square=5.0, freedom=2)
+    correction = Ns(**vars(correction), residual=np.array([[0.1, 0.2]]), used=np.array([False]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(quality_sections, "residual_sigma", lambda _: np.array([[0.3, 0.4]]))
+        control = {"nadir": Ns(polynomial=Ns(correction=correction), names=IDS[:1])}
+        table, full = quality_sections.control_section(control).artefacts
+    assert table.rows == [("nadir", 3.0, pytest.approx(0.2), -4.0, pytest.approx(0.5), 5.0, 2)]
+    assert full.rows == [("nadir", "a", 0.1, 0.3, 0.2, 0.4, "left out")]
