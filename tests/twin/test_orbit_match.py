@@ -123,7 +123,7 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
         np.testing.assert_allclose(there.line[b] - 10.0, row.line[a], rtol=0, atol=0.02)
 
 
-WIDE = {"row": 0, "column": 0, "rows": 9999, "columns": 9}
+WIDE = {"row": 0, "column": 0, "rows": 9999, "columns": 40}
 WRONG = [
     ({"images": {"nadir": {"file": "photo.tiff", "first_pixel_sees": "up"}}}, None),
     ({"orthophoto": {"file": "nadir.tiff"}}, "without a place"),
