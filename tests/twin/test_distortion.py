@@ -176,6 +176,8 @@ def test_test_that_cannot_be_measured(changes, key, text):
         measure(replace(b, turn=b.turn[few], design_offset=b.design_offset[few]), 3)
     assert error.value.key == (key,)
     assert error.value.remedy
+    assert ("less light" in error.value.remedy) is (text == "saturated")
+    assert ("more light" in error.value.remedy) is (text == "no spot")
 
 
 @pytest.mark.second
