@@ -266,6 +266,12 @@ BAD = {
     "node": ("base/backward: {", "base/backwards: {", "motion.base/backwards", ["no such node", "'base/backward'"]),
     "pivot": ("pivot: rear_node", "pivot: front", "motion.base/backward/focal_plane.pivot", ["no such pivot"]),
     "too far": ("-1.2 arcsec, -0.8", "-500 arcsec, -0.8", "course", ["keep the beams on the mirrors"]),
+    "cold": (
+        "change: [0 K, 0 K, 0 K, 0 K, 0 K]",
+        "change: [0 K, 0 K, 0 K, -300 K, 0 K]",
+        "course.temperature.base/forward/monitor/left/prism_180.change[3]",
+        ["absolute zero", "30 min"],
+    ),
     "interval": ("interval: 20 min", "interval: 50 min", "interval", ["longer than the course"]),
     "disturbances": ("repeats: 30", "disturbances: orbits", "disturbances.file", ["did you mean 'orbit'"]),
     "cause": (

@@ -17,6 +17,9 @@ from twin.orbit.block import block_report
 from twin.orbit.calibration import calibration_report, influences
 from twin.orbit.conventions import check_report
 from twin.orbit.export import export_report, quality_sections
+from twin.orbit.export.ground_accuracy import TOGETHER
+from twin.orbit.export.polynomial_control import residual_sigma
+from twin.orbit.export.quality_sections import quality_answers
 from twin.orbit.images import simulate_report
 from twin.orbit.matching import match_report
 from twin.orbit.monitoring import monitoring_report
@@ -297,3 +300,18 @@ def test_tables_of_accuracy_and_control_have_their_units() -> None:
         table, full = quality_sections.control_section(control).artefacts
     assert table.rows == [("nadir", 3.0, pytest.approx(0.2), -4.0, pytest.approx(0.5), 5.0, 2)]
     assert full.rows == [("nadir", "a", 0.1, 0.3, 0.2, 0.4, "left out")]
+
+
+def test_sentences_of_accuracy_and_residuals_name_their_own_numbers() -> None:
+    """Points that are used, the bias after the correction, the largest CE90 and the LE90 of intersected points."""
+    correction = Ns(used=np.array([True, False]), kind="shift")
+    polynomial = Ns(correction=correction, before=Ns(bias_m=9.0), after=Ns(bias_m=0.25))
+    maps = {
+        TOGETHER: Ns(ce90=np.array([1.0, 2.0]), le90=np.array([3.0, np.nan])),
+        "nadir": Ns(ce90=np.array([4.0, np.nan])),
+    }
+    first, second, third = quality_answers(Ns(control={"nadir": Ns(polynomial=polynomial, names=IDS)}, maps=maps))
+    assert first.startswith("1 of 2 control points correct the polynomials of nadir by a shift, to 0.25 m")
+    assert second == "CE90 is at most 4.00 m, of points of nadir"
+    assert third == "LE90 of intersected points is at most 3.00 m"
+    assert residual_sigma(Ns(variance=np.array([[[4.0, 1.0], [1.0, 9.0]]]))) == pytest.approx(np.array([[2.0, 3.0]]))
