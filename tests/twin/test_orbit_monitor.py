@@ -1,6 +1,5 @@
 """From the on-board monitor to heights on the ground, end to end, and as a user runs it."""
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from tests.tiers import quick
 from tests.twin.commands import invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
-from twin.orbit.monitoring.monitoring_report import monitor_report
 from twin.orbit.monitoring.monitoring_run import rms, run_monitor
 from twin.run.procedure import silent
 
@@ -245,17 +243,6 @@ def test_smoothed_heights(stated) -> None:
         assert one.agrees
         assert one.consistency.agrees
         assert one.consistency.degrees % 8 == 0
-
-
-@pytest.mark.second
-def test_contradictions_stand_in_the_report(stated) -> None:
-    chosen = stated.smoothing[1200.0]
-    assert not monitor_report(stated).warnings
-    off = replace(chosen, consistency=replace(chosen.consistency, chi_square=500.0), error=50.0 * chosen.sigma)
-    told = monitor_report(replace(stated, smoothing={**stated.smoothing, 1200.0: off}))
-    assert [warning.split(":")[0] for warning in told.warnings[:1]] == ["the measured shifts contradict the prior"]
-    assert "wrong by up to 50 of their sigma" in told.warnings[1]
-    assert "contradicts their sigma" in " ".join(told.lead)
 
 
 # The command

@@ -15,6 +15,7 @@ from twin.laboratory import distortion_report, focus_report, turntable_report
 from twin.orbit.angle import angle_report
 from twin.orbit.block import block_report
 from twin.orbit.calibration import calibration_report, influences
+from twin.orbit.calibration.calibration_numbers import FIT, STEPWISE
 from twin.orbit.conventions import check_report
 from twin.orbit.export import export_report, quality_sections
 from twin.orbit.export.ground_accuracy import TOGETHER
@@ -23,6 +24,7 @@ from twin.orbit.export.quality_sections import quality_answers
 from twin.orbit.images import simulate_report
 from twin.orbit.matching import match_report
 from twin.orbit.monitoring import monitoring_report
+from twin.orbit.monitoring.monitoring_numbers import PROPAGATION, SMOOTHING
 
 FAR, NEAR = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]), np.zeros((2, 3))
 IDS = np.array(["a", "b"], object)
@@ -315,3 +317,28 @@ def test_sentences_of_accuracy_and_residuals_name_their_own_numbers() -> None:
     assert second == "CE90 is at most 4.00 m, of points of nadir"
     assert third == "LE90 of intersected points is at most 3.00 m"
     assert residual_sigma(Ns(variance=np.array([[[4.0, 1.0], [1.0, 9.0]]]))) == pytest.approx(np.array([[2.0, 3.0]]))
+
+
+def test_verdicts_among_the_numbers_warn_when_they_are_false() -> None:
+    """Fit and stepwise solution of a calibration, the monitor's scatter, its shifts and its smoothed heights."""
+    spec = Ns(errors=Ns(switched_on=True), setup=None)
+    run = Ns(together=Ns(p_value=1e-3), campaign=Ns(spec=spec, simulated=Ns(drift=())), truth=None)
+    assert FIT["agrees"].of(run) is True
+    run.together.p_value = 0.9e-3
+    assert FIT["agrees"].of(run) is False
+    assert "a chi-square as large has a chance of 0.0009; biases" in FIT["agrees"].warning(run)
+    spec.errors.switched_on = False
+    assert FIT["agrees"].of(run) is None
+    right = Ns(agrees=True, spread=3.0, sigma=2.0, limits=(0.8, 1.2), chi_square=9.5, limit=8.25, furthest=5.0)
+    wrong = Ns(**vars(right) | {"agrees": False})
+    for verdict, whole, part, words in (
+        (STEPWISE["converged"], "stepwise", None, "has not settled after 7 rounds"),
+        (PROPAGATION["agrees"], "scatter", None, "ratio 1.5, limits 0.80 to 1.20"),
+        (SMOOTHING["shifts_agree"], "smoothed", "consistency", "contradict the prior: chi-square 9.5, limit 8.25"),
+        (SMOOTHING["agrees"], "smoothed", None, "wrong by up to 5 of their sigma, limit 8.25"),
+    ):
+        for one, value in ((right, True), (wrong, False)):
+            found = Ns(**vars(one), converged=value, rounds=7)
+            run = Ns(**{whole: found if part is None else Ns(**{part: found})})
+            assert verdict.of(run) is value
+            assert words in verdict.warning(run)
