@@ -351,6 +351,7 @@ def test_series_of_unequal_length() -> None:
     assert expected_rejections(np.full(41, 10)) == rejection_rate(10) * 410
 
 
+@pytest.mark.second
 def test_a_turntable_without_held_out_readings_has_its_report(folder: Path, tmp_path: Path) -> None:
     """`held_out` may be missing; of few angles, with which the fits take a second."""
     head_, *body = (folder / "comparisons.csv").read_text().splitlines()

@@ -42,6 +42,7 @@ def run(tmp_path_factory):
     return run_adjustment(setup(tmp_path_factory.mktemp("block")), None, 3)
 
 
+@pytest.mark.second
 def test_errors_of_check_points_are_those_predicted_and_every_sensor_helps(run):
     assert 0.3 < run.worth[ALL].agreement < 2.0
     full = run.worth[ALL].predicted
@@ -55,6 +56,7 @@ def test_errors_of_check_points_are_those_predicted_and_every_sensor_helps(run):
     assert block_report(run).warnings == ()
 
 
+@pytest.mark.second
 def test_cameras_are_found_within_their_sigmas(run):
     ratio = np.array([(c.found - c.truth) / c.sigma for c in run.cameras.values()])
     # 16 normals: beyond 4 by chance in 1 of 1000 blocks

@@ -330,12 +330,13 @@ def test_what_is_wrong_is_told(tmp_path: Path) -> None:
     assert numbers["open"]["height_camera_rms_m"] > 0.0
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("mechanism", "words"),
     [
         ("base/forward/M9 rotate y", ("no such node",)),
         ("base/forward rotate y about rear_node", ("no such pivot",)),
-        pytest.param("base/backward rotate y", ("does nothing to d_alpha of forward",), marks=pytest.mark.second),
+        ("base/backward rotate y", ("does nothing to d_alpha of forward",)),
     ],
 )
 def test_a_mechanism_that_cannot_be_is_refused(tmp_path: Path, mechanism: str, words: tuple[str, ...]) -> None:
