@@ -183,7 +183,7 @@ def search(
         try:
             fitted = _fitted(kept, np.array([*frequency, float(now.frequency[best])]), np.array(chances))
             fitted, others = _unaliased(kept, lines, fitted, reach, false_alarm)
-            again = _good(given.evened(factors), fitted)
+            again = _good(given.evened(_beside(given.taken(used), fitted).factors()), fitted)
             kept = given.taken(again).evened(factors)
             fitted = _fitted(kept, fitted.frequency, np.array(chances))
             # a strong line was noise to the factors before

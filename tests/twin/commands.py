@@ -36,3 +36,14 @@ def refused(run: Callable, command: str, path: Path, key: str, words: Sequence[s
     for word in words:
         assert word in result.stderr, result.stderr
     return int(found[1])
+
+
+def edited_copy(source: Path, folder: Path, *changes: tuple[str, str]) -> Path:
+    """Write the text of a file into a folder with texts replaced, each of which stands in it exactly once."""
+    text = source.read_text("utf-8")
+    for old, new in changes:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path = folder / "small.yaml"
+    path.write_text(text, "utf-8")
+    return path

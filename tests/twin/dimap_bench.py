@@ -117,11 +117,9 @@ def dimap(scene: Scene) -> str:
     fixes = scene.start + step * (np.arange(count) - count // 2 + 0.4)
     place, speed = scene.orbit(fixes)
     points = "\n".join(
-        f"""          <Point>
-            <LOCATION_XYZ unit="m">{" ".join(map(repr, p.tolist()))}</LOCATION_XYZ>
+        f"""<Point><LOCATION_XYZ unit="m">{" ".join(map(repr, p.tolist()))}</LOCATION_XYZ>
             <VELOCITY_XYZ unit="m/s">{" ".join(map(repr, v.tolist()))}</VELOCITY_XYZ>
-            <TIME>{clock(scene, t)}</TIME>
-          </Point>"""
+            <TIME>{clock(scene, t)}</TIME></Point>"""
         for t, p, v in zip(fixes, place, speed, strict=True)
     )
     looks = "".join(
@@ -138,56 +136,31 @@ def dimap(scene: Scene) -> str:
     period = scene.period * (1e6 if unit == "microsecond" else 1e3)
     return f"""<?xml version="1.0" encoding="UTF-8" standalone="no"?>
 <Dimap_Document>
-  <Metadata_Identification>
-    <METADATA_FORMAT version="{scene.version}">DIMAP</METADATA_FORMAT>
-    <METADATA_PROFILE>{scene.profile}</METADATA_PROFILE>
-    <METADATA_SUBPROFILE>PRODUCT</METADATA_SUBPROFILE>
+  <Metadata_Identification><METADATA_FORMAT version="{scene.version}">DIMAP</METADATA_FORMAT>
+    <METADATA_PROFILE>{scene.profile}</METADATA_PROFILE><METADATA_SUBPROFILE>PRODUCT</METADATA_SUBPROFILE>
   </Metadata_Identification>
   <Dataset_Identification><DATASET_NAME>SCENE_P</DATASET_NAME></Dataset_Identification>
-  <Geoposition><Geoposition_Models><Rational_Function_Model><Component>
-    <COMPONENT_PATH href="RPC_SCENE.XML" />
+  <Geoposition><Geoposition_Models><Rational_Function_Model><Component><COMPONENT_PATH href="RPC_SCENE.XML" />
   </Component></Rational_Function_Model></Geoposition_Models></Geoposition>
-  <Processing_Information><Product_Settings>
-    <Geometric_Settings>{settings}</Geometric_Settings>
+  <Processing_Information><Product_Settings><Geometric_Settings>{settings}</Geometric_Settings>
   </Product_Settings></Processing_Information>
-  <Raster_Data>
-    <Raster_Dimensions>
-      <NROWS>{scene.lines}</NROWS>
-      <NCOLS>{scene.pixels}</NCOLS>
-      <NBANDS>1</NBANDS>
-    </Raster_Dimensions>
-  </Raster_Data>
-  <Geometric_Data>
-    <Refined_Model>
+  <Raster_Data><Raster_Dimensions><NROWS>{scene.lines}</NROWS><NCOLS>{scene.pixels}</NCOLS><NBANDS>1</NBANDS>
+  </Raster_Dimensions></Raster_Data>
+  <Geometric_Data><Refined_Model>
       <Time>
-        <Time_Range>
-          <START>{clock(scene, scene.start)}</START>
-          <END>{clock(scene, last)}</END>
-        </Time_Range>
-        <Time_Stamp>
-          <LINE_PERIOD unit="{unit}">{period!r}</LINE_PERIOD>
-        </Time_Stamp>
+        <Time_Range><START>{clock(scene, scene.start)}</START><END>{clock(scene, last)}</END></Time_Range>
+        <Time_Stamp><LINE_PERIOD unit="{unit}">{period!r}</LINE_PERIOD></Time_Stamp>
       </Time>
-      <Ephemeris>
-        <EPHEMERIS_USED>CORRECTED</EPHEMERIS_USED>
-        <Point_List>
+      <Ephemeris><EPHEMERIS_USED>CORRECTED</EPHEMERIS_USED><Point_List>
 {points}
-        </Point_List>
-      </Ephemeris>
-      <Attitudes>
-{_attitude(scene, last)}
-      </Attitudes>
-      <Geometric_Calibration>
-        <Instrument_Calibration>
-          <Swath_Range>
-            <FIRST_COL>{scene.first_column}</FIRST_COL>
-            <LAST_COL>{scene.first_column + scene.pixels - 1}</LAST_COL>
-          </Swath_Range>
+      </Point_List></Ephemeris>
+      <Attitudes>{_attitude(scene, last)}</Attitudes>
+      <Geometric_Calibration><Instrument_Calibration>
+          <Swath_Range><FIRST_COL>{scene.first_column}</FIRST_COL>
+            <LAST_COL>{scene.first_column + scene.pixels - 1}</LAST_COL></Swath_Range>
           {looks}
-        </Instrument_Calibration>
-      </Geometric_Calibration>
-    </Refined_Model>
-  </Geometric_Data>
+      </Instrument_Calibration></Geometric_Calibration>
+  </Refined_Model></Geometric_Data>
 </Dimap_Document>
 """
 
@@ -243,19 +216,15 @@ def rpc(model: RationalPolynomial, version: str = "2.15") -> str:
     )
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <Dimap_Document>
-  <Metadata_Identification>
-    <METADATA_FORMAT version="{version}">DIMAP</METADATA_FORMAT>
-    <METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE>
-    <METADATA_SUBPROFILE>RPC</METADATA_SUBPROFILE>
+  <Metadata_Identification><METADATA_FORMAT version="{version}">DIMAP</METADATA_FORMAT>
+    <METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE><METADATA_SUBPROFILE>RPC</METADATA_SUBPROFILE>
   </Metadata_Identification>
-  <Rational_Function_Model>
-    <Global_RFM>
+  <Rational_Function_Model><Global_RFM>
       <{ground}>
 {rows}      </{ground}>
       <RFM_Validity>
 {sizes}      </RFM_Validity>
-    </Global_RFM>
-  </Rational_Function_Model>
+  </Global_RFM></Rational_Function_Model>
 </Dimap_Document>
 """
 

@@ -100,21 +100,14 @@ def attitude_csv(
 
 def oem(path: Path, frame: str = "GCRF", scale: str = "UTC", step: float = 1.0, satellite: str = "2010-040A") -> Path:
     s = sampled("ITRS" if frame.startswith("ITRF") else "GCRS", step)
-    lines = [
-        "CCSDS_OEM_VERS = 2.0",
-        "CREATION_DATE = 2011-03-06T00:00:00",
-        "ORIGINATOR = HERE",
-        "META_START",
-        "OBJECT_NAME = PASS",
-        f"OBJECT_ID = {satellite}",
-        "CENTER_NAME = EARTH",
-        f"REF_FRAME = {frame}",
-        f"TIME_SYSTEM = {scale}",
-        f"START_TIME = {calendar(s.seconds[0], scale)}",
-        f"STOP_TIME = {calendar(s.seconds[-1], scale)}",
-        "META_STOP",
-        "COMMENT states",
-    ]
+    lines = f"""CCSDS_OEM_VERS = 2.0
+CREATION_DATE = 2011-03-06T00:00:00
+ORIGINATOR = HERE
+META_START
+OBJECT_NAME = PASS\nOBJECT_ID = {satellite}\nCENTER_NAME = EARTH\nREF_FRAME = {frame}\nTIME_SYSTEM = {scale}
+START_TIME = {calendar(s.seconds[0], scale)}\nSTOP_TIME = {calendar(s.seconds[-1], scale)}
+META_STOP
+COMMENT states""".splitlines()
     for t, r, v in zip(s.seconds, s.position / 1e3, s.velocity / 1e3, strict=True):
         lines.append(f"{calendar(t, scale)} " + " ".join(repr(float(x)) for x in (*r, *v)))
     path.write_text("\n".join(lines) + "\n", "utf-8")
@@ -125,26 +118,17 @@ def aem(path: Path, scale: str = "UTC", direction: str = "A2B", first: bool = Fa
     t = np.arange(-60.0, 60.0 + 1e-9, step)
     inverse = direction == "B2A"
     q = quaternions(t, "GCRS", "wxyz" if first else "xyzw", inverse)
-    lines = [
-        "CCSDS_AEM_VERS = 1.0",
-        "CREATION_DATE = 2011-03-06T00:00:00",
-        "ORIGINATOR = HERE",
-        "META_START",
-        "OBJECT_NAME = PASS",
-        "OBJECT_ID = 2010-040A",
-        "REF_FRAME_A = ICRF",
-        "REF_FRAME_B = SC_BODY_1",
-        f"ATTITUDE_DIR = {direction}",
-        f"TIME_SYSTEM = {scale}",
-        f"START_TIME = {calendar(t[0], scale)}",
-        f"STOP_TIME = {calendar(t[-1], scale)}",
-        "ATTITUDE_TYPE = QUATERNION",
-        f"QUATERNION_TYPE = {'FIRST' if first else 'LAST'}",
-        "META_STOP",
-        "DATA_START",
-        *(f"{calendar(s, scale)} " + " ".join(f"{float(x):.15f}" for x in row) for s, row in zip(t, q, strict=True)),
-        "DATA_STOP",
-    ]
+    rows = [f"{calendar(s, scale)} " + " ".join(f"{float(x):.15f}" for x in row) for s, row in zip(t, q, strict=True)]
+    lines = f"""CCSDS_AEM_VERS = 1.0
+CREATION_DATE = 2011-03-06T00:00:00
+ORIGINATOR = HERE
+META_START
+OBJECT_NAME = PASS\nOBJECT_ID = 2010-040A\nREF_FRAME_A = ICRF\nREF_FRAME_B = SC_BODY_1\nATTITUDE_DIR = {direction}
+TIME_SYSTEM = {scale}\nSTART_TIME = {calendar(t[0], scale)}\nSTOP_TIME = {calendar(t[-1], scale)}
+ATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = {"FIRST" if first else "LAST"}
+META_STOP
+DATA_START""".splitlines()
+    lines += [*rows, "DATA_STOP"]
     path.write_text("\n".join(lines) + "\n", "utf-8")
     return path
 

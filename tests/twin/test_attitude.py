@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from optics.geometry.pose import rotation_vector
 from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec, OrbitSpec
-from twin.orbit.flight.earth import RATE, Earth
+from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
 
@@ -111,21 +111,6 @@ def test_yaw_steering_stops_the_drift_along_the_line(nadir: str, latitude: float
         assert abs(across / along) > 0.01
 
 
-def test_yaw_angle_at_the_equator() -> None:
-    # inertial velocity (v cos i, v sin i) east and north; the ground takes (omega r, 0) away
-    steered, free = trajectory("geocentric", "yaw", 0.0), trajectory("geocentric", "none", 0.0)
-    turn = rotation_vector(free.body_to_itrs(0.0).T @ steered.body_to_itrs(0.0))
-    position, inertial = free.position(0.0), free.inertial_velocity(0.0)
-    speed, r = np.linalg.norm(inertial), np.linalg.norm(position)
-    inclination = math.acos(np.cross(position, inertial)[2] / (r * speed))
-    drift = math.atan2(math.cos(inclination) - RATE * r / speed, math.sin(inclination)) - math.atan2(
-        math.cos(inclination), math.sin(inclination)
-    )
-    # descending: the track lies to the west of the inertial velocity, right of a satellite going south
-    np.testing.assert_allclose(turn, [0.0, 0.0, -drift], atol=1e-12)
-    assert 3.5 < math.degrees(-drift) < 4.2
-
-
 def test_offset_is_a_turn_of_the_body() -> None:
     path = trajectory(offset=("1 deg", "-2 deg", "3 deg"))
     turn = np.swapaxes(path.orbital_to_itrs([0.0, 9.0]), -1, -2) @ path.body_to_itrs([0.0, 9.0])
@@ -160,17 +145,6 @@ def test_white_noise() -> None:
             assert not inside(x, 1.3 * sigma)
             # white: neighbours' correlation has the deviation 1/sqrt(N); 4.9 sigma for the false-alarm rate
             assert abs(np.mean(x[1:] * x[:-1])) < 4.9 * sigma**2 / math.sqrt(x.size - 1)
-
-
-def test_noise_between_readings_is_joined_smoothly() -> None:
-    path = trajectory().with_errors(SPEC, 5, ["attitude_noise"])
-    t = np.arange(-500.0, 500.0, 0.25)
-    step = 1e-5
-    ends = differences(path, np.concatenate([t - step, t + step]))[2].reshape(2, -1, 3)
-    # a jump at the readings would be arcseconds
-    assert np.max(np.abs(ends[1] - ends[0])) < 1e-2 * ARCSEC
-    halfway = differences(path, t + 0.125)[2] / ARCSEC
-    assert 0.7 * 2 < np.std(halfway[:, 0]) < 1.0 * 2
 
 
 @pytest.mark.second
@@ -224,19 +198,6 @@ def test_terms_are_switched_one_by_one_and_do_not_touch_each_other() -> None:
     np.testing.assert_allclose(
         measured.velocity(t) - path.velocity(t), measured.inertial_velocity(t) - path.inertial_velocity(t), atol=1e-10
     )
-
-
-def test_seeds() -> None:
-    path, t = trajectory(), np.linspace(-10.0, 10.0, 5)
-    one, again, other = (path.with_errors(SPEC, seed) for seed in (3, 3, 4))
-    assert np.array_equal(one.position(t), again.position(t))
-    assert np.array_equal(one.body_to_itrs(t), again.body_to_itrs(t))
-    assert np.min(np.abs(one.position(t) - other.position(t))) > 0.0
-    # errors replace errors, and off they are the truth to the bit
-    assert np.array_equal(other.with_errors(SPEC, 3).position(t), one.position(t))
-    for none in (replace(one, errors=None), path.with_errors(SPEC, 3, []), path.with_errors(ErrorsSpec(), 3)):
-        np.testing.assert_array_equal(none.position(t), path.position(t))
-        np.testing.assert_array_equal(none.body_to_itrs(t), path.body_to_itrs(t))
 
 
 def test_mistakes() -> None:

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from scenes.specs.measured.orbit_data import LineTimesFileSpec
 from scenes.specs.measured.pass_files import PlatformFilesSpec
@@ -130,17 +128,6 @@ def test_the_rpc_of_the_same_file_agrees(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(back, np.degrees((latitude, longitude)), rtol=0, atol=2e-3 * 1e-5)  # 2e-3 px of 0.7 m
 
 
-def test_an_rpc_that_is_off_is_seen(tmp_path: Path) -> None:
-    """Half a pixel between the conventions of the versions is half a pixel here."""
-    sensor = read_scene(write(tmp_path, PLEIADES)).sensor
-    model = RationalPolynomial.fit(sensor, 0, PLEIADES.pixels, (0.0, 3000.0))
-    (tmp_path / "RPC.XML").write_text(
-        rpc(model, "3.0").replace('version="3.0"', 'version="2.1"').replace("GroundtoImage_Values", "Inverse_Model")
-    )
-    found = read_rpc(tmp_path / "RPC.XML")
-    assert found.offset[0] == pytest.approx(model.offset[0] - 1.0, abs=1e-9)
-
-
 def test_signs_of_the_body(tmp_path: Path) -> None:
     """By the file's own orbit, without any model: pixels count from the right of the track, lines with the flight, and
     a look that is turned forward lies ahead.
@@ -180,21 +167,13 @@ def test_an_orbit_that_begins_with_the_image_is_carried_on(tmp_path: Path) -> No
     away = found.ground(row, 100.0) - whole.ground(row, 100.0)
     # times with nanoseconds make 4 um of position, which a spline 3 ms beyond its first points enlarges tenfold
     assert np.abs(away).max() < 1e-3
-    for gap, within in ((0.08, 8e-3), (0.2, None)):
-        # gravity alone, and not the axes' turn, bends the path: a seventh of 2.7 cm in 80 ms
-        later = made
-        for t in seconds:
-            later = later.replace(clock(scene, t), clock(scene, t + gap - 0.003), 1)
-        for (p, v), (q, u) in zip(
-            zip(place, speed, strict=True), zip(*scene.orbit(seconds + gap - 0.003), strict=True), strict=True
-        ):
-            later = later.replace(" ".join(map(repr, p.tolist())), " ".join(map(repr, q.tolist())), 1)
-            later = later.replace(" ".join(map(repr, v.tolist())), " ".join(map(repr, u.tolist())), 1)
-        path.write_text(text.replace("".join(points), later))
-        if within is not None:
-            first = read_dimap(path).spanning_orbit()
-            there = scene.orbit(first.clock.second[:1])[0]
-            assert np.abs(first.position[0] - there[0]).max() < within
+    # 200 ms are too much
+    for t, p, v in zip(seconds, place, speed, strict=True):
+        (q,), (u,) = scene.orbit(np.array([t + 0.197]))
+        made = made.replace(clock(scene, t), clock(scene, t + 0.197), 1)
+        for old, new in ((p, q), (v, u)):
+            made = made.replace(" ".join(map(repr, old.tolist())), " ".join(map(repr, new.tolist())), 1)
+    path.write_text(text.replace("".join(points), made))
     with pytest.raises(InputError, match="begins before the ephemeris"):
         read_scene(path)
 
@@ -245,14 +224,8 @@ REFUSED = {
     "unit": (_edit('LINE_PERIOD unit="ms"', 'LINE_PERIOD unit="furlong"'), r"LINE_PERIOD: another unit"),
     "microseconds": (_edit('LINE_PERIOD unit="ms"', 'LINE_PERIOD unit="us"'), r"LINE_PERIOD: out of bounds"),
     "seconds": (_edit('LINE_PERIOD unit="ms">0.', 'LINE_PERIOD unit="ms">1.'), r"line period, number of lines and tim"),
-    "profile": (
-        _edit("PHR_SENSOR", "PHR_ORTHO"),
-        r"METADATA_PROFILE: a profile that is not read.*polynomials",
-    ),
-    "version": (
-        _edit('version="2.15"', 'version="1.1"'),
-        r"METADATA_FORMAT: not this format.*DIMAP 1.1.*SPOT 1 to 5",
-    ),
+    "profile": (_edit("PHR_SENSOR", "PHR_ORTHO"), r"METADATA_PROFILE: a profile that is not read.*polynomials"),
+    "version": (_edit('version="2.15"', 'version="1.1"'), r"METADATA_FORMAT: not this format.*DIMAP 1.1.*SPOT 1 to 5"),
     "version 4": (_edit('version="2.15"', 'version="4.0"'), r"METADATA_FORMAT: not this format"),
     "ground segment": (lambda t: t.replace("Dimap_Document", "PHR_Dimap_Document"), r"not a DIMAP file.*DIMAP_PHR"),
     "no model": (lambda t: t.replace("Refined_Model", "Sensor_Model"), r"no rigorous model"),
@@ -262,6 +235,10 @@ REFUSED = {
     "five coefficients": (
         _edit("<DEGREE>3</DEGREE><COEFFICIENTS>", "<DEGREE>3</DEGREE><COEFFICIENTS>1 "),
         r"COEFFICIENTS: another number of",
+    ),
+    "looks away": (
+        lambda t: t.replace("Q0>", "Qx>").replace("Q2>", "Q0>").replace("Qx>", "Q2>"),
+        r"the middle of the image does not look at the Earth",
     ),
     "not unit": (lambda t: re.sub(r"(<Q1><DEGREE>3</DEGREE><COEFFICIENTS>)\S+", r"\g<1>3.5", t), r"not a quaternion"),
     "a coordinate lost": (lambda t: re.sub(r'"m">(-?)(\d+)', r'"m">\1', t), r"no place of a satellite"),
@@ -311,30 +288,6 @@ def test_a_billion_laughs_and_files_that_are_too_deep_or_long(tmp_path: Path, mo
         (tmp_path / "DIM.XML").write_text(text)
         with pytest.raises(InputError, match=message):
             read_dimap(tmp_path / "DIM.XML")
-
-
-TEXT = dimap(replace(PLEIADES, lines=2000))
-TOKENS = [m.span() for m in re.finditer(r"[^<>\s]+|<[^>]*>", TEXT)]
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    st.integers(0, len(TOKENS) - 1),
-    st.sampled_from(
-        ["", "0", "-1", "1e400", "nan", "x", "<", "&", "1 2 3", "9" * 400, "<a/>", "\u0661", "2017", "1e12"]
-    ),
-)
-def test_any_edit_is_read_or_told(tmp_path: Path, which: int, put: str) -> None:
-    """Whatever one piece of the file becomes, it is a scene or a message with file and place, and nothing else."""
-    start, end = TOKENS[which]
-    path = tmp_path / "DIM.XML"
-    path.write_text(TEXT[:start] + put + TEXT[end:])
-    told = []
-    try:
-        assert read_scene(path).read.lines >= 1
-    except InputError as error:
-        told = error.issues
-    assert all(issue.file == str(path) and issue.problem for issue in told)
 
 
 def test_line_times_of_a_scene(tmp_path: Path) -> None:
@@ -392,30 +345,3 @@ def test_velocities_of_other_files_are_not_those_against_the_stars() -> None:
                     require_own_velocity(orbit)
             else:
                 require_own_velocity(orbit)
-
-
-def test_an_image_that_spans_ephemeris_and_samples_keeps_its_order(tmp_path: Path) -> None:
-    """Both begin with the first line and end with the last, as of SPOT 6: half a line lies outside at either end."""
-    scene = replace(SPOT, start=80_000.0, lines=6000)
-    whole = read_scene(write(tmp_path, scene)).sensor
-    last = scene.start + (scene.lines - 1) * scene.period
-    t = np.linspace(scene.start, last, 50)
-    place, speed = scene.orbit(t)
-    points = "".join(
-        f"<Point><LOCATION_XYZ>{' '.join(map(repr, p.tolist()))}</LOCATION_XYZ>"
-        f"<VELOCITY_XYZ>{' '.join(map(repr, v.tolist()))}</VELOCITY_XYZ><TIME>{clock(scene, s)}</TIME></Point>"
-        for s, p, v in zip(t, place, speed, strict=True)
-    )
-    turns = "".join(
-        f"<Quaternion>{''.join(f'<Q{k}>{v!r}</Q{k}>' for k, v in enumerate(q.tolist()))}"
-        f"<TIME>{clock(scene, s)}</TIME></Quaternion>"
-        for s, q in zip(t, scene.quaternions(t), strict=True)
-    )
-    text = re.sub(r"<Point_List>.*</Point_List>", f"<Point_List>{points}</Point_List>", dimap(scene), flags=re.DOTALL)
-    made = f"<Quaternion_List>{turns}</Quaternion_List>"
-    text = re.sub(r"<Quaternion_List>.*</Quaternion_List>", made, text, flags=re.DOTALL)
-    (tmp_path / "DIM_SCENE.XML").write_text(text)
-    found = read_scene(tmp_path / "DIM_SCENE.XML").sensor
-    row = np.array([-0.5, 0.0, 3000.0, scene.lines - 0.5])
-    # texts of times have nanoseconds, in which the satellite moves by 7 um; over a sample of 25 ms tenfold
-    assert np.abs(found.ground(row, 10.0) - whole.ground(row, 10.0)).max() < 1e-3

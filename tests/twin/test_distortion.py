@@ -9,7 +9,6 @@ from scipy import stats
 
 from analysis.orientation.interior import fit_interior_orientation
 from analysis.orientation.measurement import Spots, locate_spots
-from analysis.spots.centroid import energy_centroid
 from analysis.turntable.dividing_error import choose, compensate
 from analysis.units import ARCSEC
 from optics.numerics.backend import load_backend
@@ -21,7 +20,6 @@ from scenes.specs.resolved import resolve_distortion
 from tests.tiers import quick
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_numbers import DISTORTION
-from twin.laboratory.distortion_report import distortion_report
 from twin.laboratory.distortion_run import CLOSED_FORMS, SimulatedDistortion, measure, reduce
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import rms
@@ -85,51 +83,6 @@ def test_images_are_those_of_the_general_renderer():
 
 
 @pytest.mark.second
-def test_pixel_sampling_moves_no_centroid():
-    """Noise-free spots, shifted by a pixel in steps: the pinhole is wide enough for pixels of 7 um."""
-    b = bench()
-    pitch = b.ccd.band.pitch
-    steps = np.linspace(0.0, 1.0, 11)
-    place = np.stack([(15.0 + steps) * pitch, np.full(11, 15.3 * pitch)], axis=-1)
-    images = b.images(0.6 * b.turn[-1], place)
-    spots = energy_centroid(1e4 * images + 100.0, 4, b.noise, b.radius)
-    off = spots.column * pitch - place[:, 0]
-    # 0.001 pixel, a hundredth of what one exposure scatters
-    assert np.ptp(off) < 7 * NM
-    assert np.ptp(spots.column) == pytest.approx(1.0, abs=2e-3)
-
-
-@pytest.mark.second
-def test_line_follows_the_turn_and_the_middle_is_zero():
-    b, truth = bench(), run().truth
-    middle = b.places(truth.axis, np.zeros(1))[0]
-    assert middle == pytest.approx([0.0, 0.0], abs=1e-12)
-    along = b.places(truth.axis, np.array([-1e-3, 1e-3]))[:, 0]
-    # L = +f tan W with the focal length along the line; mirror figures change it by parts in 1e5
-    assert along == pytest.approx(b.path.model.line_principal_distance * np.tan([-1e-3, 1e-3]), rel=1e-4)
-    # a tilted axis moves spots across the line to first order, along it to second order only
-    straight = b.places(np.array([1.0, 0.0, 0.0]), b.turn)
-    tilted = b.places(np.array([1.0, 1e-4, 0.0]) / np.hypot(1.0, 1e-4), b.turn)
-    assert np.max(np.abs(tilted[:, 0] - straight[:, 0])) < 0.1 * UM
-    slope = np.polyfit(b.turn, tilted[:, 1] - straight[:, 1], 1)[0]
-    # by the tilt times the focal length across the line (conventions: 5.672 m)
-    assert abs(slope) == pytest.approx(1e-4 * 5.672, rel=0.01)
-
-
-@pytest.mark.second
-def test_spots_are_found_where_the_chief_rays_go():
-    """Centroids, less the design's offset, against chief rays: noise and what the window cuts off."""
-    r = run()
-    off = r.spots.position - r.truth.place[..., 0]
-    off = off - np.mean(off)
-    assert off.size == 550
-    # noise of frames and columns is 20 nm; coma beyond the design and the window's edge leave some 10 nm over the field
-    assert np.std(off) < 40 * NM
-    slope = np.polyfit(np.tan(r.bench.turn), np.mean(off, axis=1), 1)[0]
-    assert abs(slope) < 0.2 * r.compensated.fit.sigma("principal_distance")
-
-
-@pytest.mark.second
 def test_noise_of_the_spots_is_as_stated():
     """The same spots on another day's frames: temporal noise, and columns that stay."""
     b = within(altered(points=55, setting=0.0))
@@ -152,6 +105,7 @@ def test_noise_of_the_spots_is_as_stated():
     assert low < np.var(rest) * 55 / 51 / np.mean(spots.fixed**2 + spots.temporal**2 / 10) < high
 
 
+@pytest.mark.second
 def test_result_agrees_with_the_truth():
     data = DISTORTION(run())
     truth = data["truth"]
@@ -189,19 +143,6 @@ def test_error_of_the_zero_spoils_the_printed_equations_and_not_the_constant():
     assert r.estimates["eq2"].p - r.estimates["constant"].p == pytest.approx(expected, rel=0.1)
 
 
-def test_report_and_images():
-    result = distortion_report(run())
-    names = {artefact.name for section in result.sections for artefact in section.artefacts}
-    assert {"distortion-curve", "distortion-points", "distortion-spot", "distortion-estimates"} <= names
-    assert {name: frames.shape for name, frames in result.images.items()} == {
-        "spot-01": (4, 32, 32),
-        "spot-28": (4, 32, 32),
-        "spot-55": (4, 32, 32),
-    }
-    assert "not observable" in result.lead[-1]
-    assert "within 3 σ of the truth" in result.verdict
-
-
 @pytest.mark.parametrize(
     ("changes", "key", "text"),
     [
@@ -217,6 +158,7 @@ def test_bench_that_cannot_be_built(changes, key, text):
     assert error.value.remedy
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("changes", "key", "text"),
     quick(
@@ -234,8 +176,11 @@ def test_test_that_cannot_be_measured(changes, key, text):
         measure(replace(b, turn=b.turn[few], design_offset=b.design_offset[few]), 3)
     assert error.value.key == (key,)
     assert error.value.remedy
+    assert ("less light" in error.value.remedy) is (text == "saturated")
+    assert ("more light" in error.value.remedy) is (text == "no spot")
 
 
+@pytest.mark.second
 def test_fewer_points_than_unknowns():
     b = bench()
     few = [0, 27, 54]
@@ -243,36 +188,6 @@ def test_fewer_points_than_unknowns():
     with pytest.raises(BenchError, match="3 different angles for 4 unknowns") as error:
         measure(b, 1)
     assert error.value.key == ("points",)
-
-
-@pytest.mark.slow
-def test_hundred_tests():
-    """Scatter against sigmas over 100 tests: another table, calibration, zero, axis, detector and noise in each."""
-    count, terms = 100, ("principal_distance", "principal_point")
-    score, radial, pointwise, raw, own = [], [], [], [], []
-    for seed in range(1000, 1000 + count):
-        r = measure(bench(), seed)
-        true, fit = r.true_fit(), r.compensated.fit
-        score.append([(fit.value(term) - true.value(term)) / fit.sigma(term) for term in terms])
-        smooth, exact = r.compensated.smooth, r.true_fit(r.compensated.smooth.terms)
-        radial.append((smooth.value("radial3") - exact.value("radial3")) / smooth.sigma("radial3"))
-        pointwise.append(np.mean((r.error(r.compensated) / r.compensated.sigma) ** 2))
-        raw.append(np.sqrt(np.mean(r.error(r.raw) ** 2)))
-        own.append(np.sqrt(np.mean(r.error(r.compensated) ** 2)))
-    score = np.array(score)
-    low, high = stats.chi2.ppf([FALSE_ALARM, 1 - FALSE_ALARM], count)
-    for values in (*score.T, np.array(radial)):
-        assert low < np.sum(values**2) < high
-        # no bias: the mean of 100 is within 4 of its sigmas
-        assert abs(np.mean(values)) < 4 / np.sqrt(count)
-    # 95.4 % within two sigmas
-    for values in score.T:
-        assert np.sum(np.abs(values) < 2) >= stats.binom.ppf(FALSE_ALARM, count, 0.954)
-    # points of one test share the calibration's noise; the mean square of one test scatters by 0.2 to 0.3
-    assert np.mean(pointwise) == pytest.approx(1.0, abs=4 * np.std(pointwise) / np.sqrt(count) + 0.05)
-    assert np.max(own) < ACCURACY_UM * UM
-    # the paper's 35 % is in the range of what tables of this class give
-    assert 0.2 < np.median(1.0 - np.array(own) / np.array(raw)) < 0.6
 
 
 def turntable_score(setup, seed: int) -> list[float]:
@@ -302,13 +217,11 @@ def turntable_score(setup, seed: int) -> list[float]:
     return out
 
 
-@pytest.mark.slow
-def test_sigmas_over_400_turntables():
-    """In 22 tests f had once scattered by 1.35 of its sigma; over 400 others it was 0.91, p 0.85 and radial3 0.86."""
-    setup, count = resolve_distortion("distortion"), 400
+@pytest.mark.second
+def test_sigmas_over_40_turntables():
+    """Of f, p and radial3; over 400 tests they scattered by 0.91, 0.85 and 0.86 of their sigmas."""
+    setup, count = resolve_distortion("distortion"), 40
     score = np.array([turntable_score(setup, seed) for seed in range(2000, 2000 + count)])
-    # sigmas hold, and are not more than 1.4 times too large
     for values in score.T:
-        assert np.sum(values**2) < stats.chi2.isf(FALSE_ALARM, count)
-        assert np.mean(values**2) > 0.5
+        assert stats.chi2.ppf(FALSE_ALARM, count) < np.sum(values**2) < stats.chi2.isf(FALSE_ALARM, count)
         assert abs(np.mean(values)) < 4.0 / np.sqrt(count)

@@ -3,23 +3,16 @@
 Seeds are fixed, so that a test passes or fails for good. Every chi-square test has a false-alarm rate of 1e-4 per side.
 """
 
-import json
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from analysis.focal_plane.plane_fit import RigidMotion
 from optics.geometry.pose import Pose, rotation_matrix, rotation_vector
-from optics.numerics.backend import load_backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import FocusSetup, resolve_focus
 from twin.laboratory.focus_bench import FocusBench
-from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_run import SimulatedFocus, align, line_turn, misset, mount_of, plan_shims, run_focus
 from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, Standing
 from twin.run.procedure import BenchError, silent
@@ -33,8 +26,6 @@ LEVEL = ARCMIN
 """and level within +-1 arcmin."""
 FALSE_ALARM = 1e-4
 SEEDS = (1, 2)
-MANY = range(100, 150)
-PROCESSES = 2
 
 
 def reduced() -> FocusSetup:
@@ -111,26 +102,12 @@ def test_level_is_read_and_set_with_the_theodolites_sigma(alignments) -> None:
         assert low < np.sum(np.square(values)) < high
 
 
-@pytest.mark.slow
-def test_the_seed_decides(alignments, coarse) -> None:
-    """The coarse shims' run repeats the first seed as far as the first shims."""
-    first, second = (focus_numbers(alignments[seed]) for seed in SEEDS)
-    again = focus_numbers(coarse)
-    assert again["initial"] == first["initial"]
-    assert again["truth"]["initial"] == first["truth"]["initial"]
-    for part in ("initial", "rounds"):
-        assert first[part] != second[part]
-        assert first["truth"][part] != second["truth"][part]
-
-
 @pytest.mark.second
 def test_misset_is_drawn_with_the_files_sizes(bench) -> None:
     """400 draws: variances of rotations, shifts and chips by chi-square."""
     spec = bench.setup.test.misset
     draws = [misset(bench, seed) for seed in range(400)]
-    values = np.array(
-        [[*rotation_vector(d.pose.rotation), *d.pose.translation, *d.heights.values()] for d in draws],
-    )
+    values = np.array([[*rotation_vector(d.pose.rotation), *d.pose.translation, *d.heights.values()] for d in draws])
     sigma = np.array([*spec.rotate, *spec.shift, *[spec.chips] * len(bench.ccds)])
     low, high = chi2.ppf([FALSE_ALARM, 1.0 - FALSE_ALARM], len(draws))
     sums = np.sum((values / sigma) ** 2, axis=0)
@@ -138,27 +115,6 @@ def test_misset_is_drawn_with_the_files_sizes(bench) -> None:
 
 
 @pytest.mark.second
-def test_json(bench, alignments) -> None:
-    alignment = alignments[SEEDS[0]]
-    data = json.loads(json.dumps(focus_numbers(alignment), allow_nan=False))
-    assert len(data["rounds"]) == bench.setup.test.rounds == 1
-    end, truth = data["rounds"][0], data["truth"]
-    assert {"confocal_um_max", "line_level_arcmin", "mtf_nyquist", "shims_um"} <= set(end)
-    assert list(end["mtf_nyquist"]) == ["P", "B4"]
-    assert list(end["shims_um"]) == ["hole_1", "hole_2", "hole_3", "hole_4"]
-    mount = bench.setup.test.mount
-    for name, thickness in end["shims_um"].items():
-        assert thickness / (1e6 * mount.step) == pytest.approx(round(thickness / (1e6 * mount.step)), abs=1e-9)
-        assert thickness - end["shim_changes_um"][name] == pytest.approx(1e6 * mount.thickness, abs=1e-6)
-    assert end["confocal_um_max"] == max(abs(site["defocus_um"]) for site in end["sites"])
-    assert truth["rounds"][0]["confocal_um_max"] == max(abs(v) for v in truth["rounds"][0]["defocus_um"])
-    # five sigma of the measured MTF, and what the measurement of an edge leaves
-    for band, value in end["mtf_nyquist"].items():
-        allowed = 5.0 * end["mtf_nyquist_sigma"][band] + 1e-3
-        assert value == pytest.approx(truth["rounds"][0]["mtf_nyquist"][band], abs=allowed)
-
-
-@pytest.mark.slow
 def test_coarse_shims_leave_what_their_rounding_leaves(bench, alignments, coarse) -> None:
     """Steps of 50 um: every hole is off by up to 25 um, and the plan says what that leaves at the CCDs."""
     fine = alignments[SEEDS[0]]
@@ -172,19 +128,6 @@ def test_coarse_shims_leave_what_their_rounding_leaves(bench, alignments, coarse
     # the plan's plane is at the nominal places; the chips stand up to 1 mm beside them, on slopes of 0.1 mrad
     np.testing.assert_allclose(predicted, found, rtol=0.0, atol=0.2e-6)
     assert np.max(np.abs(found)) > 3e-6
-
-
-@pytest.mark.second
-def test_a_second_round_goes_on_from_the_first(coarse) -> None:
-    assert len(coarse.states) == 3
-    first, second = (s.plan for s in coarse.shimmings)
-    np.testing.assert_allclose(second.thickness - second.rounded_change, first.thickness, rtol=0.0, atol=1e-12)
-    # what is left to do is what rounding left, and what the first plane was wrong by
-    wrong = np.sqrt(np.diag(first.change_covariance))
-    assert np.all(np.abs(second.change) < 25e-6 + 5.0 * wrong)
-    for state in coarse.states[1:]:
-        assert np.max(np.abs(state.true_defocus)) < CONFOCAL
-        assert abs(state.true_level) < LEVEL
 
 
 @pytest.mark.second
@@ -235,84 +178,3 @@ def test_what_cannot_be_done_names_the_key(bench, backend) -> None:
     with pytest.raises(BenchError, match=r"beam is \d+ mm wide .* aperture 500 mm") as caught:
         run_focus(setup.model_copy(update={"test": test}), backend, 1, silent)
     assert caught.value.key == ("collimator", "aperture")
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What one alignment of many leaves behind.
-
-    Attributes:
-        error: (3,) measured minus true plane: piston and slopes.
-        covariance: (3, 3) predicted.
-        systematic: (3,) sigma of the part of the error that all alignments share.
-        measured, true: (2, N) defocus before and after, metres.
-        sigma: (2, N) of the measured one.
-        level: (2,) true, radians.
-    """
-
-    error: np.ndarray
-    covariance: np.ndarray
-    systematic: np.ndarray
-    measured: np.ndarray
-    true: np.ndarray
-    sigma: np.ndarray
-    level: np.ndarray
-
-
-_bench: FocusBench | None = None
-
-
-def start_worker() -> None:
-    """Build the full bench once in every process."""
-    global _bench
-    _bench = FocusBench(resolve_focus(FILE), load_backend("llvm"))
-
-
-def outcome(seed: int) -> Outcome:
-    """One alignment on the process's bench."""
-    assert _bench is not None
-    done = align(_bench, seed)
-    plane = done.shimmings[0].plane
-    return Outcome(
-        np.array([plane.piston, plane.slope_x, plane.slope_y]) - done.true_plane(0),
-        done.shimmings[0].covariance,
-        done.shimmings[0].systematic,
-        np.array([state.defocus for state in done.states]),
-        np.array([state.true_defocus for state in done.states]),
-        np.array([state.defocus_sigma for state in done.states]),
-        np.array([state.true_level for state in done.states]),
-    )
-
-
-def many_outcomes() -> list[Outcome]:
-    """Fifty alignments; a spawned process does not inherit the threads of this one."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(PROCESSES, context, start_worker) as pool:
-        return list(pool.map(outcome, MANY))
-
-
-def judge(outcomes: list[Outcome]) -> None:
-    """What must hold of many alignments."""
-    confocal = np.array([np.max(np.abs(o.true[1])) for o in outcomes])
-    level = np.array([abs(o.level[1]) for o in outcomes])
-    # nearly all of them began outside
-    assert np.mean([np.max(np.abs(o.true[0])) > CONFOCAL for o in outcomes]) > 0.9
-    assert np.mean((confocal < CONFOCAL) & (level < LEVEL)) >= 0.95
-    # measured confocal error against the true one: the largest of 25 is off by less than four sigma of a single site
-    for o in outcomes:
-        measured, true = (np.max(np.abs(v[1])) for v in (o.measured, o.true))
-        assert abs(measured - true) < 4.0 * np.hypot(np.max(o.sigma[1]), VERTEX_ERROR)
-    # the plane's sigma: noise by the scatter, and what is common to all alignments of a camera by the mean
-    error, systematic = np.array([o.error for o in outcomes]), np.array([o.systematic for o in outcomes])
-    noise = np.array([np.diag(o.covariance) for o in outcomes]) - systematic**2
-    common = np.average(error, weights=1.0 / noise, axis=0)
-    scatter = np.sum((error - common) ** 2 / noise, axis=0)
-    low, high = chi2.ppf([FALSE_ALARM, 1.0 - FALSE_ALARM], len(outcomes) - 1)
-    assert np.all((low < scatter) & (scatter < high))
-    assert np.all(np.abs(common) < 3.0 * np.sqrt(systematic[0] ** 2 + np.mean(noise, axis=0) / len(outcomes)))
-
-
-@pytest.mark.slow
-def test_fifty_random_missettings() -> None:
-    """Rotations of 3, 10 and 3 arcmin and a piston of 0.3 mm, one sigma each, with all bands and fields."""
-    judge(many_outcomes())

@@ -73,6 +73,7 @@ def places(bench: FocusBench) -> np.ndarray:
     return np.array(out)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("defocus", "tolerance"),
     quick(4, [(0.0, TABLE), (37.4e-6, TABLE), (-112.3e-6, TABLE), (0.5876e-3, TABLE), (-0.8e-3, OUTSIDE)]),
@@ -88,6 +89,7 @@ def test_tables(bench, defocus: float, tolerance: float) -> None:
             assert np.all(imager.optics.at(defocus, frequency)[frequency > imager.optics.cutoff] == 0.0)
 
 
+@pytest.mark.second
 def test_best_focus_is_the_maximum(middle) -> None:
     """Against a fine scan of the exact transfer function: the MTF is flat at its peak, to 1e-6."""
     site = middle.sites[0]
@@ -99,6 +101,7 @@ def test_best_focus_is_the_maximum(middle) -> None:
         assert z[np.argmax(exact[:, 0])] == pytest.approx(site.edge_focus[edge], abs=1.1e-6)
 
 
+@pytest.mark.second
 def test_geometry_of_a_misset_focal_plane(bench) -> None:
     """Where chief rays meet it, and the MTF there, against rays traced to the turned and shifted focal plane.
 
@@ -141,6 +144,7 @@ def test_a_chips_height_counts_downstream(middle) -> None:
     assert heights[0] - heights[1] == pytest.approx((last.place[0] - first.place[0]) * np.tan(5.0 * ARCMIN), rel=1e-3)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("shift", [1e-3, -1e-3])
 def test_a_moved_target_is_a_moved_detector(bench, shift: float) -> None:
     """Pupils traced with the target 1 mm out of the collimator's focus, 80 um at the image."""
@@ -159,6 +163,7 @@ def test_a_moved_target_is_a_moved_detector(bench, shift: float) -> None:
                 assert abs(float(np.abs(imager.optics.at(-as_detector, frequency))[0]) - exact) > 0.02
 
 
+@pytest.mark.second
 def test_images_are_measured_right(bench) -> None:
     """Without noise: rendered edges, measured from the pixels, against the transfer function up to Nyquist."""
     for site in bench.sites:
@@ -175,6 +180,7 @@ def test_images_are_measured_right(bench) -> None:
                 np.testing.assert_allclose(measured.mtf[below], true, rtol=0.0, atol=5e-3)
 
 
+@pytest.mark.second
 def test_site_image_moves_target_and_chip(middle) -> None:
     """A target moved as far as the chip stands gives the image in focus."""
     site = middle.sites[0]
@@ -189,6 +195,7 @@ def budget(middle) -> tuple[BudgetLine, ...]:
     return middle.budget()
 
 
+@pytest.mark.second
 def test_budget(middle, budget) -> None:
     """Factors multiply to the total, and the total along the track is the paper's MTF (Table 1) to 0.025: the paper
     gives two decimals of one camera, and by the diffraction limit B1 to B4 cannot be as alike as it prints them.
@@ -208,22 +215,3 @@ def test_budget(middle, budget) -> None:
     by_band = {line.band: line for line in budget if line.edge == TRACK}
     assert by_band["P"].total == pytest.approx(0.20, abs=0.02)
     assert np.mean([by_band[b].total for b in ("B1", "B2", "B3", "B4")]) == pytest.approx(0.3625, abs=0.02)
-
-
-def test_diffraction_factor_against_an_unaberrated_circle(middle, budget) -> None:
-    """Hopkins' MTF of a round pupil at the band's frequency and wavelengths, F/9.2 to F/9.45 by direction: the pupil
-    is an ellipse of even light.
-    """
-    for line in budget:
-        site = next(s for s in middle.sites if s.band == line.band)
-        imager = site.imagers[line.edge]
-        wavelength, weight = band_wavelengths(imager.ccd.band)
-        cutoff = imager.optics.cutoff * wavelength.min() / wavelength
-        cutoff *= imager.ccd.band.spectrum.ends[0] / wavelength.min()
-        s = site.nyquist / cutoff
-        circle = 2.0 / np.pi * (np.arccos(s) - s * np.sqrt(1.0 - s * s))
-        expected = float(np.sum(weight * circle) / np.sum(weight))
-        # the pupil is an ellipse of even light to some 1e-3
-        assert line.factors["diffraction"] == pytest.approx(expected, rel=2e-3)
-        # the design's own wavefront of 0.018 waves takes (2 pi 0.018)^2 = 1.3% at most
-        assert 0.98 < line.factors["design"] <= 1.0

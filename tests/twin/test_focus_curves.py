@@ -55,6 +55,7 @@ def piston_pull(run: FocusRun) -> float:
     return float((1e6 * plane.plane.piston - PLANE[0]) / (1e6 * np.sqrt(plane.plane_covariance[0, 0])))
 
 
+@pytest.mark.second
 def test_a_skew_of_all_curves_is_a_common_error(tmp_path):
     """Widths 1.25 and 0.85: without the skew in sigma the piston is 19 of them off."""
     runs = {}
@@ -73,6 +74,7 @@ def test_a_skew_of_all_curves_is_a_common_error(tmp_path):
     assert 1e6 * even < 2.0
 
 
+@pytest.mark.second
 def test_rows_with_gross_errors_are_named_and_do_not_count(tmp_path):
     """One row in twenty wrong by 0.1, at any position: what is left out is wrong, and the plane is right."""
     rows, rng = series(4), np.random.default_rng(9)
@@ -110,6 +112,7 @@ def test_sound_curves_lose_no_point():
         assert not outlying_points(1e-6 * STEPS, value, np.full(STEPS.size, SIGMA), 5.0).any()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("copies", [0, 195])
 def test_copied_rows_are_said(tmp_path, copies):
     rows = series(5)

@@ -11,6 +11,7 @@ from scenes.specs.orbit.setup import resolve_simulate
 from twin.orbit.export import ground_accuracy
 from twin.orbit.export.ground_accuracy import (
     TOGETHER,
+    AccuracyMap,
     CameraUncertainty,
     intersected_accuracy,
     maps_of,
@@ -66,6 +67,17 @@ def wrong(sensor: Sensor, error: np.ndarray) -> Sensor:
 def level(sensor: Sensor, ground: np.ndarray) -> np.ndarray:
     longitude, latitude, _ = sensor.earth.geodetic(ground)
     return east_north_up(longitude, latitude)
+
+
+def test_a_map_of_known_covariances() -> None:
+    """RMS of a horizontal axis, the circle and the interval of 90 %, and nothing where nothing is seen."""
+    constant, random = (np.array([np.diag(v)] * 2) for v in ([4.0, 8.0, 100.0], [1.0, 3.0, 25.0]))
+    place = np.array([0.1, np.nan])
+    found = AccuracyMap(place, place, place, place, 300.0, constant, random, 0.0 * random, (1, 2))
+    assert found.horizontal() == pytest.approx((np.sqrt(6.0), np.sqrt(2.0)))
+    assert found.le90 == pytest.approx([1.6448536 * np.sqrt(125.0), np.nan], nan_ok=True)
+    even = replace(found, constant=np.array([np.diag([4.0, 4.0, 9.0])] * 2), random=0.0 * random)
+    assert even.ce90 == pytest.approx([2.0 * np.sqrt(2.0 * np.log(10.0)), np.nan], nan_ok=True)
 
 
 @pytest.mark.second
@@ -146,15 +158,6 @@ def test_intersected_points_against_least_squares(sensors) -> None:
 
 
 @pytest.mark.second
-def test_three_lines_know_heights_better_than_two(sensors) -> None:
-    only = uncertainty(platform=np.zeros((6, 6)), interior=np.zeros((3, 3)))
-    two = intersected_accuracy({n: sensors[n] for n in ("nadir", "forward")}, only, HEIGHT)
-    three = intersected_accuracy({n: sensors[n] for n in ("nadir", "forward", "backward")}, only, HEIGHT)
-    middle = slice(5, 10)  # lines that all three see
-    assert np.all(three.le90[middle] < 0.6 * two.le90[middle])
-    assert not np.any(two.constant[two.seen])
-
-
 def test_maps_of_a_pass(sensors) -> None:
     places = {name: (s, 0, s.camera.pixels) for name, s in sensors.items()}
     maps = maps_of(places, uncertainty(), HEIGHT)

@@ -5,28 +5,21 @@ from functools import partial
 
 import numpy as np
 import pytest
-import yaml
 
-import twin.render as command
 from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import aim_collimated
 from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import fit_wavefront, path_difference
 from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.specs.load import LIBRARY, load_detector
-from scenes.specs.resolved import resolve
-from tests.twin.commands import invoke
-from twin.monitor.image_quality import FIELDS, PLACES, QUALITY, quality_dicts
+from scenes.specs.load import load_detector
+from twin.monitor.image_quality import FIELDS, PLACES, QUALITY
 from twin.monitor.image_quality import image_quality as quality_of
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
-from twin.study.runs.base_job import Run
-from twin.study.runs.render_base import RenderBase
 from twin.targets.target_path import TargetPath
 
 WAVELENGTH, ARCSEC = 650e-9, np.pi / 180 / 3600
@@ -79,33 +72,8 @@ def launched(instrument, backend, state, direction: np.ndarray) -> np.ndarray:
     return aim_collimated(backend, to_stop, direction, start, radius * POINTS)[0][0]
 
 
-def single(instrument, backend, state, field: float) -> float:
-    """Wavefront error in waves by one state's rays about the chief ray that is really traced."""
-    direction = light_of(instrument, backend, state, field)
-    launch = launched(instrument, backend, state, direction)
-    system = assemble(instrument.assembly, [f"{CAMERA}/imaging"], [state])
-    position, leaving, path, valid = (
-        a[0] for a in trace(backend, system, make_rays(backend, launch, direction)).numpy()
-    )
-    assert valid.all()
-    # the pixel looks where its chief ray came from
-    assert np.allclose(position[0], place_of(instrument, field), atol=1e-10)
-    radius = float(instrument.cameras[CAMERA].first_order.exit_pupil_distance[0])
-    return rms(path_difference(position, leaving, path + launch @ direction, 0, radius))
-
-
 def rms(difference: np.ndarray) -> float:
     return float(fit_wavefront(NODES.x, NODES.y, NODES.weight, difference[1:]).rms) / WAVELENGTH
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("s", range(len(STATES)))
-def test_wavefront_error_is_that_of_one_traced_beam(gf7_pair, backend, quality, s: int) -> None:
-    """More rings, and a chief ray among the rays: what is left is rounding of paths of 10 m, 1e-15 m, and of aiming."""
-    expected = [single(gf7_pair, backend, STATES[s], field) for field in FIELDS]
-    np.testing.assert_allclose(quality.cameras[CAMERA].wfe[s], expected, rtol=0, atol=1e-8)
-    if s == 1:
-        assert min(expected) > 0.05  # far beyond the design's 0.015
 
 
 def test_nominal_wavefront_errors(quality) -> None:
@@ -149,42 +117,6 @@ def test_wavefront_error_against_batoid(gf7_pair, backend) -> None:
         assert rms(difference) == pytest.approx(value, abs=1e-6)
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("despace", [30e-6, -80e-6])
-def test_defocus_of_a_moved_secondary_mirror(gf7_pair, backend, despace: float) -> None:
-    moved = {f"{ROOT}/M2": Motion(shift=(0.0, 0.0, despace))}
-    fields = (1.0, 0.0, -1.0)
-    nominal, after = (image_quality(gf7_pair, backend, [s], fields).cameras[CAMERA] for s in ({}, moved))
-    assert np.all(after.wfe > 2.0 * after.wfe_refocused)
-    for k, field in enumerate(fields):
-        # after three mirrors the light goes along the focal plane's Z; where the line is put into its focus none is
-        # left but for the field, which moves a little under the pixel
-        refocused = {**moved, f"{ROOT}/focal_plane": Motion(shift=(0.0, 0.0, float(after.defocus[0, k])))}
-        again = image_quality(gf7_pair, backend, [refocused], (field,)).cameras[CAMERA]
-        assert abs(again.defocus[0, 0]) < 1e-8
-        assert again.wfe[0, 0] == pytest.approx(after.wfe_refocused[0, k], abs=1e-5)
-        # and it is how far the crossing of close rays moves, but for the aberrations that come along
-        change = after.defocus[0, k] - nominal.defocus[0, k]
-        crossing = [close_crossing(gf7_pair, backend, state, field) for state in ({}, moved)]
-        assert change == pytest.approx(crossing[1] - crossing[0], rel=0.02)
-        assert abs(change) > 2.0 * abs(despace)  # magnified along the light
-
-
-def close_crossing(instrument, backend, state, field: float) -> float:
-    """Mean distance downstream of the focal plane at which rays of 1 mm around the chief ray cross it, metres."""
-    direction = light_of(instrument, backend, state, field)
-    launch = launched(instrument, backend, state, direction)[0]
-    system = assemble(instrument.assembly, [f"{CAMERA}/imaging"], [state])
-    side = np.cross(direction, [0.0, 1.0, 0.0])
-    side /= np.linalg.norm(side)
-    other = np.cross(direction, side)
-    around = launch + 1e-3 * np.array([0 * side, side, -side, other, -other])
-    position, leaving, *_ = (a[0] for a in trace(backend, system, make_rays(backend, around, direction)).numpy())
-    slope = leaving[:, :2] / np.abs(leaving[:, 2:])
-    offset, spread = position[1:, :2] - position[0, :2], slope[1:] - slope[0]
-    return float(-np.sum(offset * spread) / np.sum(spread**2))
-
-
 @pytest.mark.parametrize("s", [0, 1])
 def test_mtf_is_that_of_the_path_that_images_edges(gf7_pair, backend, quality, s: int) -> None:
     """Required: 1e-4. Nodes, wavelengths and the solution of the fit are others, 1e-6; a line in its nominal place."""
@@ -200,24 +132,6 @@ def test_mtf_is_that_of_the_path_that_images_edges(gf7_pair, backend, quality, s
     np.testing.assert_allclose(quality.cameras[CAMERA].mtf_along_line[s], along, atol=2e-6)
     np.testing.assert_allclose(quality.cameras[CAMERA].mtf_along_track[s], track, atol=2e-6)
     assert np.ptp(along - track) > 1e-4 or s == 0  # the directions are not the same by chance
-
-
-def test_mtf_falls_with_defocus_on_both_sides(gf7_pair, backend) -> None:
-    """As the sum of both directions' phases says: about its own best focus it falls like the square of the defocus."""
-    steps = 1e-6 * np.arange(-160, 161, 20)
-    states = [{f"{ROOT}/focal_plane": Motion(shift=(0.0, 0.0, float(z)))} for z in steps]
-    found = image_quality(gf7_pair, backend, states, (0.0,)).cameras[CAMERA]
-    # a line that moves downstream leaves its focus behind; the field moves a little under the pixel
-    np.testing.assert_allclose(found.defocus[:, 0] - found.defocus[8, 0], -steps, atol=5e-9)
-    for mtf in (found.mtf_along_line[:, 0], found.mtf_along_track[:, 0]):
-        best = np.argmax(mtf)
-        assert 6 <= best <= 10  # within 40 um: astigmatism
-        assert np.all(np.diff(mtf[: best + 1]) > 0.0)
-        assert np.all(np.diff(mtf[best:]) < 0.0)
-        curve = np.polynomial.Polynomial.fit(steps[6:11], mtf[6:11], 2)
-        assert np.max(np.abs(curve(steps[6:11]) - mtf[6:11])) < 1e-3 * mtf[best]
-        # a perfect beam of F/9.2 at 675 nm: at 50 um a fortieth of the contrast and more is lost, at 160 um a quarter
-        assert mtf[[0, -1]].max() < 0.75 * mtf[best]
 
 
 def test_a_state_is_the_same_alone_and_among_others_one_of_which_is_lost(gf7_pair, backend, quality) -> None:
@@ -264,69 +178,10 @@ def test_too_rough_a_wavefront_has_no_mtf_but_an_error(gf7_pair, backend) -> Non
     assert np.isfinite(found.mtf_along_line[1]).all()
 
 
-def test_states_compile_no_kernels(gf7_pair, backend, quality) -> None:
-    import drjit as dr
-
-    def kernels(states) -> set[int]:
-        dr.set_flag(dr.JitFlag.KernelHistory, True)
-        dr.kernel_history_clear()
-        image_quality(gf7_pair, backend, states)
-        found = {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
-        dr.set_flag(dr.JitFlag.KernelHistory, False)
-        return found
-
-    rng = np.random.default_rng(2)
-    states = [{f"{ROOT}/M2": Motion(shift=tuple(rng.normal(0.0, 1e-5, 3)))} for _ in range(6)]
-    first = kernels(states[:3])
-    assert first
-    assert kernels(states[3:]) == first
-
-
 def test_fields_outside_of_the_line_are_refused(gf7_pair, backend) -> None:
     for fields in ((), (0.0, 1.2)):
         with pytest.raises(ValueError, match="fields"):
             image_quality(gf7_pair, backend, [{}], fields)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A run of an instrument with one camera whose M2 moves."""
-    place = tmp_path_factory.mktemp("quality")
-    instrument = yaml.safe_load((LIBRARY / "instruments" / "gf7_pair.yaml").read_text())
-    instrument["name"], instrument["cameras"] = "single", {"one": instrument["cameras"]["forward"]}
-    del instrument["baffles"]
-    (place / "single.yaml").write_text(yaml.safe_dump(instrument))
-    (place / "job.yaml").write_text(
-        "instrument: single.yaml\nperturb:\n  base/one/M2: {shift: [0 um, 0 um, 20 um]}\n"
-        "render: {frames: 1, quality: true}\n"
-    )
-    done = invoke(command.app, place / "job.yaml", "--out", place / "run")
-    assert done.exit_code == 0, done.output
-    return place
-
-
-@pytest.mark.slow
-def test_a_job_and_a_study_with_image_quality(folder, backend) -> None:
-    written = json.loads((folder / "run" / "quality.json").read_text())
-    after, before = (part["cameras"]["one"] for part in (written, written["before"]))
-    assert set(after) == {
-        "wfe_rms_waves", "wfe_rms_waves_focus_removed", "wfe_worst_waves", "defocus_um", "mtf_along_line",
-        "mtf_along_track", "light_lost", "obstructed_by",
-    }  # fmt: skip
-    assert after["wfe_worst_waves"] >= after["wfe_rms_waves"] > 2.0 * before["wfe_rms_waves"]
-    assert list(after["defocus_um"]) == ["left", "centre", "right"]
-    assert after["mtf_along_line"]["centre"] < before["mtf_along_line"]["centre"]
-    page = (folder / "run" / "report.html").read_text()
-    assert f'data-key="quality.one.mtf_along_line.centre.after">{after["mtf_along_line"]["centre"]:.4f}<' in page
-    # the same numbers as a response of a study, whose states are done together
-    job = resolve(folder / "job.yaml")
-    key = ("job", "perturb", "base/one/M2", "shift", 2)
-    runs = [Run(k, ((key, value),), 1) for k, value in enumerate(("20 um", "5 um"))]
-    outcomes = RenderBase().evaluate(job.plain(), runs, backend)
-    found = outcomes[0]["quality"]["cameras"]["one"]
-    assert found["wfe_rms_waves"] == pytest.approx(after["wfe_rms_waves"], abs=1e-9)
-    assert found["mtf_along_track"] == pytest.approx(after["mtf_along_track"], abs=1e-9)
-    assert outcomes[1]["quality"]["cameras"]["one"]["wfe_rms_waves"] < after["wfe_rms_waves"]
 
 
 def test_files_have_each_number_under_its_key(quality) -> None:
@@ -344,7 +199,3 @@ def test_files_have_each_number_under_its_key(quality) -> None:
     assert told["wfe_rms_waves"] == camera.wfe[1].mean()
     assert told["wfe_rms_waves_focus_removed"] == camera.wfe_refocused[1].mean()
     assert told["wfe_worst_waves"] == camera.wfe[1].max()
-
-
-def test_nothing_is_worked_out_of_nothing(gf7_pair, backend) -> None:
-    assert quality_dicts(gf7_pair, backend, []) == []

@@ -12,14 +12,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import load_camera, load_instrument
 from tests.hunt.dense_images import DenseImages
 from twin.monitor import image_sampling, monitor_beams, monitor_path
-from twin.monitor.image_sampling import (
-    WRONG,
-    NodeClasses,
-    UncertainImageError,
-    disagreement,
-    lost_or_gained,
-)
-from twin.monitor.monitor_experiment import TEMPLATE_MARGIN
+from twin.monitor.image_sampling import NodeClasses, UncertainImageError, lost_or_gained
 from twin.monitor.monitor_path import MonitorPath
 
 ACCURACY = 3e-6  # of the peak: what classes of blurred spots are chosen for, in double precision
@@ -66,25 +59,6 @@ def test_blurred_images_are_those_of_many_more_nodes(blurred, defocus: float) ->
 
 
 @pytest.mark.second
-def test_the_blur_matters(blurred) -> None:
-    """Nodes that are right for sharp spots on the whole CCD are wrong by the peak for these."""
-    path = blurred(DEFOCUS[-1])
-    sharp = path.node_classes.nodes(2)
-    assert path.nodes.count > 1.5 * sharp.count
-    assert (
-        largest(with_nodes(path, path.node_classes.nodes(0)).expected_photons([{}]), path.expected_photons([{}])) > 0.1
-    )
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("defocus", [0.0, *DEFOCUS])
-def test_an_instrument_is_the_same_before_and_after(blurred, defocus: float) -> None:
-    """With the template's margin and without."""
-    path, m = blurred(defocus), TEMPLATE_MARGIN
-    wide = path.expected_photons([{}], margin=m, single=False)[0][:, m:-m, m:-m]
-    assert largest(path.photons_of({}), wide) < ACCURACY
-
-
 def test_the_check_finds_what_the_choice_overlooks(blurred, monkeypatch) -> None:
     """A wavefront whose blur the few rays do not show: more nodes are taken until two rules agree."""
     path = blurred(DEFOCUS[1])
@@ -97,6 +71,7 @@ def test_the_check_finds_what_the_choice_overlooks(blurred, monkeypatch) -> None
     assert largest(got, want) < image_sampling.GOOD
 
 
+@pytest.mark.second
 def test_what_no_nodes_can_do_is_refused(blurred, monkeypatch) -> None:
     path = blurred(0.3)
     path.expected_photons([{}])
@@ -109,19 +84,6 @@ def test_what_no_nodes_can_do_is_refused(blurred, monkeypatch) -> None:
 def test_spots_blurred_beyond_the_last_class_are_refused(blurred) -> None:
     with pytest.raises(UncertainImageError, match=r"blurred so much .* spread over \S+ px or .* mm; refocus"):
         blurred(2.0).expected_photons([{}])
-
-
-@pytest.mark.second
-def test_a_beam_that_an_edge_cuts_gets_the_nodes_it_needs(blurred) -> None:
-    """Against a rule of twice as many nodes that stand elsewhere."""
-    path = blurred(0.0)
-    state: State = {"base/forward/monitor/left/prism_0": Motion(shift=(0.012, 0.0, 0.0))}
-    got = path.photons_of(state)[None]
-    assert 0.7 < got[0, 0].sum() / got[0, 1].sum() < 0.95
-    few = with_nodes(path, path.node_classes.nodes(0)).expected_photons([state], single=False)
-    want = with_nodes(path, quadrature.disk(147, 577, turn=0.3)).expected_photons([state], single=False)
-    assert largest(got, want) < WRONG
-    assert largest(few, want) > 3.0 * WRONG
 
 
 def test_light_is_that_of_the_rays(blurred, monkeypatch) -> None:
@@ -145,17 +107,6 @@ def test_energy_leaves_room_for_diffraction_alone() -> None:
     # one quarter is surely on the image, one surely not
     for light, expected in ((0.1, -0.07), (0.2, 0.0), (0.8, 0.0), (0.9, 0.07)):
         assert lost_or_gained(np.array([light]), place, share, half, wings)[0] == pytest.approx(expected)
-
-
-@pytest.mark.second
-def test_disagreement_is_of_the_peak(blurred) -> None:
-    path = blurred(DEFOCUS[0])
-    x, y = path.grid(1), path.grid(0)
-    field, dense = (with_nodes(path, n).fields([{}]) for n in (path.nodes, quadrature.disk_for(90.0)))
-    images = monitor_path.image(field, x, y)
-    assert np.max(disagreement(images, dense, x, y)) < ACCURACY
-    images[0] += 1e-3 * images[0].max()
-    assert disagreement(images, dense, x, y)[0] == pytest.approx(1e-3, rel=0.02)
 
 
 def test_classes_grow_to_the_most_phase() -> None:
@@ -186,6 +137,7 @@ def test_figures_with_fine_structure_move_rays_about(blurred) -> None:
     assert np.abs(dense.photons(1, rows, columns) - image[rows, columns]).max() < 1e-5 * image.max()
 
 
+@pytest.mark.second
 def test_figures_that_are_too_rough_are_refused(blurred, monkeypatch) -> None:
     """Spots that are not blurred beyond all nodes do not come so far; the limit is lowered."""
     monkeypatch.setattr(monitor_beams, "TOO_ROUGH", 1e-9)

@@ -73,21 +73,6 @@ def test_the_mean_square_over_phases_is_that_of_a_time_integration(steps: int, s
         np.testing.assert_allclose(found, np.mean(each, axis=1), rtol=0, atol=1e-4)
 
 
-def test_its_limits_are_a_linear_smear_and_a_bessel_function() -> None:
-    light = Collection(64, STEP)
-    slow, amplitude, phase = 0.2, 1.5, 0.4  # 0.009 cycles: the bend of the motion is (pi f T)^2 of its slope
-    way = amplitude * np.cos(phase) * 2.0 * np.pi * slow * light.length
-    found = light.transfer(NU, slow, amplitude, phase)
-    np.testing.assert_allclose(np.abs(found), np.sinc(NU * way), rtol=0, atol=2e-4)
-    np.testing.assert_allclose(np.angle(found * np.exp(2j * np.pi * NU * amplitude * np.sin(phase))), 0.0, atol=5e-3)
-    from scipy.special import j0
-
-    fast = 40.3 / light.length
-    # the other terms are the mean of 40 cycles and a rest: 1/(pi 40)
-    np.testing.assert_allclose(light.transfer(NU, fast, 0.4, phase), j0(2.0 * np.pi * NU * 0.4), rtol=0, atol=0.01)
-    assert np.isclose(light.mean(1.0 / STEP * 3.0), 0.0, atol=1e-9)  # whole cycles in every step
-
-
 @pytest.mark.second
 def test_bands_and_lines_together_against_drawn_motions() -> None:
     """The expectation over draws of a band and a line: 4000 of them leave 0.3/sqrt(4000)."""
@@ -137,14 +122,6 @@ def test_jitter_has_the_stated_amplitude_phase_and_level() -> None:
     inside = (frequency > 6.0) & (frequency < 24.0)
     assert np.mean(power[inside]) == pytest.approx(0.02, rel=5.0 / np.sqrt(inside.sum()))
     assert np.mean(power[frequency > 30.0]) < 1e-4
-
-
-def test_random_phases_follow_the_seed_and_are_those_of_each_line_alone() -> None:
-    first = {"frequency": "3 Hz", "amplitude": "1 1 1 arcsec"}
-    t = np.linspace(0.0, 1.0, 20)
-    both = stated({"lines": [first, {"frequency": "7 Hz", "amplitude": "0 2 0 arcsec"}]})(t)
-    np.testing.assert_array_equal(both[:, 0], stated({"lines": [first]})(t)[:, 0])
-    assert not np.allclose(both, stated({"lines": [first]}, 2)(t))
 
 
 def test_the_mean_over_a_collection_is_that_of_its_moments() -> None:

@@ -7,7 +7,7 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -79,75 +79,48 @@ def run(*arguments: object) -> tuple[int, str]:
     return done.exit_code, " ".join(done.output.split())
 
 
-def loop(command: str, place: Path, test: str) -> tuple[dict, dict]:
-    """Numbers of a simulated bench and of what it exported."""
-    code, told = run(
-        command, JOBS / f"{command}.yaml", "--out", place / "simulated", "--export", place / "files", "--quiet"
-    )
+def numbers(command: str, test: Path, place: Path, *options: object) -> dict:
+    """Return the numbers of a command's run."""
+    code, told = run(command, test, "--out", place, "--quiet", *options)
     assert code == 0, told
-    code, told = run(command, place / "files" / test, "--out", place / "measured", "--quiet")
-    assert code == 0, told
-    return tuple(json.loads((place / name / f"{command}.json").read_text()) for name in ("simulated", "measured"))  # type: ignore[return-value]
-
-
-def same(simulated: dict, measured: dict) -> None:
-    """Every number that both have, to the bit: exported files have all digits."""
-    assert simulated["truth"]
-    assert "truth" not in measured
-    there, here = ({k: v for k, v in each.items() if k not in ("truth", "verdict")} for each in (simulated, measured))
-    assert there == {name: here[name] for name in there}
-
-
-@pytest.mark.slow
-def test_turntable_exported_and_read_back(tmp_path: Path) -> None:
-    simulated, measured = loop("turntable", tmp_path, "turntable.yaml")
-    page = (tmp_path / "measured" / "report.html").read_text("utf-8")
-    assert "truth" not in re.sub("<style>.*?</style>", "", page, flags=re.DOTALL)
-    same(simulated, measured)
-    # the run's own config gives the same from anywhere
-    code, told = run("turntable", tmp_path / "measured" / "config.yaml", "--out", tmp_path / "again", "--quiet")
-    assert code == 0, told
-    assert (tmp_path / "again" / "turntable.json").read_bytes() == (
-        tmp_path / "measured" / "turntable.json"
-    ).read_bytes()
+    return json.loads((place / f"{command}.json").read_text())
 
 
 @pytest.mark.second
 def test_distortion_exported_and_read_back(tmp_path: Path) -> None:
-    simulated, measured = loop("distortion", tmp_path, "distortion.yaml")
-    same(simulated, measured)
+    """Every number that both have, to the bit: exported files have all digits."""
+    files = tmp_path / "files"
+    simulated = numbers("distortion", JOBS / "distortion.yaml", tmp_path / "simulated", "--export", files)
+    measured = numbers("distortion", files / "distortion.yaml", tmp_path / "measured")
+    assert simulated["truth"]
+    assert "truth" not in measured
+    there = {k: v for k, v in simulated.items() if k not in ("truth", "verdict")}
+    assert there == {name: measured[name] for name in there}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("table", ["images", "mtf"])
-def test_focus_exported_and_read_back(tmp_path: Path, table: str) -> None:
-    simulated, measured = loop("focus", tmp_path, f"focus_before_{table}.yaml")
-    own = {(one["band"], round(one["y_mm"])): one for one in measured["sites"]}
+@pytest.mark.second
+def test_focus_exported_and_read_back(tmp_path: Path) -> None:
+    """Sites, shims and the correction, from the frames and from the table of MTF that the bench exports."""
+    files = tmp_path / "files"
+    simulated = numbers("focus", JOBS / "focus.yaml", tmp_path / "simulated", "--export", files)
     order = sorted(simulated["initial"]["sites"], key=lambda one: (one["band"], one["field"]))
-    for there, here in zip(order, sorted(own.values(), key=lambda one: (one["band"], one["y_mm"])), strict=True):
-        assert abs(here["defocus_um"] - there["defocus_um"]) < ROUNDING * there["defocus_um_sigma"]
-        assert here["defocus_um_sigma"] == pytest.approx(there["defocus_um_sigma"], rel=1e-9)
     done = simulated["rounds"][0]
+    # the sigma of an image's own edge holds its grey steps as well, by which the points of a curve weigh a little else
+    for table, share, rel in (("images", 0.3, 0.05), ("mtf", ROUNDING, 1e-9)):
+        measured = numbers("focus", files / f"focus_before_{table}.yaml", tmp_path / table)
+        own = {(one["band"], round(one["y_mm"])): one for one in measured["sites"]}
+        for there, here in zip(order, sorted(own.values(), key=lambda one: (one["band"], one["y_mm"])), strict=True):
+            assert abs(here["defocus_um"] - there["defocus_um"]) < share * there["defocus_um_sigma"]
+            assert here["defocus_um_sigma"] == pytest.approx(there["defocus_um_sigma"], rel=rel)
+        sigma = measured["correction"]["piston_um_sigma"]
+        assert sigma == pytest.approx(done["correction"]["piston_um_sigma"], rel=rel)
     for hole, shim in done["shim_changes_um"].items():
         assert measured["shims"][hole]["ground_um"] == shim
         assert measured["shims"][hole]["shim_um"] == done["shims_um"][hole]
     for name in ("rotation_arcmin", "shift_um"):
         np.testing.assert_allclose(measured["correction"][name], done["correction"][name], rtol=1e-9, atol=1e-9)
-    assert measured["correction"]["piston_um_sigma"] == pytest.approx(done["correction"]["piston_um_sigma"], rel=1e-9)
-    # frames are those that the bench recorded, to the bit: their MTF is that of the simulation's own table
-    values = [float(row[-2]) for row in rows_of(tmp_path / "files" / "before_mtf.csv")[1:]]
-    if table == "images":
-        images = align_files(resolve_focus_test(tmp_path / "files" / "focus_before_images.yaml").test)  # type: ignore[arg-type]
-        again = sorted(
-            float(v) for scan in images.states[0].scans for edge in scan.mtf.values() for v in edge if v > 0.0
-        )
-        assert again == sorted(values)
     # after the round the assembly stands where the shims were to bring it
-    code, told = run(
-        "focus", tmp_path / "files" / f"focus_round_1_{table}.yaml", "--out", tmp_path / "after", "--quiet"
-    )
-    assert code == 0, told
-    after = json.loads((tmp_path / "after" / "focus.json").read_text())
+    after = numbers("focus", files / "focus_round_1_mtf.yaml", tmp_path / "after")
     assert after["confocal_um_max"] == pytest.approx(done["confocal_um_max"], rel=1e-9)
 
 
@@ -196,22 +169,6 @@ def in_unit(path: Path, old: str, new: str, factor: float) -> None:
     write(path, [head, *body])
 
 
-@pytest.mark.second
-def test_order_of_rows_and_columns_changes_no_bit(folder: Path) -> None:
-    kinds: list[Callable[[], np.ndarray]] = [
-        lambda: turntable_of(folder).series.mean,
-        lambda: distortion_of(folder).compensated.fit.values,
-        lambda: np.concatenate(
-            [focus_of(folder).states[0].defocus, np.diag(focus_of(folder).shimmings[0].plane.covariance)]
-        ),
-    ]
-    before = [kind() for kind in kinds]
-    for k, name in enumerate(("comparisons.csv", "held_out.csv", "spots.csv", "mtf.csv")):
-        shuffled(folder / name, k)
-    for there, kind in zip(before, kinds, strict=True):
-        np.testing.assert_array_equal(kind(), there)
-
-
 def renumbered(path: Path, name: str, seed: int) -> None:
     """Numbers of the stops in the order of a walk to and fro, which is not that of the readings."""
     head, *body = rows_of(path)
@@ -227,17 +184,23 @@ def renumbered(path: Path, name: str, seed: int) -> None:
 
 
 @pytest.mark.second
-def test_stops_in_any_order_change_no_bit(folder: Path) -> None:
-    before, run = distortion_of(folder), turntable_of(folder)
+def test_order_of_rows_columns_and_stops_changes_no_bit(folder: Path) -> None:
+    """Rows and columns shuffled, and stops numbered in an order that is not that of their readings."""
+
+    def found() -> list[np.ndarray]:
+        table, spots, focus = turntable_of(folder), distortion_of(folder), focus_of(folder)
+        fit = spots.compensated.fit
+        curves = [table.series.mean, table.compensation.fit(table.series.angle)]
+        planes = [focus.states[0].defocus, np.diag(focus.shimmings[0].plane.covariance)]
+        return [*curves, fit.values, fit.covariance, spots.compensated.distortion, *planes]
+
+    before = found()
     for k, (name, column) in enumerate((("comparisons", "position"), ("held_out", "position"), ("spots", "point"))):
         renumbered(folder / f"{name}.csv", column, k)
-    again = distortion_of(folder)
-    np.testing.assert_array_equal(again.compensated.fit.values, before.compensated.fit.values)
-    np.testing.assert_array_equal(again.compensated.fit.covariance, before.compensated.fit.covariance)
-    np.testing.assert_array_equal(again.compensated.distortion, before.compensated.distortion)
-    found = turntable_of(folder)
-    np.testing.assert_array_equal(found.tables[0].lines, run.tables[0].lines)
-    np.testing.assert_array_equal(found.compensation.fit(run.series.angle), run.compensation.fit(run.series.angle))
+    for k, name in enumerate(("comparisons.csv", "held_out.csv", "spots.csv", "mtf.csv")):
+        shuffled(folder / name, k)
+    for there, here in zip(before, found(), strict=True):
+        np.testing.assert_array_equal(here, there)
 
 
 @pytest.mark.second
@@ -277,6 +240,7 @@ def test_columns_in_pixels_and_readings_that_fall(folder: Path) -> None:
     assert mirrored.value("principal_point") == pytest.approx(-fit.value("principal_point"), abs=1e-6)
 
 
+@pytest.mark.second
 def test_a_moved_focal_plane_and_a_moved_target(folder: Path) -> None:
     there = focus_of(folder).states[0].defocus
     text = (folder / "focus.yaml").read_text()
@@ -317,6 +281,7 @@ def shifted(path: Path, head: str, off: float, circle: bool = False) -> None:
     write(path, rows)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("around", [0.0, 355.0])
 def test_readings_across_the_zero_of_the_circle(folder: Path, around: float) -> None:
     """A table that counts from 0 to 360 deg and is used on both sides of its zero: as if it had counted on."""
@@ -471,33 +436,6 @@ def test_turntable_agrees_with_scipy(folder: Path) -> None:
 
 
 # --- more data -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.second
-def test_more_data_never_raise_a_sigma(folder: Path) -> None:
-    """Known noise: each place and each angle that is added lowers sigmas or leaves them."""
-    head, *body = rows_of(folder / "mtf.csv")
-    last = None
-    for step in (4, 2, 1):  # every fourth position on either side of focus is too few: whole scans are left out
-        places = sorted({(row[0], row[2]) for row in body})[::step]
-        write(folder / "mtf.csv", [head, *(row for row in body if (row[0], row[2]) in places)])
-        run_ = focus_of(folder)
-        design = (
-            np.column_stack([np.ones(len(run_.places)), run_.shimmings[0].plane.place])
-            / run_.states[0].defocus_sigma[:, None]
-        )
-        sigma = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
-        if last is not None:
-            assert np.all(sigma < last)
-        last = sigma
-    # the same repeats once more: half of the variance, but for the limits that depend on their number
-    before = turntable_of(folder).series
-    head, *body = rows_of(folder / "comparisons.csv")
-    write(folder / "comparisons.csv", [head, *body, *([a, str(int(r) + 10), d] for a, r, d in body)])
-    after = turntable_of(folder).series
-    ratio = after.noise_sigma / before.noise_sigma
-    assert np.all(ratio < 0.85)
-    assert np.median(ratio) == pytest.approx(math.sqrt(0.5), rel=0.1)
 
 
 # --- one model for all terms -----------------------------------------------------------------------------

@@ -4,7 +4,6 @@ tables of a million rows.
 
 import csv
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,10 +17,10 @@ from analysis.turntable.dividing_error import CalibrationSeries, expected_reject
 from scenes.specs.load import SCENES
 from scenes.specs.resolved import resolve_focus_test
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from twin.lab import app
 from twin.laboratory.focus_report import focus_report
 from twin.laboratory.focus_run import align_files
-from twin.laboratory.measured_readings import read_comparisons
 
 EXAMPLES = SCENES / "lab" / "measured"
 TABLE = {"turntable": "comparisons.csv", "distortion": "spots.csv", "focus": "mtf.csv"}
@@ -149,7 +148,7 @@ TABLES = [
 ]
 
 
-@pytest.mark.parametrize(("command", "spoil", "told"), TABLES, ids=[f"{k}-{n}" for n, (k, _, _) in enumerate(TABLES)])
+@pytest.mark.parametrize(("command", "spoil", "told"), quick(16, TABLES))
 def test_bad_tables(folder: Path, tmp_path: Path, command: str, spoil: Callable, told: str | None) -> None:
     edited(folder / TABLE[command], spoil)
     done = CliRunner().invoke(app, [command, str(folder / f"{command}.yaml"), "--out", str(tmp_path / "run")])
@@ -190,7 +189,7 @@ FILES = [
 ]
 
 
-@pytest.mark.parametrize(("command", "old", "new", "told"), FILES, ids=[f"{f[0]}-{k}" for k, f in enumerate(FILES)])
+@pytest.mark.parametrize(("command", "old", "new", "told"), quick(9, FILES))
 def test_bad_files(folder: Path, tmp_path: Path, command: str, old: str, new: str, told: str) -> None:
     file = folder / f"{command}.yaml"
     text = file.read_text()
@@ -248,6 +247,7 @@ def stack(folder: Path, images: Path) -> Path:
     return folder
 
 
+@pytest.mark.second
 def test_a_stack_that_the_twin_did_not_make(stack: Path) -> None:
     run = align_files(resolve_focus_test(stack / "focus.yaml").test)  # type: ignore[arg-type]
     true = np.array([-20e-6, -40e-6, -20e-6, -40e-6])
@@ -262,6 +262,7 @@ def test_a_stack_that_the_twin_did_not_make(stack: Path) -> None:
     assert not run.readings.no_edge
 
 
+@pytest.mark.second
 def test_an_image_in_uneven_light_is_named(stack: Path) -> None:
     """A light that is no plane; one that is costs sigma alone."""
     row, column = np.mgrid[-1:1:64j, -1:1:64j]
@@ -302,7 +303,8 @@ IMAGES = [
 ]
 
 
-@pytest.mark.parametrize(("spoil", "told"), IMAGES, ids=[told.replace(" ", "-") for _, told in IMAGES])
+@pytest.mark.second
+@pytest.mark.parametrize(("spoil", "told"), IMAGES)
 def test_bad_images(stack: Path, tmp_path: Path, spoil: Callable[[Path], object], told: str) -> None:
     spoil(stack)
     done = CliRunner().invoke(app, ["focus", str(stack / "focus.yaml"), "--out", str(tmp_path / "run")])
@@ -332,28 +334,6 @@ def test_images_without_an_edge_are_told_and_have_no_weight(stack: Path) -> None
 # --- size, and series of unequal length ------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_a_million_rows(folder: Path) -> None:
-    """The shipped tables, as often as makes a million rows; the limit is that of a slow machine."""
-    rng = np.random.default_rng(1)
-    angle = np.repeat(np.linspace(92.0, 112.0, 41), 24_400)
-    value = rng.normal(0.0, 0.02, angle.size)
-    with (folder / "comparisons.csv").open("w") as stream:
-        stream.write("reading [deg],difference [arcsec]\n")
-        stream.writelines(f"{a},{v}\n" for a, v in zip(angle.tolist(), value.tolist(), strict=True))
-    start = time.process_time()
-    found = read_comparisons(str(folder / "comparisons.csv"), 1e-8)
-    assert time.process_time() - start < 30.0
-    assert found.series.comparisons.shape == (41, 24_400)
-    assert found.series.repeatability == pytest.approx(0.02 * np.pi / 648000, rel=0.01)
-    head_, *body = (folder / "mtf.csv").read_text().splitlines()
-    (folder / "mtf.csv").write_text("\n".join([head_, *body * (1_000_000 // len(body) + 1)]) + "\n")
-    start = time.process_time()
-    run = align_files(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
-    assert time.process_time() - start < 60.0
-    assert len(run.places) == 25
-
-
 def test_series_of_unequal_length() -> None:
     """The noise of all angles together is right whatever the numbers of repeats; 4000 of 3 to 12, 1% is 3 sigma."""
     rng = np.random.default_rng(4)
@@ -371,6 +351,7 @@ def test_series_of_unequal_length() -> None:
     assert expected_rejections(np.full(41, 10)) == rejection_rate(10) * 410
 
 
+@pytest.mark.second
 def test_a_turntable_without_held_out_readings_has_its_report(folder: Path, tmp_path: Path) -> None:
     """`held_out` may be missing; of few angles, with which the fits take a second."""
     head_, *body = (folder / "comparisons.csv").read_text().splitlines()

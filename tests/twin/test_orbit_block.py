@@ -1,28 +1,24 @@
 """``twin.orbit adjust``: what the command says of blocks that are right, and of blocks that are not."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from analysis.block.block_adjustment import adjust_block
-from analysis.orbit.ground_errors import predicted
 from analysis.orbit.three_line_model import misclosure
-from optics.numerics.threads import one_blas_thread
 from scenes.specs.load import SCENES
 from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
 from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
 from scenes.yaml.errors import InputError
-from tests.twin.commands import invoke
-from twin.orbit.__main__ import app
+from twin.orbit.block.block_numbers import CHANGE
 from twin.orbit.block.block_report import block_report
-from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
+from twin.orbit.block.block_run import ALL, NOTHING, CameraChange, run_adjustment
 from twin.orbit.block.drawn_block import draw_block
 from twin.orbit.block.measured_block import measured_block
 from twin.orbit.block.pass_knowledge import change_covariance
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign_adjustment import simultaneous
+from twin.orbit.measured.pass_measurements import GroundPoints
 from twin.run.procedure import BenchError
 
 FILE = SCENES / "orbit" / "adjust.yaml"
@@ -46,6 +42,7 @@ def run(tmp_path_factory):
     return run_adjustment(setup(tmp_path_factory.mktemp("block")), None, 3)
 
 
+@pytest.mark.second
 def test_errors_of_check_points_are_those_predicted_and_every_sensor_helps(run):
     assert 0.3 < run.worth[ALL].agreement < 2.0
     full = run.worth[ALL].predicted
@@ -59,6 +56,7 @@ def test_errors_of_check_points_are_those_predicted_and_every_sensor_helps(run):
     assert block_report(run).warnings == ()
 
 
+@pytest.mark.second
 def test_cameras_are_found_within_their_sigmas(run):
     ratio = np.array([(c.found - c.truth) / c.sigma for c in run.cameras.values()])
     # 16 normals: beyond 4 by chance in 1 of 1000 blocks
@@ -115,19 +113,6 @@ def test_a_wrong_datum_is_told(tmp_path):
     assert any("another datum" in w for w in block_report(found).warnings)
 
 
-def test_command_writes_its_numbers_and_takes_sensors_away(tmp_path):
-    setup(tmp_path)
-    out = tmp_path / "run"
-    words = ["adjust", tmp_path / "adjust.yaml", "--without", "control", "--out", out, "--json"]
-    result = invoke(app, *words)
-    assert result.exit_code == 0
-    numbers = json.loads((out / "block.json").read_text("utf-8"))
-    assert numbers["check_points"] == json.loads(result.stdout)["check_points"]
-    assert "control" not in numbers["sensors"]
-    assert "without: [control]" in (out / "config.yaml").read_text("utf-8")
-    assert numbers["verdict"].startswith("Nine ground points in ten lie within ")
-
-
 def test_sensors_that_are_not_there_are_refused():
     with pytest.raises(InputError, match="no such sensor; did you mean 'control'"):
         without_sensors(resolve_adjust(FILE), ["controls"])
@@ -157,6 +142,32 @@ def test_scenes_that_share_no_ground_are_an_error_with_a_key(tmp_path):
         run_adjustment(alone, None, 1)
 
 
+def test_changes_of_cameras_have_arcseconds_and_micrometres():
+    """Found, sigma, sigma before the block and truth, each of the four under its own key and unit."""
+    scale = np.array([np.pi / 648000.0] * 3 + [1e-6])
+    rows = [scale * (10.0 * k + np.arange(1.0, 5.0)) for k in range(4)]
+    numbers = CHANGE(CameraChange(*rows))
+    for k, end in enumerate(("", "_sigma", "_sigma_before", "_true")):
+        for j, key in enumerate(("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")):
+            assert numbers[f"{key}{end}"] == pytest.approx(10.0 * k + j + 1.0, rel=1e-12), (key, end)
+    assert CHANGE(CameraChange(*rows[:3], None))["d_f_um_true"] is None
+
+
+def test_ground_points_that_are_none_are_refused():
+    """Shapes, names, roles, coordinates and covariances."""
+    good = [np.array(["a", "b"], object), np.zeros((2, 3)), np.eye(3), "control"]
+    GroundPoints.of(*good)
+    for k, wrong, words in (
+        (1, np.zeros((2, 2)), "2 names and coordinates"),
+        (0, ["a", "a"], "a name stands twice"),
+        (3, "boss", "roles are"),
+        (1, np.full((2, 3), np.nan), "is not finite"),
+        (2, -np.eye(3), "a covariance is not one"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            GroundPoints.of(*(wrong if j == k else one for j, one in enumerate(good)))
+
+
 def test_covariance_of_changes_holds_all_three_laws():
     spec = setup().test.changes["forward"]
     walk = spec.walk.model_copy(update={"angles": (1e-6, 0.0, 0.0)})
@@ -168,51 +179,10 @@ def test_covariance_of_changes_holds_all_three_laws():
     assert spread[4, 9] == 0.0
 
 
-GF7 = SCENES / "orbit" / "adjust_gf7.yaml"
-OWN = "angles: [0.043 arcsec, 0.021 arcsec, 0.5 arcsec], principal_distance: 6.2 um"
-WATCHED = {
-    "nothing": None,
-    "gf7_pair": OWN,
-    # twelve times better in all four, as its angle is
-    "gf7_pair_two": "angles: [0.0035 arcsec, 0.0017 arcsec, 0.04 arcsec], principal_distance: 0.5 um",
-    "gf7_pair_best": "angles: [0.003 arcsec, 0.0015 arcsec, 0.035 arcsec], principal_distance: 0.4 um",
-}
-
-
-@pytest.mark.second
-@one_blas_thread()
-def test_worth_of_monitor_and_laser_beside_what_gf7_reports(tmp_path):
-    """GF-7 reports 2.15 m in height without and 0.75 m with its laser, a factor of 2.9: the table of docs/block.md."""
-    text = GF7.read_text("utf-8").replace("control: 0, tie: 150", "control: 2, control_sigma: [0.3 m, 0.3 m], tie: 150")
-    (tmp_path / "gf7.yaml").write_text(text.replace("check: 60", "check: 30"), "utf-8")
-    sigma = {}
-    for name, monitor in WATCHED.items():
-        (tmp_path / "one.yaml").write_text((tmp_path / "gf7.yaml").read_text("utf-8").replace(OWN, monitor or OWN))
-        block = draw_block(resolve_adjust(tmp_path / "one.yaml"), np.random.SeedSequence(1)).block
-        if monitor is None:
-            block = block.without("monitor")
-        cases = {"no control": ("laser", "control"), "control": ("laser",), "laser": ("control",)}
-        for case, left_out in cases.items():
-            some = block
-            for sensor in left_out:
-                some = some.without(sensor)
-            where = np.flatnonzero(block.points.role == "check")
-            found = adjust_block(some)
-            heights = predicted(found.ground[where], found.point_covariance(where)).le90 / 1.645
-            sigma[name, case] = heights
-    table = {name: [round(sigma[name, case], 2) for case in ("no control", "control", "laser")] for name in WATCHED}
-    # the digits of the page, of a block with other points: 10%
-    assert table["nothing"] == pytest.approx([4.6, 0.71, 0.62], rel=0.1)
-    for name in ("gf7_pair", "gf7_pair_two", "gf7_pair_best"):
-        assert table[name] == pytest.approx([1.7, 0.70, 0.62], rel=0.1), name
-        assert sigma[name, "no control"] / sigma[name, "laser"] == pytest.approx(2.8, rel=0.12)
-    assert sigma["nothing", "no control"] / sigma["nothing", "laser"] == pytest.approx(7.4, rel=0.12)
-
-
 MEASURED = SCENES / "orbit" / "measured" / "adjust.yaml"
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_measured_passes_as_their_calibration_has_them():
     """The tables of the shipped campaign: two image points of control points were moved by some pixels."""
     found = run_adjustment(resolve_any_adjust(MEASURED), None, 0)
@@ -242,6 +212,11 @@ def test_monitor_readings_of_measured_passes_hold_the_cameras(tmp_path):
     file = tmp_path / "adjust.yaml"
     file.write_text(text + monitor, "utf-8")
     block, given = measured_block(resolve_any_adjust(file))
+    setup_ = resolve_any_adjust(file)
+    known = {name: change for name, change in setup_.test.changes.items() if name != "nadir"}
+    setup_ = setup_.model_copy(update={"test": setup_.test.model_copy(update={"changes": known})})
+    with pytest.raises(BenchError, match="it is not said how nadir may have changed"):
+        measured_block(setup_)
     known = block.monitored["nadir"]
     # what lasts is read in one pass and known in both, to the reading's sigma
     assert known.mean[0, 3] == pytest.approx(20e-6, rel=1e-3)

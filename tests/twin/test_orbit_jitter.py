@@ -1,12 +1,11 @@
 """Jitter of a pass, found in what the lines of a camera saw: simulated, exported, read back."""
 
-import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
 
 import twin.orbit.__main__ as command
 from analysis.orbit.jitter_lines import Found, search
@@ -23,8 +22,10 @@ from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.jitter import sights
 from twin.orbit.jitter.jitter_numbers import JITTER, blind_multiples
+from twin.orbit.jitter.jitter_report import _summary as jitter_table
+from twin.orbit.jitter.jitter_report import _warnings as jitter_warnings
 from twin.orbit.jitter.jitter_report import jitter_report
-from twin.orbit.jitter.jitter_run import fly_strip, run_jitter
+from twin.orbit.jitter.jitter_run import JitterRun, fly_strip, run_jitter
 from twin.orbit.jitter.sights import SightsError, sights_of
 from twin.orbit.jitter.steady_platform import SteadyPlatform
 from twin.run.procedure import BenchError
@@ -60,12 +61,41 @@ def searched(one: JitterSetup, seed: int) -> Found:
     return search(seen.observations, spec.search.lowest, spec.search.highest, spec.search.false_alarm)
 
 
-def test_an_oscillation_of_the_body_is_found_about_its_axes() -> None:
+@pytest.fixture(scope="module")
+def oscillating() -> JitterRun:
     """1 px of roll and 0.4 px of pitch at 0.65 Hz through geometry, light, attitude readings and matching noise."""
-    found = run_jitter(setup(attitude=attitude(OSCILLATION), search={"highest": "12 Hz", "height": "250 m"}), None, 3)
+    return run_jitter(setup(attitude=attitude(OSCILLATION), search={"highest": "12 Hz", "height": "250 m"}), None, 3)
+
+
+def test_every_warning_of_a_search_is_told_when_and_only_when_it_holds(oscillating: JitterRun) -> None:
+    """Too many wrong matches, noise beyond the covariances, and a frequency that may be another."""
+    one = oscillating.passes["jitter"]
+
+    def told(**changes) -> tuple[str, ...]:
+        changed = replace(one, found=replace(one.found, **changes))
+        return jitter_warnings(replace(oscillating, passes={"jitter": changed}))
+
+    lines, used = one.found.lines, np.arange(len(one.found.used)) / len(one.found.used)
+    for nothing in ({}, {"used": used < 0.71}, {"factors": 0.0 * one.found.factors + 1.29**2}):
+        assert told(**nothing) == (), nothing
+    assert any("31% of the observations of jitter were left out as wrong" in text for text in told(used=used < 0.69))
+    assert any(
+        "what remains in jitter is the noise" in text for text in told(factors=0.0 * one.found.factors + 1.31**2)
+    )
+    (text,) = told(lines=replace(lines, aliases=((8.5, 9.1),)))
+    assert "jitter: 0.65 Hz may as well be 8.5, 9.1 Hz" in text.replace(f"{lines.frequency[0]:.4g}", "0.65")
+    (text,) = told(lines=replace(lines, frequency=np.array([21.0])))
+    assert "jitter: 21 Hz lies beyond the search" in text
+
+
+def test_an_oscillation_of_the_body_is_found_about_its_axes(oscillating: JitterRun) -> None:
+    """Frequency, amplitudes, phases and their sigmas, the gaps between the lines and where each pair is blind."""
+    found = oscillating
     one = found.passes["jitter"]
     lines = one.found.lines
     assert one.sights.lines == ("blue", "green", "red", "nir")
+    # no match is wrong here: the oscillation itself must not make any seem so
+    assert one.found.used.mean() > 0.98
     assert len(lines.frequency) == 1
     assert lines.frequency[0] == pytest.approx(0.65, abs=4.0 * lines.frequency_sigma[0])
     away = (lines.amplitude[0] / ARCSEC - [2.4, 1.0]) / (lines.amplitude_sigma[0] / ARCSEC)
@@ -80,6 +110,31 @@ def test_an_oscillation_of_the_body_is_found_about_its_axes() -> None:
     assert first["green", "red"] == pytest.approx(9.77, abs=0.02)
     numbers = JITTER(found)["passes"]["jitter"]
     assert numbers["oscillations"][0]["true_amplitude_arcsec"] == pytest.approx({"roll": 2.4, "pitch": 1.0})
+
+
+def test_numbers_and_table_of_a_search_have_their_units(oscillating: JitterRun) -> None:
+    """Angles in arcseconds, in pixels and in degrees, times in milliseconds, and chances of what is left."""
+    one = oscillating.passes["jitter"]
+    lines, found = one.found.lines, one.found
+    (row,) = jitter_table(oscillating).rows
+    amplitude, sigma, pixel = lines.amplitude[0], lines.amplitude_sigma[0], one.sights.pixel
+    per_axis = [v for a, s in zip(amplitude, sigma, strict=True) for v in (a / ARCSEC, s / ARCSEC, a / pixel)]
+    expected = [lines.frequency[0], lines.frequency_sigma[0], *per_axis, lines.chance[0], 0.65, 2.4, 1.0]
+    assert row[0] == "jitter"
+    assert row[1:] == pytest.approx(expected, rel=1e-9)
+    told = JITTER(oscillating)["passes"]["jitter"]
+    (first,) = told["oscillations"]
+    for k, axis in enumerate(("roll", "pitch")):
+        assert first["amplitude_arcsec"][axis] == pytest.approx(amplitude[k] / ARCSEC)
+        assert first["amplitude_arcsec_sigma"][axis] == pytest.approx(sigma[k] / ARCSEC)
+        assert first["amplitude_px"][axis] == pytest.approx(amplitude[k] / pixel)
+        assert first["phase_deg"][axis] == pytest.approx(np.degrees(lines.phase[0, k]))
+        seen = found.detectable[~found.before.blind][:, k]
+        assert told["detectable_arcsec"][axis] == pytest.approx(np.median(seen) / ARCSEC)
+    assert told["chance_of_the_next"] == found.after.chance(found.after.power[found.after.best])
+    assert told["pixel_arcsec"] == pytest.approx(pixel / ARCSEC)
+    assert told["gap_ms"]["blue to green"] == pytest.approx(121.6, abs=0.2)
+    assert list(told["noise_factor"].values()) == pytest.approx(np.sqrt(found.factors[:-1]))
 
 
 @pytest.mark.second
@@ -145,54 +200,6 @@ def test_an_alias_is_reported_in_words_and_numbers() -> None:
     assert min(abs(f - 21.0) for f in (first["frequency_hz"], *first["aliases_hz"])) < 0.02
     assert first["in_search"] == (first["frequency_hz"] < 4.0)
     assert any("beyond the search" in text or "may as well be" in text for text in jitter_report(found).warnings)
-
-
-@pytest.mark.slow
-def test_a_hundred_passes_without_jitter_in_figures() -> None:
-    """False alarms within the stated rate, at the binomial limit of 1e-3, and no period of the readings."""
-    found = [searched(quiet(), seed) for seed in range(100)]
-    chances = np.array([float(one.before.chance(one.before.power[one.before.best])) for one in found])
-    alarms = [one.lines.frequency for one in found if len(one.lines.frequency)]
-    print(f"{len(alarms)} of 100 alarms at {RATE:g}, {int(np.sum(chances < 0.1))} at 0.1; {alarms}")  # noqa: T201
-    assert len(alarms) <= stats.binom.ppf(1.0 - 1e-3, 100, RATE)
-    for rate in (0.05, 0.1, 0.3):
-        assert np.sum(chances < rate) <= stats.binom.ppf(1.0 - 1e-3, 100, rate)
-    # far sharper than alarms: the power of all passes together at the readings' rate and at half, twice of it
-    for frequency in (0.5 / READINGS, 1.0 / READINGS, 2.0 / READINGS):
-        power = 0.0
-        for one in found:
-            k = int(np.argmin(np.abs(one.before.frequency - frequency)))
-            power += one.before.power[k] / (one.before.total / one.before.freedom)
-        print(f"{frequency:g} Hz: {power:.0f} of {len(found) * one.before.order} expected")  # noqa: T201
-        assert power <= stats.chi2.ppf(1.0 - 1e-3, len(found) * one.before.order), frequency
-
-
-@pytest.mark.slow
-def test_what_is_exported_gives_the_same_oscillations(tmp_path: Path) -> None:
-    path = tmp_path / "pass.yaml"
-    ask = {"highest": "6 Hz", "height": "300 m", "spline": {"interval": "0.2 s", "sigma": "3 arcsec"}}
-    one = setup(attitude=attitude(OSCILLATION), search=ask)
-    path.write_text(dump_yaml({**one.test.plain(), "camera": "ms4"}))
-    out, data = tmp_path / "run", tmp_path / "data"
-    result = run("jitter", path, "--out", out, "--export", data, "--json")
-    assert result.exit_code == 0, result.output
-    first = json.loads(result.stdout)["passes"]["jitter"]
-    again = run("jitter", data / "jitter.yaml", "--out", tmp_path / "again", "--json")
-    assert again.exit_code == 0, again.output
-    second = json.loads(again.stdout)["passes"]["jitter"]
-    assert "true_frequency_hz" not in second["oscillations"][0]
-    there, back = (one["oscillations"][0]["frequency_hz"] for one in (first, second))
-    assert back == pytest.approx(there, rel=1e-7)
-    course = (tmp_path / "again/artefacts/attitude.csv").read_text().splitlines()
-    assert course[0].startswith("time [s],roll [arcsec],σ roll")
-    assert "roll spline [arcsec]" in course[0]
-    values = np.array([line.split(",") for line in course[1:]], float)
-    turn = 2.4 * np.sin(2.0 * np.pi * 0.65 * values[:, 0] + np.radians(40.0))
-    assert np.std(values[:, 1] - turn) < 0.1
-    # a spline has no shape to go by: it follows with its sigma
-    inner = np.abs(values[:, 0]) < 4.0
-    assert np.std((values[:, 5] - turn)[inner]) < 0.5
-    assert (tmp_path / "again/artefacts/frequencies.csv").is_file()
 
 
 def test_steady_readings_are_those_of_a_pass_without_noise() -> None:

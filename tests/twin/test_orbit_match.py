@@ -1,6 +1,5 @@
 """Points measured in a user's images: the simulation's images and maps, through files alone."""
 
-import json
 import shutil
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,7 @@ from scenes.specs.measured.orbit_data_setup import MatchSetup
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.orbit.setup import load_three_line_camera, resolve_simulate
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml
+from tests.tiers import quick
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke
 from twin.orbit.images.simulate_run import Simulation, run_simulation
@@ -38,6 +37,8 @@ def flown() -> Simulation:
 @pytest.fixture(scope="module")
 def files(flown: Simulation, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("match")
+    tifffile.imwrite(folder / "nan.tiff", np.full((40, 40), np.nan, np.float32))
+    tifffile.imwrite(folder / "complex.tiff", np.zeros((40, 40), np.complex64))
     return folder, bench.match_files(folder, flown)
 
 
@@ -79,7 +80,7 @@ def test_points_in_files_are_where_the_true_sensor_has_them(flown: Simulation, f
     assert np.all(np.isnan(found.measurements.ground.itrs[role == "tie"]))
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, tmp_path: Path) -> None:
     """Columns the other way round, said so: the same points to a hundredth of a pixel."""
     folder, data = files
@@ -122,31 +123,7 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
         np.testing.assert_allclose(there.line[b] - 10.0, row.line[a], rtol=0, atol=0.02)
 
 
-@pytest.mark.second
-def test_the_command_exports_what_a_calibration_reads(files, tmp_path: Path) -> None:
-    from scenes.specs.measured.orbit_data import OrbitDataSpec
-    from scenes.yaml.spec import validate
-    from scenes.yaml.yaml_file import read_yaml
-    from twin.orbit.measured.measurement_tables import read_pass
-
-    folder, data = files
-    path = folder / "match.yaml"
-    path.write_text(dump_yaml(data))
-    result = run("match", path, "--out", tmp_path / "run", "--export", tmp_path / "data", "--json")
-    assert result.exit_code == 0, result.output
-    numbers = json.loads(result.stdout)
-    assert numbers["control_points"] > 10
-    assert numbers["orthophoto"]["rows"] > 100
-    found = validate(OrbitDataSpec, read_yaml(tmp_path / "data/data.yaml"))
-    assert list(found.passes) == ["pass"]
-    files_of = {key: str(tmp_path / "data" / name) for key, name in found.passes["pass"].files.items()}
-    there = found.passes["pass"].model_copy(update=files_of)
-    read = read_pass("pass", there, found.conventions, load_three_line_camera("th1"))
-    assert int(np.sum(read.ground.role == "control")) == numbers["control_points"]
-    assert int(np.sum(read.ground.role == "tie")) == numbers["tie_points"]
-    assert (tmp_path / "run/artefacts/points.csv").is_file()
-
-
+WIDE = {"row": 0, "column": 0, "rows": 9999, "columns": 40}
 WRONG = [
     ({"images": {"nadir": {"file": "photo.tiff", "first_pixel_sees": "up"}}}, None),
     ({"orthophoto": {"file": "nadir.tiff"}}, "without a place"),
@@ -155,11 +132,14 @@ WRONG = [
     ({"images": {"nadir": {"file": "none.tiff", "first_pixel_sees": "right"}}}, "no such file"),
     ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel": 11_900, "first_pixel_sees": "right"}}}, "wider than"),
     ({"images": {"nadir": {"file": "nadir.tiff", "first_line": 50, "first_pixel_sees": "right"}}}, "longer than its"),
+    ({"images": {"nadir": {"file": "nan.tiff", "first_pixel_sees": "right"}}}, "grey values that are not finite"),
+    ({"images": {"nadir": {"file": "complex.tiff", "first_pixel_sees": "right"}}}, "values that are no grey values"),
+    ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel_sees": "right", "window": WIDE}}}, "a window outside of"),
     ({"images": {"nadir": {"file": "nadir.tiff", "band": 2, "first_pixel_sees": "right"}}}, "no such band"),
 ]
 
 
-@pytest.mark.parametrize(("change", "told"), WRONG)
+@pytest.mark.parametrize(("change", "told"), quick(0, WRONG))
 def test_what_does_not_fit_is_refused(files, change: dict[str, Any], told: str | None) -> None:
     folder, data = files
     if told is None:
@@ -170,6 +150,7 @@ def test_what_does_not_fit_is_refused(files, change: dict[str, Any], told: str |
         matched(folder, {**data, **change})
 
 
+@pytest.mark.second
 def test_heights_that_no_ground_has_are_refused(files, tmp_path: Path) -> None:
     """One of them, as a flipped bit makes it, would put the ground beyond the Earth."""
     folder, data = files

@@ -7,7 +7,7 @@ import pytest
 
 import tests.twin.orbit_file_bench as bench
 from scenes.yaml.errors import InputError
-from tests.twin.test_platform_files import CSV_ATTITUDE, EARTH, edited, read
+from tests.twin.test_platform_files import CSV_ATTITUDE, EARTH, read
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.measured.orbit_files import read_oem, read_sp3
 from twin.orbit.measured.platform_readings import known_frame
@@ -94,6 +94,20 @@ def test_nothing_is_interpolated_from_one_segment_to_the_next(tmp_path: Path) ->
         path.position(path.last + 0.5)
 
 
+def test_segments_that_are_not_of_one_orbit_are_refused(tmp_path: Path) -> None:
+    """Two satellites of which none is named, two time scales; and an SP3 file of one place."""
+    whole = segments(tmp_path / "a.oem").read_text("utf-8")
+    for old, new, words in (
+        ("OBJECT_ID = 2010-040A", "OBJECT_ID = 1999-001A", "which satellite is not said"),
+        ("TIME_SYSTEM = UTC", "TIME_SYSTEM = GPS", "segments with different TIME_SYSTEM"),
+    ):
+        (tmp_path / "a.oem").write_text(whole.replace(old, new, 1))
+        with pytest.raises(InputError, match=words):
+            read_oem(tmp_path / "a.oem")
+    with pytest.raises(InputError, match="fewer than two places of L51"):
+        read_sp3(bench.sp3(tmp_path / "a.sp3", step=200.0), "L51")
+
+
 def test_usable_times_are_kept_to(tmp_path: Path) -> None:
     bench.attitude_csv(tmp_path / "attitude.csv")
     segments(tmp_path / "a.oem", f"USEABLE_STOP_TIME = {bench.calendar(5.0, 'UTC')}")
@@ -131,9 +145,3 @@ def test_older_and_unfinished_files_of_sp3(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["ECF", "IER97", "ITR97", "IGS14", "IGb08", "IGc20", "WGS84"])
 def test_frames_as_sp3_spells_them(name: str) -> None:
     assert known_frame(name, "a.sp3") == "ITRS"
-
-
-def test_an_edit_is_one(tmp_path: Path) -> None:
-    path = bench.sp3(tmp_path / "a.sp3")
-    edited(path, "IGS20", "ECF  ")
-    assert read_sp3(path, "L51").frame == "ITRS"

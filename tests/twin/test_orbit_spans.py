@@ -1,6 +1,5 @@
 """Spans of orbit, attitude and lines that do not end together, and ends that meet to rounding."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +15,8 @@ from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.yaml.errors import InputError
 from tests.twin import orbit_file_bench as bench
 from tests.twin.orbit_bench import CirclePlatform
-from tests.twin.orbit_files import edit, export, flown, read_back, small
-from twin.orbit.calibration.calibration_run import third_differences
-from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.orbit.flight.line_camera import LinePiece, LineTimes, line_cameras
+from twin.orbit.flight.line_camera import LinePiece, line_cameras
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.platform_files import platform_table, read_platform
 
@@ -70,33 +64,6 @@ def platform(orbit: np.ndarray, attitude: np.ndarray, circle: CirclePlatform) ->
     return TabulatedTrajectory(table)
 
 
-@pytest.mark.parametrize("which", ["both", "orbit", "attitude"])
-def test_images_as_long_as_orbit_or_attitude_have_a_sensor(which: str) -> None:
-    """40 passes whose lines fill the span that orbit and attitude share, to their halves, each cut to microseconds."""
-    random = np.random.default_rng({"both": 1, "orbit": 2, "attitude": 3}[which])
-    circle = CirclePlatform(span=(-np.inf, np.inf))
-    camera = line_cameras(load_three_line_camera("th1"))["nadir"]
-    for _ in range(40):
-        first, lines = round(float(random.uniform(-1e4, 1e4)), 6), int(random.integers(2, 20_000))
-        line_time = round(float(random.uniform(1e-4, 1e-3)), 10)
-        last = round(first + lines * line_time, 6)
-        fixes, looks = (np.linspace(first - x, last + x, 16) for x in random.uniform(0.5, 9.0, 2))
-        if which in ("both", "orbit"):
-            fixes = np.linspace(first, last, 16)
-        if which in ("both", "attitude"):
-            looks = np.linspace(first, last, 16)
-        path = platform(fixes, looks, circle)
-        times = LineTimes.even(first + 0.5 * line_time, line_time, lines)
-        sensor = Sensor.of_lines(camera, path, Earth(), times, NO_EFFECTS)
-        ground = sensor.ground(np.array([-0.5, lines - 0.5]), 100.0)
-        # half a microsecond beyond the readings a curve goes on as it came: 1e-6 m of 4 mm
-        whole = platform(np.linspace(first - 9, last + 9, 400), np.linspace(first - 9, last + 9, 400), circle)
-        there = replace(sensor, trajectory=whole).ground(np.array([-0.5, lines - 0.5]), 100.0)
-        assert np.abs(ground - there).max() < 1e-3
-        with pytest.raises(ValueError, match="outside of the readings"):
-            path.position(last + 10.0 if which != "both" else last + 3e-6)
-
-
 def test_a_gap_keeps_its_ends_to_rounding() -> None:
     circle = CirclePlatform()
     time = np.concatenate([np.arange(-10.0, 0.0, 0.5), 4.0 + np.arange(0.0, 6.0, 0.5)])
@@ -129,81 +96,22 @@ def test_times_of_a_course_are_named_in_any_unit() -> None:
         CourseSpec.model_validate({"times": times, "temperature": temperature, "detail": "66.1 min"})
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Exported measurements of two fields."""
-    setup = small()
-    return export(tmp_path_factory.mktemp("data"), setup, flown(setup)).parent
-
-
-@pytest.mark.second
-def test_spans_that_do_not_end_together_calibrate(folder: Path, tmp_path: Path) -> None:
-    """The attitude ends 5 ms before and after the exposures, the orbit goes on: third differences and lines that are
-    10 ms late are statistics for the page, and refuse nothing.
-    """
-    shutil.copytree(folder, tmp_path / "data")
-    file = tmp_path / "data" / "calibrate.yaml"
-    _, whole = read_back(file)
-    for one in whole.passes:
-        exposed = np.concatenate([one.data.sensors[k].time(r.line) for k, r in one.control_images.items()])
-        exposed = np.concatenate([exposed, *(one.data.sensors[k].time(r.line) for k, r in one.check_images.items())])
-        begin, end = exposed.min() - 0.005, exposed.max() + 0.005
-        path, table = one.measured, tmp_path / "data" / one.name / "attitude.csv"
-        inner = path.table.attitude_time
-        time = np.array([begin, *inner[(inner > begin + 0.01) & (inner < end - 0.01)], end])
-        turn = Rotation.from_matrix(path.body_to_itrs(time)).as_quat(canonical=False)
-        made = [[repr(float(v)) for v in (t, *q)] for t, q in zip(time, turn, strict=True)]
-        edit(table, lambda heads, _, rows=made: (heads, rows))
-        made = []
-        for name in one.control_images:
-            sensor = one.data.sensors[name]
-            ends = np.array([begin, end]) - sensor.time(np.array([0.0]))
-            ends = np.ceil(ends / sensor.line_time) + np.array([1.0, -2.0])
-            made += [[name, repr(float(n)), repr(float(t))] for n, t in zip(ends, sensor.time(ends), strict=True)]
-        edit(tmp_path / "data" / one.name / "lines.csv", lambda heads, _, rows=made: (heads, rows))
-    _, short = read_back(file)
-    for one, other in zip(short.passes, whole.passes, strict=True):
-        found, before = third_differences(one), third_differences(other)
-        assert found[0].rms == pytest.approx(before[0].rms, rel=1e-9)
-        # of readings of 8 Hz, half of them left
-        assert found[1].rms == pytest.approx(before[1].rms, rel=0.1)
-        # beyond the last reading the motion goes on as it came: 10 ms of an acceleration of 8 m/s^2 and of noise of
-        # 1 m and 0.5 arcsec a reading
-        late, there = one.later(0.01).control.rays, other.later(0.01).control.rays
-        for name in late:
-            assert np.abs(late[name].station - there[name].station).max() < 0.02
-            turned = Rotation.from_matrix(late[name].attitude) * Rotation.from_matrix(there[name].attitude).inv()
-            assert turned.magnitude().max() < np.radians(1.0 / 3600.0)
-
-
 def test_attitude_against_the_orbit_may_be_longer_than_it(tmp_path: Path) -> None:
     """Angles from 60 s before to 60 s after, an orbit of which 20 s at either end are missing."""
     t = np.arange(-60.0, 60.0 + 1e-9, 0.25)
     angles = np.zeros((3, len(t))).tolist()
-    bench.csv(
-        tmp_path / "a.csv",
-        ("date_time", "roll [deg]", "pitch [deg]", "yaw [deg]"),
-        [bench.calendar(s) for s in t],
-        *angles,
-    )
+    heads = ("date_time", "roll [deg]", "pitch [deg]", "yaw [deg]")
+    bench.csv(tmp_path / "a.csv", heads, [bench.calendar(s) for s in t], *angles)
     bench.orbit_csv(tmp_path / "whole.csv")
     head, *rows = (tmp_path / "whole.csv").read_text().splitlines()
     (tmp_path / "short.csv").write_text("\n".join([head, *rows[20:-20]]) + "\n")
     (tmp_path / "none.csv").write_text("\n".join([head, *rows[:3]]) + "\n")
 
+    turn = {"file": "a.csv", "time_scale": "UTC", "frame": "orbital", "nadir": "geodetic", "steering": "yaw"}
+    turn |= {"sequence": "xyz", "body_axes": ["forward", "right", "down"]}
+
     def read(name: str) -> PlatformTable:
-        data = {
-            "orbit": {"file": name, "frame": "ITRS", "time_scale": "UTC"},
-            "attitude": {
-                "file": "a.csv",
-                "time_scale": "UTC",
-                "frame": "orbital",
-                "nadir": "geodetic",
-                "steering": "yaw",
-                "sequence": "xyz",
-                "body_axes": ["forward", "right", "down"],
-            },
-        }
+        data = {"orbit": {"file": name, "frame": "ITRS", "time_scale": "UTC"}, "attitude": turn}
         return platform_table(*read_platform(PlatformFilesSpec.model_validate(data), tmp_path), bench.EPOCH)
 
     short, whole = (TabulatedTrajectory(read(f"{name}.csv")) for name in ("short", "whole"))

@@ -133,6 +133,7 @@ def test_slopes_are_those_of_the_rigorous_sensor(sensor, model: RationalPolynomi
         np.testing.assert_allclose(found[:, :, k], (ends[0] - ends[1]) / 10.0, rtol=0, atol=2e-7)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", quick(1, ["shift", "affine"]))
 def test_a_known_bias_is_recovered_within_its_sigma(sensor, model: RationalPolynomial, kind: str) -> None:
     """Over 200 draws of points, with errors in the image and on the ground: chi-square of the corrected polynomials'
@@ -170,6 +171,7 @@ def test_a_known_bias_is_recovered_within_its_sigma(sensor, model: RationalPolyn
         assert chi2.ppf(2.5e-5, count) < value < chi2.isf(2.5e-5, count)
 
 
+@pytest.mark.second
 def test_err_bias_and_err_rand(sensor, model: RationalPolynomial) -> None:
     """Of a shift: its sigma times the pixels on the ground, root mean square of the two horizontal axes (GDAL, RFC 22).
     What scatters beyond the sigmas is the other.

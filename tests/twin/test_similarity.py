@@ -13,11 +13,7 @@ import pytest
 
 from optics.geometry.tree import Motion, State
 from optics.materials.material import MATERIALS, Material, material
-from optics.numerics import quadrature
-from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
 from optics.thermal.heat import Temperature
-from optics.waves.imaging import imaging_rays
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_builder import build_instrument
@@ -25,13 +21,10 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.scenery import build_scenery
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.load import load_camera, load_instrument
-from scenes.specs.spectrum import SpectrumSpec
-from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_beams import CcdRays
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
-from twin.pictures.light_paths import trace_light_paths
 from twin.targets.target_path import TargetPath
 
 ARCSEC = np.pi / 648000.0
@@ -137,54 +130,6 @@ def test_motions_do_the_same_to_a_grown_instrument(camera: str, with_camera, bac
     np.testing.assert_allclose(coarse[:, 1:] - coarse[:, :1], 0.0, rtol=0, atol=PIXELS)
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("camera", ["gf7", "monitor"])
-def test_every_ray_meets_every_mirror_and_face_at_the_grown_place(camera: str, with_camera, backend) -> None:
-    """Not only the means: rays of the nominal instrument, started at grown places, in the grown one."""
-    instrument, grown = with_camera(camera), 1.0 + ALUMINIUM.expansion * WARMER
-    state, path = heated(instrument, ALUMINIUM), MonitorPath(instrument, backend).scout
-    for kind in ("monitor", "outgoing"):
-        names = [f"{channel.key}/{kind}" for channel in path.channels]
-        every = range(len(instrument.assembly.sequences[names[0]]))
-        start, along = np.broadcast_arrays(path.nominal.position, path.nominal.direction)
-        traced = [
-            trace(backend, assemble(instrument.assembly, names, [s]), make_rays(backend, g * start, along), every, True)
-            for s, g in (({}, 1.0), (state, grown))
-        ]
-        for k in every:
-            # a path's rounding, metres, after up to 40 of them
-            np.testing.assert_allclose(traced[1].hit(k), grown * traced[0].hit(k), rtol=0, atol=1e-13)
-        before, after = (t.numpy(t.world) for t in traced)
-        np.testing.assert_allclose(after[1], before[1], rtol=0, atol=ROUNDING)
-        np.testing.assert_allclose(after[2], grown * before[2], rtol=1e-14)
-        np.testing.assert_array_equal(after[3], before[3])
-
-
-def test_the_return_face_has_grown_to_its_edge(with_camera, backend) -> None:
-    """Nodes that lie within 2e-4 of the edge, on a face larger by 9e-4."""
-    instrument = with_camera("gf7")
-    path = MonitorPath(instrument, backend, quadrature.disk(60))
-    rim = np.hypot(path.nodes.x, path.nodes.y).max()
-    assert (1.0 + 40.0 * ALUMINIUM.expansion) * rim > 1.0005
-    assert path.rays([heated(instrument, ALUMINIUM, 40.0)]).valid.all()
-
-
-def test_the_light_through_a_grown_stop_is_that_of_its_area(with_camera, backend) -> None:
-    instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
-    stop = instrument.assembly.elements["forward/M2"].aperture
-    axes = instrument.camera_axes("forward")
-    start = instrument.assembly.nominal_pose("base/forward").translation + 3.0 * axes[:, 2]
-    ways, nodes = [["forward/imaging"], ["forward/to_stop"]], quadrature.disk(6)
-    rays = []
-    for state in ({}, heated(instrument, ALUMINIUM)):
-        systems = [assemble(instrument.assembly, way, [state]) for way in ways]
-        rays.append(imaging_rays(backend, *systems, -axes[:, 2], start, stop, nodes))
-    # aimed to 1e-12 m, differences of which at 0.1 m are 1e-11
-    np.testing.assert_allclose(rays[1].launch_area, grown**2 * rays[0].launch_area, rtol=1e-9)
-    # unit power on directions that have not changed
-    np.testing.assert_allclose(rays[1].amplitude, rays[0].amplitude, rtol=1e-9)
-
-
 def test_the_lines_of_the_satellite_keep_their_looks(with_camera, backend) -> None:
     instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
     for motions in ({}, MOVED):
@@ -220,62 +165,6 @@ def test_targets_are_imaged_on_the_same_pixels(with_camera, backend) -> None:
             )
             # what the polynomials leave of both; growth that is left out anywhere is 5e-5
             np.testing.assert_allclose(new, old, rtol=0, atol=1e-7)
-
-
-def redder(instrument: Instrument, size: float) -> Instrument:
-    """The same instrument for light whose wavelengths are ``size`` times as long."""
-    cameras = {}
-    for name, model in instrument.cameras.items():
-        bands = {
-            key: band.model_copy(update={"spectrum": SpectrumSpec.evenly(*(size * w for w in band.spectrum.ends))})
-            for key, band in model.spec.bands.items()
-        }
-        cameras[name] = replace(model, spec=model.spec.model_copy(update={"bands": bands}))
-    return replace(instrument, cameras=cameras)
-
-
-@pytest.mark.second
-def test_image_quality_is_the_same_for_light_that_grows_too(with_camera, backend) -> None:
-    instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
-    state = heated(instrument, ALUMINIUM, motions=MOVED)
-    before = image_quality(instrument, backend, [MOVED])
-    after = image_quality(redder(instrument, grown), backend, [state], wavelength=grown * before.wavelength)
-    for name, old in before.cameras.items():
-        new = after.cameras[name]
-        np.testing.assert_allclose(new.wfe, old.wfe, rtol=1e-7)
-        # 1e-14 m of rounding in a path is 1e-11 m of defocus at F/9
-        np.testing.assert_allclose(new.defocus, grown * old.defocus, rtol=0, atol=3e-11)
-        for key in ("mtf_along_line", "mtf_along_track"):
-            # what polynomials leave; growth that is left out anywhere is 5e-5
-            np.testing.assert_allclose(getattr(new, key), getattr(old, key), rtol=0, atol=1e-7)
-
-
-def test_rendered_spots_stay_on_their_pixels(with_camera, backend) -> None:
-    """Expected images; light does not grow, so that rings are narrower on the pixels by the growth."""
-    instrument = with_camera("gf7")
-    path = MonitorPath(instrument, backend)
-    far = {"base/forward/focal_plane": Motion(shift=(80e-6, -120e-6, 0.0))}
-    still, warm = path.expected_photons([far, heated(instrument, ALUMINIUM, 20.0, far)], single=False)
-    size = 20.0 * ALUMINIUM.expansion
-    assert np.abs(warm - still).max() < 3.0 * size * still.max()
-    np.testing.assert_allclose(warm.sum(axis=(1, 2)), still.sum(axis=(1, 2)), rtol=0.1 * size)
-    axes = [np.arange(n) - 0.5 * (n - 1) for n in path.shape]
-    core = still > 0.05 * still.max(axis=(1, 2), keepdims=True)
-    for k, axis in enumerate(axes):
-        where = np.expand_dims(axis, 1 - k)
-        old, new = (np.sum(f * core * where, axis=(1, 2)) / np.sum(f * core, axis=(1, 2)) for f in (still, warm))
-        assert np.abs(old).max() > 10.0
-        # a pixel grid that did not grow would move the far spots by 6e-3 to 1e-2 pixels
-        np.testing.assert_allclose(new, old, rtol=0, atol=3e-4)
-
-
-def test_drawn_beams_grow(with_camera, backend) -> None:
-    instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
-    before, after = (trace_light_paths(instrument, backend, s).beams for s in ({}, heated(instrument, ALUMINIUM)))
-    for one, other in zip(before, after, strict=True):
-        first = 1 if "imaging" in one.name else 0  # where the scene's beam is cut off is not on the instrument
-        # rays are aimed to 1e-9 m
-        np.testing.assert_allclose(other.vertices[:, first:], grown * one.vertices[:, first:], rtol=0, atol=1e-7)
 
 
 def test_detectors_of_the_path_tracer_have_grown_pixels(with_camera, backend) -> None:

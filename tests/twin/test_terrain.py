@@ -1,5 +1,7 @@
 """Ground: exact coordinates, one function of height, spectra and shares as asked for, light by hand."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from twin.orbit.ground.grid import GroundFrame, SplineGrid, correlated_field, fr
 from twin.orbit.ground.orthophoto import SCALE, make_control
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import Extent, apparent, reflectance
+from twin.orbit.images.image_points import ReferenceHeights
 
 SEED = np.random.SeedSequence(7)
 FRAME = GroundFrame(np.radians(116.0), np.radians(40.0))
@@ -113,6 +116,21 @@ def test_nothing_beyond_the_ground() -> None:
     assert np.all(np.isfinite(ground(*corners)))
     with pytest.raises(ValueError, match="beyond what is known"):
         ground(corners[0] * 1.1, corners[1])
+
+
+def test_heights_beside_a_gap_of_a_map_are_unknown() -> None:
+    """A place needs all four posts around it; of these a gap takes one away, and the map's edge others."""
+    valid = np.ones((7, 9), bool)
+    valid[2, 5] = False
+    posts = np.add.outer(10.0 * np.arange(7.0), np.arange(9.0)).astype(np.float32)
+    heights = ReferenceHeights.of(SimpleNamespace(values=posts, valid=valid, row_column=lambda e, n: (n, e)))
+    north, east = np.meshgrid(np.arange(-0.5, 7.0), np.arange(-0.5, 9.0), indexing="ij")
+    found = heights(east, north)
+    unknown = {(k, j) for k, j in np.argwhere(np.isnan(found)) if 0 < k < 7 and 0 < j < 9}
+    assert unknown == {(2, 5), (2, 6), (3, 5), (3, 6)}
+    assert np.isnan([found[0], found[-1]]).all()
+    assert np.isnan([found[:, 0], found[:, -1]]).all()
+    assert found[5, 3] == pytest.approx(47.0, abs=0.3)
 
 
 def test_light_by_hand() -> None:

@@ -4,7 +4,6 @@ inputs that cannot be used.
 Chi-square tests have a false-alarm rate of 1e-4 each, two-sided; seeds are fixed, so that they pass or fail for good.
 """
 
-import json
 import math
 from pathlib import Path
 
@@ -12,15 +11,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import choose, compensate
 from scenes.specs.load import EXAMPLES, LAB, load_named
 from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.laboratory.turntable_bench import DividingError, TurntableModel
-from twin.laboratory.turntable_numbers import TURNTABLE
-from twin.laboratory.turntable_report import turntable_report
-from twin.laboratory.turntable_run import TurntableRun, run_turntable
+from twin.laboratory.turntable_run import run_turntable
 
 ARCSEC = math.pi / 648000
 FALSE_ALARM = 1e-4
@@ -30,18 +26,6 @@ FILE = EXAMPLES.parent / "lab" / "turntable.yaml"
 
 def with_plan(**changes: object) -> TurntableTestSpec:
     return SPEC.model_copy(update={"calibration": SPEC.calibration.model_copy(update=changes)})
-
-
-@pytest.fixture(scope="module")
-def run() -> TurntableRun:
-    """All five fits; three folds instead of ten, to save trainings of the network."""
-    return run_turntable(with_plan(folds=3), 1)
-
-
-def test_spec_and_seed_determine_everything() -> None:
-    first, again, other = (TURNTABLE(run_turntable(SPEC, seed, names=("cubic_spline",))) for seed in (4, 4, 5))
-    assert first == again
-    assert first["points"] != other["points"]
 
 
 def test_sign_and_inverse() -> None:
@@ -57,6 +41,9 @@ def test_sign_and_inverse() -> None:
     scatter = model.stand(np.full(4000, 1.7), np.random.default_rng(1)) - model.stand(1.7)
     # 4000 values: 1.1%, 4 sigma
     assert np.std(scatter) == pytest.approx(SPEC.dividing_error.repeatability, rel=0.045)
+    # the subdivision's slope enlarges it by some hundredths
+    scatter = model.read(np.full(4000, 1.7), np.random.default_rng(2)) - model.read(1.7)
+    assert np.std(scatter) == pytest.approx(SPEC.dividing_error.repeatability, rel=0.1)
 
 
 def test_parts_have_the_sizes_of_the_file() -> None:
@@ -93,26 +80,6 @@ def test_calibration_cannot_see_the_subdivision_error() -> None:
     np.testing.assert_allclose(subdivision(reading + period), subdivision(reading), rtol=0.0, atol=1e-9 * ARCSEC)
     assert np.ptp(subdivision(model.calibrate().angle)) < 1e-9 * ARCSEC
     assert np.std(subdivision(model.held_out().angle)) > 0.5 * subdivision.rms
-
-
-def test_class_of_the_paper() -> None:
-    """0.081 arcsec and 0.037 arcsec of paper 004 lie in the middle half of 60 tables. Averaging alone stays below
-    0.037 arcsec, so that this is no RMS of a mean.
-    """
-    series = [TurntableModel(SPEC, seed).calibrate() for seed in range(60)]
-    before, after, mean, alone = (
-        np.array(values) / ARCSEC
-        for values in zip(
-            *((np.max(s.rms_before), np.max(s.rms_after), s.mean_rms, s.averaging_alone) for s in series), strict=True
-        )
-    )
-    for values, paper in ((before, 0.081), (after, 0.037)):
-        low, high = np.percentile(values, [25.0, 75.0])
-        assert low < paper < high
-    assert np.median(alone) < 0.030
-    assert np.median(mean) < 0.015
-    # without gross errors about as many are rejected as the formula says; with them some more
-    assert 8.0 < np.mean([s.rejected for s in series]) < 20.0
 
 
 @pytest.mark.second
@@ -155,44 +122,6 @@ def test_without_errors_the_truth_comes_out() -> None:
     left = done.fits["cubic_spline"](done.truth_readings) - done.true_error
     # fourth order of the step, 0.005 (2 pi 0.5 / 6)^4 of 0.5 arcsec, is 2e-4
     assert np.max(np.abs(left[inside])) < 1e-3 * ARCSEC
-
-
-@pytest.mark.second
-def test_contract(run: TurntableRun) -> None:
-    result = json.loads(json.dumps(TURNTABLE(run), allow_nan=False))
-    assert set(result["fits"]) == set(FITS) == set(result["truth"]["fits"])
-    assert not result["failed"]
-    fits = result["fits"]
-    assert result["chosen"] == min(fits, key=lambda name: fits[name]["cross_validation_rms_arcsec"])
-    held = [fits[name]["heldout_rms_arcsec"] for name in result["ranking"]]
-    assert held == sorted(held)
-    assert fits[result["chosen"]]["heldout_rms_arcsec"] < 0.1
-    assert fits["piecewise_linear"]["train_rms_arcsec"] == 0.0 < fits["piecewise_linear"]["heldout_rms_arcsec"]
-    assert result["mean_rms_arcsec"] < result["averaging_alone_rms_arcsec"] < result["chauvenet_rms_arcsec"]
-    assert result["chauvenet_rms_arcsec"] < result["repeat_rms_arcsec"]
-    assert len(result["points"]) == 41
-    assert len(result["heldout_points"]) == 40
-    point = result["points"][3]
-    kept = np.array(point["comparisons_arcsec"])[point["kept"]]
-    assert point["mean_arcsec"] == pytest.approx(np.mean(kept), abs=1e-12)
-    assert sum(not k for p in result["points"] for k in p["kept"]) == result["rejected"]
-
-
-@pytest.mark.second
-def test_network_weights_stay_within_the_points(run: TurntableRun) -> None:
-    """A linearisation with more effective parameters than points would be one at no minimum."""
-    for fit in run.fits.values():
-        assert 2.0 < fit.effective_parameters < 41.0 + 1e-6
-
-
-@pytest.mark.second
-def test_report(run: TurntableRun) -> None:
-    parts = turntable_report(run).sections
-    artefacts = [artefact for part in parts for artefact in part.artefacts]
-    assert len({artefact.name for artefact in artefacts}) == len(artefacts) == 7
-    assert all(artefact.content() for artefact in artefacts)
-    text = " ".join(paragraph for part in parts for paragraph in part.text)
-    assert "50 whole periods" in text
 
 
 @pytest.mark.parametrize(
