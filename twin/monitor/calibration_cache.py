@@ -20,7 +20,7 @@ import pickle
 import stat
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from enum import Enum
 from functools import cache
@@ -76,6 +76,24 @@ def cache_folder() -> Path | None:
         except RuntimeError:
             return None
     return shared / NAME
+
+
+@contextmanager
+def recomputed() -> Iterator[None]:
+    """Leave the cache alone within a ``with`` block or a function so decorated, also in the processes that it starts.
+
+    For checks of a result, and where a function or constant of the program is replaced while it runs: no name of an
+    entry contains that.
+    """
+    before = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = OFF
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[VARIABLE]
+        else:
+            os.environ[VARIABLE] = before
 
 
 @dataclass(frozen=True)
@@ -168,15 +186,16 @@ class _Writer(pickle.Pickler):
 
     def __init__(self, file: io.BytesIO, entry: CacheEntry) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
-        self._known = {id(one): k for k, one in enumerate((entry.backend, *entry.specs))}
-        self._backend = entry.backend
+        self._known = entry.backend, *entry.specs
 
     def persistent_id(self, thing: Any) -> int | None:
-        if isinstance(thing, Backend) and thing == self._backend:
-            return 0
-        if isinstance(thing, Spec) and id(thing) not in self._known:
-            raise pickle.PicklingError(f"{type(thing).__name__} is none of the specifications that were given")
-        return self._known.get(id(thing))
+        if not isinstance(thing, Backend | Spec):
+            return None
+        for number, known in enumerate(self._known):
+            # instruments that are equal share their parts in one process, those of the first job's specification
+            if thing is known or (thing == known and repr(thing) == repr(known)):
+                return number
+        raise pickle.PicklingError(f"{type(thing).__name__} is none of the specifications that were given")
 
 
 class _Reader(pickle.Unpickler):
@@ -306,6 +325,6 @@ def _words(value: Any) -> Iterator[str]:
 
 def _name(thing: Any) -> str:
     """Module and name of a class or function of the program."""
-    if not _of_program(thing.__module__) and thing.__module__ != "builtins" or "<" in thing.__qualname__:
+    if (not _of_program(thing.__module__) and thing.__module__ != "builtins") or "<" in thing.__qualname__:
         raise _UnnamedError(f"{thing!r} is no part of the program")
     return f"{thing.__module__}.{thing.__qualname__}"
