@@ -231,10 +231,7 @@ DAMAGES = {
     "cut": lambda file, entry: file.write_bytes(file.read_bytes()[:-1]),
     "empty": lambda file, entry: file.write_bytes(b""),
     "flipped": lambda file, entry: file.write_bytes(file.read_bytes()[:-1] + bytes([file.read_bytes()[-1] ^ 1])),
-    "other key": lambda file, entry: (
-        replace(entry, key="other").write(1),
-        file.with_name(f"other{ENDING}").rename(file),
-    ),
+    "other key": lambda file, entry: replace(entry, key="x").write(1) or file.with_name(f"x{ENDING}").rename(file),
     "readable by others": lambda file, entry: file.chmod(0o640),
     "folder of others": lambda file, entry: file.parent.chmod(0o770),
     "a link": lambda file, entry: file.symlink_to(file.rename(file.with_suffix(".x"))),
