@@ -6,6 +6,7 @@ import shutil
 import signal
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache, partial
 
@@ -21,7 +22,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera, load_instrument
 from scenes.specs.resolved import resolve_job
-from tests.tiers import longest_first
+from tests.tiers import longest_first, seed_of_the_day, shuffled
 from twin.monitor.calibration_cache import VARIABLE, recomputed
 from twin.monitor.monitor_experiment import MonitorExperiment
 
@@ -68,14 +69,28 @@ def pytest_configure(config: pytest.Config) -> None:
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--random-order", type=int, metavar="SEED", help="shuffle the files, and the tests in each")
+
+
+def pytest_report_header() -> str:
+    return f"seed of the day: {seed_of_the_day()} (TWIN_TEST_SEED)"
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """A slow case of a test of the second tier belongs to the third alone. Several processes begin with long files."""
-    if config.option.markexpr == "second":
-        slow = [item for item in items if item.get_closest_marker("slow")]
-        config.hook.pytest_deselected(items=slow)
-        items[:] = [item for item in items if not item.get_closest_marker("slow")]
-    if hasattr(config, "workerinput"):
+    """Several processes begin with long files."""
+    if (seed := config.getoption("--random-order")) is not None:
+        items[:] = shuffled(items, seed)
+    elif hasattr(config, "workerinput"):
         items[:] = longest_first(items)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Count the skipped tests of each reason."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    reasons = Counter(report.longrepr[2].removeprefix("Skipped: ") for report in skipped)
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"{count} skipped: {reason}")
 
 
 @pytest.hookimpl(trylast=True)
