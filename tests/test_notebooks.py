@@ -11,7 +11,7 @@ from nbclient import NotebookClient
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 LONG = ("heat", "orbit_calibration", "targets_mtf", "trade_study")
-"""Twenty seconds to a minute each: of the third tier."""
+"""Notebooks of which no other test needs the time: their cells run in those of the same subject."""
 MOST_SECONDS = 60.0
 """Of the processor, all processes together, with kernels compiled; not on the clock, for a machine may be busy."""
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import re
 import subprocess
 import sys
 import tomllib
@@ -14,7 +12,6 @@ import pytest
 
 from docs.site.command_pages import commands, programs
 from tests.tiers import quick
-from tests.twin.live_page import running
 from twin.run.console import COMPLETE, PROGRAMS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -109,13 +106,6 @@ def test_the_console_command_knows_every_program(tmp_path):
     assert started(tmp_path, script, "--version").stdout.endswith(f" from {ROOT}\n")
 
 
-def test_the_console_command_lists_without_importing_what_it_lists(tmp_path):
-    done = started(tmp_path, "-X", "importtime", console(tmp_path), "--help")
-    found = set(re.findall(r"\| +([\w.]+)$", done.stderr, re.M))
-    assert "typer" in found
-    assert not {"numpy", "pydantic", "rich", "optics", "scenes", *(module for module, _ in PROGRAMS.values())} & found
-
-
 @pytest.mark.parametrize(
     ("typed", "offered"), quick(1, [("or", {"orbit"}), ("lab f", {"focus"}), ("mtf --pitc", {"--pitch"})])
 )
@@ -130,26 +120,15 @@ def test_shells_are_offered_programs_subcommands_and_options(tmp_path, monkeypat
     assert COMPLETE in started(tmp_path, console(tmp_path), "--show-completion", "bash").stdout
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("way", ["module", "console"])
-def test_processes_of_a_command_run_nothing_of_it_either(tmp_path, way):
+@pytest.mark.second
+def test_processes_of_a_command_run_nothing_of_it_either(tmp_path):
     """The second process of the main job, workers of a study, and what they start."""
-    place = folder_of_traps(tmp_path, *(["twin"] if way == "module" else []))
-
-    def run(name: str, *words: str) -> None:
-        how = ["-m", f"twin.{name}"] if way == "module" else [console(place), name]
-        done = started(place, *how, *words)
+    place = folder_of_traps(tmp_path)
+    for words, made in (
+        (("render", "scenes/examples/perturb.yaml", "--frames", "1"), "truth.json"),
+        (("study", "scenes/examples/study_smoke.yaml", "--workers", "2", "--yes"), "study.nc"),
+    ):
+        out = place / words[0]
+        done = started(place, console(place), words[0], str(ROOT / words[1]), *words[2:], "--out", str(out), "--quiet")
         assert (done.returncode, hits(place)) == (0, ""), done.stderr
-
-    run("render", str(ROOT / "scenes/examples/perturb.yaml"), "--frames", "1", "--out", "one", "--quiet")
-    assert json.loads((place / "one/truth.json").read_text("utf-8"))
-    run("study", str(ROOT / "scenes/examples/study_smoke.yaml"), "--workers", "2", "--out", "two", "--yes", "--quiet")
-    assert (place / "two/study.nc").exists()
-
-
-@pytest.mark.slow
-def test_the_process_of_the_live_twin_runs_nothing_of_it_either(tmp_path):
-    place = folder_of_traps(tmp_path, "twin")
-    with running("gf7_pair", "--port", "0", "--stay", cwd=place, PYTHONPATH=str(ROOT)) as command:
-        assert command.end() == 0
-    assert hits(place) == ""
+        assert (out / made).exists()
