@@ -172,6 +172,9 @@ def test_ids_are_unique_and_belong_to_a_paper():
             check(wrong)
     with pytest.raises(ValueError, match="another paper"):
         CheckGroup("004.x", "", 1.0, (check("001.x"),), answers)
+    for checks, seconds in (((), 1.0), ((check("001.x"),), 0.0)):
+        with pytest.raises(ValueError, match=r"group '001\.x' needs checks and a rough time"):
+            CheckGroup("001.x", "", seconds, checks, answers)
     with pytest.raises(ValueError, match="group prefix"):
         CheckGroup("001/../x", "", 1.0, (check("001.x"),), answers)
 

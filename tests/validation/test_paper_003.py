@@ -15,7 +15,7 @@ from twin.validation.checks.check import (
     UNDECIDED,
     median_of,
 )
-from twin.validation.paper_003 import fields, flights, model
+from twin.validation.paper_003 import fields, flights, model, rendered
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
@@ -88,6 +88,20 @@ def test_a_few_campaigns(monkeypatch):
     assert values["003.before.plan"] == pytest.approx(111.0, abs=3.0)
     (run,) = validation.runs
     assert {a.name for a in run.artefacts} == {"schemes", "accuracy", "latitude", "biases"}
+
+
+def test_marks_that_cannot_be_told_apart_are_refused():
+    image = np.zeros((60, 60))
+    image[30, 29:31] = 1.0
+    assert rendered._centroid(image, 30, 30) == pytest.approx([30.0, 29.5])
+    for row, column in ((30, 1), (58, 30), (1, 30), (30, 58)):
+        with pytest.raises(ValueError, match="too near to the window's border"):
+            rendered._centroid(image, row, column)
+    at, ground = np.array([[1.0, 1.0], [9.0, 9.0]]), np.array([[4.0], [5.0]])
+    near = (np.array([9.1, 1.2]), np.array([9.0, 1.0]))
+    assert rendered._matched(near, at, ground).tolist() == [[5.0], [4.0]]
+    with pytest.raises(ValueError, match="two marks in the image are nearest to one"):
+        rendered._matched((np.array([1.0, 99.0]), np.array([1.0, 99.0])), at, ground)
 
 
 def test_median_knows_its_scatter():

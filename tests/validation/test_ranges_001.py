@@ -12,7 +12,7 @@ from twin.validation.checks.check import CORRECTED, REFUTED
 from twin.validation.checks.group import Context
 from twin.validation.paper_001.ranges import ranges_group
 from twin.validation.paper_001.ranges.curves import Bench, sampled
-from twin.validation.paper_001.ranges.defocus import variant
+from twin.validation.paper_001.ranges.defocus import variant, with_return
 from twin.validation.paper_001.ranges.ranges_group import GROUP
 from twin.validation.paper_001.ranges.turns import EDGE_PX, WIDE_PX, motion_of, single_range
 from twin.validation.registry import select
@@ -61,6 +61,12 @@ def test_a_limit_is_found_between_the_points():
 def test_larger_ccds_read_the_same_positions(bench, wide):
     # the same light on the same pixels; single precision of the images is 1e-7 of the peak
     assert wide.positions([{}]) == pytest.approx(bench.positions([{}]), abs=1e-4)
+
+
+def test_an_unknown_kind_of_return_is_refused(bench):
+    with pytest.raises(ValueError, match="no return 'mirror'; there are plane, "):
+        with_return(bench.experiment, "mirror")
+    assert with_return(bench.experiment, "plane") is bench.experiment
 
 
 @pytest.mark.second
