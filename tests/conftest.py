@@ -22,7 +22,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera, load_instrument
 from scenes.specs.resolved import resolve_job
-from tests.tiers import longest_first, seed_of_the_day, shuffled
+from tests.tiers import longest_first, shuffled
 from twin.monitor.calibration_cache import VARIABLE, recomputed
 from twin.monitor.monitor_experiment import MonitorExperiment
 
@@ -71,10 +71,6 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--random-order", type=int, metavar="SEED", help="shuffle the files, and the tests in each")
-
-
-def pytest_report_header() -> str:
-    return f"seed of the day: {seed_of_the_day()} (TWIN_TEST_SEED)"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -41,14 +41,11 @@ from optics.geometry.sag_terms import SAG_TERMS, XYPolynomial, grown
 from optics.geometry.surface import plane
 from optics.geometry.tree import Motion, State
 from optics.geometry.vector_shape import Polygon
-from optics.materials.material import material
 from optics.numerics.backend import load_backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.targets.target_shapes import Target
-from optics.thermal.heat import Temperature
 from optics.waves.pupil_stack import circular_pupil
 from scenes.models.camera_model import surface_of
 from scenes.models.obstruction import find_obstructions
@@ -67,7 +64,6 @@ from scenes.yaml.file_kind import FileKind
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
-from tests.tiers import quick
 from tests.twin import test_path_figure as path_figure
 from tests.twin import test_prism_images
 from tests.twin.commands import invoke
@@ -176,27 +172,6 @@ class TwoLevels:
         return
 
 
-@dataclass(frozen=True)
-class Flicker:
-    """A gain that changes from pixel to pixel and frame to frame: noise in proportion to the signal."""
-
-    share: float
-
-    @property
-    def fixed_variance_e2(self) -> float:
-        return 0.0
-
-    def temporal_variance_e2(self, electrons: Any) -> Any:
-        # of a Poisson number n with mean m: the mean of n^2 is m^2 + m
-        return self.share**2 * (np.square(electrons) + electrons)
-
-    def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> None:
-        return
-
-    def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return self.share * electrons * rng.standard_normal(electrons.shape)
-
-
 def sheet_file(folder: Path, noise: str) -> Path:
     """The data sheet of the monitor's CCD with further noise."""
     text = (LIBRARY / "detectors" / "monitor_ccd.yaml").read_text("utf-8")
@@ -210,13 +185,12 @@ def within_chance(chi2: float, freedom: int) -> bool:
 
 
 @extends(NOISE)
-@pytest.mark.parametrize(("toy", "number"), quick(1, [(TwoLevels, 300.0), (Flicker, 0.05)]))
-def test_a_noise_term(toy: type, number: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_noise_term(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames scatter by it, and spot centres scatter as the analysis says that knows its variance; one that does not is
     wrong.
     """
-    add(monkeypatch, NOISE, "toy", toy)
-    sheet = load_detector(sheet_file(tmp_path, f"{{toy: {number}}}"))
+    add(monkeypatch, NOISE, "toy", TwoLevels)
+    sheet = load_detector(sheet_file(tmp_path, "{toy: 300.0}"))
     exposure, frames, count, side = 0.01, 8, 300, 24
     detector = EmvaDetector.from_sheet(sheet, exposure)
     plain = EmvaDetector.from_sheet(sheet.model_copy(update={"noise": None}), exposure)
@@ -567,23 +541,11 @@ def test_a_surface(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(out[valid], mirrored[valid], rtol=0, atol=1e-11)
     np.testing.assert_allclose(length, np.linalg.norm(met - position, axis=1) + np.linalg.norm(place - met, axis=1))
 
-    # derivatives: by the mirror's size, against a difference over 2e-6 whose third derivative shows at 1e-12
-    step = assemble(assembly, ["all"], [state], [("mirror", "scale", 0)])
-    start = np.broadcast_to(position, (1, *position.shape)), np.broadcast_to(direction, (1, *direction.shape))
-    slope = jvp(backend, step, *start).position[0]
-    ends = []
-    for scale in (2e-3 - 1e-6, 2e-3 + 1e-6):
-        moved = assemble(assembly, ["all"], [{"mirror": Motion(scale=scale)}])
-        ends.append(trace(backend, moved, make_rays(backend, position, direction)).numpy()[0][0])
-    np.testing.assert_allclose(slope[valid], (ends[1] - ends[0])[valid] / 2e-6, rtol=0, atol=1e-8)
-    assert np.max(np.abs(slope[valid])) > 1e-2
-
     # the path tracer
     polynomial = XYPolynomial(x2y=1e-3, y4=2e-3)
     for case, heat in (
         (surface, state),
         (surface.with_figure(path_figure.ASTIGMATIC), path_figure.HEAT),
-        (surface.with_figure(path_figure.WAVY), {}),
         (replace(surface, even=(1e-3,), terms=(*surface.terms, polynomial)), {}),
         (replace(plane(), terms=(polynomial,)), {}),
     ):
@@ -702,13 +664,6 @@ def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     # images of one of these states: rows are y, columns x; of the beams' mean and the centroid coma makes two things
     seen = np.diff(spot_places(experiment, [{}, single[0]]), axis=0)[0]
     np.testing.assert_allclose(seen[:, ::-1], moved[len(whole)], rtol=0, atol=0.05)
-
-    # heat: a free plate in a gradient across it becomes a sphere of curvature alpha times the gradient
-    plate = "base/forward/monitor/left/prism_180/mirror"
-    warm = experiment.thermal.state({plate: Temperature(0.0, (0.0, 0.0, 2.0))})[plate]
-    disk = 0.03 * np.sqrt(2.0)  # the smallest circle round the ellipse that the beam leaves on the tilted face
-    bent = -2.0 * material("fused silica").expansion * disk**2 / (4.0 * np.sqrt(3.0))
-    assert warm.figure[4] == pytest.approx(bent, rel=1e-6)
 
     # the path tracer, with a mirror turned
     state = turned("prism_0/first", (0.0, TURN, 0.0))

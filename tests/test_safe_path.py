@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -104,6 +105,13 @@ def test_the_console_command_knows_every_program(tmp_path):
     assert wrong.returncode == 2
     assert "Did you mean 'render'" in wrong.stderr
     assert started(tmp_path, script, "--version").stdout.endswith(f" from {ROOT}\n")
+
+
+def test_the_console_command_lists_without_importing_what_it_lists(tmp_path):
+    done = started(tmp_path, "-X", "importtime", console(tmp_path), "--help")
+    found = set(re.findall(r"\| +([\w.]+)$", done.stderr, re.M))
+    assert "typer" in found
+    assert not {"numpy", "pydantic", "rich", "optics", "scenes", *(module for module, _ in PROGRAMS.values())} & found
 
 
 @pytest.mark.parametrize(

@@ -131,6 +131,16 @@ def test_what_differs_from_the_lock_is_told(lock: Path, monkeypatch: pytest.Monk
     assert "bash setup.sh" in line.detail
 
 
+def test_setup_installs_the_lock_and_nothing_else() -> None:
+    """Each call of pip: by checksums, or the project itself without what it asks for."""
+    text = (ROOT / "setup.sh").read_text("utf-8").replace("\\\n", " ")
+    calls = [line for line in text.splitlines() if "-m pip install" in line]
+    assert len(calls) == 2
+    assert all("--no-deps" in line for line in calls)
+    assert "--require-hashes --only-binary :all:" in calls[0]
+    assert "--no-build-isolation -e ." in calls[1]
+
+
 def forged(folder: Path, name: str, version: str) -> None:
     """A wheel that can be installed, with other contents than the locked one."""
     with zipfile.ZipFile(folder / f"{name}-{version}-py3-none-any.whl", "w") as wheel:

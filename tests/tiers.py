@@ -1,10 +1,8 @@
-"""Cases of a test in both tiers, which files begin, and seeds that change from day to day."""
+"""Cases of a test in both tiers, and the order of files."""
 
-import os
 import random
 from collections import Counter
 from collections.abc import Callable, Iterable
-from datetime import UTC, datetime
 from typing import Any
 
 import pytest
@@ -31,14 +29,6 @@ def one_of_each(key: Callable[[Any], Any], cases: Iterable[Any]) -> list[Any]:
     for case in cases:
         first.setdefault(key(case), pytest.param(*(case if isinstance(case, tuple) else (case,))))
     return [pytest.param(*case.values, marks=pytest.mark.second) for case in first.values()]
-
-
-def seed_of_the_day() -> int:
-    """Return the seed of tests that look for what nobody thought of: YYYYMMDD, or the variable TWIN_TEST_SEED.
-
-    The head of a test run prints it.
-    """
-    return int(os.environ.get("TWIN_TEST_SEED") or datetime.now(UTC).strftime("%Y%m%d"))
 
 
 def shuffled(items: list[pytest.Item], seed: int) -> list[pytest.Item]:
