@@ -28,8 +28,7 @@ import twin.render
 import twin.validate
 from analysis.monitor import recovery
 from analysis.monitor.calibration import CameraCalibration
-from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.estimators import Estimator, Formula, OfEachCamera, Shifts
+from analysis.monitor.estimators import Formula, OfEachCamera
 from analysis.monitor.monitoring import MonitorGeometry
 from analysis.monitor.parameters import Parameter
 from analysis.monitor.recovery import measure_spots
@@ -244,17 +243,6 @@ class Half(OfEachCamera):
         return 0.5 * DERIVED.camera_gain(camera, covariance)
 
 
-class Nothing(Estimator):
-    """No camera has changed, whatever the spots say, where something is stated."""
-
-    title = "nothing"
-    note = "that nothing has changed"
-    stated = True
-
-    def gain(self, shifts: Shifts) -> np.ndarray:
-        return np.zeros((len(shifts.covariance), 4 * len(shifts.cameras), shifts.covariance.shape[-1]))
-
-
 def one_bar(pitch: float, region: int) -> Target:
     half = 0.5 * pitch * np.array(BAR)
     return Target(0.0, ((1.0, Polygon(half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))),))
@@ -287,32 +275,11 @@ def calibrations() -> dict[str, CameraCalibration]:
     return {name: CameraCalibration(geometry, look, jacobian, changes, motions) for name, look in looks.items()}
 
 
-def three_motions() -> Disturbances:
-    """Of the first camera, the second, and both."""
-    generator = np.random.default_rng(5)
-    names = ("one", "two", "both")
-    return Disturbances(
-        "toys",
-        names,
-        names,
-        names,
-        np.ones(3),
-        ("um",) * 3,
-        generator.normal(0.0, 0.2, (8, 3)),
-        generator.normal(0.0, 1e-6, (8, 3)),
-        np.eye(3),
-        (TimeLaw(),) * 3,
-    )
-
-
 @extends(ESTIMATORS)
 def test_an_estimator(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half of what ``derived`` reads, with half of its noise, for every camera and for the angle between them; in the
-    total sigma stands the other half, which it misses.
-    """
+    """Half of what ``derived`` reads, with half of its noise, for every camera and for the angle between them."""
     without = recovery.estimates(**turned(5), cameras=calibrations()).parameters
     add(monkeypatch, ESTIMATORS, "half", Half())
-    add(monkeypatch, ESTIMATORS, "nothing", Nothing())
     found = recovery.estimates(**turned(5), cameras=calibrations())
     assert list(found.parameters["forward"]) == [*without["forward"], "half"]
     for camera, estimators in found.parameters.items():
@@ -324,16 +291,6 @@ def test_an_estimator(monkeypatch: pytest.MonkeyPatch) -> None:
     angles = found.angle
     # to first order; the exact formula departs by products of angles of 1e-6, and of the turn of 1e-5
     np.testing.assert_allclose(angles["half"].change_rad, 0.5 * angles["derived"].change_rad, rtol=1e-3)
-    stated = three_motions()
-    total = recovery.estimates(**turned(5), cameras=calibrations(), disturbances=stated).parameters
-    assert list(total["forward"]) == [*without["forward"], "posterior", "half", "nothing"]
-    both = ("forward", "backward")
-    prior = np.sqrt(np.diag(stated.parameter_covariance))
-    np.testing.assert_allclose(np.concatenate([total[c]["nothing"].sigma[0] for c in both]), prior, rtol=1e-12)
-    half, derived = (np.concatenate([total[c][name].sigma_noise for c in both], -1) for name in ("half", "derived"))
-    np.testing.assert_allclose(half, 0.5 * derived, rtol=1e-13)
-    for name in ("half", "derived", "model"):
-        assert np.all(np.concatenate([total[c][name].sigma - total[c]["posterior"].sigma for c in both]) > 0.0)
 
 
 READINGS = "analysis.monitor.parameters.CAMERA_PARAMETERS"

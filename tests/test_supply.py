@@ -81,19 +81,6 @@ def test_nothing_else_is_locked() -> None:
         assert {(normal(r.name), str(r.specifier)) for r in listed} == {(p.name, f"=={p.version}") for p in LOCK[layer]}
 
 
-def test_what_the_twin_needs_in_this_environment_is_locked() -> None:
-    """By what the installed packages ask for, not by what the lock says of itself; rasterio's command line apart."""
-    names = {p.name for p in read_lock()}
-    for name in {p.name for p in LOCK["runtime"] if p.here}:
-        try:
-            lines = importlib.metadata.requires(name) or []
-        except importlib.metadata.PackageNotFoundError:
-            continue
-        for one in map(Requirement, lines):
-            if one.marker is None or one.marker.evaluate({"extra": ""}):
-                assert normal(one.name) in names | {"click-plugins", "cligj"}, (name, one.name)
-
-
 def test_a_lock_file_that_is_none_is_refused() -> None:
     for text, told in (
         ("numpy==2.4.6\n", "x:1: numpy has no hash"),

@@ -32,7 +32,7 @@ BENCHMARKS = {
     "tolerance": ("cameras drawn within their tolerances, beside optiland", 65),
     "record": ("one reading more in the record of an instrument", 340),
     "block": ("a block of a hundred scenes with a million tie points", 600),
-    "live": ("the live twin: from a slider to painted spots and readings", 75),
+    "live": ("the live twin: from a state that is sent to the server's answer", 30),
     "start": ("help, the main job with an empty and a filled cache", 90),
 }
 """Name -> what is measured, by ``measure`` of the module NAME_speed, and seconds that it takes on two cores. `study`

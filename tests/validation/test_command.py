@@ -2,11 +2,9 @@
 something goes wrong. Tiny groups stand for the real ones, but for one run of paper 001's formulas.
 """
 
-import hashlib
 import json
 import math
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -17,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import twin.validate as command
-from tests.twin.commands import files, invoke
+from tests.twin.commands import invoke
 from twin.run.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation import registry
 from twin.validation.checks.check import (
@@ -29,13 +27,10 @@ from twin.validation.checks.check import (
     REFUTED,
     REPRODUCED,
     UNDECIDED,
-    VERDICTS,
     Check,
     CheckResult,
     Chosen,
     Explanation,
-    InputRange,
-    Supposed,
 )
 from twin.validation.checks.group import CheckGroup, Context, matches
 from twin.validation.checks.row_names import names_in_files
@@ -367,18 +362,6 @@ def test_how_far_a_chosen_input_can_move_before_the_row_fails(comparison, power,
     assert (lost.low, lost.high, lost.agrees) == (None, None, False)
 
 
-def test_the_limits_of_an_input_for_a_reader():
-    def text(low, high, agrees=True):
-        return InputRange("heat", 5.0, "mK", low, high, agrees).text
-
-    assert text(4.0, 612.3) == "heat 5 mK, holds from 4.0 to 610 mK"
-    assert text(None, 6.0) == "heat 5 mK, holds up to 6.0 mK"
-    assert text(4.0, None) == "heat 5 mK, holds from 4.0 mK"
-    assert text(None, None) == "heat 5 mK, holds whatever it is"
-    assert text(None, None, False) == "heat 5 mK"
-    assert Supposed("in Rome", "holds in 3 of 4 places").range(bool, True).text == "in Rome, holds in 3 of 4 places"
-
-
 def test_a_row_of_two_equations_fails_with_either():
     row = check(also=("001.eq6",), expected=CORRECTED)
     right, wrong = (row.evaluate(v, None, "", explained=[2.0], facts={"factor": 2}) for v in (2.0, 1.0))
@@ -426,86 +409,6 @@ def test_no_verdict_on_what_is_no_number(measured):
 
 
 # --- what is written --------------------------------------------------------------------------------------------------
-
-FILES = {
-    "validation.json",
-    "validation.html",
-    "manifest.json",
-    *(f"summary/{name}" for name in ("README.md", "001.table3-drawing.svg", "001.table3-picture.png")),
-    *(f"artefacts/001.table3/{name}" for name in ("drawing.svg", "picture.png", "numbers.csv", "data.json", "own.txt")),
-}
-
-
-def test_the_run_folder_is_complete(fake, tmp_path):
-    fake(GOOD, group("001.table4", "", run=lambda context: [context.check("001.table4").evaluate(1.0, None, "")]))
-    result = run("--out", tmp_path / "new/run", "--json", "--seed", 7)
-    assert result.exit_code == 0
-    assert files(tmp_path) == {f"new/run/{name}" for name in FILES}
-    assert not (tmp_path / "new/run/artefacts/001.table4").exists()
-    assert result.stderr == ""
-    assert result.stdout.count("\n") == 1
-    printed = json.loads(result.stdout)
-    assert printed == json.loads((tmp_path / "new/run/validation.json").read_text())
-    assert (printed["schema"], printed["version"]) == ("space-camera-twin/validation", 2)
-    assert (printed["seed"], printed["backend"], printed["only"], printed["fast"]) == (7, "llvm", None, False)
-    assert printed["unexpected"] == []
-    assert "drjit" in printed["versions"]
-    assert printed["counts"] == {**dict.fromkeys(VERDICTS, 0), CONFIRMED: 3}
-    named = [a["file"] for a in printed["groups"][0]["artefacts"]] + printed["groups"][0]["files"]
-    assert set(named) == {name for name in FILES if name.startswith("artefacts")}
-    manifest = json.loads((tmp_path / "new/run/manifest.json").read_text())
-    assert set(manifest["sha256"]) == FILES - {"manifest.json"}
-    for name, digest in manifest["sha256"].items():
-        assert hashlib.sha256((tmp_path / "new/run" / name).read_bytes()).hexdigest() == digest
-    drawing = (tmp_path / "new/run/artefacts/001.table3/drawing.svg").read_text()
-    assert 'xmlns="http://www.w3.org/2000/svg"' in drawing
-
-
-def test_the_summary_names_every_check_and_every_correction(fake, tmp_path):
-    def one(context: Context):
-        yield context.check("001.eq5").evaluate(2.0, 0.001, "Twice | as much.", explained=[2.0], facts={"factor": 2})
-        light = Chosen.power("light", 8.0, "mW", 1.0, -1.0)
-        yield context.check("001.eq9").evaluate(1.0, 0.02, "Dim.", 1.0, inputs=[light])
-
-    silent = check("001.eq8", printed=None, not_checkable="No number is printed.")
-    chosen = check("001.eq9", printed=None, basis="chosen")
-    fake(GOOD, CheckGroup("001.formulas", "", 1.0, (check("001.eq5", expected=CORRECTED), silent, chosen), one))
-    assert run("--out", tmp_path / "run").exit_code == 0
-    page = (tmp_path / "run/summary/README.md").read_text("utf-8")
-    rows = [line for line in page.splitlines() if line.startswith("| `")]
-    assert [row.split("`")[1] for row in rows] == [*GOOD.ids, "001.eq5", "001.eq8", "001.eq9"]
-    assert all(row.replace("\\|", "").count("|") == 10 for row in rows)
-    assert "2.0000 ± 0.0010 arcsec" in rows[2]
-    assert "- `001.eq5` (Table 3), confirmed with correction: A factor 2 is missing. That gives 2." in page
-    assert "- `001.eq8` (Table 3), not checkable: No number is printed." in page
-    # implied value, tolerance with its reason, power with its share of the claim, and what is told from what
-    told = "0.1 arcsec: a reason | 0.16 arcsec, 16 % | half, 0.5 arcsec away"
-    assert f"| [1] | two-sided | 1.000 ± 0.020 arcsec | {told} | reproduced |" in rows[4]
-    assert "- `001.eq9`: light 8 mW, holds from 6.9 to 9.5 mW" in page
-    for figure in re.findall(r"\]\(([^)]+)\)", page):
-        assert (tmp_path / "run/summary" / figure).is_file()
-
-
-def test_an_existing_folder_is_replaced_only_by_force(fake, tmp_path):
-    fake(GOOD)
-    target = tmp_path / "run"
-    assert run("--out", target).exit_code == 0
-    (target / "note.txt").touch()
-    second = run("--out", target)
-    assert (second.exit_code, second.stdout) == (2, "")
-    assert "--force" in second.stderr
-    assert (target / "note.txt").exists()
-    third = run("--out", target, "--force")
-    assert (third.exit_code, "note.txt" in third.stderr) == (2, True)
-    (target / "note.txt").unlink()
-    assert run("--out", target, "--force").exit_code == 0
-    assert files(target) == FILES
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/thesis.txt").touch()
-    assert run("--out", tmp_path / "mine", "--force").exit_code == 2
-    assert files(tmp_path / "mine") == {"thesis.txt"}
-
 
 # --- what goes wrong --------------------------------------------------------------------------------------------------
 
