@@ -25,7 +25,6 @@ from twin.monitor.calibration_cache import ENDING, OFF, VARIABLE, CacheEntry, ca
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run import provenance
 
-BACKEND = load_backend("llvm")
 PIECES = """
 import sys
 from tests.twin.test_calibration_cache import calibrated, job, numbers
@@ -41,7 +40,7 @@ def job(disturbances: str = "launch") -> ResolvedJob:
 
 def calibrated(resolved: ResolvedJob) -> tuple[MonitorExperiment, bool]:
     """A calibrated experiment, and whether its calibration was there before."""
-    experiment = MonitorExperiment(resolved, BACKEND)
+    experiment = MonitorExperiment(resolved, load_backend())
     return experiment, "calibration" in vars(experiment)
 
 
@@ -78,12 +77,12 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def entry() -> CacheEntry:
-    return CacheEntry.of(BACKEND, (), "some input")
+    return CacheEntry.of(load_backend(), (), "some input")
 
 
 def test_a_calibration_read_back_is_the_computed_one_bit_for_bit(folder: Path) -> None:
     os.environ[VARIABLE] = OFF
-    computed = numbers(MonitorExperiment(job(), BACKEND))
+    computed = numbers(MonitorExperiment(job(), load_backend()))
     os.environ[VARIABLE] = str(folder)
     first, kept = calibrated(job())
     assert not kept
@@ -137,7 +136,7 @@ def changed(value: Any) -> Iterator[Any]:
 def test_every_value_of_every_input_is_part_of_the_key() -> None:
     resolved = job()
     given = resolved.instrument, dict(resolved.cameras), resolved.detector, resolved.disturbances
-    keys = [CacheEntry.of(BACKEND, (), one).key for one in (given, *changed(given))]
+    keys = [CacheEntry.of(load_backend(), (), one).key for one in (given, *changed(given))]
     assert None not in keys
     assert len(set(keys)) == len(keys) > 300
 
@@ -154,11 +153,11 @@ def test_an_experiment_names_each_of_its_inputs() -> None:
         "detector": {"detector": detector},
         "instrument": {"instrument": instrument},
     }
-    keys = {"": MonitorExperiment(resolved, BACKEND)._entry.key}
-    keys |= {k: MonitorExperiment(resolved.model_copy(update=u), BACKEND)._entry.key for k, u in jobs.items()}
-    keys["beams"] = MonitorExperiment(resolved, BACKEND, free_beams=False)._entry.key
+    keys = {"": MonitorExperiment(resolved, load_backend())._entry.key}
+    keys |= {k: MonitorExperiment(resolved.model_copy(update=u), load_backend())._entry.key for k, u in jobs.items()}
+    keys["beams"] = MonitorExperiment(resolved, load_backend(), free_beams=False)._entry.key
     assert len(set(keys.values())) == 5
-    one = MonitorExperiment(resolved, BACKEND)
+    one = MonitorExperiment(resolved, load_backend())
     stated = [one._entry.part("disturbances", replace(one.stated, name=name)).key for name in ("launch", "other")]
     assert len({*stated, one._entry.key}) == 3
 
@@ -181,14 +180,15 @@ def test_an_experiment_names_each_of_its_inputs() -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_program_packages_and_machine_are_part_of_the_key(owner, name, value, entry, monkeypatch) -> None:
+    backend = load_backend()
     (monkeypatch.setitem if isinstance(owner, dict | os._Environ) else monkeypatch.setattr)(owner, name, value)
     calibration_cache._machine.cache_clear()
-    other = CacheEntry.of(BACKEND, (), "some input").key
+    other = CacheEntry.of(backend, (), "some input").key
     monkeypatch.undo()
     calibration_cache._machine.cache_clear()
     assert None not in (other, entry.key)
     assert other != entry.key
-    assert CacheEntry.of(BACKEND, (), "some input").key == entry.key
+    assert CacheEntry.of(backend, (), "some input").key == entry.key
 
 
 def test_the_content_of_a_file_that_an_input_names_is_part_of_the_key(tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_the_content_of_a_file_that_an_input_names_is_part_of_the_key(tmp_path: 
     keys = []
     for text in ("1", "2"):
         file.write_text(text)
-        keys.append(CacheEntry.of(BACKEND, (), str(file)).key)
+        keys.append(CacheEntry.of(load_backend(), (), str(file)).key)
     assert keys[0] != keys[1]
 
 
@@ -206,12 +206,12 @@ class Foreign:
 
 @pytest.mark.parametrize("value", [Foreign, Foreign(), lambda: 0, object(), {"a": [Foreign()]}])
 def test_what_is_no_part_of_the_program_has_no_key_and_is_not_kept(value, folder: Path) -> None:
-    entry = CacheEntry.of(BACKEND, (), value)
+    entry = CacheEntry.of(load_backend(), (), value)
     assert entry.key is None
     assert entry.part("more").key is None
     assert entry.get(lambda: 1.0) == 1.0
     assert not folder.exists()
-    assert CacheEntry.of(replace(BACKEND, name="cuda"), (), 1).key is None
+    assert CacheEntry.of(replace(load_backend(), name="cuda"), (), 1).key is None
 
 
 class Command:
