@@ -2,10 +2,13 @@
 
 import gc
 import os
+import shutil
 import signal
 import sys
+import tempfile
+from collections import Counter
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -18,9 +21,9 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera, load_instrument
-from scenes.specs.resolved import ResolvedJob, resolve_job
-from tests.tiers import longest_first
-from twin.monitor import monitor_experiment
+from scenes.specs.resolved import resolve_job
+from tests.tiers import longest_first, shuffled
+from twin.monitor.calibration_cache import VARIABLE, recomputed
 from twin.monitor.monitor_experiment import MonitorExperiment
 
 # Properties are tried on the same examples every time, on every machine. Kernels compile with the first of them.
@@ -57,19 +60,33 @@ def pytest_configure(config: pytest.Config) -> None:
     # The tests start hundreds of Python processes, and each would compile the same sources.
     sys.dont_write_bytecode = False
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    if VARIABLE not in os.environ:
+        # the processes of one run share what they calibrate, and start from nothing
+        os.environ[VARIABLE] = tempfile.mkdtemp(prefix="calibrations-")
+        config.add_cleanup(partial(shutil.rmtree, os.environ[VARIABLE], ignore_errors=True))
     if getattr(config.option, "numprocesses", None):
         for library in ("OPENBLAS", "OMP", "MKL"):
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--random-order", type=int, metavar="SEED", help="shuffle the files, and the tests in each")
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """A slow case of a test of the second tier belongs to the third alone. Several processes begin with long files."""
-    if config.option.markexpr == "second":
-        slow = [item for item in items if item.get_closest_marker("slow")]
-        config.hook.pytest_deselected(items=slow)
-        items[:] = [item for item in items if not item.get_closest_marker("slow")]
-    if hasattr(config, "workerinput"):
+    """Several processes begin with long files."""
+    if (seed := config.getoption("--random-order")) is not None:
+        items[:] = shuffled(items, seed)
+    elif hasattr(config, "workerinput"):
         items[:] = longest_first(items)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Count the skipped tests of each reason."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    reasons = Counter(report.longrepr[2].removeprefix("Skipped: ") for report in skipped)
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"{count} skipped: {reason}")
 
 
 @pytest.hookimpl(trylast=True)
@@ -89,65 +106,16 @@ def no_heartbeat() -> Iterator[None]:
         yield
 
 
-class Calibrated:
-    """The experiments of this process. A new one on an equal instrument starts with what is computed for the others, as
-    those do that a script makes from each other; one of unequal disturbances computes what rests on them itself.
-
-    Attributes:
-        on: whether experiments and instruments are kept and taken. What is computed under a test's monkeypatch is its
-            own.
-    """
-
-    def __init__(self) -> None:
-        self.on = True
-        self._build = MonitorExperiment.__init__
-        self._built = instrument_builder._built
-        self._kept: list[MonitorExperiment] = []
-
-    def init(self, new: MonitorExperiment, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
-        like = (
-            [one for one in self._kept if free_beams and _of_one_instrument(one, resolved, backend)] if self.on else []
-        )
-        same = [one for one in like if one.resolved.disturbances == resolved.disturbances]
-        if like:
-            vars(new).update(vars(same[0] if same else like[0].stating(resolved)))
-            vars(new).update(resolved=resolved, _deformed={}, _heated={}, _patterns={})
-            if new.monitored:
-                monitor_experiment.require_memory(resolved, new.size(), new.detector)
-        else:
-            self._build(new, resolved, backend, free_beams)
-        if self.on and free_beams:
-            self._kept = [new, *(one for one in self._kept if one not in same)]
-
-    def built(self, asked: instrument_builder._Asked) -> Instrument:
-        return self._built(asked) if self.on else self._built.__wrapped__(asked)
-
-    def keep_only(self, one: MonitorExperiment) -> None:
-        self._kept = [one]
-
-
-def _of_one_instrument(one: MonitorExperiment, resolved: ResolvedJob, backend: Backend) -> bool:
-    """Equal with the order in which parts are named, which is that of the results and no part of equality."""
-    return one.backend == backend and all(
-        getattr(one.resolved, name) == getattr(resolved, name)
-        and repr(getattr(one.resolved, name)) == repr(getattr(resolved, name))
-        for name in ("instrument", "cameras", "detector")
-    )
-
-
-@pytest.fixture(scope="session", autouse=True)
-def calibrated() -> Iterator[Calibrated]:
-    """Most of a small job is the calibration of its instrument: each worker does it once."""
-    found = Calibrated()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MonitorExperiment, "__init__", lambda *arguments, **options: found.init(*arguments, **options))
-        patch.setattr(instrument_builder, "_built", found.built)
-        yield found
-
-
 @pytest.fixture(autouse=True)
-def calibrated_unpatched(request, calibrated: Calibrated) -> None:
-    calibrated.on = "monkeypatch" not in request.fixturenames
+def calibrations_of_patched_code(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Compute the calibrations of a test that patches the program, and keep none of them for other tests."""
+    if "monkeypatch" not in request.fixturenames:
+        yield
+        return
+    instrument_builder._built.cache_clear()
+    with recomputed():
+        yield
+    instrument_builder._built.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 import os
 import resource
+from datetime import UTC, datetime
 from pathlib import Path
 
 import nbformat
@@ -11,7 +12,7 @@ from nbclient import NotebookClient
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 LONG = ("heat", "orbit_calibration", "targets_mtf", "trade_study")
-"""Twenty seconds to a minute each: of the third tier."""
+"""Twenty seconds to a minute each: another one every day."""
 MOST_SECONDS = 60.0
 """Of the processor, all processes together, with kernels compiled; not on the clock, for a machine may be busy."""
 
@@ -21,14 +22,11 @@ def test_there_are_six() -> None:
     assert {path.stem for path in NOTEBOOKS} > set(LONG)
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem in LONG else pytest.mark.second)
-        for path in NOTEBOOKS
-    ],
-)
-def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.second
+@pytest.mark.parametrize("path", [path for path in NOTEBOOKS if path.stem not in LONG] + [None])
+def test_a_notebook_runs(path: Path | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    today = LONG[datetime.now(UTC).toordinal() % len(LONG)]
+    path = path or ROOT / f"docs/notebooks/{today}.ipynb"
     notebook = nbformat.read(path, as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells)
     assert notebook.cells[0].source.startswith("# ")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
@@ -14,7 +13,6 @@ import pytest
 
 from docs.site.command_pages import commands, programs
 from tests.tiers import quick
-from tests.twin.live_page import running
 from twin.run.console import COMPLETE, PROGRAMS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -130,26 +128,15 @@ def test_shells_are_offered_programs_subcommands_and_options(tmp_path, monkeypat
     assert COMPLETE in started(tmp_path, console(tmp_path), "--show-completion", "bash").stdout
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("way", ["module", "console"])
-def test_processes_of_a_command_run_nothing_of_it_either(tmp_path, way):
+@pytest.mark.second
+def test_processes_of_a_command_run_nothing_of_it_either(tmp_path):
     """The second process of the main job, workers of a study, and what they start."""
-    place = folder_of_traps(tmp_path, *(["twin"] if way == "module" else []))
-
-    def run(name: str, *words: str) -> None:
-        how = ["-m", f"twin.{name}"] if way == "module" else [console(place), name]
-        done = started(place, *how, *words)
+    place = folder_of_traps(tmp_path)
+    for words, made in (
+        (("render", "scenes/examples/perturb.yaml", "--frames", "1"), "truth.json"),
+        (("study", "scenes/examples/study_smoke.yaml", "--workers", "2", "--yes"), "study.nc"),
+    ):
+        out = place / words[0]
+        done = started(place, console(place), words[0], str(ROOT / words[1]), *words[2:], "--out", str(out), "--quiet")
         assert (done.returncode, hits(place)) == (0, ""), done.stderr
-
-    run("render", str(ROOT / "scenes/examples/perturb.yaml"), "--frames", "1", "--out", "one", "--quiet")
-    assert json.loads((place / "one/truth.json").read_text("utf-8"))
-    run("study", str(ROOT / "scenes/examples/study_smoke.yaml"), "--workers", "2", "--out", "two", "--yes", "--quiet")
-    assert (place / "two/study.nc").exists()
-
-
-@pytest.mark.slow
-def test_the_process_of_the_live_twin_runs_nothing_of_it_either(tmp_path):
-    place = folder_of_traps(tmp_path, "twin")
-    with running("gf7_pair", "--port", "0", "--stay", cwd=place, PYTHONPATH=str(ROOT)) as command:
-        assert command.end() == 0
-    assert hits(place) == ""
+        assert (out / made).exists()

@@ -1,8 +1,6 @@
 """The documentation's site: the reference leaves nothing out, its examples are right, and its links lead somewhere."""
 
-import importlib
 import inspect
-import json
 import re
 import typing
 from collections.abc import Iterator
@@ -14,23 +12,17 @@ from pydantic import BaseModel
 
 import twin
 from docs.site.api_page import api_page
-from docs.site.build import NEEDED, BuildError, build, index_page, written_pages
-from docs.site.command_pages import NOT_FOR_USERS, command_page, commands, parser, programs
+from docs.site.build import NEEDED, BuildError, build
+from docs.site.command_pages import command_page, commands, programs
 from docs.site.file_pages import READ_BY, file_pages
 from docs.site.link_check import faults
 from docs.site.markdown import slug
 from docs.site.node_pages import ACTIONS, node_table
 from docs.site.policy import with_policy
-from docs.site.run_files import FILES, described, known, meaning
-from docs.site.run_files import commands as golden_commands
-from docs.site.run_pages import run_pages
 from docs.site.spec_examples import accepted, examples, kinds_of, shipped
 from docs.site.spec_keys import flow
 from scenes.schema import MODELS, json_schema
 from scenes.yaml.yaml_file import parse_yaml
-from tests.golden.fields import fields_file, fields_of, json_fields, kept_fields
-from tests.golden.golden import golden_file
-from tests.golden.jobs import ALL
 from twin.run.page import checksum
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -39,11 +31,6 @@ ROOT = Path(__file__).resolve().parent.parent
 @pytest.fixture(scope="module")
 def pages() -> dict[str, str]:
     return file_pages()
-
-
-@pytest.fixture(scope="module")
-def folders() -> dict[str, str]:
-    return run_pages()
 
 
 # --- keys of files ---------------------------------------------------------------------------------------
@@ -73,75 +60,45 @@ def rows(page: str) -> dict[str, str]:
     return {found[1]: found[0] for found in re.finditer(r'^\| <span id="([^"]+)"></span>.*$', page, re.M)}
 
 
-@pytest.mark.parametrize("kind", MODELS)
-def test_every_key_stands_in_the_reference(kind: str, pages: dict[str, str]) -> None:
-    """Each model's keys in one table, as many tables as there are models, each row with all five columns filled."""
-    found = rows(pages[f"reference/files/{kind}.md"])
-    wanted = list(keys_below(MODELS[kind], set()))
-    assert len(found) == len(wanted)
-    assert sorted(place.split(".")[-1] for place in found) == sorted(slug(name) for _, name in wanted)
-    for row in found.values():
-        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]]
-        assert len(cells) == 5
-        assert all(cells), row
+def test_every_key_stands_in_the_reference(pages: dict[str, str]) -> None:
+    """Each model's keys in one table, each row with all five columns filled; by the models themselves, and by the JSON
+    Schemas, which pydantic makes.
+    """
+    for kind, model in MODELS.items():
+        page = pages[f"reference/files/{kind}.md"]
+        found, wanted = rows(page), list(keys_below(model, set()))
+        assert len(found) == len(wanted), kind
+        assert sorted(place.split(".")[-1] for place in found) == sorted(slug(name) for _, name in wanted), kind
+        for row in found.values():
+            cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]]
+            assert len(cells) == 5, row
+            assert all(cells), row
+        assert schema_keys(json_schema(kind)) <= set(re.findall(r"`([A-Za-z0-9_]+)`", page)), kind
 
 
-@pytest.mark.parametrize("kind", MODELS)
-def test_every_key_of_the_json_schema_stands_in_the_reference(kind: str, pages: dict[str, str]) -> None:
-    """The schemas for editors are made in another way: by pydantic, terms of a surface as keys of their own."""
-    schema, page = json_schema(kind), pages[f"reference/files/{kind}.md"]
-    named = set(re.findall(r"`([A-Za-z0-9_]+)`", page))
-
-    def keys(node: Any) -> Iterator[str]:
-        if isinstance(node, dict):
-            yield from node.get("properties", {})
-            for below in node.values():
-                yield from keys(below)
-        elif isinstance(node, list):
-            for below in node:
-                yield from keys(below)
-
-    assert set(keys(schema)) <= named
+def schema_keys(node: Any) -> set[str]:
+    below = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    own = set(node.get("properties", {})) if isinstance(node, dict) else set()
+    return own.union(*map(schema_keys, below))
 
 
-@pytest.mark.parametrize("kind", MODELS)
-def test_every_example_is_taken_by_its_model(kind: str) -> None:
+def test_every_example_is_taken_by_its_model() -> None:
     """As it is shown: the line is read as YAML and put into the mapping that it is an example in."""
-    for (model, name), example in examples(kind).items():
-        data = parse_yaml(example.text).data
-        assert list(data) == [name]
-        assert accepted(model, {**example.mapping, **data}), example.text
-        assert not accepted(model, {**example.mapping, "no_such_key": 1})
-
-
-def test_an_example_that_is_wrong_would_be_found() -> None:
+    for kind in MODELS:
+        for (model, name), example in examples(kind).items():
+            data = parse_yaml(example.text).data
+            assert list(data) == [name]
+            assert accepted(model, {**example.mapping, **data}), example.text
+            assert not accepted(model, {**example.mapping, "no_such_key": 1})
     (model, _), example = next((key, one) for key, one in examples("job").items() if key[1] == "frames")
     assert not accepted(model, {**example.mapping, "frames": 0})
     assert not accepted(model, {**example.mapping, "frames": "9 s"})
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        "2 um",
-        "name",
-        "a: b",
-        "# no comment",
-        "null",
-        "true",
-        "1.5",
-        "",
-        "-",
-        "[x",
-        "it's",
-        7,
-        0.1,
-        True,
-        ["a, b", {"k": "v: w"}],
-    ],
-)
-def test_a_value_in_one_line_of_yaml_reads_back(value: Any) -> None:
-    assert parse_yaml(f"x: {flow(value)}\n").data == {"x": value}
+def test_a_value_in_one_line_of_yaml_reads_back() -> None:
+    texts = ["2 um", "name", "a: b", "# no comment", "null", "true", "1.5", "", "-", "[x", "it's"]
+    for value in (*texts, 7, 0.1, True, ["a, b", {"k": "v: w"}]):
+        assert parse_yaml(f"x: {flow(value)}\n").data == {"x": value}
 
 
 def test_every_sort_of_file_says_what_reads_it_and_ships_an_example(pages: dict[str, str]) -> None:
@@ -187,14 +144,6 @@ def test_every_command_and_every_option_stands_in_the_reference() -> None:
             assert set(re.findall(r"^\| .*?`(--[\w-]+)`", section, re.M)) <= set(options)
 
 
-def test_a_command_that_is_not_for_users_has_a_reason() -> None:
-    for module, reason in NOT_FOR_USERS.items():
-        assert importlib.util.find_spec(module) is not None
-        assert reason
-    with pytest.raises(LookupError):
-        parser("scenes.specs.job")
-
-
 def test_everything_in_the_library_stands_in_the_reference_and_has_a_docstring() -> None:
     page = api_page()
     for name in twin.__all__:
@@ -206,91 +155,7 @@ def test_everything_in_the_library_stands_in_the_reference_and_has_a_docstring()
             assert all(inspect.getdoc(member) for member in public)
 
 
-# --- run folders -----------------------------------------------------------------------------------------
-
-
-def test_fields_are_kept_of_every_golden_run() -> None:
-    """Of each the same files as its golden file lists, so that neither is renewed without the other."""
-    for job in ALL:
-        if golden_file(job.name).exists():
-            files = json.loads(golden_file(job.name).read_text("utf-8"))["run"]["files"]
-            kept = kept_fields(job.name)
-            assert sorted(kept) == sorted(files) or (not kept and job.name == "schema"), job.name
-    names = {job.name for job in ALL}
-    assert {path.stem for path in fields_file("x").parent.glob("*.json")} <= names
-
-
-@pytest.mark.second
-def test_every_file_of_every_command_is_described(folders: dict[str, str]) -> None:
-    for command, jobs in golden_commands().items():
-        page = next(text for text in folders.values() if text.startswith(f"# Files of `{command}`"))
-        for job in jobs:
-            for name, told in kept_fields(job).items():
-                one = described(command, name)
-                assert one is not None, f"{command}: {name}"
-                assert f"`{one.shown}`" in page
-                assert all(f"`{column}`" in page or "artefacts" in name for column in told.get("columns", ()))
-                for group in told.get("groups", {}).values():
-                    assert all(f"`{variable}`" in page for variable in group["variables"])
-                assert all(f"`{tag}`" in page for tag in told.get("tags", ()))
-
-
-@pytest.mark.second
-def test_every_field_of_every_file_stands_in_the_reference(folders: dict[str, str]) -> None:
-    """By its own name, below the mappings that hold it; names of one sort of thing may be more than are shown."""
-    for command, jobs in golden_commands().items():
-        page = next(text for text in folders.values() if text.startswith(f"# Files of `{command}`"))
-        shown = set(re.findall(r"[\w]+", " ".join(re.findall(r"`([^`]+)`", page))))
-        for job in jobs:
-            for name, told in kept_fields(job).items():
-                for path in told.get("fields", ()):
-                    last = re.sub(r"(\[\])+$", "", re.split(r"\.(?![^{]*\})", path)[-1])
-                    if not path.startswith("reference_frames") and "{" not in last:
-                        known_words = re.findall(r"\w+", last)
-                        assert shown.issuperset(known_words) or "…" in page, f"{command}: {name}: {path}"
-
-
-def test_no_file_is_described_that_no_command_leaves() -> None:
-    rare = {"study.parquet", "picture*.png", "chunks/*"}
-    for command in FILES:
-        names = [name for job in golden_commands().get(command, ()) for name in kept_fields(job)]
-        if names:
-            for one in known(command):
-                used = any(re.fullmatch(one.pattern, name) for name in names)
-                assert (
-                    used
-                    or one.shown in {*rare, "artefacts/*"}
-                    or one.shown in ("config.yaml", "manifest.json", "report.html")
-                )
-
-
-def test_fields_of_json_are_found_in_lists_and_under_names() -> None:
-    tree = {"a": 1, "b": [{"c_um": 1.5}, {"c_um": None, "d": "x"}], "cameras": {"p": {"f": 1}, "q": {"f": 2}}, "e": []}
-    assert json_fields(tree) == {
-        "a": "number",
-        "b[].c_um": "number or null",
-        "b[].d": "text",
-        "cameras.{p|q}.f": "number",
-        "e[]": "",
-    }
-
-
-def test_fields_of_a_folder_are_those_of_its_files(tmp_path: Path) -> None:
-    (tmp_path / "numbers.json").write_text('{"x_um": 1}')
-    (tmp_path / "table.csv").write_text("a,b\n1,2\n")
-    (tmp_path / "chunks").mkdir()
-    (tmp_path / "chunks/1.npz").write_bytes(b"")
-    assert fields_of(tmp_path) == {"numbers.json": {"fields": {"x_um": "number"}}, "table.csv": {"columns": ["a", "b"]}}
-
-
 # --- the site --------------------------------------------------------------------------------------------
-
-
-def test_every_page_of_docs_stands_in_the_contents() -> None:
-    listed = set(re.findall(r"^(?:.* <)?((?:docs|reference)/[^>\s]+|README)>?$", index_page(), re.M))
-    written = {page.relative_to(ROOT).with_suffix("").as_posix() for page in written_pages()}
-    assert written <= listed
-    assert {"README", "reference/commands", "reference/nodes", "reference/api"} <= listed
 
 
 def write_site(folder: Path, **pages: str) -> Path:
@@ -319,20 +184,6 @@ def test_a_broken_site_is_found(page: str, said: str | None, tmp_path: Path) -> 
     assert (said is None and found == []) or any(said in line for line in found if said)
 
 
-def test_a_style_sheet_that_loads_from_the_network_is_found(tmp_path: Path) -> None:
-    write_site(tmp_path, index="")
-    (tmp_path / "a.css").write_text("@font-face { src: url(https://example.org/f.woff) }")
-    assert len(faults(tmp_path)) == 1
-
-
-def test_names_of_mappings_lead_to_their_records() -> None:
-    """Runs of one camera name it as a key; what stands below is declared all the same."""
-    for name in ("one", "{backward|forward}"):
-        assert meaning("quality", ("cameras", name, "wfe_worst_waves")) == "the same of the worst field"
-        assert meaning("quality", ("mtf", name, "spectrum_nm[]")) == "first and last wavelength of the light"
-    assert meaning("quality", ("invented", "one", "wfe_worst_waves")) == ""
-
-
 def test_a_folder_with_other_things_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(BuildError):
@@ -340,16 +191,13 @@ def test_a_folder_with_other_things_is_not_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "thesis.tex").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_the_site_is_built_without_a_warning_and_without_a_broken_link(tmp_path: Path) -> None:
-    """With its notebooks run; `build` fails on any warning of Sphinx and on any fault of a link."""
+    """`build` fails on any warning of Sphinx and on any fault of a link; tests/test_notebooks.py runs the notebooks."""
     for name in NEEDED:
         pytest.importorskip(name)
-    count = build(tmp_path / "site")
-    assert count > 40
+    assert build(tmp_path / "site", notebooks=False) > 40
     assert (tmp_path / "site/searchindex.js").exists()
-    # in place of a former site
-    assert "Every quantity" in (tmp_path / "site/reference/files/index.html").read_text("utf-8")
 
 
 # --- what its pages may do --------------------------------------------------------------------------------

@@ -1,39 +1,37 @@
-"""Which tier a case belongs to, and which files come first."""
+"""Which tests run, and in which order."""
 
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from tests import conftest
-from tests.tiers import LONGEST, longest_first
+from tests.tiers import LONGEST, longest_first, one_of_each, quick, shuffled
 
 
-class Marked:
-    def __init__(self, *marks: str) -> None:
-        self.marks = marks
-
-    def get_closest_marker(self, name: str) -> str | None:
-        return name if name in self.marks else None
-
-
-@pytest.mark.parametrize(
-    ("expression", "kept"), [("second", [True, False]), ("slow", [True, True]), ("", [True, True])]
-)
-def test_a_slow_case_of_a_test_of_the_second_tier_belongs_to_the_third(expression: str, kept: list[bool]) -> None:
-    both = [Marked("second"), Marked("second", "slow")]
-    left: list[Marked] = []
-    hook = SimpleNamespace(pytest_deselected=lambda items: left.extend(items))
-    items = list(both)
-    conftest.pytest_collection_modifyitems(
-        SimpleNamespace(option=SimpleNamespace(markexpr=expression), hook=hook), items
-    )
-    assert items == [one for one, stays in zip(both, kept, strict=True) if stays]
-    assert left == [one for one, stays in zip(both, kept, strict=True) if not stays]
+def item(name: str) -> SimpleNamespace:
+    return SimpleNamespace(nodeid=f"tests/{name}", path=Path("tests", name.partition("::")[0]))
 
 
 def test_files_that_take_longest_come_first_and_then_those_of_most_tests() -> None:
     assert [name for name in LONGEST if not (Path(__file__).parent / name).is_file()] == []
     names = ["a.py::one", f"{LONGEST[1]}::b", "c.py::one", "c.py::two", f"{LONGEST[0]}::a"]
-    items = longest_first([SimpleNamespace(nodeid=f"tests/{name}") for name in names])
-    assert [item.nodeid.removeprefix("tests/") for item in items] == [names[k] for k in (4, 1, 2, 3, 0)]
+    assert longest_first(list(map(item, names))) == [item(names[k]) for k in (4, 1, 2, 3, 0)]
+
+
+def test_a_random_order_keeps_files_together_and_is_that_of_its_seed() -> None:
+    names = [f"{file}.py::{k}" for file in "abcdef" for k in range(6)]
+    orders = [[one.nodeid for one in shuffled(list(map(item, names)), seed)] for seed in (1, 1, 2)]
+    assert orders[0] == orders[1] != orders[2]
+    assert sorted(orders[2]) == sorted(f"tests/{name}" for name in names)
+    files = [name.partition("::")[0] for name in orders[0]]
+    assert sum(a != b for a, b in pairwise(files)) == 5
+    assert files != sorted(files)
+
+
+def test_cases_of_the_second_tier() -> None:
+    first, second = quick(1, [(1, "a"), pytest.param(2, "b", id="two")])
+    assert (first.values, list(first.marks)) == ((1, "a"), [])
+    assert (second.values, second.id, [mark.name for mark in second.marks]) == ((2, "b"), "two", ["second"])
+    each = one_of_each(lambda case: case % 2, [1, 2, 3, 4])
+    assert [(one.values, [mark.name for mark in one.marks]) for one in each] == [((1,), ["second"]), ((2,), ["second"])]

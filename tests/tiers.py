@@ -1,5 +1,6 @@
-"""Cases of a test in more than one tier, and which files begin."""
+"""Cases of a test in both tiers, and the order of files."""
 
+import random
 from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -19,19 +20,24 @@ def quick(count: int, cases: Iterable[Any]) -> list[Any]:
     return [*sets[:count], *rest]
 
 
-def one_of_each(key: Callable[[Any], Any], cases: Iterable[Any], long: Iterable[Any] = ()) -> list[Any]:
-    """Cases for ``parametrize``: the second tier takes the first case of each key, the third tier all others.
+def one_of_each(key: Callable[[Any], Any], cases: Iterable[Any]) -> list[Any]:
+    """Cases for ``parametrize``: the first case of each key, in the second tier.
 
-    A case of several parameters is a tuple; ``key`` gets the case as it is. All cases of the keys ``long``, which take
-    half a minute each, are of the third tier.
+    A case of several parameters is a tuple; ``key`` gets the case as it is.
     """
-    seen: set[Any] = {*long}
-    marked = []
+    first: dict[Any, Any] = {}
     for case in cases:
-        values = case if isinstance(case, tuple) else (case,)
-        marked.append(pytest.param(*values, marks=pytest.mark.slow if key(case) in seen else pytest.mark.second))
-        seen.add(key(case))
-    return marked
+        first.setdefault(key(case), pytest.param(*(case if isinstance(case, tuple) else (case,))))
+    return [pytest.param(*case.values, marks=pytest.mark.second) for case in first.values()]
+
+
+def shuffled(items: list[pytest.Item], seed: int) -> list[pytest.Item]:
+    """Return tests with the files, and the tests of each file, in a random order."""
+    drawn = random.Random(seed)
+    files = sorted({item.path for item in items})
+    drawn.shuffle(files)
+    rank = {path: k for k, path in enumerate(files)}
+    return sorted(items, key=lambda item: (rank[item.path], drawn.random()))
 
 
 LONGEST = (
@@ -51,7 +57,7 @@ LONGEST = (
     "twin/test_operate_faults.py",
     "twin/test_target_job.py",
 )
-"""Files whose tests of the first two tiers take about twenty seconds and more, longest first. Few tests they may be:
+"""Files whose tests take about twenty seconds and more, longest first. Few tests they may be:
 by their number they would come last, and one process would wait for the other.
 """
 

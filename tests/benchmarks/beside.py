@@ -92,13 +92,6 @@ def _git(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(["git", *arguments], 127, stdout="", stderr=str(error))
 
 
-def commit_here() -> str:
-    """The commit of these sources, ``with changes`` where files differ from it; empty where this is no checkout."""
-    name = _git("rev-parse", "--short=12", "HEAD").stdout.strip()
-    changed = _git("status", "--porcelain", "--untracked-files=no", ":!tests/benchmarks/limits.json").stdout.strip()
-    return f"{name} with changes" if name and changed else name
-
-
 def numbers_of(sources: Path, name: str, quick: bool) -> Numbers | None:
     """What a benchmark finds in a process with the given sources; None where they have no benchmark of that name.
 

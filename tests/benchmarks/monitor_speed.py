@@ -12,18 +12,12 @@ from scenes.specs.instrument import BASE
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
-from tests.benchmarks.yardsticks import pace
 from twin.monitor.observation import Observing, StateReader, observe, one_detector
 from twin.sensors.poisson_numbers import poisson_numbers
 
 STATES, QUICK_STATES = 200, 25
 FRAMES = 9
 ROUNDS = 5
-PACE = pace(python=0.4, arithmetic=0.4, memory=0.2)
-ALONE = pace(python=0.7, arithmetic=0.3)
-DRAWN = pace(arithmetic=1.0)
-WANTED_MS = 8.0
-"""Processor time of a state of a batch."""
 
 
 def random_states(count: int, seed: int) -> list[State]:
@@ -48,7 +42,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         return list(observe(setup, states, Observing(one_detector(setup, FRAMES, 1), stated=False)))
 
     rounds = 1 if quick else ROUNDS
-    spent = in_turns({"batch": Work(batch)}, rounds, bench.look)["batch"]
+    spent = in_turns({"batch": Work(batch)}, rounds)["batch"]
     assert sum(len(found.numbers) for found in spent.result) == count
     wall, cpu = 1e3 * spent.wall_s / count, 1e3 * spent.cpu_s / count
     reader = StateReader(setup, FRAMES, 1)
@@ -58,21 +52,19 @@ def measure(bench: Workbench, quick: bool) -> Speed:
 
     for noise in (True, False):
         reader.read(states[0], noise)
-    alone = in_turns({"one": one(False), "frames": one(True)}, rounds, bench.look)
+    alone = in_turns({"one": one(False), "frames": one(True)}, rounds)
     light = setup.nominal_photons * setup.detector.quantum_efficiency
     rng = np.random.Generator(np.random.SFC64(1))
-    drawn = in_turns(
-        {"numbers": Work(lambda _: [poisson_numbers(one, FRAMES, rng) for one in light])}, rounds, bench.look
-    )
+    drawn = in_turns({"numbers": Work(lambda _: [poisson_numbers(one, FRAMES, rng) for one in light])}, rounds)
     expected, noisy = (1e3 * alone[name].cpu_s for name in ("one", "frames"))
     numbers = 1e9 * drawn["numbers"].cpu_s / (FRAMES * light.size)
     return Speed(
         (
-            Number("states_per_s", 1e3 / wall, f"monitor states, batch of {count}", "states/s", PACE, True, clock=True),
-            Number("ms_per_state", wall, "  wall time of a state", "ms", PACE, limited=True, clock=True),
-            Number("cpu_ms_per_state", cpu, "  processor time", "ms", PACE, limited=True, target=WANTED_MS),
-            Number("one_ms", expected, "  one alone, expected images: processor time", "ms", ALONE, limited=True),
-            Number("frames_ms", noisy, "  one alone, noisy frames: processor time", "ms", ALONE, limited=True),
-            Number("poisson_ns", numbers, "  a Poisson number, processor time", "ns", DRAWN, limited=True),
+            Number("states_per_s", 1e3 / wall, f"monitor states, batch of {count}", "states/s"),
+            Number("ms_per_state", wall, "  wall time of a state", "ms"),
+            Number("cpu_ms_per_state", cpu, "  processor time", "ms"),
+            Number("one_ms", expected, "  one alone, expected images: processor time", "ms"),
+            Number("frames_ms", noisy, "  one alone, noisy frames: processor time", "ms"),
+            Number("poisson_ns", numbers, "  a Poisson number, processor time", "ns"),
         )
     )

@@ -17,7 +17,6 @@ from scenes.models.scenery import build_scenery
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
-from tests.benchmarks.yardsticks import pace
 from tests.twin.path_bench import IDEAL, scene_beam
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.source import DiskSource
@@ -28,8 +27,6 @@ INSTRUMENTS = ("gf7_pair", "monitor_pair")
 PATHS, PATHS_BACK, QUICK_PATHS = 1 << 19, 1 << 18, 1 << 15
 CORES = 2
 ROUNDS = 7
-PACE = pace(arithmetic=0.6, memory=0.4)
-WANTED = {"out_and_back": 2.5e6}
 STRAY_PATHS, STRAY_SIGMA = 1 << 19, 1e-7
 """Paths of one source, and the standard deviation, in spots, that its stray light on its area CCD is to have."""
 
@@ -88,18 +85,17 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         run, seeds = prepare(bench, bench.instrument(name), paths), itertools.count()
         work = Work(lambda _, run=run, seeds=seeds: run(next(seeds)))
 
-        spent = in_turns({"paths": work}, 1 if quick else ROUNDS, bench.look)["paths"]
+        spent = in_turns({"paths": work}, 1 if quick else ROUNDS)["paths"]
         rate = paths * CORES / spent.cpu_s
-        wanted = WANTED.get(kind) if name == INSTRUMENTS[0] else None
         key = "" if name == INSTRUMENTS[0] else f"{name}_"
         text = f"paths of {name}, {kind.replace('_', ' ')}, two cores"
-        numbers.append(Number(f"{key}{kind}_paths_per_s", rate, text, "paths/s", PACE, True, True, wanted))
+        numbers.append(Number(f"{key}{kind}_paths_per_s", rate, text, "paths/s"))
     faint, seeds = (
         stray(bench, bench.instrument(INSTRUMENTS[0]), QUICK_PATHS if quick else STRAY_PATHS),
         itertools.count(),
     )
-    spent = in_turns({"stray": Work(lambda _: faint(next(seeds)))}, 1 if quick else ROUNDS, bench.look)["stray"]
+    spent = in_turns({"stray": Work(lambda _: faint(next(seeds)))}, 1 if quick else ROUNDS)["stray"]
     text = f"processor time for stray light of one source to {STRAY_SIGMA:g} of a spot"
     seconds = spent.cpu_s * spent.result / STRAY_SIGMA**2
-    numbers.append(Number("stray_s", seconds, text, "s", PACE, limited=True))
+    numbers.append(Number("stray_s", seconds, text, "s"))
     return Speed(tuple(numbers))

@@ -17,15 +17,12 @@ from optics.waves.diffraction import Grid, image
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench, absent, installed
-from tests.benchmarks.yardsticks import pace
 from tests.oracles.pupil_grid import FarPoint, fitted, poppy_wave, pupil_grid
 
 PUPIL, QUICK_PUPIL = 256, 64
 PIXELS, QUICK_PIXELS = 128, 48
 STEP = 1.5e-6
 ROUNDS = 7
-PACE, NODES = pace(arithmetic=0.8, memory=0.2), pace(python=1.0)
-"""Of many samples; and of few nodes, where calls take most of the time."""
 SAME = 1e-10
 """Difference of images of the same samples, of the peak: rounding of sums of 50 000 waves."""
 MANY = quadrature.disk(40, 160)
@@ -53,7 +50,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         works["poppy"] = Work(poppy)
     else:
         notes.append(absent("poppy"))
-    spent = in_turns(works, 2 if quick else ROUNDS, bench.look)
+    spent = in_turns(works, 2 if quick else ROUNDS)
 
     many = image(point.field(MANY), axis, axis)[0]
 
@@ -62,18 +59,11 @@ def measure(bench: Workbench, quick: bool) -> Speed:
 
     own = f"PSF of gf7, {size} x {size} pupil samples to {pixels} x {pixels} pixels"
     numbers = [
-        Number("seconds", spent["twin"].wall_s, own, "s", PACE, clock=True),
-        Number("cpu_ms", 1e3 * spent["twin"].cpu_s, "  processor time", "ms", PACE, limited=True),
+        Number("seconds", spent["twin"].wall_s, own, "s"),
+        Number("cpu_ms", 1e3 * spent["twin"].cpu_s, "  processor time", "ms"),
         Number("difference", difference(spent["twin"].result, many), "  its error, of the peak"),
-        Number(
-            "quadrature_seconds",
-            spent["quadrature"].wall_s,
-            f"PSF from {rule.count} quadrature nodes",
-            "s",
-            NODES,
-            clock=True,
-        ),
-        Number("quadrature_cpu_ms", 1e3 * spent["quadrature"].cpu_s, "  processor time", "ms", NODES, limited=True),
+        Number("quadrature_seconds", spent["quadrature"].wall_s, f"PSF from {rule.count} quadrature nodes", "s"),
+        Number("quadrature_cpu_ms", 1e3 * spent["quadrature"].cpu_s, "  processor time", "ms"),
         Number("quadrature_difference", difference(spent["quadrature"].result, many), "  its error, of the peak"),
     ]
     if "poppy" in spent:
@@ -81,26 +71,10 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         assert same < SAME, same
         seconds = spent["poppy"].wall_s
         numbers[3:3] = [
-            Number("poppy_seconds", seconds, "  poppy, same samples, same pixels", "s", PACE, clock=True),
-            Number(
-                "ratio_poppy",
-                seconds / spent["twin"].wall_s,
-                "  times poppy, same samples",
-                least=True,
-                limited=True,
-                clock=True,
-            ),
+            Number("poppy_seconds", seconds, "  poppy, same samples, same pixels", "s"),
+            Number("ratio_poppy", seconds / spent["twin"].wall_s, "  times poppy, same samples"),
             Number("poppy_difference", same, "  difference from poppy's image, of the peak"),
         ]
         ratio = seconds / spent["quadrature"].wall_s
-        numbers.append(
-            Number(
-                "quadrature_ratio_poppy",
-                ratio,
-                "  times poppy with the samples above",
-                least=True,
-                limited=True,
-                clock=True,
-            )
-        )
+        numbers.append(Number("quadrature_ratio_poppy", ratio, "  times poppy with the samples above"))
     return Speed(tuple(numbers), tuple(notes))

@@ -14,14 +14,12 @@ import numpy as np
 from scenes.specs.operation import read_operation
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.workbench import Workbench
-from tests.benchmarks.yardsticks import pace
 from tests.twin.record_bench import A_DAY, START, given, made
 from twin.operate.estimate.operation import Operation
 from twin.operate.record.entries import Entry
 from twin.operate.record.history import History
 from twin.operate.record.place import FILE
 
-PACE = pace(python=1.0)
 DAYS = 365
 REPEATS = 41
 CAMERAS, ESTIMATORS = ("forward", "backward"), ("paper_single", "paper_joint", "derived", "model", "posterior")
@@ -67,7 +65,6 @@ def measure(bench: Workbench, quick: bool) -> Speed:
                 estimate = Operation(history, plan)
                 estimate.standing()
                 clock, spent, more = [], [], []
-                bench.look()
                 for _ in range(REPEATS):
                     start, begun = time.process_time(), time.perf_counter()
                     assert history.take(given(f"one{done}", [reading(done)])).new == 1
@@ -84,21 +81,20 @@ def measure(bench: Workbench, quick: bool) -> Speed:
                 text = f"one reading after {year} year{'s' if year > 1 else ''} of {A_DAY} a day"
                 after = "  and of the estimate after it"
                 numbers += [
-                    Number(f"reading_{year}_ms", clocks[-1], text, "ms", PACE, clock=True),
-                    Number(f"reading_{year}_cpu_ms", medians[-1], "  processor time", "ms", PACE, limited=True),
-                    Number(f"estimate_{year}_cpu_ms", followed[-1], after, "ms", PACE, limited=True),
+                    Number(f"reading_{year}_ms", clocks[-1], text, "ms"),
+                    Number(f"reading_{year}_cpu_ms", medians[-1], "  processor time", "ms"),
+                    Number(f"estimate_{year}_cpu_ms", followed[-1], after, "ms"),
                 ]
-            bench.look()
             start = time.process_time()
             estimate.smoothed(START + 86_400_000_000 * np.arange(DAYS * years[-1], dtype=np.int64))
             spent_s = time.process_time() - start
             text = f"the state of every day of {years[-1]} years by all {done} readings: processor time"
-            numbers.append(Number("smoothed_s", spent_s, text, "s", PACE, limited=True))
+            numbers.append(Number("smoothed_s", spent_s, text, "s"))
         size = (Path(name) / "record" / FILE).stat().st_size
     if not quick:
-        numbers.append(Number("grows", medians[-1] / medians[0], "  after ten years over after one", limited=True))
+        numbers.append(Number("grows", medians[-1] / medians[0], "  after ten years over after one"))
         ratio = followed[-1] / followed[0]
-        numbers.append(Number("estimate_grows", ratio, "  of the estimate", limited=True))
+        numbers.append(Number("estimate_grows", ratio, "  of the estimate"))
     per = len(json.dumps(reading(0).content))
     numbers.append(Number("size_MB", 1e-6 * size, f"  size of the record then, {per} letters a reading", "MB"))
     return Speed(tuple(numbers))

@@ -1,4 +1,4 @@
-"""Time of some work: wall time, and processor time of all threads; and what other programs take meanwhile."""
+"""Time of some work: wall time, and processor time of all threads."""
 
 from __future__ import annotations
 
@@ -56,18 +56,16 @@ def timed(work: Work) -> Spent:
     return Spent(min(wall), min(cpu), max(c / w for c, w in zip(cpu, wall, strict=True)), result)
 
 
-def in_turns(works: Mapping[str, Work], rounds: int, look: Callable[[], None] = lambda: None) -> dict[str, Spent]:
+def in_turns(works: Mapping[str, Work], rounds: int) -> dict[str, Spent]:
     """Least times of several works, taken in turns, so that a busy machine is busy for all of them.
 
     Args:
         works: name -> work.
         rounds: of all works.
-        look: what is done before each work, outside the time: to take the yardsticks.
     """
     best: dict[str, Spent] = {}
     for _ in range(rounds):
         for name, work in works.items():
-            look()
             now, old = timed(work), best.get(name)
             if old is not None:
                 wall, cpu = min(now.wall_s, old.wall_s), min(now.cpu_s, old.cpu_s)
@@ -85,23 +83,3 @@ def processor_s() -> float:
             times = process.cpu_times()
             spent += times.user + times.system + times.children_user + times.children_system
     return spent
-
-
-class OtherPrograms:
-    """What other programs take of the machine from now on."""
-
-    def __init__(self) -> None:
-        self._begun = self._now()
-
-    @staticmethod
-    def _now() -> tuple[float, float, float]:
-        times = psutil.cpu_times()
-        idle = times.idle + getattr(times, "iowait", 0.0)
-        guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # which `user` counts, too
-        return sum(times) - guests, idle, processor_s()
-
-    @property
-    def share(self) -> float:
-        """Of all cores together, 0 to 1; what the hypervisor gave to others is among it."""
-        every, idle, own = (now - then for now, then in zip(self._now(), self._begun, strict=True))
-        return min(1.0, max(0.0, every - idle - own) / every) if every > 0.0 else 0.0

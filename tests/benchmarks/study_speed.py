@@ -6,9 +6,12 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+import psutil
+
 from tests.benchmarks.number import Number, Speed
+from tests.benchmarks.stopwatch import processor_s
 from tests.benchmarks.workbench import Workbench
-from tests.benchmarks.yardsticks import pace
 from tests.twin.study_bench import write_study
 from twin.run.cluster import Workers, local_workers
 from twin.run.provenance import source_digest
@@ -20,8 +23,8 @@ from twin.study.runs.setup import resolve_study
 from twin.study.runs.task import Task, evaluate
 
 RUNS, QUICK_RUNS = 1825, 125
-PACE = pace(python=0.7, arithmetic=0.3)
-WANTED_EFFICIENCY = 0.85
+LARGE, QUICK_LARGE = 10_000, 200
+"""States of the pair's monitor with nine frames, which share their noise: the frames before are taken once."""
 
 
 def run_engine(folder: Path, plan: Plan, workers: Workers, chunk_blocks: int = 4) -> tuple[float, float, int]:
@@ -50,6 +53,33 @@ def warm(workers: Workers, plan: Plan, count: int) -> None:
     assert workers.count == count
 
 
+def measure_large(quick: bool) -> tuple[Number, ...]:
+    """Seconds for all states, start of the workers and compilation not included; memory of all processes together."""
+    runs = QUICK_LARGE if quick else LARGE
+    changes = (("runs: 100", f"runs: {runs}"), ("file: job.yaml", "file: perturb"))
+    largest = [0]
+
+    def look(done: int, total: int) -> None:
+        own = psutil.Process()
+        largest[0] = max(largest[0], sum(p.memory_info().rss for p in (own, *own.children(recursive=True))))
+
+    with tempfile.TemporaryDirectory() as name:
+        study = write_study(Path(name) / "in", *changes, ("responses:", "noise: shared\nresponses:"))
+        plan = Plan.of(resolve_study(study))
+        store = ChunkStore(Path(name), plan)
+        store.open()
+        with local_workers(2) as workers:
+            begun, spent = time.monotonic(), processor_s()
+            Engine(plan, store, progress=Progress(done=look)).run(workers)
+            seconds, spent = time.monotonic() - begun, processor_s() - spent
+        assert np.isfinite(store.result().values).all()
+    return (
+        Number("large_s", seconds, f"study of {runs} monitor states, nine frames, two workers", "s"),
+        Number("large_cpu_ms_per_state", 1e3 * spent / runs, "  processor time of a state", "ms"),
+        Number("large_memory_gib", largest[0] / 2**30, "  memory of all processes", "GiB"),
+    )
+
+
 def measure(bench: Workbench, quick: bool) -> Speed:
     """States per second of two workers; the processor time of the engine itself, which is that of this process."""
     numbers, rate = [], {}
@@ -60,21 +90,12 @@ def measure(bench: Workbench, quick: bool) -> Speed:
         for count in (1, 2):
             with local_workers(count) as workers:
                 warm(workers, plan, count)
-                bench.look()
                 wall, own, runs = run_engine(folder / f"out{count}", plan, workers)
             rate[count] = runs / wall
             if count == 1:
                 text = "  the engine itself: processor time"
-                numbers.append(Number("overhead_ms_per_state", 1e3 * own / runs, text, "ms", PACE, limited=True))
-    first = Number("states_per_s", rate[2], "study of a small monitor, two workers", "states/s", PACE, True, clock=True)
-    one = Number("one_worker_states_per_s", rate[1], "  one worker", "states/s", PACE, True, clock=True)
-    shared = Number(
-        "efficiency",
-        rate[2] / (2.0 * rate[1]),
-        "  two workers over twice one",
-        least=True,
-        limited=True,
-        target=WANTED_EFFICIENCY,
-        clock=True,
-    )
-    return Speed((first, one, *numbers, shared))
+                numbers.append(Number("overhead_ms_per_state", 1e3 * own / runs, text, "ms"))
+    first = Number("states_per_s", rate[2], "study of a small monitor, two workers", "states/s")
+    one = Number("one_worker_states_per_s", rate[1], "  one worker", "states/s")
+    shared = Number("efficiency", rate[2] / (2.0 * rate[1]), "  two workers over twice one")
+    return Speed((*measure_large(quick), first, one, *numbers, shared))

@@ -12,19 +12,13 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera, load_instrument
 from scenes.specs.resolved import resolve_job
-from tests.benchmarks.yardsticks import Watch
 from twin.monitor.monitor_experiment import MonitorExperiment
 
 
 class Workbench:
-    """Backend, cameras, instruments and experiments of the library; kernels stay compiled.
-
-    Attributes:
-        watch: takes the yardsticks of the benchmark that runs; None where nobody asks for them.
-    """
+    """Backend, cameras, instruments and experiments of the library; kernels stay compiled."""
 
     def __init__(self) -> None:
-        self.watch: Watch | None = None
         self.camera = cache(self._camera)
         self.instrument = cache(self._instrument)
         self.experiment = cache(self._experiment)
@@ -33,11 +27,6 @@ class Workbench:
     def backend(self) -> Backend:
         """The processor's."""
         return load_backend("llvm")
-
-    def look(self) -> None:
-        """Take the yardsticks: before work that is timed, outside its time."""
-        if self.watch is not None:
-            self.watch.look()
 
     def _camera(self, name: str) -> CameraModel:
         return derive_camera(load_camera(name), self.backend)

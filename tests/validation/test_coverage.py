@@ -1,9 +1,6 @@
 """Every equation, table and figure of the papers has a row, and the summary in docs/ is of these rows."""
 
-import re
 from pathlib import Path
-
-import pytest
 
 from twin.validation import registry
 from twin.validation.checks.check import PAPERS, REFUTED
@@ -23,21 +20,10 @@ IDS = {
 CHECKS = {check.id: check for group in registry.GROUPS for check in group.checks}
 
 
-@pytest.mark.parametrize("prefix", [f"{paper}.{name}" for paper, names in IDS.items() for name in names.split()])
-def test_everything_that_is_printed_has_a_row(prefix):
+def test_everything_that_is_printed_has_a_row():
     assert set(IDS) == set(PAPERS)
-    assert [name for check in CHECKS.values() for name in check.names if matches(name, prefix)]
-
-
-def test_every_statement_is_a_sentence_with_its_source():
-    for check in CHECKS.values():
-        assert len(check.statement) > 15, check.id
-        assert re.search(r"section|eq|Table|Fig|abstract|text", check.equation), check.id
-        assert len(check.because) > 10, check.id
-
-
-def test_no_two_checks_are_the_same():
-    assert len({(check.paper, check.statement) for check in CHECKS.values()}) == len(CHECKS)
+    for prefix in (f"{paper}.{name}" for paper, names in IDS.items() for name in names.split()):
+        assert [name for check in CHECKS.values() for name in check.names if matches(name, prefix)], prefix
 
 
 def test_the_summary_in_the_docs_is_of_these_checks():

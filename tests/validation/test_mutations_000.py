@@ -1,8 +1,7 @@
 """Every formula of paper 000, broken on purpose: at least one verdict of its checks must turn.
 
 Measurements are drawn once; a mutation is patched in where the checks look the formula up.
-The first one of the paper belongs to the second tier, which .ci/run runs; all others, and that unbroken formulas
-turn nothing (twin.validate shows it), to the third.
+That unbroken formulas turn nothing, `python -m twin.validate` shows.
 
 What no check can see, and why: the sign and a factor of (3), whose right side is zero; the modulus in (6) and (7), for
 all normals have z = -1 in the frame used and their products are positive (tested); a common factor of the curves of
@@ -18,7 +17,6 @@ from analysis.orbit.planes import PlaneFit
 from optics.geometry.pose import about_axis
 from optics.numerics.backend import load_backend
 from scenes.specs.orbit.angle import LINES
-from tests.tiers import one_of_each
 from tests.validation.undrawn import undrawn
 from twin.orbit.angle import angle_flight as flight_module
 from twin.validation.checks.check import VERDICTS
@@ -31,7 +29,6 @@ from twin.validation.runner import run_checks
 
 GROUPS = tuple(group for group in ALL if group.prefix.startswith("000"))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}
-GROUP = {check.id: group for group in GROUPS for check in group.checks}
 
 
 @pytest.fixture(scope="module")
@@ -177,77 +174,25 @@ def _swapped_ends(what, name, axis):
 solve = np.linalg.solve
 MUTATIONS = {
     ("000.eq1", "sign"): (coefficients(lambda a0, a1, x, y, z: z + a0 * x + a1 * y), ["000.eq1"]),
-    ("000.eq1", "factor 2"): (coefficients(lambda a0, a1, x, y, z: z - 2 * a0 * x - a1 * y), ["000.eq1"]),
-    ("000.eq1", "x and y swapped"): (coefficients(lambda a0, a1, x, y, z: z - a1 * x - a0 * y), ["000.eq1"]),
-    ("000.eq2", "sign"): (squares(lambda s, p, o: (-s, p, o)), ["000.eq2", "000.eq3"]),
     ("000.eq2", "factor 2"): (squares(lambda s, p, o: (s * [2.0, 1.0], p, o)), ["000.eq2", "000.eq4"]),
-    ("000.eq2", "x and y swapped"): (squares(lambda s, p, o: (s[::-1], p, o)), ["000.eq2", "000.eq4"]),
-    ("000.eq2", "station left out"): (squares(lambda s, p, o: (s, p, 0 * o)), ["000.eq2", "000.eq4"]),
     ("000.eq3", "not at zero"): (solved(lambda m, r: solve(m, 1.0001 * r)), ["000.eq3"]),
-    ("000.eq3", "x and y swapped"): (solved(lambda m, r: solve(m, r)[::-1]), ["000.eq3"]),
-    ("000.eq4", "sign"): (sums(lambda d, *_: -d), ["000.eq4"]),
-    ("000.eq4", "factor 2"): (sums(lambda d, *_: d / 2), ["000.eq4"]),
     ("000.eq4", "x and y swapped"): (sums(lambda d, *_: d[::-1]), ["000.eq4"]),
     ("000.eq5", "printed with the right sign"): (solved(lambda m, r: solve(m, r), "printed"), ["000.eq5"]),
-    ("000.eq5", "sign"): (solved(lambda m, r: solve(m, -r)), ["000.eq2", "000.eq1", "000.eq3"]),
-    ("000.eq5", "sign of one row"): (solved(lambda m, r: solve(m, r * [1, -1])), ["000.eq2", "000.eq6"]),
     ("000.eq5", "factor 2"): (solved(lambda m, r: solve(m, 2 * r)), ["000.eq2", "000.eq5.angles", "000.eq6"]),
-    ("000.eq5", "x and y swapped"): (solved(lambda m, r: solve(m, r[::-1])), ["000.eq2", "000.eq6", "000.eq7"]),
-    ("000.eq5", "sign of the mixed sum"): (
-        solved(lambda m, r: solve(m * [[1, -1], [-1, 1]], r)), ["000.eq2", "000.eq6", "000.eq7"],
-    ),
-    ("000.eq6", "sign"): (angles(lambda n, a: np.array([np.pi - a[0], a[1]])), ["000.eq6"]),
     ("000.eq6", "factor 2"): (angles(lambda n, a: np.array([2 * a[0], a[1]])), ["000.eq6"]),
-    ("000.eq6", "sine for cosine"): (angles(lambda n, a: np.array([np.pi / 2 - a[0], a[1]])), ["000.eq6"]),
-    ("000.eq6", "ends swapped"): (angles(lambda n, a: np.array([angle(n[2], n[1]), a[1]])), ["000.eq6"]),
-    ("000.eq6", "backward for nadir"): (angles(lambda n, a: np.array([angle(n[0], n[2]), a[1]])), ["000.eq6"]),
-    ("000.eq6", "single precision"): (
-        angles(lambda n, a: np.arccos(np.cos(a).astype(np.float32)).astype(float)), ["000.eq6.arccos"],
-    ),
-    ("000.eq6", "off axis, factor 2"): (
-        angles(lambda n, a: 2 * a, suppositions, "off_axis_angle"), ["000.outlook.unsigned"],
-    ),
-    ("000.eq7", "sign"): (angles(lambda n, a: np.array([a[0], np.pi - a[1]])), ["000.eq7"]),
-    ("000.eq7", "factor 2"): (angles(lambda n, a: np.array([a[0], 2 * a[1]])), ["000.eq7"]),
-    ("000.eq7", "sine for cosine"): (angles(lambda n, a: np.array([a[0], np.pi / 2 - a[1]])), ["000.eq7"]),
     ("000.eq7", "ends swapped"): (angles(lambda n, a: np.array([a[0], angle(n[0], n[1])])), ["000.eq7"]),
-    ("000.eq7", "forward for nadir"): (angles(lambda n, a: np.array([a[0], angle(n[0], n[2])])), ["000.eq7"]),
     ("000.fig3", "sign"): (
         curves(lambda *key: (key, -1.0)), ["000.fig3.alpha_signs", "000.fig3.beta_signs", "000.fig3.ordinate"],
     ),
-    ("000.fig3", "x and y swapped"): (curves(_swapped_xy), ["000.fig3.alpha_signs", "000.fig3.beta_largest"]),
-    ("000.fig3", "ends swapped"): (curves(_swapped_ends), ["000.fig3.alpha_largest", "000.fig3.beta_largest"]),
-    ("000.fig4", "sign"): (curves(lambda *key: (key, -1.0)), ["000.fig4.forward_signs", "000.fig4.nadir_signs"]),
-    ("000.fig4", "x and y swapped"): (curves(_swapped_xy), ["000.fig4.forward_signs", "000.fig4.forward_y"]),
     ("000.fig4", "ends swapped"): (curves(_swapped_ends), ["000.fig4.forward_signs", "000.fig4.nadir_signs"]),
-    ("000.fig5", "sign"): (curves(lambda *key: (key, -1.0)), ["000.fig5.nadir_signs", "000.fig5.aft_signs"]),
     ("000.fig5", "x and y swapped"): (curves(_swapped_xy), ["000.fig5.nadir_signs", "000.fig5.aft_x"]),
-    ("000.fig5", "ends swapped"): (curves(_swapped_ends), ["000.fig5.nadir_signs", "000.fig5.aft_largest"]),
     ("000.height", "half"): (turn(lambda axis, a: (axis, a / 2)), ["000.height.alpha", "000.height.beta"]),
-    ("000.height", "factor 2"): (turn(lambda axis, a: (axis, 2 * a)), ["000.height.size"]),
-    ("000.height", "roll for pitch"): (turn(lambda axis, a: (0, a)), ["000.height.alpha", "000.height.beta"]),
 }  # fmt: skip
 """(formula, mutation) -> how it is patched in, and the checks whose verdicts must turn."""
 
-FORMULAS = ("000.eq1", "000.eq2", "000.eq3", "000.eq4", "000.eq5", "000.eq6", "000.eq7")
-
 
 @pytest.mark.second
-def test_every_formula_has_mutations():
-    named = {formula for formula, _ in MUTATIONS}
-    assert named == {*FORMULAS, "000.fig3", "000.fig4", "000.fig5", "000.height"}
-    assert {name for name in EXPECTED if name.startswith("000.eq") and name.count(".") == 1} == set(FORMULAS)
-    for formula in FORMULAS:
-        assert len([1 for name, _ in MUTATIONS if name == formula]) >= 2
-
-
-@pytest.mark.slow
-def test_without_mutation_all_is_as_expected(quick):
-    named = sorted({name for _, turned in MUTATIONS.values() for name in turned})
-    assert verdicts(named) == {name: EXPECTED[name] for name in named}
-
-
-@pytest.mark.parametrize(("formula", "mutation"), one_of_each(lambda _: "000", MUTATIONS))
+@pytest.mark.parametrize(("formula", "mutation"), MUTATIONS)
 def test_a_broken_formula_turns_a_verdict(formula, mutation, quick):
     patch, turned = MUTATIONS[formula, mutation]
     patch(quick)

@@ -11,7 +11,7 @@ from analysis.turntable.angle_fits import FITS
 from optics.numerics.backend import load_backend
 from tests.tiers import quick
 from twin.validation import registry
-from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED, UNDECIDED
+from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, REFUTED, REPRODUCED
 from twin.validation.paper_004 import distortion_checks, focus_checks, turntable_checks
 from twin.validation.paper_004.equations_004 import Perspective
 from twin.validation.paper_004.turntable_checks import FittedTable
@@ -20,68 +20,6 @@ from twin.validation.runner import run_checks
 
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix.startswith("004."))
 
-# id -> printed, tolerance, unit, comparison, expected verdict
-STATED = {
-    "004.table1.P": (0.2, 0.02, "1", "two-sided", REPRODUCED),
-    "004.table1.B1": (0.36, 0.036, "1", "two-sided", REPRODUCED),
-    "004.table1.B2": (0.36, 0.036, "1", "two-sided", REPRODUCED),
-    "004.table1.B3": (0.37, 0.037, "1", "two-sided", REPRODUCED),
-    "004.table1.B4": (0.36, 0.036, "1", "two-sided", REPRODUCED),
-    "004.table1.frequency": (None, 0.1, "1", "two-sided", REPRODUCED),
-    "004.table1.average": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.alignment.coupling": (6.0, 0.0, "1", "two-sided", CORRECTED),
-    "004.alignment.defocus": (None, 4.0, "µm", "two-sided", CONFIRMED),
-    "004.alignment.plane": (0.04, 0.0, "mm", "at most", REPRODUCED),
-    "004.alignment.constraint": (1.0, 0.0, "arcmin", "at most", REPRODUCED),
-    "004.alignment.shims": (None, 5.0, "µm", "two-sided", CONFIRMED),
-    "004.alignment.confocal": (0.04, 0.0, "mm", "at most", REPRODUCED),
-    "004.alignment.level": (1.0, 0.0, "arcmin", "at most", REPRODUCED),
-    "004.alignment.rounds": (1.0, 0.0, "1", "at most", REPRODUCED),
-    "004.eq2.solution": (None, 1e-06, "µm", "two-sided", CONFIRMED),
-    "004.eq3.solution": (None, 1e-06, "µm", "two-sided", CONFIRMED),
-    "004.eq4.solution": (None, 1e-06, "µm", "two-sided", CONFIRMED),
-    "004.eq3.ignored": (2.3, 0.05, "µm", "at most", CONFIRMED),
-    "004.turntable.range": (5.0, 0.0, "deg", "at most", CONFIRMED),
-    "004.turntable.repeat": (0.081, 0.0162, "arcsec", "two-sided", REPRODUCED),
-    "004.turntable.criterion": (None, 0.01, "1", "two-sided", CONSISTENT),
-    "004.turntable.chauvenet": (0.037, 0.0074, "arcsec", "two-sided", REPRODUCED),
-    "004.turntable.chauvenet_mean": (0.037, 0.005123, "arcsec", "two-sided", CORRECTED),
-    "004.turntable.interpolation": (2.0, 0.0, "arcsec", "at most", REPRODUCED),
-    "004.turntable.fit": (0.2, 0.0, "arcsec", "at most", REPRODUCED),
-    "004.turntable.network": (None, 0.02, "1", "at most", REFUTED),
-    "004.turntable.architecture": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.turntable.time": (50.0, 0.0, "%", "two-sided", NOT_CHECKABLE),
-    "004.eq1.constant": (2.3, 0.5, "µm", "at most", CORRECTED),
-    "004.eq1.zero": (2.3, 0.05, "µm", "at most", REPRODUCED),
-    "004.eq2.f": (None, 0.05, "mm", "two-sided", CONFIRMED),
-    "004.eq2.distance": (None, 0.5, "1", "two-sided", CONSISTENT),
-    "004.eq2.p": (0.007, 5.5, "mm", "at most", CORRECTED),
-    "004.eq2.uneven": (None, 5.5, "mm", "two-sided", CONFIRMED),
-    "004.eq2.point": (1.0, 9.0, "1", "at most", REFUTED),
-    "004.eq4.uneven": (None, 5.5, "mm", "two-sided", CONFIRMED),
-    "004.sensitivity.angle": (None, 0.0, "%", "at least", REPRODUCED),
-    "004.sensitivity.field": (None, 0.0, "1", "at least", CONFIRMED),
-    "004.sensitivity.distance": (None, 0.0, "1", "at least", CONFIRMED),
-    "004.sensitivity.points": (None, 0.0, "1", "at least", CONFIRMED),
-    "004.turntable.compensated": (0.2, 0.0, "arcsec", "at most", REPRODUCED),
-    "004.sensitivity.requirement": (2.3, 0.05, "µm", "at most", REFUTED),
-    "004.table2.reduction": (35.0, 1.0, "%", "two-sided", REFUTED),
-    "004.table2.mean": (35.0, 1.0, "%", "two-sided", REFUTED),
-    "004.table2.largest": (35.0, 1.0, "%", "two-sided", CONFIRMED),
-    "004.table2.bound": (2.3, 0.0, "µm", "at most", CONFIRMED),
-    "004.table2.accuracy": (2.3, 0.05, "µm", "at most", REPRODUCED),
-    "004.table2.compensation": (35.0, 1.0, "%", "two-sided", UNDECIDED),
-    "004.table2.points": (34.54545454545455, 15.0, "%", "two-sided", REFUTED),
-    "004.fig1": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.fig2": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.fig3": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.fig4": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.fig5": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.fig6": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.fig7": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.fig8": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-    "004.fig9": (None, 0.0, "1", "two-sided", NOT_CHECKABLE),
-}
 CHEAP = "004.eq2.solution,004.eq3.solution,004.eq3.ignored,004.eq4.solution,004.turntable.range"
 REPEATS = "004.turntable.repeat,004.turntable.criterion,004.turntable.chauvenet,004.turntable.chauvenet_mean"
 CHEAP += "," + REPEATS
@@ -93,22 +31,6 @@ CHEAP += ",004.table2.reduction,004.table2.mean,004.table2.largest,004.table2.bo
 def results(only, seed=1):
     validation = run_checks(select(GROUPS, only), load_backend("llvm"), seed, fast=True)
     return {result.id: result for result in validation.results}
-
-
-def test_what_is_compared():
-    checks = {check.id: check for group in GROUPS for check in group.checks}
-    assert set(checks) == set(STATED)
-    for identifier, (printed, tolerance, unit, comparison, expected) in STATED.items():
-        check = checks[identifier]
-        assert (check.printed, check.unit, check.comparison) == (pytest.approx(printed), unit, comparison)
-        assert check.expected == expected
-        assert check.tolerance == pytest.approx(tolerance, rel=1e-3)
-        assert len(check.because) > 5
-
-
-@pytest.mark.parametrize("prefix", ["eq1", "eq2", "eq3", "eq4", "table1", "table2", "turntable", "alignment"])
-def test_every_equation_and_table_has_rows(prefix):
-    assert any(identifier.startswith(f"004.{prefix}.") for identifier in STATED)
 
 
 @pytest.mark.second
@@ -137,7 +59,6 @@ def test_cheap_checks(identifier, value, accuracy, verdict):
 
 def test_printed_solutions_are_least_squares_to_rounding():
     found = results(CHEAP)
-    assert set(found) == {i for i in STATED if any(i == p or i.startswith(f"{p}.") for p in CHEAP.split(","))}
     for name in ("004.eq2.solution", "004.eq3.solution", "004.eq4.solution"):
         assert found[name].verdict == CONFIRMED
         assert 0.0 <= found[name].measured < 1e-6
@@ -222,29 +143,3 @@ def test_nearest_camera_without_distortion(tilt):
     assert found.f == pytest.approx(5.5, rel=1e-12)
     assert found.p == pytest.approx(5.5 * np.tan(tilt), abs=1e-10)
     assert np.max(np.abs(found.rest)) < 1e-14
-
-
-@pytest.mark.second
-def test_reading_of_one_table_can_be_repeated():
-    name = "004.turntable.repeat"
-    alone = results(name, 3)[name].measured
-    assert alone == results(REPEATS, 3)[name].measured
-    assert alone != results(CHEAP)[name].measured
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_everything_is_as_expected(seed):
-    """Verdicts that no seed should change, and artefacts."""
-    validation = run_checks(select(GROUPS, None), load_backend("llvm"), seed, fast=True)
-    assert {r.id: r.verdict for r in validation.results} == {name: row[-1] for name, row in STATED.items()}
-    found = {r.id: r for r in validation.results}
-    for name in ("P", "B1", "B2", "B3", "B4"):
-        assert found[f"004.table1.{name}"].sigma < 0.002
-    assert found["004.eq2.point"].measured > 30
-    assert found["004.eq2.f"].measured == pytest.approx(5512.0, abs=0.1)
-    artefacts = {a.name: a for run in validation.runs for a in run.artefacts}
-    assert set(artefacts) == {"table1", "alignments", "fits", "table2", "reduction", "principal-point"}
-    paper, *simulated = artefacts["table2"].rows
-    assert [float(cell) for cell in paper[1:]] == [1.294, 0.983, 24.0, 0.898, 0.662, 26.3, 3.5, 2.2, 37.1]
-    assert np.all(np.isfinite([[float(cell) for cell in row[1:]] for row in simulated]))

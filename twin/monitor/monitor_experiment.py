@@ -5,7 +5,9 @@ it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +21,7 @@ from analysis.short_repr import shows
 from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import PhysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import NodalDeformation
@@ -34,6 +37,7 @@ from scenes.specs.instrument import SIDES
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
+from twin.monitor.calibration_cache import CacheEntry
 from twin.monitor.line_curvature import motion_models
 from twin.monitor.monitor_beams import SpotFocus
 from twin.monitor.monitor_derivative import disturbances_of, spot_jacobian
@@ -46,6 +50,19 @@ from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 TEMPLATE_MARGIN = 40
 """Pixels by which the calibrated spot shape is larger than the CCD, so that it can be shifted over it."""
+
+_CALIBRATED = (
+    "instrument",
+    "path",
+    "wide_photons",
+    "sight",
+    "nominal_truth",
+    "_truth_by_family",
+    "cameras",
+    "calibration",
+    "ground",
+)
+"""Attributes of an experiment that depend on its instrument and detectors alone, and are kept on disk."""
 
 
 @shows("resolved.instrument.name", "resolved.instrument.cameras")
@@ -68,13 +85,25 @@ class MonitorExperiment:
     def __init__(self, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
         self.backend = backend
         self.resolved = resolved
-        self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend, free_beams)
+        specs = resolved.instrument, *resolved.cameras.values()
+        self._entry = CacheEntry.of(backend, specs, tuple(resolved.cameras), resolved.detector, free_beams)
+        known = self._entry.read()
+        if known is None:
+            self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend, free_beams)
+        else:
+            vars(self).update(known)
         if self.monitored:
             self._require_sampled()
             require_memory(resolved, self.size(), self.detector)
+        if known is None:
+            self._keep()
         self._deformed: dict[tuple[str, DeformationSpec], NodalDeformation] = {}
         self._heated: dict[tuple[str, TableTemperatureSpec], HeatedBody] = {}
         self._patterns: dict[int | tuple[int, ...], FixedPattern] = {}
+
+    def _keep(self) -> None:
+        """Keep what is calibrated for the processes to come."""
+        self._entry.write({name: vars(self)[name] for name in _CALIBRATED if name in vars(self)})
 
     @property
     def monitored(self) -> bool:
@@ -120,6 +149,20 @@ class MonitorExperiment:
         other.resolved = resolved
         for name in ("stated", "disturbances", "motion_models"):
             vars(other).pop(name, None)
+        return other
+
+    def with_instrument(self, instrument: Instrument) -> MonitorExperiment:
+        """Return an experiment on another instrument with the same detectors, of which nothing is calibrated yet.
+
+        Args:
+            instrument: may differ from what the job's files describe, so its calibration is not kept on disk.
+        """
+        other = copy(self)
+        for name in (*_CALIBRATED, "stated", "disturbances", "motion_models", "thermal"):
+            vars(other).pop(name, None)
+        other.instrument = instrument
+        other._entry = replace(self._entry, key=None)
+        other._deformed, other._heated, other._patterns = {}, {}, {}
         return other
 
     @cached_property
@@ -255,7 +298,15 @@ class MonitorExperiment:
         photons = self.wide_photons
         with one_blas_thread():  # several threads of a small decomposition wait for each other
             template = SpotTemplate.stack([self._template(image) for image in photons])
-        return MonitorCalibration(self.cameras, template, self.detector.noise_model(self.exposure), self.ground)
+        noise = self.detector.noise_model(self.exposure)
+        found = MonitorCalibration(self.cameras, template, noise, self.ground)
+        # the path counts its images for the manifest: with those of other states it is not kept
+        if self.path.checked.images == len(self.path.channels):
+            with suppress(PhysicalError, ArithmeticError):  # said where it is asked for
+                self.path.focus  # noqa: B018
+            vars(self)["calibration"] = found
+            self._keep()
+        return found
 
     @cached_property
     def ground(self) -> GroundGeometry | None:
@@ -283,9 +334,12 @@ class MonitorExperiment:
         """The prior with its effect on spots and cameras, for the analysis; None without a prior. Raises InputError as
         `stated`.
         """
-        if self.stated is None:
+        stated = self.stated
+        if stated is None:
             return None
-        return disturbances_of(self.stated, self.path, self.thermal, self.instrument, self.backend)
+        return self._entry.part("disturbances", stated).get(
+            lambda: disturbances_of(stated, self.path, self.thermal, self.instrument, self.backend)
+        )
 
     @cached_property
     def motion_models(self) -> Mapping[str, MotionModel]:

@@ -20,6 +20,7 @@ import numpy as np
 
 from scenes.yaml.errors import InputError
 from scenes.yaml.input_file import why_unreadable
+from twin.monitor.calibration_cache import recomputed
 from twin.run import cli, data_files, provenance, report, run_folder
 from twin.study.runs import setup, task
 from twin.study.runs.base_job import BlockResult
@@ -241,6 +242,7 @@ def _goes_in(name: str) -> bool:
     return name == CONFIG or name.split("/")[0] in ("deformation", "temperature", "finish")
 
 
+@recomputed()  # a repetition takes nothing over from the run that it checks
 def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
     """Make a whole run again, and compare every file.
 
@@ -307,6 +309,7 @@ def of_rounded(files: Sequence[difference.FileDifference]) -> Iterator[differenc
         )
 
 
+@recomputed()
 def repeat_chunk(state: FolderState) -> Repetition:
     """Make one chunk of a study again, the one in the middle, and hold all chunks against the study's data set.
 

@@ -19,7 +19,6 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_path import MonitorPath
 from twin.validation.checks.group import load_printed
 from twin.validation.paper_001.ranges.curves import CORRECTED, FORMS, Bench, Curves, sampled
 from twin.validation.paper_001.ranges.turns import CLAIMED, FINE, NAMES, motion_of
@@ -88,14 +87,14 @@ def variant(
 
 
 def with_return(experiment: MonitorExperiment, kind: str) -> MonitorExperiment:
-    """The experiment with another kind of return, in place; call it before anything is rendered.
+    """Return the experiment with another kind of return.
 
     The facet becomes an opening of the same size, behind which two or three mirrors stand square to each other and
     meet in its middle. Rays meet them in one order; the other orders give the same ray, as turns by half a turn do not
     depend on theirs.
 
     Args:
-        experiment: newly built.
+        experiment: with the plane return that was built.
         kind: of RETURNS.
 
     Raises:
@@ -103,11 +102,10 @@ def with_return(experiment: MonitorExperiment, kind: str) -> MonitorExperiment:
     """
     if kind not in RETURNS:
         raise ValueError(f"no return {kind!r}; there are {', '.join(RETURNS)}")
-    if kind != "plane":
-        instrument = experiment.instrument
-        experiment.instrument = replace(instrument, assembly=_returning(instrument, kind))
-        experiment.path = MonitorPath(experiment.instrument, experiment.backend)
-    return experiment
+    if kind == "plane":
+        return experiment
+    instrument = experiment.instrument
+    return experiment.with_instrument(replace(instrument, assembly=_returning(instrument, kind)))
 
 
 def _returning(instrument: Instrument, kind: str) -> Assembly:
