@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 import json
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -51,29 +49,6 @@ def test_the_first_state_is_the_main_job(bench, first, backend):
     assert told["truth"] == run.truth_dict()
     assert np.array_equal(after, run.after[:, 0])
     assert np.array_equal(bench.before(first), run.before[:, 0])
-
-
-@pytest.mark.second
-def test_a_state_leaves_nothing_that_only_refers_to_itself(bench, first):
-    """What does would stay, images and all, until Python looks for it, which it does the less the more there is."""
-
-    def states() -> None:
-        for n in range(3):
-            bench.state(changed(first, {f"{M2} shift z": 0.5 + n}, noise=bool(n % 2)))
-
-    # The first states drive out of the caches what earlier tests kept there, with its cycles.
-    states()
-    gc.collect()
-    gc.disable()
-    gc.set_debug(gc.DEBUG_SAVEALL)
-    try:
-        states()
-        gc.collect()
-        assert not Counter(type(left).__qualname__ for left in gc.garbage)
-    finally:
-        gc.set_debug(0)
-        gc.garbage.clear()
-        gc.enable()
 
 
 @pytest.mark.second
@@ -318,12 +293,6 @@ def test_pictures_of_a_camera(bench, view):
     assert pictures.draw(view, "forward", 0.5, bench.twin.state, 1, 1).startswith("<svg")
     with pytest.raises(ValueError, match="no camera"):
         pictures.draw(view, "sideward", 0.5, {}, 1, 1)
-
-
-@pytest.mark.slow
-def test_the_picture_of_a_knife_edge(bench):
-    pictures = CameraPictures(bench.twin.experiment)
-    assert "Nyquist" not in pictures.draw("target", "forward", 0.0, bench.twin.state, 4, 1)[:100]
 
 
 @pytest.mark.second

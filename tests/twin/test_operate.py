@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine, event, inspect
+from sqlalchemy import create_engine, inspect
 
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
@@ -24,7 +24,7 @@ from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair,
 from twin.operate.__main__ import app
 from twin.operate.record import schema
 from twin.operate.record.database import url_of
-from twin.operate.record.entries import Alarm, Entry, Given, digest_of_job, instrument_digest, micros, utc_text
+from twin.operate.record.entries import Alarm, Entry, Given, digest_of_job, instrument_digest, micros, now, utc_text
 from twin.operate.record.history import History, content_of, initialised
 from twin.operate.record.place import FILE, NotARecord
 from twin.operate.record.record_tables import tables
@@ -485,11 +485,21 @@ def test_other_numbers_of_a_moment_do_not_replace_those_that_are_there(record: P
 
 
 def test_a_time_still_to_come_is_of_a_wrong_clock(tmp_path: Path) -> None:
-    far = [replace(temperatures(0, 1)[0], time=micros("2098-01-01T00:00:00Z"))]
+    """A clock of the computer's may be a day behind, and no more; simulated readings come whenever they do."""
+    (one,) = temperatures(0, 1)
+    far = [replace(one, time=now() + round((24 + 0.2) * 3600e6))]
     with made(tmp_path / "real", simulated=False) as history:
+        assert history.take(given("b", [replace(one, time=now() + round((24 - 0.2) * 3600e6))])).new == 1
         assert "is still to come" in history.take(given("a", far)).refused[0][1]
     with made(tmp_path / "simulated") as history:
         assert history.take(given("a", far)).new == 1
+
+
+def test_every_transaction_is_on_the_disk_with_its_folder_before_it_is_over(record: Path) -> None:
+    """SQLite's synchronous = EXTRA, a journal that is removed, foreign keys, and no functions from the schema."""
+    with History(str(record)) as history, history.reading() as connection:
+        wanted = {"synchronous": 3, "journal_mode": "delete", "foreign_keys": 1, "trusted_schema": 0}
+        assert {name: connection.exec_driver_sql(f"PRAGMA {name}").scalar() for name in wanted} == wanted
 
 
 def test_an_unknown_event_is_refused_with_the_nearest(record: Path, tmp_path: Path) -> None:
@@ -746,50 +756,3 @@ def test_a_record_of_a_later_version_is_left_alone(record: Path) -> None:
         History(str(record))
     with pytest.raises(NotARecord, match="use a later program"):
         initialised(str(record), pair())
-
-
-def test_frames_of_a_file_are_kept_with_it(record: Path) -> None:
-    entry = Entry("monitor", "monitor", START, {"numbers": {}}, None, "a" * 64)
-    with History(str(record)) as history:
-        history.take(Given("f", "b" * 64, "", [entry], {"x.tiff": "c" * 64}))
-        with history.reading() as connection:
-            assert connection.exec_driver_sql("SELECT file, sha256 FROM frame").all() == [("x.tiff", "c" * 64)]
-
-
-def test_one_reading_more_is_as_much_work_in_a_long_record(tmp_path: Path) -> None:
-    """Counted in steps of SQLite's machine: taking a reading, and all that an estimate asks the record for after it."""
-    steps = [0]
-
-    def count() -> int:
-        steps[0] += 1
-        return 0
-
-    def counted(raw: sqlite3.Connection, *_: object) -> None:
-        raw.set_progress_handler(count, 1)
-
-    def released(raw: sqlite3.Connection, *_: object) -> None:
-        raw.set_progress_handler(None, 1)
-
-    def work(history: History, k: int) -> int:
-        newest, time = history.newest_id(), START + MINUTE * (k - 1)
-        steps[0] = 0
-        assert history.take(given(f"one{k}", temperatures(k, 1))).new == 1
-        assert history.first("temperature") is not None
-        assert history.subjects("temperature") == ["base"]
-        assert not history.came_late(newest, time)
-        assert [one["time_us"] for one in history.entries(after_us=time)] == [time + MINUTE]
-        assert history.save_checkpoint("plan", 0, time, newest, b"")
-        assert history.checkpoint("plan", valid=True) is not None
-        return steps[0]
-
-    with made(tmp_path / "record") as history:
-        event.listen(history._engine, "checkin", released)
-        history.take(given("few", temperatures(0, 100)))
-        event.listen(history._engine, "checkout", counted)
-        few = work(history, 100)
-        event.remove(history._engine, "checkout", counted)
-        history.take(given("many", temperatures(101, 1500)))
-        event.listen(history._engine, "checkout", counted)
-        many = work(history, 1601)
-    assert few > 100
-    assert many < 1.1 * few

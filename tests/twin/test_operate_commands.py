@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,23 +13,13 @@ import pytest
 from optics.numerics.backend import load_backend
 from scenes.specs.operation import OperationSpec, RequirementSpec
 from tests.twin.commands import invoke
-from tests.twin.operation_records import (
-    START,
-    given,
-    life_of,
-    monitor_entry,
-    plan_of,
-    record_of,
-    temperature_entry,
-)
-from tests.twin.record_bench import operating
+from tests.twin.operation_records import START, given, life_of, monitor_entry, plan_of, record_of, temperature_entry
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.alarms import AGAIN, alarms_of, raise_alarms
 from twin.operate.estimate.operation import Break, Following, FoundJump, Operation, SensorState
-from twin.operate.estimate.plans import keep_plan, kept_plan
-from twin.operate.followed import known_of
-from twin.operate.record.entries import MICRO, Alarm, Entry, utc_text
+from twin.operate.estimate.plans import keep_plan
+from twin.operate.record.entries import MICRO, Entry, utc_text
 from twin.operate.record.history import History
 from twin.run.provenance import negative_verdicts
 
@@ -239,26 +228,6 @@ def test_who_has_seen_which_alarm(words: tuple[object, ...], text: str, record: 
     assert (done.exit_code, text in done.stderr) == (2, True), done.stderr
 
 
-@pytest.mark.slow
-def test_kills_while_a_record_is_followed(record: Path, life: Path, tmp_path: Path) -> None:
-    """What the estimate is, and which alarms there are, does not depend on where it was killed before."""
-    run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
-    shutil.copytree(record, tmp_path / "whole")
-    start = time.monotonic()
-    process = operating("status", tmp_path / "whole", "--json")
-    whole = json.loads(process.communicate(timeout=120)[0])
-    seconds = time.monotonic() - start
-    for k in range(4):
-        place = shutil.copytree(record, tmp_path / f"killed{k}")
-        process = operating("status", place)
-        time.sleep(seconds * (0.4 + 0.17 * k))
-        process.kill()
-        process.communicate()
-        told = json.loads(operating("status", place, "--json").communicate(timeout=120)[0])
-        assert told["estimate"] == whole["estimate"]
-        assert told["open_alarms"] == whole["open_alarms"] == 2
-
-
 PLAN = OperationSpec(
     instrument="monitor_pair",
     disturbances="own",
@@ -348,15 +317,3 @@ def test_a_jump_whose_time_is_known_better_is_the_same(record: Path, following: 
         assert len(raise_alarms(history, PLAN, replace(clean(following), jumps=(jump, other)))) == 1
         history.acknowledge(1, "Ann", "")
         assert raise_alarms(history, PLAN, replace(clean(following), jumps=(jump, other))) == []
-
-
-def test_an_estimate_is_used_from_python(record: Path, life: Path) -> None:
-    """As the documentation shows it."""
-    with History(str(record)) as history:
-        keep_plan(plan_of(life), life / "plan.yaml", history)
-        plan = kept_plan(history)
-        assert plan is not None
-        operation = Operation(history, plan)
-        found, new = known_of(operation)
-        assert {type(one) for one in new} == {Alarm}
-        assert operation.forecast([found.time + DAY]).values.shape == (1, len(operation.quantities))
