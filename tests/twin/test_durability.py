@@ -70,18 +70,19 @@ def begin(
     return subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.second
 @pytest.mark.parametrize("kind", REPLACE)
-def test_signals_at_ten_moments(tmp_path, kind, number) -> None:
+def test_signals_at_three_moments(tmp_path, kind) -> None:
+    """A signal each at the begin, the middle and the end of a command's steps on the disk."""
     place = tmp_path / "disk"
     place.mkdir()
     target = place / "run"
     REPLACE[kind](target, "old", 0.1)
     steps = int(begin(kind, target, "again", 0.1, 0, 0).stdout)
-    for moment in np.linspace(1, steps, 10).astype(int):
+    moments = np.linspace(1, steps, 3).astype(int).tolist()
+    for moment, number in zip(moments, (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL), strict=True):
         before = standing(target)
-        done = begin(kind, target, f"new {moment}", 0.1, int(moment), number)
+        done = begin(kind, target, f"new {moment}", 0.1, moment, number)
         assert done.returncode != 0, done.stderr
         assert standing(target) in (before, f"new {moment}"), (moment, done.stderr)
         if number != signal.SIGKILL and kind == "run":

@@ -338,7 +338,7 @@ def test_what_cannot_be_opened(file, says):
         read_source(file)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_other_values_of_a_factor_build_the_instrument_anew():
     """With half the aperture a quarter of the light comes, and the readings are noisier."""
     answers = Answers("scenes/examples/study_aperture.yaml", "llvm", lambda part: None)

@@ -39,7 +39,7 @@ def answer(ws, n: int, seconds: float = 120.0) -> dict:
             return reading(said)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_values_of_a_studys_factors_stay_when_the_process_is_started_again():
     with running("scenes/examples/study_aperture.yaml", "--port", "0", "--stay") as command:
         with connect(*command.place) as ws:

@@ -171,14 +171,31 @@ def test_tables_name_run_folders(record: Path, tmp_path: Path) -> None:
     assert [(one["line"], "no reading in" in one["reason"]) for one in file["refused"]] == [(4, True)]
 
 
-def test_a_series_is_a_reading_for_each_time(record: Path, tmp_path: Path) -> None:
-    folder = run_folder(tmp_path / "run")
-    data = json.loads((folder / "recovered.json").read_text())
-    data |= {"times_s": [0.0, 60.0], "series": [{"cameras": data["cameras"]}, {"cameras": data["cameras"]}]}
+def rewritten(folder: Path, data: object) -> Path:
+    """Another content of a run's results, as if it had written that."""
     (folder / "recovered.json").write_text(json.dumps(data))
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["sha256"]["recovered.json"] = hashlib.sha256((folder / "recovered.json").read_bytes()).hexdigest()
     (folder / "manifest.json").write_text(json.dumps(manifest))
+    return folder
+
+
+def test_results_that_are_none_are_refused(record: Path, tmp_path: Path) -> None:
+    apart, bare = "times and states that do not belong together", "a state without cameras or without a time"
+    cases = [([], "no results"), ({"times_s": [0, 1], "series": [{"cameras": {}}]}, apart), ({"series": {}}, bare)]
+    cases += [({"series": [{}]}, bare), ({"times_s": ["x"], "series": [{"cameras": {}}]}, bare)]
+    cases += [({"series": 3}, apart), ({"cameras": {"forward": float("nan")}}, "")]
+    for k, (data, words) in enumerate(cases):
+        folder = rewritten(run_folder(tmp_path / f"run{k}", frame=bytes([k])), data)
+        done = run("ingest", record, folder, "--time", "2026-03-05T03:05:00Z")
+        assert (done.exit_code, words in done.stdout, "0 taken" in done.stdout) == (2, True, True), done.stdout
+    assert status(record)["entries"] == 0
+
+
+def test_a_series_is_a_reading_for_each_time(record: Path, tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run")
+    data = json.loads((folder / "recovered.json").read_text())
+    rewritten(folder, {"times_s": [0.0, 60.0], "series": [{"cameras": data["cameras"]}, {"cameras": data["cameras"]}]})
     with History(str(record)) as history:
         taken = history.take(run_entries(folder, "", START, history, stated=False))
         assert (taken.new, taken.refused) == (2, ())
@@ -334,6 +351,41 @@ def test_a_row_that_cannot_be_is_refused_and_the_others_are_taken(case: str, rec
     for word in words:
         assert word in one["reason"]
     assert [(r["line"], r["reason"]) for r in status(record)["refused"]] == [(2, one["reason"])]
+
+
+def test_a_quaternion_of_a_turn_has_length_one(record: Path, tmp_path: Path) -> None:
+    """Within a thousandth, and is taken with length one; the scalar last."""
+    columns = "{tracker: {column: [a, b, c, d], unit: quaternion, sigma: 2 arcsec}}"
+    text = f"instrument: gf7_pair\nreadings:\n  - {{kind: attitude, files: q.csv, time: UTC, columns: {columns}}}\n"
+    cells = ["0,0,0.6,0.8", "0,0,0.6012,0.8", "0,0,0.6012,0.802", "0,0,0.598,0.798", "0,0,nan,1", "0,0,x,1"]
+    rows = "".join(f"2026-01-01T0{k}:00:00Z,{cell}\n" for k, cell in enumerate(cells))
+    result = run("ingest", record, written(tmp_path, text, {"q.csv": f"UTC,a,b,c,d\n{rows}"}), "--json")
+    (file,) = json.loads(result.stdout)["files"]
+    reasons = {one["line"]: one["reason"] for one in file["refused"]}
+    assert (file["new"], list(reasons)) == (2, [4, 5, 6, 7])
+    assert "not a quaternion of a turn" in reasons[4]
+    assert "not a quaternion of a turn" in reasons[5]
+    assert "not a finite number" in reasons[6]
+    with History(str(record)) as history:
+        found = [content_of(row)["values"] for row in history.entries("attitude")]
+    assert found == [pytest.approx([0.0, 0.0, 0.6, 0.8]), pytest.approx([0.0, 0.0, 0.60077, 0.79943], abs=1e-5)]
+
+
+def test_a_temperature_is_within_a_hundred_kelvin_of_the_instruments(record: Path, tmp_path: Path) -> None:
+    cells = ["119.9", "120.1", "-79.9", "-80.1"]  # of an instrument at 20 degC
+    rows = "".join(f"2026-01-01T0{k}:00:00Z,{cell}\n" for k, cell in enumerate(cells))
+    result = run("ingest", record, written(tmp_path, TELEMETRY, {"t_1.csv": f"UTC,T\n{rows}"}), "--json")
+    assert [one["line"] for one in json.loads(result.stdout)["files"][0]["refused"]] == [3, 5]
+
+
+def test_a_place_that_cannot_be_written_is_told(record: Path) -> None:
+    below = record / FILE / "below"
+    for words, code, told in (
+        (("init", below, "gf7_pair"), 2, "no folder can be made at"),
+        (("export", record, "--out", below), 1, "what is there is not all of the record"),
+    ):
+        done = run(*words)
+        assert (done.exit_code, told in " ".join(done.stderr.split())) == (code, True), done.stderr
 
 
 def test_a_refused_row_of_a_growing_table_counts_once(record: Path, tmp_path: Path) -> None:

@@ -284,6 +284,19 @@ def test_a_reading_that_contradicts_what_is_stated(following: Following) -> None
     jump = FoundJump("base/forward/M1", times[1], times[2], times[3], (), 30.0, 1e-9, {})
     kinds = [kind for kind, _ in told_of(replace(own, innovations=seen[1:], jumps=(jump,)))]
     assert kinds == ["jump"]
+    # it explains the reading with which it was told, and not the last one before it
+    for after, until, wanted in ((times[1], times[2], ["jump"]), (times[2], times[3], ["jump", "contradiction"])):
+        one = replace(jump, after_us=after, told_us=until)
+        assert [kind for kind, _ in told_of(replace(own, innovations=seen, jumps=(one,)))] == wanted
+
+
+def test_bodies_that_explain_a_jump_nearly_as_well_are_named(following: Following) -> None:
+    """Within a difference of log likelihoods of three, and three of them at most."""
+    (jump,) = following.jumps
+    many = {f"body{k}": 28.0 + k for k in range(5)}
+    for rivals, named in (({"a": 27.1, "b": 26.9}, "a"), ({"b": 26.9}, ""), (many, "body0, body1, body2")):
+        ((_, text),) = told_of(replace(clean(following), jumps=(replace(jump, log_ratio=30.0, rivals=rivals),)))
+        assert text.partition("; ")[2] == (f"{named} would explain it nearly as well" if named else "")
 
 
 def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(record: Path, following: Following) -> None:
@@ -304,7 +317,7 @@ def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(record: P
         assert raised(history, 0) == []
         assert raised(history, 29) == ["contradiction"]  # every reading is one of its own
         history.acknowledge(4, "Ann", "")
-        assert raised(history, 31) == ["broken", "sensor", "contradiction"]
+        assert raised(history, 30) == ["broken", "sensor", "contradiction"]
 
 
 def test_a_jump_whose_time_is_known_better_is_the_same(record: Path, following: Following) -> None:

@@ -173,7 +173,7 @@ def test_the_job_of_a_state_is_that_state(tmp_path: Path) -> None:
         np.testing.assert_allclose(read, meant, rtol=1e-9, atol=1e-15)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_spots_of_the_rendered_state_are_those_that_were_measured(history: History, tmp_path: Path) -> None:
     """A state is drawn and its frames are read; twin.render of the product's job gives the spots of that reading."""
     state = state_of(drawn(7)[0], experiment().stated.components, experiment().thermal)
@@ -648,6 +648,14 @@ def test_what_the_command_refuses(followed: Followed, tmp_path: Path, words, sai
     assert (result.exit_code, result.stdout) == (2, "")
     assert said in result.stderr
     assert not (tmp_path / "products").exists()
+
+
+def test_products_that_cannot_be_written_are_told(followed: Followed) -> None:
+    result = command(followed.place, "--time", utc_text(followed.time), "--out", followed.place / "record.sqlite" / "x")
+    assert (result.exit_code, "what is there is not all of the products" in " ".join(result.stderr.split())) == (
+        1,
+        True,
+    )
 
 
 def test_a_record_without_a_plan_says_how_to_keep_one(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ from twin.study.runs.engine import Engine, IncompleteError
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 
-pytestmark = pytest.mark.slow
-RUNS = 600
-"""With 24 blocks a killing has something to hit; a few seconds of work."""
+pytestmark = pytest.mark.second
+RUNS = 300
+"""With 12 blocks a killing has something to hit; a few seconds of work."""
 
 
 def run_to_end(*arguments: object) -> None:
