@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
 from twin.live.__main__ import TOKEN
-from twin.live.clients import BAD_MESSAGES, BURST, MOST_CLIENTS, Client
+from twin.live.clients import BAD_MESSAGES, BURST, Client, Goodbye
 from twin.live.computer import CannotStart, ComputerLost
 from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
 from twin.live.server import LiveServer
@@ -243,6 +243,24 @@ def test_a_long_message_is_refused_before_it_has_come(running):
     assert read_message(GOOD[0] + " " * (LARGEST_MESSAGE - len(GOOD[0]))).type == "state"
 
 
+def test_a_page_may_say_so_much(monkeypatch):
+    """2000 messages at once and 400 a second after them; 20 that are none."""
+    now = [time.monotonic() + 60.0]
+    monkeypatch.setattr("twin.live.clients.time.monotonic", lambda: now[0])
+    client = Client()
+    for count, wait in ((2000, 0.5), (200, 0.0)):
+        for _ in range(count):
+            client.take(GOOD[0])
+        now[0] += wait
+    with pytest.raises(Goodbye, match="too many messages"):
+        client.take(GOOD[0])
+    client = Client()
+    for _ in range(20):
+        client.take("nonsense")
+    with pytest.raises(Goodbye, match="too many messages that are none"):
+        client.take("nonsense")
+
+
 def test_too_many_messages(running):
     port, _ = running
     with connect(port) as ws:
@@ -257,7 +275,7 @@ def test_too_many_pages(running):
             break
         time.sleep(0.05)
     with ExitStack() as stack:
-        for _ in range(MOST_CLIENTS):
+        for _ in range(8):
             stack.enter_context(connect(port)).recv(5)
         with connect(port) as ws, pytest.raises(ConnectionClosed) as closed:
             ws.recv(5)

@@ -246,8 +246,17 @@ def clean(following: Following) -> Following:
 
 
 def test_what_contradicts_the_plan_is_in_the_numbers(following: Following) -> None:
-    good = replace(clean(following), widened=1.0, too_many_jumps=False).to_dict()
+    calm = replace(clean(following), widened=1.0, too_many_jumps=False, bad_readings=((1, "x"), (2, "y")))
+    good = calm.to_dict()
     assert (good["agrees"], good["warnings"]) == (True, [])
+    for change, words in (
+        ({"undecided": True}, "the newest reading may be bad: y; until then sigmas count with both"),
+        ({"bad_readings": ((1, "x"),) * 3}, "3 readings were taken for bad ones"),
+        ({"too_small": ("heat", "mounts")}, "sensors of several bodies together disagree with heat, mounts"),
+        ({"widened": 1.01}, "all sigmas are 1.01 times as wide"),
+    ):
+        (text,) = replace(calm, **change).warnings
+        assert words in text
     bad = replace(clean(following), widened=2.5, too_many_jumps=True).to_dict()
     assert not bad["agrees"]
     assert [text.partition(";")[0] for text in bad["warnings"]] == [
@@ -287,7 +296,8 @@ def test_a_reading_that_contradicts_what_is_stated(following: Following) -> None
     # it explains the reading with which it was told, and not the last one before it
     for after, until, wanted in ((times[1], times[2], ["jump"]), (times[2], times[3], ["jump", "contradiction"])):
         one = replace(jump, after_us=after, told_us=until)
-        assert [kind for kind, _ in told_of(replace(own, innovations=seen, jumps=(one,)))] == wanted
+        alone = tuple((time, 50.0 if time == times[2] else 8.0, 8) for time in times)
+        assert [kind for kind, _ in told_of(replace(own, innovations=alone, jumps=(one,)))] == wanted
 
 
 def test_bodies_that_explain_a_jump_nearly_as_well_are_named(following: Following) -> None:

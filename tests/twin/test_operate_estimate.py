@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 from scenes.yaml.errors import Problem
 from tests.tiers import quick
@@ -24,6 +24,7 @@ from tests.twin.operation_records import (
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate import operation as operation_module
 from twin.operate.estimate.operation import Operation, beyond
+from twin.operate.estimate.standing import Scores, Sensor, Standing
 from twin.operate.posterior import posterior
 from twin.operate.record.entries import MICRO, Entry
 
@@ -314,3 +315,60 @@ def test_readings_that_contradict_the_statement_widen_sigma(known, tmp_path) -> 
     assert np.all(wrong < 6.0)
     calm = life_of(stated, 60.0, 3.0, 12, {})
     assert followed(known, tmp_path, entries_of(known, calm, 12), "calm").follow().widened == 1.0
+
+
+# --- sensors and scores by themselves ----------------------------------------------------------------------------
+
+
+def test_a_sensor_is_dead_after_ten_of_its_intervals() -> None:
+    sensor = Sensor("base")
+    for k in range(5):
+        sensor = sensor.came(100 * k, 290.0 + 0.1 * k, 0.05)
+    assert [sensor.state(now, True)[:2] for now in (1400, 1401)] == [("ok", 0), ("dead", 400)]
+    assert Sensor("base").came(0, 290.0, 0.05).state(10**15, True)[0] == "ok"  # of one reading there is no interval
+
+
+@pytest.mark.parametrize(("step", "repeats"), [(0.1, 19), (0.01, 4), (1e-4, 3)])
+def test_a_sensor_is_stuck_when_chance_does_not_repeat_it_so_often(step: float, repeats: int) -> None:
+    """Rounded to a step, two readings of sigma 0.05 K agree with the chance erf(5 step / K): 0.52, 0.056 and 0.00056;
+    to the power of the repeats, over all readings, at most 1e-4, and never before the third.
+    """
+    sensor = Sensor("base")
+    for k in range(5):
+        sensor = sensor.came(k, 290.0 + step * k, 0.05)
+    for k in range(repeats):
+        assert not sensor.stuck
+        sensor = sensor.came(5 + k, sensor.value, 0.05)
+    state, since, why = sensor.state(5 + repeats, True)
+    assert (state, since, why.split()[0]) == ("stuck", 4, str(repeats + 1))
+    assert not sensor.came(99, 280.0, 0.05).stuck
+
+
+def test_a_sensor_is_doubtful_when_three_of_its_last_ten_readings_are_far() -> None:
+    sensor = Sensor("base")
+    for white in (7.0, -6.01, 6.0):  # six standard deviations are not yet far
+        sensor = sensor.judged(white)
+    assert (sensor.far, sensor.state(0, True)[0]) == (2, "ok")
+    sensor = sensor.judged(-8.0)
+    assert [sensor.state(0, alone)[0] for alone in (True, False)] == ["doubtful", "ok"]
+    for _ in range(7):
+        sensor = sensor.judged(0.0)
+    assert (sensor.far, len(sensor.recent)) == (2, 10)
+    limit = np.sqrt(chi2.isf(1e-3, 4) / 4)  # a false alarm in a thousand
+    for share, wrong in ((0.999, False), (1.001, True)):
+        assert Sensor("base", recent=(share * limit,) * 4).disagrees == wrong
+    assert not Sensor("base").disagrees
+
+
+def test_scores_count_what_lies_within_and_its_mean_density() -> None:
+    one = Scores().with_one(np.array([0.5, -1.0, 1.0, 1.99, -2.0, 3.0]), -4.0).with_one(np.array([0.0]), 2.0)
+    assert (one.readings, one.components, one.within_one, one.within_two) == (2, 7, 2, 5)
+    assert (one.log_score, one.chi_square) == (-1.0, pytest.approx(0.25 + 1.0 + 1.0 + 1.99**2 + 4.0 + 9.0))
+
+
+def test_what_temperatures_explain_is_a_share_of_the_variance() -> None:
+    whole, rest = np.random.default_rng(1).standard_normal((2, 9, 3)) + 5.0
+    spread = np.stack([whole.sum(0), (whole**2).sum(0), rest.sum(0), (rest**2).sum(0)])
+    found = Standing(None, 0, Scores(9), spread=spread).explained
+    assert found == pytest.approx(1.0 - np.var(rest, axis=0) / np.var(whole, axis=0), rel=1e-9)
+    assert np.all(np.isnan(Standing(None, 0, Scores(1), spread=spread).explained))

@@ -37,7 +37,7 @@ from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.plans import keep_plan
 from twin.operate.estimated_motions import EstimatedMotions, perturbation, prior_files, state_file
 from twin.operate.product_files import product_files
-from twin.operate.products import Products
+from twin.operate.products import Products, _warnings
 from twin.operate.products import made as products_of
 from twin.operate.record.entries import MICRO, Entry, micros, utc_text
 from twin.operate.record.history import History, initialised
@@ -364,6 +364,26 @@ def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
     broken = replace(operation, breaks=(SimpleNamespace(quantity=quantity, breaks_us=None, holds_now=False),))
     found = products_of(broken, history, START, None, load_backend())
     assert found.warnings == ("ground height_m does not keep its requirement",)
+
+
+def test_what_limits_products_is_told() -> None:
+    """A scene a minute and more from the estimate, a model without polynomials, what a job or a prior does not have."""
+    calm = SimpleNamespace(warnings=["doubt"], breaks=(SimpleNamespace(quantity="q", holds_now=True),))
+    whole = SimpleNamespace(left_out=())
+    assert _warnings(calm, START, START - 60 * MICRO, None, (), whole) == ("doubt",)
+    assert _warnings(calm, START, None, None, (), whole) == ("doubt",)
+    broken = SimpleNamespace(warnings=[], breaks=(SimpleNamespace(quantity="q", holds_now=False),))
+    lines = {"a": SimpleNamespace(polynomial=None, refused="too steep"), "b": SimpleNamespace(polynomial=1)}
+    small = SimpleNamespace(left_out=(SimpleNamespace(share=0.001), SimpleNamespace(share=0.02)))
+    found = _warnings(broken, START, START + 60 * MICRO + 1, SimpleNamespace(lines=lines), (1, 2, 3), small)
+    assert found == (
+        f"the scene was taken at {utc_text(START + 60 * MICRO + 1)}, and the estimate is for {utc_text(START)}",
+        "q does not keep its requirement",
+        "a has no rational polynomials: too steep",
+        "state.yaml does not have 3 motions that a job cannot say",
+        "prior.yaml does not have the 2 components that matter least; none makes more than 2 percent of the variance "
+        "of a spot or a parameter",
+    )
 
 
 # --- camera models ------------------------------------------------------------------------------------------------

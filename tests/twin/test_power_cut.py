@@ -9,6 +9,7 @@ the file system may keep, the newest, and mixtures. It writes nothing through it
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import json
 import os
@@ -24,10 +25,21 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tests.twin import replacing
+from tests.twin import record_bench, replacing, study_bench
+from tests.twin.commands import invoke
+from twin.operate.__main__ import app
+from twin.run import durable, owned_files
+from twin.run.kept_work import KeptWork
+from twin.run.run_folder import RunFolder, RunFolderError, read_manifest, remove_replaced, write_manifest
+from twin.study.runs.base_job import BlockResult
+from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
+from twin.study.runs.study_folder import StudyFolder
+from twin.tolerance.samples import _journal
 
 pytestmark = pytest.mark.second
 LAYER = """
@@ -160,8 +172,7 @@ def disks(recorder: Recorder, files: bool = True, folders: bool = True) -> Itera
         last |= moment.contents
         if moment.event.startswith("done "):
             acknowledged += (moment.event.removeprefix("done "),)
-        empty = dict.fromkeys(last, b"")
-        old = empty | synced
+        old = dict.fromkeys(last, b"") | synced
         zeros = {one: old[one][: len(new)].ljust(len(new), b"\0") for one, new in last.items()}
         models = [
             ("nothing more", listed, old),
@@ -197,8 +208,6 @@ def _standing(folder: Inode, names: dict, folders: set[Inode], contents: dict, p
 
 def done(step: str) -> None:
     """Say that a step has been acknowledged to its user."""
-    import ctypes
-
     ctypes.CDLL(None).power_cut_report(f"done {step}".encode(), -1)
 
 
@@ -218,9 +227,6 @@ ENTRIES = [0, 5, 6, 7, 12]
 
 
 def operate(base: Path, inputs: Path) -> None:
-    from tests.twin.commands import invoke
-    from twin.operate.__main__ import app
-
     for number, words in enumerate(commands(base, inputs)):
         result = invoke(app, *words)
         assert result.exit_code == 0, result.output
@@ -228,9 +234,6 @@ def operate(base: Path, inputs: Path) -> None:
 
 
 def check_record(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
-    from tests.twin.commands import invoke
-    from twin.operate.__main__ import app
-
     def status() -> int:
         result = invoke(app, "status", base / "record", "--check-all", "--json")
         if result.exit_code:
@@ -252,8 +255,6 @@ def check_record(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) 
 def replace_run(base: Path, inputs: Path) -> None:
     import h5py
 
-    from twin.run.run_folder import RunFolder, write_manifest
-
     for stem in ("1", "2"):
         with RunFolder(base / "runs/run", force=True) as folder:
             folder.write_bytes("which.txt", stem.encode())
@@ -265,9 +266,6 @@ def replace_run(base: Path, inputs: Path) -> None:
 
 
 def check_run(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
-    from twin.run import owned_files
-    from twin.run.run_folder import read_manifest, remove_replaced
-
     target = base / "runs/run"
     found = replacing.standing(target) if target.exists() and any(target.iterdir()) else ""
     assert found in ("", "1", "2")[len(steps) : len(steps) + 2], f"{found!r} after {steps}"
@@ -281,8 +279,6 @@ def check_run(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> 
 
 
 def replace_study(base: Path, inputs: Path) -> None:
-    from twin.study.runs.chunk_store import ChunkStore
-
     write, number = ChunkStore.write, iter(range(1000))
 
     def acknowledged(store: ChunkStore, first: int, parts: list) -> None:
@@ -296,13 +292,10 @@ def replace_study(base: Path, inputs: Path) -> None:
 
 
 def check_study(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
-    from twin.run.owned_files import successor
-    from twin.study.runs.chunk_store import ChunkStore
-
     target, plan = base / "run", _plan()
     stands = [step for step in steps if step in ("1", "2")]
     begun = len(steps) - 1 - steps.index(stands[-1]) if stands else len(steps)
-    place = successor(target) if stands == ["1"] and successor(target).exists() else target
+    place = owned_files.successor(target) if stands == ["1"] and owned_files.successor(target).exists() else target
     found = replacing.standing(target)
     assert found in ((None, "1"), ("1", "2"), ("2",))[len(stands)], f"{found!r} after {steps}"
     if found != "2" and begun:
@@ -316,13 +309,6 @@ def check_study(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -
 
 
 def keep_work(base: Path, inputs: Path) -> None:
-    import numpy as np
-
-    from twin.run.kept_work import KeptWork
-    from twin.study.runs.base_job import BlockResult
-    from twin.study.runs.chunk_store import ChunkStore
-    from twin.tolerance.samples import _journal
-
     plan = _plan()
     with KeptWork(base / "out", "out", "samples", resume=True) as kept:
         folder = kept.begin() / "tested"
@@ -338,16 +324,10 @@ def keep_work(base: Path, inputs: Path) -> None:
 
 @cache
 def _plan() -> Plan:
-    from twin.study.runs.setup import resolve_study
-
     return Plan.of(resolve_study(Path(os.environ["TWIN_STUDY"])))
 
 
 def check_kept(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
-    from twin.run.run_folder import RunFolderError
-    from twin.study.runs.chunk_store import ChunkStore
-    from twin.tolerance.samples import _journal
-
     folder = base / "out.samples/tested"
     if steps:
         with pytest.raises(RunFolderError, match="of another budget"), _journal(folder, "another budget"):
@@ -370,7 +350,6 @@ SCENARIOS = {
 def plant(fault: str) -> None:
     """Leave out what keeps acknowledged work through a power cut."""
     from twin.operate.record import database
-    from twin.run import durable
 
     if fault.startswith("synchronous"):
         connect = database._on_connect
@@ -400,15 +379,14 @@ def layer(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("layer")
     (folder / "layer.c").write_text(LAYER)
     line = [compiler, "-shared", "-fPIC", "-o", str(folder / "layer.so"), str(folder / "layer.c"), "-ldl"]
-    subprocess.run(line, check=True, capture_output=True)
+    if subprocess.run(line, check=False, capture_output=True).returncode:
+        pytest.skip("the C compiler here does not build the layer that sees what is written through")
     return folder / "layer.so"
 
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory) -> Path:
     """Tables, a run folder and a study."""
-    from tests.twin import record_bench, study_bench
-
     folder = tmp_path_factory.mktemp("inputs")
     for name, first in (("a", 0), ("b", 100)):
         (folder / f"{name}_t.csv").write_text(record_bench.table(first, 5))
@@ -496,13 +474,6 @@ def test_a_missing_sync_is_noticed(scenario, fault, synced, recorded, inputs, tm
 
 def second_command(scenario: str, base: Path) -> str:
     """What is told to another command that begins meanwhile; nothing to one that clears up."""
-    from tests.twin.commands import invoke
-    from twin.operate.__main__ import app
-    from twin.run import owned_files
-    from twin.run.kept_work import KeptWork
-    from twin.run.run_folder import RunFolderError, remove_replaced
-    from twin.study.runs.study_folder import StudyFolder
-
     try:
         if scenario == "record":
             return invoke(app, "init", base / "record", "gf7_pair", "--simulated").stderr
