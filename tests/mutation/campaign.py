@@ -11,31 +11,24 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
-from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
 import typer
 
 from tests.mutation.coverage_map import CoverageMap
+from tests.mutation.fork_server import ForkServer
 from tests.mutation.mutants import Mutant
-from tests.mutation.warm_pytest import WarmPytest
 
 Fate = Literal["killed", "survived", "uncovered"]
-Mode = Literal["round", "first", "every"]
-"""When a mutant's tests end: after the round that killed it, at the first test that fails, or never."""
-STAGES = ((25.0, 3), (60.0, 10_000), (120.0, 10_000))
-"""For each round of tests its seconds at the most (without any fault) and how many cases of one test function.
-
-The last round takes whole files: a fixture that lasts the session or a cached function is run by the first test alone
-that asks.
-"""
-_STARTING = 60
-"""Processor seconds that starting pytest and compiling kernels may take, beside ten times what the tests take.
+STAGES = ((6.0, 2), (30.0, 6), (60.0, 10_000))
+"""For each round of tests its seconds at the most (without any fault) and how many cases of one test function."""
+_STARTING = 40
+"""Processor seconds that starting and compiling kernels may take, beside five times what the tests take.
 
 Not time on the clock, for a busy machine must not make a mutant look as if it hung."""
 
@@ -47,7 +40,7 @@ class Verdict:
     Attributes:
         mutant: the fault.
         fate: "killed" by a test that failed or hung, "survived" all that run its lines, "uncovered" where none does.
-        killers: every test that failed in the rounds that ran; "time" or the exit code where none can be named.
+        killers: the tests that failed; "time" or the exit code where none can be named.
         tests: how many tests ran at the most.
         seconds: how long it took.
     """
@@ -76,32 +69,19 @@ def read_verdicts(file: Path) -> dict[str, Verdict]:
     return found
 
 
-def run_campaign(
-    root: Path,
-    chosen: list[Mutant],
-    known: CoverageMap,
-    results: Path,
-    workers: int,
-    most: int = 3,
-    mode: Mode = "round",
-    last: Collection[str] = (),
-    say: bool = True,
-) -> None:
-    """Try every mutant, in ``most`` rounds of tests, and add a line to the results as soon as its fate is known.
-
-    Tests of ``last`` (files, functions or single cases) have rounds of their own after all others.
-    """
+def run_campaign(root: Path, chosen: list[Mutant], known: CoverageMap, results: Path, workers: int) -> None:
+    """Try every mutant and add a line to the results as soon as its fate is known."""
     with _copies(root, workers) as copies, ExitStack() as stack, ThreadPoolExecutor(workers) as pool:
-        free: queue.SimpleQueue[tuple[Path, WarmPytest]] = queue.SimpleQueue()
+        free: queue.SimpleQueue[ForkServer] = queue.SimpleQueue()
         for copy in copies:
-            free.put((copy, stack.enter_context(WarmPytest())))
+            free.put(stack.enter_context(ForkServer(copy)))
 
         def work(mutant: Mutant) -> Verdict:
-            copy, warm = free.get()
+            server = free.get()
             try:
-                return try_mutant(warm, copy, mutant, known, most, mode, last)
+                return try_mutant(server, mutant, known)
             finally:
-                free.put((copy, warm))
+                free.put(server)
 
         started, done = time.monotonic(), 0
         with results.open("a") as stream:
@@ -110,36 +90,26 @@ def run_campaign(
                 stream.write(json.dumps(verdict.as_json()) + "\n")
                 stream.flush()
                 done += 1
-                if say:
-                    left = (time.monotonic() - started) / done * (len(chosen) - done)
-                    where = f"{verdict.mutant.path}:{verdict.mutant.line[0]}"
-                    text = f"{done}/{len(chosen)} {verdict.fate} {where}; about {left / 60:.0f} min left"
-                    typer.echo(text, err=True)
+                left = (time.monotonic() - started) / done * (len(chosen) - done)
+                where = f"{verdict.mutant.path}:{verdict.mutant.line[0]}"
+                typer.echo(f"{done}/{len(chosen)} {verdict.fate} {where}; about {left / 60:.0f} min left", err=True)
 
 
-def try_mutant(
-    warm: WarmPytest,
-    copy: Path,
-    mutant: Mutant,
-    known: CoverageMap,
-    most: int = 3,
-    mode: Mode = "round",
-    last: Collection[str] = (),
-) -> Verdict:
-    """Put a fault into a copy of the tree, run the tests that meet it, quick ones first, and take it out again."""
+def try_mutant(server: ForkServer, mutant: Mutant, known: CoverageMap) -> Verdict:
+    """Put a fault into the server's tree, run the tests that meet it, quick ones first, and take it out again."""
     started = time.monotonic()
     if not known.covering(mutant.path, mutant.line):
         return Verdict(mutant, "uncovered", (), 0, 0.0)
-    file = copy / mutant.path
+    file = server.tree / mutant.path
     source = file.read_bytes()
     file.write_bytes(mutant.applied(source))
     count = 0
     killers: list[str] = []
     try:
-        for tests in chain(*(islice(rounds(part, mutant), most) for part in known.parts(last))):
+        for tests in rounds(known, mutant):
             count += len(tests)
-            killers += _killers(warm, copy, tests, sum(known.seconds[name] for name in tests), mode == "first")
-            if killers and mode != "every":
+            killers = _killers(server, mutant.path, tests, sum(known.seconds[name] for name in tests))
+            if killers:
                 break
     finally:
         file.write_bytes(source)
@@ -150,15 +120,11 @@ def try_mutant(
 def rounds(known: CoverageMap, mutant: Mutant) -> Iterator[list[str]]:
     """Tests of each round, which run together."""
     covering = known.covering(mutant.path, mutant.line)
-    files = {name.split("::")[0] for name in covering}
-    whole = sorted(
-        (name for name in known.seconds if name.split("::")[0] in files), key=lambda name: known.seconds[name]
-    )
     ran: set[str] = set()
-    for (seconds, cases), names in zip(STAGES, (covering, covering, whole), strict=True):
+    for seconds, cases in STAGES:
         tests: list[str] = []
         count: Counter[str] = Counter()
-        for name in names:
+        for name in covering:
             function = name.split("[")[0]
             if name in ran or count[function] >= cases:
                 continue
@@ -173,19 +139,18 @@ def rounds(known: CoverageMap, mutant: Mutant) -> Iterator[list[str]]:
             yield tests
 
 
-def _killers(warm: WarmPytest, copy: Path, tests: list[str], seconds: float, first: bool) -> list[str]:
-    """Those of the tests that fail, or the first of them."""
-    words = ["-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-rfE", "-m", "", *(["-x"] if first else [])]
-    limit = _STARTING + int(10.0 * seconds)
-    told, arguments = copy / ".told", copy / ".arguments"
+def _killers(server: ForkServer, path: str, tests: list[str], seconds: float) -> list[str]:
+    """The first of the tests that fails."""
+    words = ["-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-rfE", "-m", "", "-x"]
+    told, arguments = server.tree / ".told", server.tree / ".arguments"
     # Arguments in a file: there can be thousands.
     arguments.write_text("\n".join(tests))
-    ended = warm.run(copy, [*words, f"@{arguments}"], told, limit)
+    ended = server.run([*words, f"@{arguments}"], told, _STARTING + int(5.0 * seconds), path)
     if ended in (-signal.SIGXCPU, -signal.SIGKILL):
         return ["time"]
     if ended == 0:
         return []
-    failed = [line for line in told.read_text().splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    failed = [line for line in told.read_text(errors="replace").splitlines() if line.startswith(("FAILED ", "ERROR "))]
     return [line.split(" ", 1)[1].split(" - ")[0] for line in failed] or [f"exit {ended}"]
 
 

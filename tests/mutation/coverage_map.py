@@ -1,27 +1,18 @@
-"""Which tests run which line: measured once.
-
-Each file of tests has a process of its own, so that none profits from another's fixtures.
-"""
+"""Which tests run which line: measured once, in one run of all tests."""
 
 from __future__ import annotations
 
 import json
-import queue
-from collections.abc import Collection
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import coverage
-import typer
 
-from tests.mutation.warm_pytest import WarmPytest
-
-
-def belongs(name: str, tests: Collection[str]) -> bool:
-    """Whether a test is among some files, functions or single cases."""
-    return not {name, name.split("[")[0], name.split("::")[0]}.isdisjoint(tests)
+from tests.mutation.fork_server import PACKAGES
 
 
 @dataclass(frozen=True)
@@ -47,62 +38,41 @@ class CoverageMap:
             names = {name for found in by_line.values() for name in found}
         return sorted(names & self.seconds.keys(), key=lambda name: (self.seconds[name], name))
 
-    def parts(self, last: Collection[str]) -> tuple[CoverageMap, CoverageMap]:
-        """The map of all tests but some, and that of these."""
-        late = {name: seconds for name, seconds in self.seconds.items() if belongs(name, last)}
-        rest = {name: seconds for name, seconds in self.seconds.items() if name not in late}
-        return replace(self, seconds=rest), replace(self, seconds=late)
+    def of_tests(self, stays: Callable[[str], bool]) -> CoverageMap:
+        """The map of some of the tests."""
+        return CoverageMap(self.tests, {name: seconds for name, seconds in self.seconds.items() if stays(name)})
 
 
-def read_map(folder: Path, root: Path) -> CoverageMap:
-    """The map from what `measure` left in a folder."""
+def read_map(folder: Path) -> CoverageMap:
+    """The map from what `measure` left in a folder, whatever tree it was measured in."""
     tests: dict[str, dict[int, list[str]]] = {}
     seconds: dict[str, float] = {}
+    for times in folder.glob("*.json"):
+        for name, value in json.loads(times.read_text()).items():
+            # Workers tell of their own tests, the one that started them of all.
+            seconds[name] = max(seconds.get(name, 0.0), value)
     for file in sorted(folder.glob("*.coverage")):
-        times = file.with_suffix(".json")
-        if not times.exists():
-            continue
-        seconds |= json.loads(times.read_text())
         data = coverage.CoverageData(basename=str(file))
         data.read()
         for source in data.measured_files():
-            by_line = tests.setdefault(Path(source).relative_to(root).as_posix(), {})
+            by_line = tests.setdefault(_below(source), {})
             for line, names in data.contexts_by_lineno(source).items():
                 by_line.setdefault(line, []).extend(names)
     return CoverageMap(tests, seconds)
 
 
-def measure(root: Path, files: list[Path], places: tuple[str, ...], folder: Path, workers: int) -> list[Path]:
-    """Run files of tests under coverage; those measured before are left out.
+def _below(source: str) -> str:
+    """The path from the project's folder: from its outermost package on."""
+    parts = Path(source).parts
+    first = min(
+        k for k, part in enumerate(parts) if part in PACKAGES and (Path(*parts[: k + 1]) / "__init__.py").exists()
+    )
+    return Path(*parts[first:]).as_posix()
 
-    Returns:
-        The files for which nothing could be measured.
-    """
+
+def measure(root: Path, folder: Path, workers: int, files: Iterable[str] = ()) -> int:
+    """Run the tests under coverage, by default all; returns pytest's exit code."""
     folder.mkdir(parents=True, exist_ok=True)
-    free: queue.SimpleQueue[WarmPytest] = queue.SimpleQueue()
-
-    def run(file: Path) -> bool:
-        target = folder / (file.relative_to(root).as_posix().replace("/", "__") + ".coverage")
-        if target.exists() and target.with_suffix(".json").exists():
-            return True
-        more = {
-            "TWIN_COVERED": ",".join(str(root / place) for place in places),
-            "TWIN_COVERAGE_FILE": str(target),
-        }
-        words = ["-q", "-n", "0", "-p", "tests.mutation.coverage_plugin", str(file)]
-        warm = free.get()
-        try:
-            ended = warm.run(root, words, target.with_suffix(".told"), more=more)
-        finally:
-            free.put(warm)
-        done = target.exists() and target.with_suffix(".json").exists()
-        # tests that fail without any fault find none
-        fails = f"; some of its tests fail, see {target.with_suffix('.told')}" if ended == 1 else ""
-        typer.echo(f"{'coverage of' if done else 'NO coverage of'} {file.relative_to(root)}{fails}", err=True)
-        return done
-
-    with ExitStack() as stack, ThreadPoolExecutor(workers) as pool:
-        for _ in range(workers):
-            free.put(stack.enter_context(WarmPytest()))
-        done = list(pool.map(run, files))
-    return [file for file, good in zip(files, done, strict=True) if not good]
+    environment = os.environ | {"TWIN_COVERAGE_OUT": str(folder.resolve()), "PYTHONPATH": str(root)}
+    words = ["-q", "-n", str(workers), "-m", "", "--tb=line", "-p", "tests.mutation.coverage_plugin", *files]
+    return subprocess.run([sys.executable, "-m", "pytest", *words], cwd=root, env=environment).returncode

@@ -1,7 +1,7 @@
-"""A plugin of pytest that notes which lines each test runs; loaded by tests.mutation.coverage_map alone.
+"""A plugin of pytest that notes which lines each test runs, also in processes that it starts.
 
-The environment says what is measured (TWIN_COVERED, with commas) and where it goes (TWIN_COVERAGE_FILE, with a .json of
-the tests' times beside it).
+The environment says where it goes (TWIN_COVERAGE_OUT): a ``.coverage`` file of each process, and a ``.json`` of the
+tests' times of each worker.
 """
 
 from __future__ import annotations
@@ -14,27 +14,50 @@ from pathlib import Path
 import coverage
 import pytest
 
-_PLACES = os.environ["TWIN_COVERED"].split(",")
-_FILE = Path(os.environ["TWIN_COVERAGE_FILE"])
-_MEASURED = coverage.Coverage(
-    data_file=str(_FILE),
-    include=[place if place.endswith(".py") else f"{place}/*" for place in _PLACES],
+PLACES = ("optics", "scenes", "analysis", "twin")
+_OUT = Path(os.environ["TWIN_COVERAGE_OUT"])
+_ROOT = Path(__file__).resolve().parents[2]
+_WORKER = os.environ.get("PYTEST_XDIST_WORKER", f"main{os.getpid()}")
+_INSIDE = """
+import atexit, os
+if os.environ.get("TWIN_TEST"):
+    import coverage
+    measured = coverage.Coverage(
+        data_file=f"{os.environ['TWIN_COVERAGE_OUT']}/process-{os.getpid()}-{os.urandom(4).hex()}.coverage",
+        include=os.environ["TWIN_COVERAGE_OF"].split(os.pathsep), context=os.environ["TWIN_TEST"], config_file=False)
+    measured.start()
+    atexit.register(lambda: (measured.stop(), measured.save()))
+"""
+_measured = coverage.Coverage(
+    data_file=str(_OUT / f"{_WORKER}.coverage"),
+    include=[f"{_ROOT / place}/*" for place in PLACES],
     config_file=False,
 )
 # Before the first import of what is measured: constants of modules count, too.
-_MEASURED.start()
+_measured.start()
 _seconds: dict[str, float] = {}
 _passed: dict[str, bool] = {}
+
+
+def pytest_configure() -> None:
+    """Make Python measure itself in every process that a test starts."""
+    inside = _OUT / "inside"
+    inside.mkdir(parents=True, exist_ok=True)
+    (inside / "sitecustomize.py").write_text(_INSIDE)
+    paths = [str(inside), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(path for path in paths if path))
+    os.environ["TWIN_COVERAGE_OF"] = os.pathsep.join(f"{_ROOT / place}/*" for place in PLACES)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """What a test and its fixtures run counts for the test."""
-    _MEASURED.switch_context(item.nodeid)
+    _measured.switch_context(item.nodeid)
+    os.environ["TWIN_TEST"] = item.nodeid
     try:
         return (yield)
     finally:
-        _MEASURED.switch_context("")
+        _measured.switch_context("")
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
@@ -45,7 +68,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 def pytest_unconfigure() -> None:
     """Write what was seen."""
-    _MEASURED.stop()
-    _MEASURED.save()
+    _measured.stop()
+    _measured.save()
     times = {name: seconds for name, seconds in _seconds.items() if _passed[name]}
-    _FILE.with_suffix(".json").write_text(json.dumps(times))
+    (_OUT / f"{_WORKER}.json").write_text(json.dumps(times))

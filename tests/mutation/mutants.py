@@ -1,8 +1,8 @@
 """Small faults in the source: where one can be put, and the source with it in.
 
-One mutant is one expression replaced by another that a slip of the pen could have written: a sign, a factor, a term
-left out, a sine for a cosine, a check that is not made. What cannot change a number or a decision is left alone:
-annotations, decorators, docstrings, messages of errors, assertions, ``strict=`` of zip, -1 of reshape (any
+One mutant is one expression or statement replaced by another. Slips of the pen are a sign, a factor, a term left out,
+a sine for a cosine; faults of meaning stand in ``semantic_faults``. What cannot change a number or a decision is left
+alone: annotations, decorators, docstrings, messages of errors, assertions, ``strict=`` of zip, -1 of reshape (any
 negative number says the same), and floats below 1e-6 or above 1e6, which are tolerances and guards.
 """
 
@@ -11,9 +11,14 @@ from __future__ import annotations
 import ast
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from tests.mutation.semantic_faults import FAULTS, Context, faults_at, name_of
+
+SLIP = "slip"
+"""Kind of every fault that is a slip of the pen and none of meaning."""
+KINDS = (*FAULTS, SLIP)
 _SWAPPED: dict[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub,
     ast.Sub: ast.Add,
@@ -74,6 +79,7 @@ class Mutant:
         before: its text, white space folded.
         after: what stands there instead.
         number: which of the same replacements in the same scope, counted from 0.
+        kind: one of `KINDS`.
     """
 
     path: str
@@ -83,6 +89,7 @@ class Mutant:
     before: str
     after: str
     number: int
+    kind: str = SLIP
 
     @property
     def key(self) -> str:
@@ -102,17 +109,22 @@ def mutants_of(path: str, source: bytes) -> list[Mutant]:
     starts = [0]
     for line in lines:
         starts.append(starts[-1] + len(line))
-    found: list[Mutant] = []
+    found: dict[tuple[int, int, str], Mutant] = {}
     counts: dict[tuple[str, str, str], int] = {}
-    for scope, node, replacement in _places(ast.parse(source), ""):
+    for scope, node, replacement, kind in _places(ast.parse(source), "", Context()):
         start = starts[node.lineno - 1] + node.col_offset
         end = starts[(node.end_lineno or node.lineno) - 1] + (node.end_col_offset or 0)
+        at = (start, end, replacement)
+        if at in found:
+            if kind != SLIP:
+                found[at] = replace(found[at], kind=kind)
+            continue
         before = " ".join(source[start:end].decode().split())
         same = (scope, before, replacement)
         counts[same] = counts.get(same, -1) + 1
         lineno = (node.lineno, node.end_lineno or node.lineno)
-        found.append(Mutant(path, scope, lineno, (start, end), before, replacement, counts[same]))
-    return found
+        found[at] = Mutant(path, scope, lineno, (start, end), before, replacement, counts[same], kind)
+    return list(found.values())
 
 
 def mutants_below(root: Path, places: tuple[str, ...]) -> list[Mutant]:
@@ -123,36 +135,62 @@ def mutants_below(root: Path, places: tuple[str, ...]) -> list[Mutant]:
     return [one for file in sorted(files) for one in mutants_of(file.relative_to(root).as_posix(), file.read_bytes())]
 
 
-Place = tuple[str, "ast.expr | ast.AugAssign", str]
+Place = tuple[str, "ast.expr | ast.stmt", str, str]
 
 
-def _places(node: ast.AST, scope: str) -> Iterator[Place]:
-    """What can be replaced below a node, with its scope and the text to put there."""
+def _places(node: ast.AST, scope: str, where: Context) -> Iterator[Place]:
+    """What can be replaced below a node, with its scope, the text to put there and the kind of fault."""
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         inside = f"{scope}.{node.name}".lstrip(".")
         if isinstance(node, ast.ClassDef):
             parts: list[ast.AST] = list(node.body)
+            within = Context()
         else:
             parts = [*node.args.defaults, *(one for one in node.args.kw_defaults if one is not None), *node.body]
+            within = Context(node.name)
         for part in parts:
-            yield from _places(part, inside)
+            yield from _places(part, inside, within)
         return
     if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr | ast.Import | ast.ImportFrom):
         return
     if isinstance(node, ast.keyword) and node.arg == "strict":
         return
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "reshape":
-        node = ast.Call(node.func, [one for one in node.args if ast.unparse(one) != "-1"], node.keywords)
-    if isinstance(node, ast.AnnAssign):
-        if node.value is not None:
-            yield from _places(node.value, scope)
+        node = ast.copy_location(
+            ast.Call(node.func, [one for one in node.args if ast.unparse(one) != "-1"], node.keywords), node
+        )
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return
     if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
         return
     for replaced in _replacements(node):
+        yield (scope, *replaced, SLIP)
+    for replaced in faults_at(node, where):
         yield (scope, *replaced)
-    for child in ast.iter_child_nodes(node):
-        yield from _places(child, scope)
+    for child, target in _children(node, where):
+        yield from _places(child, scope, Context(where.function, target))
+
+
+def _children(node: ast.AST, where: Context) -> Iterator[tuple[ast.AST, str]]:
+    """The nodes below one, each with the name that its value is given to, "" for none."""
+    match node:
+        case ast.AnnAssign():
+            if node.value is not None:
+                yield node.value, name_of(node.target)
+        case ast.Assign(targets=[target]):
+            yield node.value, name_of(target)
+        case ast.AugAssign():
+            yield node.value, ""
+        case ast.keyword():
+            yield node.value, node.arg or ""
+        case ast.Return(value=ast.expr() as value):
+            yield value, where.function
+        case ast.Dict():
+            for key, value in zip(node.keys, node.values, strict=True):
+                yield value, name_of(key) if key is not None else ""
+        case _:
+            for child in ast.iter_child_nodes(node):
+                yield child, ""
 
 
 def _replacements(node: ast.AST) -> Iterator[tuple[ast.expr | ast.AugAssign, str]]:

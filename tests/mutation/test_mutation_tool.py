@@ -1,18 +1,13 @@
 """The mutation tool itself, on a toy tree: what it puts in, what it finds, what it calls a survivor."""
 
 import ast
-import shutil
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from tests.mutation.__main__ import app, drawn, equivalents, summary, without
-from tests.mutation.campaign import read_verdicts, run_campaign
-from tests.mutation.coverage_map import CoverageMap, measure, read_map
-from tests.mutation.mutants import mutants_below, mutants_of
-
 SOURCE = b'''"""A toy."""
+import math
 LENGTH: float = 2.0
 
 def half(x: float, limit: float = 3.0) -> float:
@@ -22,11 +17,13 @@ def half(x: float, limit: float = 3.0) -> float:
 
 def unused(x):
     return -x
+
+def sigma(values):
+    return math.sqrt(sum(values))
 '''
 TESTS = """
 import pytest
-from typer.testing import CliRunner
-from toy import half
+from optics.toy import half, sigma
 
 def test_half():
     assert half(3.0) == 1.5
@@ -37,100 +34,137 @@ def test_two():
 def test_limit():
     with pytest.raises(ValueError):
         half(3.5)
+
+def test_sigma():
+    assert sigma([4.0, 5.0]) == 3.0
 """
+MEANT = {
+    "root lost": ("np.sqrt(a)", "(a)"),
+    "root added": ("f(sigma=g(a))", "((g(a)) ** 0.5)"),
+    "sigma x 0.8": ("f(sigma=g(a))", "(0.8 * (g(a)))"),
+    "sigma x 1.25": ("f(sigma_x=g(a))", "(1.25 * (g(a)))"),
+    "variance for sigma": ("sigma**2", "(sigma)"),
+    "freedom off by one": ("f(degrees_of_freedom=len(a))", "((len(a)) - 1)"),
+    "radians for degrees": ("np.degrees(a)", "(a)"),
+    "other unit": ("a / MICRO", "(1e-3)"),
+    "axis swapped": ("a[..., 0]", "1"),
+    "name swapped": ("a['forward']", "'backward'"),
+    "transposed": ("rotation @ a", "((rotation).swapaxes(-1, -2) @ (a))"),
+    "rotation reversed": ("about_axis(0, roll)", "(-(roll))"),
+    "index off by one": ("a[1:n]", "(n) - 1"),
+    "first for last": ("a[0]", "-1"),
+    "boundary": ("len(a) < 3", "(len(a) <= 3)"),
+    "seed reused": ("default_rng([seed, k])", "[seed]"),
+}
+STATEMENTS = {
+    "warning dropped": ("def warnings(a):\n    if a:\n        yield 'late'\n", "False"),
+    "refusal passed": ("if a:\n    raise ValueError\n", "False"),
+    "check skipped": ("def f(a):\n    os.fsync(a)\n", "pass"),
+    "key forgets": ("def digest(a, b):\n    return sha(a, b)\n", "sha(a)"),
+    "limit x 10": ("MOST_BYTES = 100\n", "1000"),
+}
 
 
-def test_each_mutant_changes_one_expression_and_still_parses():
+def test_each_fault_changes_one_place_still_parses_and_is_of_its_kind() -> None:
+    from tests.mutation.mutants import KINDS, SLIP, mutants_of
+
     found = mutants_of("toy.py", SOURCE)
     for one in found:
         assert ast.dump(ast.parse(one.applied(SOURCE))) != ast.dump(ast.parse(SOURCE))
     texts = {(one.before, one.after) for one in found}
-    assert ("x > limit", "False") in texts
-    assert ("x / LENGTH", "(x * LENGTH)") in texts
-    assert ("x / LENGTH - 0.0 * x", "(x / LENGTH)") in texts
+    assert {("x > limit", "False"), ("x / LENGTH", "(x * LENGTH)"), ("x / LENGTH - 0.0 * x", "(x / LENGTH)")} <= texts
     assert not any("x + 1" in before for before, _ in texts)
     assert not mutants_of("toy.py", b"def pairs(a, b):\n    return zip(a.reshape(-1), b, strict=True)\n")
-    assert [one.after for one in mutants_of("toy.py", b"def half(a):\n    return a.reshape(2, -1)\n")] == ["3"]
+    assert {*MEANT, *STATEMENTS, SLIP} == set(KINDS)
+    for kind, (text, after) in {**MEANT, **STATEMENTS}.items():
+        source = (text if kind in STATEMENTS else f"b = {text}\n").encode()
+        assert (kind, after) in {(one.kind, one.after) for one in mutants_of("toy.py", source)}, kind
 
 
-def test_what_runs_at_import_is_met_by_all_tests_of_the_file():
+def test_the_sample_goes_by_rooms_and_kinds_and_not_by_what_is_written_elsewhere() -> None:
+    from tests.mutation.__main__ import drawn
+    from tests.mutation.mutants import mutants_of
+
+    every = [one for name in ("optics/a/x.py", "optics/b/x.py") for one in mutants_of(name, SOURCE)]
+    chosen = drawn(every, 20, 1)
+    assert chosen == drawn(every[::-1], 20, 1)
+    assert chosen != drawn(every, 20, 2)
+    assert {one.path for one in chosen} == {"optics/a/x.py", "optics/b/x.py"}
+    assert len({one.kind for one in chosen}) > 4
+
+
+def test_a_fault_goes_into_functions_that_are_loaded_and_others_are_known() -> None:
+    from tests.mutation.fork_server import functions_changed
+
+    base = "A = 1\ndef f(x):\n    return [x + y for y in range(3)]\nclass C:\n    B = 2\n"
+    base += "    def g(self):\n        return 1\n"
+
+    def changed(after: str):
+        both = (compile(text, "toy", "exec") for text in (base, after))
+        return [one and one[0].co_qualname for one in functions_changed(*both)]
+
+    assert changed(base) == []
+    assert changed(base.replace("x + y", "x - y")) == ["f"]
+    assert changed(base.replace("return 1", "return 2")) == ["C.g"]
+    assert changed(base.replace("B = 2", "B = 3")) == [None]
+    assert changed(base.replace("A = 1", "A = 2")) == [None]
+
+
+def test_utterances_are_found_and_those_without_a_test_told() -> None:
+    from tests.mutation.coverage_map import CoverageMap
+    from tests.mutation.utterances import _of
+
+    (one,) = _of(ast.parse(SOURCE), "toy.py", "", (0, 0))
+    assert (one.line, one.scope, one.body) == (7, "half", (6, 8))
+    lines = {6: ["a", "b"], 7: ["a"], 8: ["b"]}
+    assert one.tests(CoverageMap({"toy.py": lines}, {})) == ({"a"}, {"b"})
+    assert one.tests(CoverageMap({"toy.py": {6: ["b"], 8: ["b"]}}, {})) == (set(), {"b"})
+
+
+def test_what_runs_at_import_is_met_by_all_tests_of_the_file() -> None:
     """Test b is the first of its file to import the module: it runs the constant's line and not the function's."""
+    from tests.mutation.coverage_map import CoverageMap
+
     known = CoverageMap({"toy.py": {2: ["", "b"], 7: ["a", "c"]}}, {"a": 2.0, "b": 1.0, "c": 0.5})
     assert known.covering("toy.py", (2, 2)) == ["c", "b", "a"]
     assert known.covering("toy.py", (7, 7)) == ["c", "a"]
-    rest, late = known.parts(["c"])
-    assert rest.covering("toy.py", (2, 2)) == ["b", "a"]
-    assert late.covering("toy.py", (2, 2)) == ["c"]
 
 
-def test_keys_differ_and_do_not_move_with_other_code():
-    before = mutants_of("toy.py", SOURCE)
-    after = mutants_of("toy.py", b'"""Longer."""\n\nOTHER = 1\n' + SOURCE)
-    assert len({one.key for one in before}) == len(before)
-    assert {one.key for one in before} < {one.key for one in after}
+def test_every_equivalent_mutant_gives_a_reason_and_every_planted_fault_is_in_the_source() -> None:
+    from tests.mutation.__main__ import equivalents, planted
+
+    assert all(len(reason) > 20 for reason in equivalents().values())
+    root = Path(__file__).resolve().parents[2]
+    for one in planted(root):
+        ast.parse(one.applied((root / one.path).read_bytes()))
 
 
-def test_a_sample_keeps_its_mutants_when_others_come():
-    few = mutants_of("toy.py", SOURCE)
-    more = mutants_of("toy.py", SOURCE + b"\n\ndef other(x):\n    return 2 * x + 1\n")
-    picked = {one.key for one in drawn(few, 5, seed=1)}
-    assert picked != {one.key for one in drawn(few, 5, seed=2)}
-    again = {one.key for one in drawn(more, 5, seed=1)}
-    assert again - picked <= {one.key for one in more} - {one.key for one in few}
+@pytest.mark.second
+def test_a_campaign_finds_what_tests_find(tmp_path, monkeypatch) -> None:
+    """From the command line on a toy tree: measured, tried, told; of a function without a test as uncovered."""
+    from tests.mutation import __main__ as command
 
-
-def test_a_place_that_is_not_there_is_told(tmp_path):
-    result = CliRunner().invoke(app, ["--out", str(tmp_path), "--only", "optics/lens.py"])
-    assert result.exit_code == 2
-    assert "optics/lens.py" in result.stderr
-    result = CliRunner().invoke(app, ["--out", str(tmp_path), "--without", f"@{tmp_path}/moved"])
-    assert result.exit_code == 2
-    assert f"{tmp_path}/moved" in result.stderr
-
-
-@pytest.mark.slow
-def test_a_campaign_tells_the_found_from_the_survivors(tmp_path: Path):
-    root = tmp_path / "tree"
-    shutil.copytree(
-        Path(__file__).parent, root / "tests/mutation", ignore=shutil.ignore_patterns("test_*", "__pycache__")
-    )
-    (root / "toy.py").write_bytes(SOURCE)
-    (root / "tests/test_toy.py").write_text(TESTS)
-    assert measure(root, [root / "tests/test_toy.py"], ("toy.py",), tmp_path / "coverage", 1) == []
-    known = read_map(tmp_path / "coverage", root)
-    wanted = {
-        ("x / LENGTH", "(x * LENGTH)"): "killed",
-        ("0.0 * x", "(0.0 / x)"): "survived",
-        ("-x", "(x)"): "uncovered",
-    }
-    chosen = [one for one in mutants_below(root, ("toy.py",)) if (one.before, one.after) in wanted]
-    # At the first failure, and the quickest of the two that fail after the other.
-    quickest = min(("half", "two"), key=lambda name: known.seconds[f"tests/test_toy.py::test_{name}"])
-    last = [f"tests/test_toy.py::test_{quickest}"]
-    run_campaign(root, chosen, known, tmp_path / "first.jsonl", 2, mode="first", last=last, say=False)
-    one_each = read_verdicts(tmp_path / "first.jsonl").values()
-    assert [len(one.killers) for one in one_each if one.fate == "killed"] == [1]
-    assert all(without(one, last) == one for one in one_each)
-    run_campaign(root, chosen, known, tmp_path / "results.jsonl", 2, say=False)
-    found = read_verdicts(tmp_path / "results.jsonl")
-    assert {(one.mutant.before, one.mutant.after): one.fate for one in found.values()} == wanted
-    assert (root / "toy.py").read_bytes() == SOURCE
-    nothing_known = summary(list(found.values()), {})
-    assert nothing_known["score"] == pytest.approx(1 / 3)
-    killed, survivor = (next(one for one in found.values() if one.fate == fate) for fate in ("killed", "survived"))
-    names = ["tests/test_toy.py::test_half", "tests/test_toy.py::test_two"]
-    assert sorted(killed.killers) == names
-    assert without(killed, names[:1]).killers == (names[1],)
-    assert without(killed, names[:1]).fate == "killed"
-    assert without(killed, ["tests/test_toy.py"]).fate == "survived"
-    assert without(survivor, names) == survivor
-    assert summary(list(found.values()), {survivor.mutant.key: "times nothing"})["score"] == pytest.approx(1 / 2)
-
-
-@pytest.mark.slow
-def test_every_equivalent_mutant_still_exists_and_has_a_reason():
-    root = Path(__file__).parents[2]
-    keys = {one.key for one in mutants_below(root, ("optics", "analysis", "twin"))}
-    known = equivalents()
-    assert known.keys() <= keys
-    assert all(len(reason) > 20 for reason in known.values())
+    for name in ("optics", "scenes", "analysis", "twin"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").touch()
+    (tmp_path / "optics/toy.py").write_bytes(SOURCE)
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests/test_toy.py").write_text(TESTS)
+    (tmp_path / "pyproject.toml").write_text("[tool.pytest.ini_options]\npythonpath = ['.']\n")
+    plugin = tmp_path / "tests/mutation"
+    plugin.mkdir()
+    for name in ("coverage_plugin.py", "__init__.py"):
+        source = Path(__file__).with_name(name)
+        (plugin / name).write_bytes(source.read_bytes() if source.exists() else b"")
+    (tmp_path / "tests/__init__.py").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(command, "planted", lambda root: [])
+    run = CliRunner().invoke
+    assert run(command.app, ["measure", "--map", "map"]).exit_code == 0
+    told = run(command.app, ["run", "--map", "map", "--out", "out", "--count", "24", "--workers", "1"])
+    survivors = [line for line in told.stdout.splitlines() if "->" in line]
+    assert any("unused" in line and "(uncovered)" in line for line in survivors), told.stdout
+    assert all("unused" in line or "0.0 *" in line or "(x)" in line or "3.0" in line for line in survivors), survivors
+    assert told.exit_code == 1
+    listed = run(command.app, ["utterances", "--map", "map"])
+    assert listed.exit_code == 0, listed.stdout
