@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -173,6 +174,21 @@ def test_an_impossible_state_says_why_and_the_next_good_one_is_good(bench, first
     assert after["readings"] == before["readings"]
 
 
+def test_little_light_and_full_pixels_are_told(bench, monkeypatch):
+    """Of each channel by itself, beside what is coarse of the instrument."""
+    monkeypatch.setattr("twin.live.live_bench.coarse_warnings", lambda resolved: ["coarse"])
+    detector = SimpleNamespace(saturated=lambda after: SimpleNamespace(pixels=np.array([0, 2, 0])))
+    channels = [SimpleNamespace(key=key) for key in "abc"]
+    experiment = SimpleNamespace(detector=detector, path=SimpleNamespace(channels=channels))
+    own = SimpleNamespace(twin=SimpleNamespace(experiment=experiment, resolved=None))
+    found = LiveBench._warnings(own, SimpleNamespace(after=None), np.array([1.0, 0.95, 0.05]))
+    assert found == [
+        "coarse",
+        "b: saturated pixels; its centroid is biased",
+        "c: only 5 % of its light reaches the CCD",
+    ]
+
+
 def test_bodies_in_each_other_are_told(bench, first):
     """The left 0-degree prism of the forward camera, moved through the central prism's room or another body."""
     placed = bench.twin.experiment.instrument.assembly.place([{}])
@@ -210,6 +226,10 @@ def test_what_is_hidden_is_not_told(bench, first):
     assert other["guess"]["spots"] != told["guess"]["spots"]
     shown = bench.hidden(asked)
     sigmas = [abs(one["sigmas"]) for one in shown["hidden"]]
+    parts = {part.name: part for part in bench.twin.experiment.stated.components}
+    for one in shown["hidden"]:
+        part = parts[one["what"]]
+        assert one["sigmas"] == pytest.approx(one["value"] * part.unit_size / part.sigma, rel=1e-12)
     assert sigmas == sorted(sigmas, reverse=True)
     assert shown["truth"]["cameras"]
 
@@ -273,6 +293,11 @@ def test_an_unknown_knob_names_the_nearest(bench):
     with pytest.raises(InputError, match="shift z"):
         perturbation({f"{M2} shft z": 1.0}, {}, bench.knobs, {})
     assert knob_name("base", "temperature", "") == "base temperature"
+    name = f"{M2} shift z"
+    limit = bench.knobs[name].limit
+    perturbation({name: limit}, {}, bench.knobs, {})
+    with pytest.raises(InputError, match="too large"):
+        perturbation({name: 1.001 * limit}, {}, bench.knobs, {})
 
 
 def test_the_greeting_and_every_answer_are_json(bench, first):
@@ -347,6 +372,11 @@ def test_other_values_of_a_factor_build_the_instrument_anew():
     opened = answers.to("factors", {"aperture": 25.0})
     assert not isinstance(opened, str)
     half, _ = answers.bench.state(asked)
+    known = (asked.noise, asked.frames, asked.seed)
+    for change, sent in (({}, False), ({"noise": False}, True), ({"frames": 3}, True), ({"seed": 99}, True)):
+        message = answers.to("state", (changed(asked, **change), known))
+        head = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
+        assert ("before" in head["images"]) == sent, change
     key = "d_alpha_arcsec_sigma_noise"
     camera = whole["readings"]["cameras"]["forward"]["model"]
     assert half["readings"]["cameras"]["forward"]["model"][key] > 1.5 * camera[key]

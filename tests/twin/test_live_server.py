@@ -134,6 +134,8 @@ def test_a_token_of_the_environment(monkeypatch):
     assert len(new_token(TOKEN)) >= 32
     monkeypatch.setenv(TOKEN, SECRET)
     assert new_token(TOKEN) == SECRET
+    monkeypatch.setenv(TOKEN, 22 * "x")
+    assert new_token(TOKEN) == 22 * "x"
     for bad in ("short", "x" * 21, "x" * 30 + ";", "x" * 30 + " ", "ü" * 30):
         monkeypatch.setenv(TOKEN, bad)
         with pytest.raises(BadToken):
@@ -354,6 +356,33 @@ def test_a_recording_is_bounded_and_has_no_hidden_states():
     client.take(json.dumps({"type": "record", "on": False}))
     client.kept(AskedState(n=6))
     assert len(client.recorded) == 5
+
+
+def test_the_computer_is_told_what_the_page_has():
+    """Images before are sent again where noise, frames or seed are others."""
+    computer = StandIn()
+    with serving(computer) as (port, _), connect(port) as ws:
+        ws.recv(5)
+        for n, more in enumerate(({}, {"seed": 5}, {"frames": 3}, {"noise": False}, {}), 1):
+            ws.send(state(n, **more))
+            assert numbered(ws.recv(5)) == n
+    asked, known = zip(*(question for _, question in computer.asked), strict=True)
+    assert known == (None, *((one.noise, one.frames, one.seed) for one in asked[:-1]))
+    assert len(set(known)) == 5
+
+
+def test_messages_and_what_waits_for_a_page_are_bounded():
+    for words, good, bad in (("frames", 64, 65), ("seed", 2**53 - 1, 2**53)):
+        assert read_message(state(1, **{words: good}))
+        with pytest.raises(BadMessage, match=words):
+            read_message(state(1, **{words: bad}))
+    assert read_message(state(1, knobs={str(k): 0.5 for k in range(400)}))
+    with pytest.raises(BadMessage, match="knobs"):
+        read_message(state(1, knobs={str(k): 0.5 for k in range(401)}))
+    client = Client()
+    for k in range(40):
+        client.tell({"k": k})
+    assert [json.loads(one)["k"] for one in client._letters] == list(range(8, 40))
 
 
 def test_what_is_hidden_is_chosen_here_and_stays_until_it_is_revealed():

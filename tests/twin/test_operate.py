@@ -93,6 +93,7 @@ def test_a_record_is_exported_with_units(tmp_path: Path) -> None:
     assert float(warm["temperature_K [K]"]) == pytest.approx(293.27, abs=1e-12)
     assert float(warm["temperature_K_sigma [K]"]) == 0.05
     assert float(rows["focus"][0]["defocus_um [um]"]) == pytest.approx(12.5, abs=1e-12)
+    assert float(rows["focus"][0]["defocus_um_sigma [um]"]) == pytest.approx(4.0, abs=1e-12)
     # GPS time is ahead of UTC by 18 s in 2026
     assert rows["attitude"][0]["time_utc"] == "2026-03-05T00:00:00Z"
     assert float(rows["attitude"][0]["angle_arcsec_sigma [arcsec]"]) == pytest.approx(2.0, abs=1e-12)
@@ -184,6 +185,7 @@ def test_results_that_are_none_are_refused(record: Path, tmp_path: Path) -> None
     apart, bare = "times and states that do not belong together", "a state without cameras or without a time"
     cases = [([], "no results"), ({"times_s": [0, 1], "series": [{"cameras": {}}]}, apart), ({"series": {}}, bare)]
     cases += [({"series": [{}]}, bare), ({"times_s": ["x"], "series": [{"cameras": {}}]}, bare)]
+    cases += [({"cameras": {"forward": 4_000_001 * "x"}}, "too large")]
     cases += [({"series": 3}, apart), ({"cameras": {"forward": float("nan")}}, "")]
     for k, (data, words) in enumerate(cases):
         folder = rewritten(run_folder(tmp_path / f"run{k}", frame=bytes([k])), data)

@@ -44,6 +44,7 @@ def off(operation: Operation, life, k: int) -> float:
     return float(np.abs((now.values[0] - operation.model.rows @ life.changes[k]) / now.sigmas[0]).max())
 
 
+@pytest.mark.second
 def test_a_bad_reading_is_named_left_out_and_forgotten(known, tmp_path, monkeypatch) -> None:
     """With it, one reading later and at the end; the past is that of a record without it. What is kept in between does
     not matter, to the bit.

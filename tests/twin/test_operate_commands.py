@@ -120,6 +120,7 @@ def test_status_tells_how_the_instrument_stands(record: Path, life: Path) -> Non
     assert "2 alarms are open" in text
     told = said("status", record)
     assert told["open_alarms"] == 2
+    assert {one["degrees_of_freedom"] for one in told["estimate"]["innovations"]} == {8}
     (size, *_) = told["estimate"]["jumps"][0]["sizes"]
     # 120 micrometres, and a jump is found with its size within 4 of its sigmas
     assert abs(size["size"] - 120.0) < 4.0 * size["sigma"]

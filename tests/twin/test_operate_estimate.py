@@ -9,7 +9,6 @@ import pytest
 from scipy.stats import binom, chi2
 
 from scenes.yaml.errors import Problem
-from tests.tiers import quick
 from tests.twin.operation_records import (
     DAY,
     START,
@@ -74,6 +73,7 @@ def test_the_instrument_is_as_warm_as_the_records_say(known) -> None:
     assert known[1].resolved.instrument.temperature == 293.15
 
 
+@pytest.mark.second
 def test_drawn_lives_are_covered(known, tmp_path) -> None:
     """Eight lives of 40 readings without a slip: the intersection angle, principal distances and turns, now, smoothed
     and 30 days ahead, counted within one and two sigma; lives are independent, times within one are not, so that the
@@ -138,7 +138,8 @@ def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> N
     assert estimate.again().follow().to_dict() == result
 
 
-@pytest.mark.parametrize(("slips", "apart", "wider"), quick(1, [(False, 0.2, 0.2), (True, 0.3, 2.0)]))
+@pytest.mark.second
+@pytest.mark.parametrize(("slips", "apart", "wider"), [(False, 0.2, 0.2), (True, 0.3, 2.0)])
 def test_a_part_of_the_past_is_that_of_the_whole(
     known, tmp_path, monkeypatch, slips: bool, apart: float, wider: float
 ) -> None:
@@ -185,8 +186,11 @@ def test_times_of_a_pass_go_together(known, tmp_path) -> None:
     assert cameras.names[:4] == tuple(f"forward {key}" for key in KEYS)
     ahead = posterior(estimate, times[4:], ["forward d_f_um"])
     assert ahead.mean[0, 0] == pytest.approx(estimate.forecast(times[4:]).values[0, 3], rel=1e-9)
-    with pytest.raises(Problem, match="out of order"):
-        posterior(estimate, times[::-1])
+    said = found.to_dict()
+    assert (said["mean"], said["covariance"]) == (found.mean.tolist(), found.covariance.tolist())
+    for wrong in (times[::-1], [first, first]):
+        with pytest.raises(Problem, match="out of order"):
+            posterior(estimate, wrong)
     with pytest.raises(Problem, match="no such quantity"):
         posterior(estimate, times, ["forward d_g_um"])
     with pytest.raises(Problem, match="before all readings"):
@@ -218,6 +222,10 @@ def test_what_a_slip_does_to_the_line_is_said_with_its_sigma(known, tmp_path) ->
     for name, true in zip(names, step.tolist(), strict=True):
         _, changed, sigma = jump.carried[name]
         assert abs(changed - true) < 5.0 * sigma + 1e-9, name
+    (one, *_) = jump.to_dict()["carried"]
+    assert one["sigma"] == jump.carried[one["quantity"]][2]
+    assert (one["share"], one["share_sigma"]) == (one["changed"] / one["read"], one["sigma"] / abs(one["read"]))
+    assert [each["sigma"] for each in jump.to_dict()["sizes"]] == [sigma for *_, sigma in jump.sizes]
     # three mirrors can have moved the spots so, and they do not turn the line alike
     read, _, sigma = jump.carried["forward d_alpha_arcsec"]
     true = float(step[names.index("forward d_alpha_arcsec")])

@@ -6,6 +6,7 @@ import html
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from tests.twin.operate_bench import COUNT, DAY, EVIL, HOUR, StandIn, filled, li
 from tests.twin.policed_page import breaches
 from tests.twin.record_bench import START, given
 from twin.operate.__main__ import app
-from twin.operate.daily_report import daily_report, end_of_day, report_html, state_table
+from twin.operate.daily_report import _warnings, daily_report, end_of_day, report_html, state_table
 from twin.operate.estimate.alarms import percent
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.plans import kept_plan
@@ -88,6 +89,25 @@ def test_the_page_needs_nothing_else_and_runs_nothing_that_a_text_brings(page):
     assert EVIL not in page
     assert "&lt;img src=x" in page
     assert not re.search(r'(src|href)="(?!#|data:)', page)
+
+
+def test_what_a_reader_has_to_know_is_told_and_nothing_else() -> None:
+    """A reading more than a day old, alarms that wait, sensors that fail; beside what the estimate warns of."""
+
+    def said(age: int, alarms: int, states: str) -> tuple[str, ...]:
+        sensors = [SimpleNamespace(body=f"body{k}", state=state) for k, state in enumerate(states.split())]
+        following = SimpleNamespace(warnings=["doubt"], sensors=sensors)
+        waiting = [{"text": f"alarm {k}"} for k in range(alarms)]
+        return _warnings(SimpleNamespace(following=following, time=0, open_alarms=lambda: waiting), age)
+
+    assert said(DAY, 0, "ok") == ("doubt",)
+    assert said(2 * DAY, 1, "ok stuck dead") == (
+        "doubt",
+        "the newest reading is 2 d older than the end of the day",
+        "one alarm waits for an acknowledgement; the newest: alarm 0",
+        "sensors that are not in order: body1 (stuck), body2 (dead)",
+    )
+    assert said(0, 3, "")[1] == "3 alarms wait for an acknowledgement; the newest: alarm 0"
 
 
 @pytest.mark.parametrize(("within", "count"), [(0, 10), (10, 10), (800, 1272), (1, 3)])
@@ -189,6 +209,7 @@ def run(*words: object):
     return invoke(app, "report", *words)
 
 
+@pytest.mark.second
 def test_the_command_writes_the_report_of_the_newest_day(life, tmp_path):
     record, _ = life
     told = run(record, "--out", tmp_path / "r.html", "--json")

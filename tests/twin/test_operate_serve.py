@@ -271,7 +271,7 @@ def test_the_state_is_that_of_the_estimate(port):
     first = told["quantities"][0]
     assert (first["name"], first["unit"]) == ("Δα of forward", "arcsec")
     assert first["value"] == pytest.approx(0.05 * (19.875 + 0.4))
-    assert first["required"]["limit"] == 0.4
+    assert (first["sigma"], first["required"]["limit"]) == (pytest.approx(0.05), 0.4)
     assert told["quantities"][8]["required"]["breaks"].startswith("2026-01-29")
     assert [one["id"] for one in told["alarms"]] == [1, 2]
     assert told["alarms"][0]["text"].endswith(EVIL)
@@ -290,6 +290,7 @@ def test_a_trend_is_cut_where_record_and_forecast_end(port):
     assert (past["times"][0], past["times"][-1], future["times"][0]) == (START, NEWEST, NEWEST)
     assert len(past["values"]) == len(told["points"]["values"]) == 12
     assert len(past["values"][0]) == len(past["times"])
+    assert set(told["points"]["sigmas"][0]) == {0.3}
     assert told["points"]["values"][11][0] is None  # of the ground a single reading says nothing
     late = data(port, f"/trend?from={NEWEST + DAY}&to={NEWEST + 2 * DAY}")
     assert late["past"]["times"][-1] == NEWEST
@@ -315,7 +316,7 @@ def test_a_reading_has_its_spots_and_its_neighbours(port):
 def test_motions_are_the_mean_of_the_estimate(port):
     told = data(port, f"/motions?time={NEWEST}")
     ratios = [abs(one["mean"]) / one["sigma"] for one in told["largest"]]
-    assert ratios == sorted(ratios, reverse=True)
+    assert (ratios, len(ratios)) == (sorted(ratios, reverse=True), 12)
     assert told["largest"][0]["mean"] / told["largest"][0]["sigma"] == pytest.approx(1.9875 / np.sqrt(0.3))
     moved = told["moved"]["base/forward"]
     assert moved["sure"]

@@ -264,6 +264,7 @@ def test_the_files_of_a_life_are_made_again_and_verified(made: tuple[Path, Path,
 # --- what is made of it ----------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_life_is_followed_and_held_against_its_truth(made: tuple[Path, Path, Mapping], tmp_path: Path) -> None:
     record, truth, _ = made
     done = run("judge", record, "--truth", truth, "--out", tmp_path / "judged", "--json")

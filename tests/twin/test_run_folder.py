@@ -445,7 +445,8 @@ def test_a_run_that_has_changed_places_with_the_old_one(tmp_path):
     """Killed just after that: what stands under the new one's hidden name is the old one, with what was put there."""
     target = a_run(tmp_path / "run")
     act = "from twin.run import run_folder as r; (folder.target / 'late.txt').write_text('mine'); "
-    act += "r.write_manifest(folder, 'twin.test', 1.0, 1.0); r.put_in_place.__globals__['exchange']("
+    act += "r.write_manifest(folder, 'twin.test', 1.0, 1.0); "
+    act += "os.rename(folder.path / r._WAITING, folder.path / r.MANIFEST); r.put_in_place.__globals__['exchange']("
     kill_a_run(target, act + "folder.path, folder.target)")
     assert everything(target) == {"half.txt", MANIFEST}
     a_run(tmp_path / "other")

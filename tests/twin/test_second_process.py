@@ -173,7 +173,7 @@ def test_nothing_is_left_behind() -> None:
             interrupted()
     assert open_files() == before
     assert not children()
-    with SecondProcess(nothing) as beside, pytest.raises(ValueError, match="more than 256"):
+    with SecondProcess(nothing) as beside, pytest.raises(ValueError, match="more than 256 tasks"):
         beside.start({str(k): nothing for k in range(MOST_TASKS + 1)})
 
 
