@@ -602,12 +602,18 @@ def test_a_reading_against_other_reference_images(record: Path, tmp_path: Path) 
     assert taken("earlier", 1, 47.5014, "--late")[0] == 2
     told = status(record)
     assert (told["entries"], told["open"]) == (2, 2)
-    numbers = [{**content_of(entry)["numbers"], "spots": spots(place)} for place in (40.0, 41.0)]
-    own = [Entry("monitor", "monitor", START + k * MINUTE, {"numbers": n}) for k, n in enumerate(numbers)]
+    base = content_of(entry)["numbers"]
+    own = [Entry("monitor", "monitor", START + k * MINUTE, {"numbers": {**base, "spots": spots(40.0)}}) for k in (0, 1)]
+    for k, axis in enumerate(("row", "column"), 1):  # one coordinate of two, by 1.4 sigma
+        moved = json.loads(json.dumps(spots(40.0)))
+        for spot in moved["forward"].values():
+            spot["before"][axis] += 0.0014
+        own.append(Entry("monitor", "monitor", START + (k + 1) * MINUTE, {"numbers": {**base, "spots": moved}}))
     shutil.rmtree(record)
     with made(record) as history:
         done = history.take(given("series", own))
-        assert (done.new, len(done.refused)) == (1, 1)
+    assert done.new == 2
+    assert ["are 0.99 sigma from these" in reason for _, reason in done.refused] == [True, True]
 
 
 def test_a_run_that_was_changed_is_refused(record: Path, tmp_path: Path) -> None:

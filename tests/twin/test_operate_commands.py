@@ -126,17 +126,6 @@ def test_status_tells_how_the_instrument_stands(record: Path, life: Path) -> Non
     assert abs(size["size"] - 120.0) < 4.0 * size["sigma"]
 
 
-def test_the_digits_are_those_that_sigma_deserves(record: Path, life: Path) -> None:
-    """Two of sigma, and the value to the same place."""
-    rows = [line for line in run("status", record, life / "plan.yaml").stdout.splitlines() if " ± " in line]
-    table = [line.split(" ± ") for line in rows if not line.startswith(("jump", "alarm"))]
-    assert len(table) == 12
-    for left, right in table:
-        value, sigma = left.split()[-1], right.split()[0]
-        assert len(sigma.replace(".", "").lstrip("0")) == 2
-        assert len(value.partition(".")[2]) == len(sigma.partition(".")[2])
-
-
 # --- forecast --------------------------------------------------------------------------------------------
 
 

@@ -22,6 +22,7 @@ from tests.twin.operation_records import (
 )
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate import operation as operation_module
+from twin.operate.estimate.following import widening
 from twin.operate.estimate.operation import Operation, beyond
 from twin.operate.estimate.standing import Scores, Sensor, Standing
 from twin.operate.posterior import posterior
@@ -380,3 +381,21 @@ def test_what_temperatures_explain_is_a_share_of_the_variance() -> None:
     found = Standing(None, 0, Scores(9), spread=spread).explained
     assert found == pytest.approx(1.0 - np.var(rest, axis=0) / np.var(whole, axis=0), rel=1e-9)
     assert np.all(np.isnan(Standing(None, 0, Scores(1), spread=spread).explained))
+
+
+def test_sigma_is_as_wide_as_the_last_readings_ask_for() -> None:
+    """The root of chi-square over its degrees of freedom, over 1, 3 or 10 readings, where chance does not explain it
+    once in 3000 times; from a reading on what lasts.
+    """
+    calm = np.tile([8.0, 8.0], (12, 1))
+    for share, wide in ((0.999, False), (1.001, True)):
+        square = share * chi2.isf(1e-3 / 3, 8)
+        found = widening(np.concatenate([calm, [[square, 8.0]]]), [12, 13], False)
+        assert found == pytest.approx([1.0, np.sqrt(square / 8.0) if wide else 1.0])
+    three = np.concatenate([calm, np.tile([20.0, 8.0], (3, 1)), calm])
+    assert widening(three, [14, 15, 16], False) == pytest.approx([1.0, np.sqrt(60.0 / 24.0), 1.0])
+    assert widening(three, [13, 14, 15], True) == pytest.approx([1.0, np.sqrt(60.0 / 24.0), 1.0])
+    lasting = [(3, np.array([[80.0, 8.0]]))]
+    assert widening(calm, [2, 3, 12], False, lasting) == pytest.approx([1.0, np.sqrt(10.0), np.sqrt(10.0)])
+    assert widening(np.zeros((2, 2)), [2], False).tolist() == [1.0]
+    assert beyond(np.array([0.0, 3.0]), np.array([1.0, 0.0]), 1.959964) == pytest.approx([0.05, 1.0], abs=1e-6)
