@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -103,34 +101,6 @@ def test_dragging_the_despace_moves_the_spots_as_twin_render_does(page, backend,
     distance = np.linalg.norm(np.subtract(moved, at_rest))
     # the factor is shown with two digits; the view is in single precision
     assert distance == pytest.approx(1e-6 * value * factor, rel=0.06)
-
-
-@pytest.mark.parametrize(("typed", "value"), [("3,5", 3.5), ("3.5", 3.5), ("\N{MINUS SIGN}0,25", -0.25), ("1e-1", 0.1)])
-def test_a_typed_number_has_a_point_or_a_comma(page, typed, value):
-    field = page.number(DESPACE)
-    field.press("Control+a")
-    field.type(typed)
-    field.press("Enter")
-    page.still()
-    assert page.page.evaluate(f"liveTwin.knobs.knobs['{DESPACE}']") == value
-    field.press("ArrowUp")
-    step = page.page.evaluate(f"liveTwin.knobs.rows.get('{DESPACE}')[0].step")
-    assert page.page.evaluate(f"liveTwin.knobs.knobs['{DESPACE}']") == pytest.approx(value + step)
-
-
-def test_an_impossible_state_is_shown_and_the_next_good_one_recovers(page):
-    page.number(DESPACE).fill("1")
-    page.still()
-    good = page.page.evaluate("liveTwin.last.readings")
-    page.unfold("base/backward", "base/backward/focal_plane")
-    page.number("base/backward/focal_plane shift x").fill("5000")
-    page.still()
-    assert page.page.is_visible("#problem")
-    assert "outside its area CCD" in page.page.text_content("#problem")
-    page.number("base/backward/focal_plane shift x").fill("0")
-    page.still()
-    assert not page.page.is_visible("#problem")
-    assert page.page.evaluate("liveTwin.last.readings") == good
 
 
 def test_blind(page):
@@ -237,23 +207,3 @@ def test_the_page_comes_back_after_a_restart(browser):
         assert page.page.evaluate(f"liveTwin.knobs.knobs['{DESPACE}']") == 2.0
         assert page.page.evaluate("liveTwin.last.readings") == before
     page.close()
-
-
-def test_the_computing_process_is_started_again(browser):
-    with running("gf7_pair", "--port", "0", "--stay") as command:
-        page = Page(browser, command.address)
-        page.ready()
-        page.unfold("base/forward", M2)
-        computer = command.computer()
-        os.kill(computer, signal.SIGSTOP)
-        said = "document.getElementById('problem')"
-        page.until(f"!{said}.hidden && {said}.textContent.includes('kill -CONT {computer}')", 2.0)
-        os.kill(computer, signal.SIGCONT)
-        page.until(f"{said}.hidden && document.getElementById('status').textContent === 'connected'", 2.0)
-        os.kill(computer, signal.SIGKILL)
-        page.until(f"!{said}.hidden && {said}.textContent.includes('SIGKILL')", 2.0)
-        page.number(DESPACE).fill("2")
-        page.until(f"{said}.hidden", 60.0)
-        page.until("liveTwin.last.truth && Math.abs(liveTwin.last.truth.cameras.forward.d_f_um) > 1", 40.0)
-        page.close()
-        assert command.end() == 0

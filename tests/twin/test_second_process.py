@@ -122,14 +122,6 @@ def test_a_process_that_dies_loses_nothing() -> None:
     assert found == {str(k): 5 for k in range(6)}
 
 
-def test_a_process_that_cannot_prepare_loses_nothing() -> None:
-    with SecondProcess(refuse) as beside:
-        time.sleep(0.3)
-        beside.start({"a": partial(square, 3), "b": partial(large, 2)})
-        found = beside.results()
-    assert found["a"] == (9, os.getpid())
-
-
 def test_a_process_that_hangs_is_ended(monkeypatch) -> None:
     monkeypatch.setattr(module, "PATIENCE", 0.3)
     own = os.getpid()

@@ -112,16 +112,6 @@ def test_a_record_that_is_not_there_waits_for_no_database(command: str, tmp_path
     assert not set(new) & HEAVY
 
 
-def test_an_unknown_check_waits_for_no_check() -> None:
-    words = ["--only", "001.eq2,004.equation"]
-    found = loaded(REFUSED, json.dumps([("check", "twin.validate", words)]))
-    code, told, new = found["check"]
-    assert (code, set(new) & HEAVY) == (2, set())
-    assert "no check '004.equation'" in told
-    # nor is YAML read
-    assert not {"ruamel", "twin.validation.checks.group"} & {*packages(found["modules"]), *found["modules"]}
-
-
 def test_import_twin_imports_nothing() -> None:
     found = loaded("import twin")["modules"]
     assert packages(found) & (HEAVY | {"numpy", "pydantic", "rich", "ruamel", "typer"}) == set()
