@@ -200,6 +200,18 @@ def test_cookies_of_other_programs_do_not_hide_ours():
             assert ask(port, "/session", cookie=None, **headers)[0] == 200
 
 
+def test_servers_on_one_host_and_a_restart_know_their_own_cookie():
+    """A browser keeps the cookies of a host, whatever the port; with the same token it is known after a restart."""
+    tokens = ["the-token-of-the-first-server", "the-token-of-the-second-one"]
+    with ExitStack() as stack:
+        ports = [stack.enter_context(serving(StandIn(), secret=token))[0] for token in tokens]
+        jar = "; ".join(f"{COOKIE.format(port=port)}={token}" for port, token in zip(ports, tokens, strict=True))
+        assert [ask(port, "/session", None, Cookie=jar)[0] for port in ports] == [200, 200]
+    for token, status in ((tokens[0], 200), ("another-token-of-enough-letters", 403)):
+        with serving(StandIn(), port=ports[0], secret=token):
+            assert ask(ports[0], "/session", None, Cookie=jar)[0] == status
+
+
 def test_every_name_of_this_machine_and_no_other():
     """With ``--host 0.0.0.0``; a request for one of its numbers says so in its Host, and came in at it."""
     with serving(StandIn(), host="0.0.0.0") as (port, _):

@@ -112,6 +112,22 @@ def test_a_record_that_is_not_there_waits_for_no_database(command: str, tmp_path
     assert not set(new) & HEAVY
 
 
+@pytest.mark.second
+def test_a_bad_file_waits_for_nothing_that_computes(tmp_path: Path) -> None:
+    """Whatever program reads it, all in one process."""
+    (tmp_path / "bad.yaml").write_text("seed: 1\nno_such_key: [2 arcsec, 3 um, 20 degC]\n", "utf-8")
+    commands = ("render", "live", "recover", "camera", "uncertainty", "study", "design", "lab focus", "orbit angle")
+    runs = []
+    for program, *sub in map(str.split, commands):
+        module = f"twin.{program}" + ("" if (ROOT / f"twin/{program}.py").exists() else ".__main__")
+        runs.append((program, module, [*sub, str(tmp_path / "bad.yaml")]))
+    found = loaded(REFUSED, json.dumps(runs))
+    for program, _, _ in runs:
+        code, told, new = found[program]
+        assert (code, set(new) & HEAVY) == (2, set()), (program, told)
+        assert "bad.yaml:" in told
+
+
 def test_import_twin_imports_nothing() -> None:
     found = loaded("import twin")["modules"]
     assert packages(found) & (HEAVY | {"numpy", "pydantic", "rich", "ruamel", "typer"}) == set()
