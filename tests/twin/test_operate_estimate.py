@@ -186,7 +186,9 @@ def test_times_of_a_pass_go_together(known, tmp_path) -> None:
     cameras = posterior(estimate, times[3:])
     assert cameras.names[:4] == tuple(f"forward {key}" for key in KEYS)
     ahead = posterior(estimate, times[4:], ["forward d_f_um"])
-    assert ahead.mean[0, 0] == pytest.approx(estimate.forecast(times[4:]).values[0, 3], rel=1e-9)
+    forecast = estimate.forecast(times[4:])
+    assert ahead.mean[0, 0] == pytest.approx(forecast.values[0, 3], rel=1e-9)
+    assert np.sqrt(ahead.covariance[0, 0, 0, 0]) == pytest.approx(forecast.sigmas[0, 3], rel=1e-6)
     said = found.to_dict()
     assert (said["mean"], said["covariance"]) == (found.mean.tolist(), found.covariance.tolist())
     for wrong in (times[::-1], [first, first]):
