@@ -68,6 +68,7 @@ def test_an_error_in_the_child_is_passed_on() -> None:
         doctor.run_probe(["-m", "twin.run.probe", "render", "no_such_variant"])
 
 
+@pytest.mark.second
 def test_the_variant_is_the_one_asked_for() -> None:
     assert doctor.run_probe(["-m", "twin.run.probe", "render", "llvm_ad_rgb"])["variant"] == "llvm_ad_rgb"
 

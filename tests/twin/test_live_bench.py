@@ -65,6 +65,7 @@ def test_a_saved_job_repeats_what_was_shown(bench, first, backend, tmp_path):
     assert np.array_equal(after, run.after[:, 0])
 
 
+@pytest.mark.second
 def test_a_job_that_is_saved_blind_says_that_it_is_the_guess(bench, first):
     asked = changed(first, {f"{M2} shift z": 3.0})
     plain = job_text(bench, asked)
@@ -117,6 +118,7 @@ def test_a_course_refuses_what_it_cannot_hold(bench, first):
         course_text(bench, turned)
 
 
+@pytest.mark.second
 def test_a_long_recording_is_thinned_to_what_a_course_may_have(bench, first):
     steps = [(0.01 * k, changed(first, {f"{M2} shift z": 0.001 * k})) for k in range(1500)]
     times = [line for line in course_text(bench, steps).splitlines() if line.strip().startswith("times:")]
@@ -312,7 +314,8 @@ def test_the_greeting_and_every_answer_are_json(bench, first):
     assert np.array_equal(pixels, image)
 
 
-@pytest.mark.parametrize("view", quick(1, ["wavefront", "spot", "mtf", "focus"]))
+@pytest.mark.second
+@pytest.mark.parametrize("view", ["wavefront", "spot", "mtf", "focus"])
 def test_pictures_of_a_camera(bench, view):
     pictures = CameraPictures(bench.twin.experiment)
     assert pictures.draw(view, "forward", 0.5, bench.twin.state, 1, 1).startswith("<svg")

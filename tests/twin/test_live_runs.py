@@ -142,6 +142,7 @@ def test_a_page_takes_so_many_frames_and_says_so(pair, tmp_path):
     assert read_source(str(written(tmp_path, JOB.replace("frames: 2", f"frames: {MOST_FRAMES}")))).notes == ()
 
 
+@pytest.mark.second
 def test_a_seed_of_63_bits_is_known_by_its_last_ones(pair, tmp_path):
     """A number in JSON holds 53; the saved job has all."""
     seed = 2**62 + 2**55 + 12345

@@ -85,6 +85,7 @@ def following(life: Path, tmp_path_factory: pytest.TempPathFactory) -> Following
 # --- without a plan, and with one ------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_without_a_plan_there_is_no_estimate(record: Path, life: Path) -> None:
     assert said("status", record)["estimate"] is None
     done = run("forecast", record)
@@ -129,6 +130,7 @@ def test_status_tells_how_the_instrument_stands(record: Path, life: Path) -> Non
 # --- forecast --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_forecast_begins_now_and_its_sigma_grows(record: Path, life: Path) -> None:
     run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
     told, now = said("forecast", record), said("status", record)["estimate"]["now"]
@@ -190,6 +192,7 @@ def test_an_estimate_that_fails_does_not_hide_what_was_taken(record: Path, life:
     assert "what was taken is in the record, and the estimate cannot be worked out: the record's plan" in said_so
 
 
+@pytest.mark.second
 def test_alarms_are_listed_and_acknowledged(record: Path, life: Path) -> None:
     run("status", record, life / "plan.yaml")
     assert "2 alarms are open, 2 in all" in run("alarms", record).stdout

@@ -240,6 +240,7 @@ def test_two_causes_about_two_points_are_one_motion(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.covariance, prior.table @ found.covariance @ prior.table.T, rtol=1e-9, atol=1e-24)
 
 
+@pytest.mark.second
 def test_the_prior_has_the_covariance_of_the_estimate(tmp_path: Path) -> None:
     """Of every spot and every parameter, though readings leave a hundredth of what single motions do to a spot."""
     found, stated = found_at(stand_in(drawn(6))), experiment().disturbances
@@ -404,6 +405,7 @@ def horizontal(sensor, away: np.ndarray, ground: np.ndarray) -> np.ndarray:
     return np.stack([np.sum(away * east, axis=-1), np.sum(away * north, axis=-1)], axis=-1)
 
 
+@pytest.mark.second
 def test_err_bias_is_the_scatter_of_points_of_drawn_cameras(one: Products) -> None:
     """Cameras drawn from the covariance see the ground beside where the estimated one does: their mean square is that
     of ERR_BIAS to the error of 200 draws, and the derivatives are those of the exact turn.
@@ -612,6 +614,7 @@ def test_the_files_of_a_record_are_its_estimate(followed: Followed, tmp_path: Pa
     assert np.abs(away / np.outer(unit, unit)).max() < 1e-6
 
 
+@pytest.mark.second
 def test_a_state_has_the_temperatures_that_do_what_was_found(tmp_path: Path) -> None:
     """Heat does twice what the thermal model says, and sensors tell the temperatures. The job of the state has those by
     which the thermal model does as much, so that its changes are the estimate's, and so has the prior.

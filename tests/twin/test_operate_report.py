@@ -49,6 +49,7 @@ def shown(page: str, words: str) -> bool:
     return words in re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page))
 
 
+@pytest.mark.second
 def test_the_first_sentence_is_the_state_and_the_second_what_changed(history, overview):
     made = daily_report(history, overview, end_of_day(None, overview.time))
     first, second = made.verdict.split(". ", 1)[0], made.verdict

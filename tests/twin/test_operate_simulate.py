@@ -365,6 +365,7 @@ def test_a_life_without_a_record_is_its_files_alone(tmp_path: Path) -> None:
     assert (taken["new"], taken["refused"]) == (17, 0)  # a reading, 14 temperatures, two events
 
 
+@pytest.mark.second
 def test_readings_that_could_not_be_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the terminal, in the numbers and in the manifest; a life without any reading is refused."""
     real, words = simulation_run.recorded, (*WORDS[:3], 1, *WORDS[4:8])
