@@ -202,6 +202,8 @@ def shifts_of(run: Path) -> tuple[np.ndarray, np.ndarray]:
 def test_what_a_job_cannot_say_is_told() -> None:
     prism = "base/forward/monitor/left/prism_180"
     glass = Component("a", prism, "index_gradient", 1, "origin", 1e-6)
+    with pytest.raises(ValueError, match="2 components"):
+        EstimatedMotions.in_units((glass, glass), np.array([2e-6]), np.eye(2))
     found = EstimatedMotions((glass,), np.array([2e-6]), np.eye(1))
     assert perturbation(found, experiment().thermal) == {}
     _, (left,) = state_file(found, experiment().thermal, "gf7_pair", "orbit", "")
