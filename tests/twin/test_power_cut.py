@@ -304,7 +304,8 @@ def check_study(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -
         assert len(store.done) >= begun, f"{len(store.done)} chunks after {steps}"
         assert not store.corrupt
     if len(stands) < 2 and again:
-        replacing.replace_study(target, "again", 1e-6, resume=place.exists() and (place / "study_state.json").exists())
+        begun = (place / "study_state.json").exists() and not (place / "manifest.json").exists()
+        replacing.replace_study(target, "again", 1e-6, resume=begun)
         assert replacing.standing(target) == "again"
 
 

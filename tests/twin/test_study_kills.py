@@ -19,8 +19,8 @@ from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 
 pytestmark = pytest.mark.second
-RUNS = 300
-"""With 12 blocks a killing has something to hit; a few seconds of work."""
+RUNS = 150
+"""With 6 blocks a killing has something to hit; a few seconds of work."""
 
 
 def run_to_end(*arguments: object) -> None:

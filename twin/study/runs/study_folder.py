@@ -205,7 +205,8 @@ class StudyFolder:
             self._check_replaced(waiting)
             if waiting.exists():
                 self._take_lock(waiting)
-                owned_files.remove_study(waiting)
+                # with what its manifest lists, if it was complete and only had to be put in place
+                owned_files.remove_files(waiting, {*(run_folder.unlisted(waiting) or ())})
             if there:
                 self.path = waiting
         if self.path == waiting and owned_files.is_study(self.target):
