@@ -69,12 +69,7 @@ def serving(computer: StandIn, stay: bool = True, host: str = "127.0.0.1", port:
 
 
 def ask(
-    port: int,
-    path: str = "/",
-    cookie: str | None = SECRET,
-    method: str = "GET",
-    to: str = "127.0.0.1",
-    **headers: str,
+    port: int, path: str = "/", cookie: str | None = SECRET, method: str = "GET", to: str = "127.0.0.1", **headers: str
 ) -> tuple[int, dict[str, str], bytes]:
     line = http.client.HTTPConnection(to, port, timeout=5)
     own = {"Host": f"127.0.0.1:{port}", **headers}

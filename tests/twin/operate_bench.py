@@ -149,7 +149,7 @@ class StandIn:
                 SensorState("base", "ok", START, newest, ""),
                 SensorState("base/forward/M1", "stuck", START + 18 * DAY, newest, stuck),
             ),
-            ((START + 3 * DAY, "monitor", "monitor", reason),),
+            tuple((START + day * DAY, "monitor", "monitor", reason) for day in (3, 4)),
             {"forward d_alpha_arcsec": 0.62, "forward d_beta_arcsec": float("nan")},
             1.5,
             False,

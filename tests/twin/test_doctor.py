@@ -11,6 +11,7 @@ from packaging.requirements import Requirement
 
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
+from twin.run import lock_file
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -68,6 +69,7 @@ def test_an_error_in_the_child_is_passed_on() -> None:
         doctor.run_probe(["-m", "twin.run.probe", "render", "no_such_variant"])
 
 
+@pytest.mark.second
 def test_the_variant_is_the_one_asked_for() -> None:
     assert doctor.run_probe(["-m", "twin.run.probe", "render", "llvm_ad_rgb"])["variant"] == "llvm_ad_rgb"
 
@@ -122,3 +124,49 @@ def test_drjit_imported_too_early_is_told() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment, timeout=60, check=False
     )
     assert result.returncode == 0 or "import optics first" in result.stderr
+
+
+def test_every_check_says_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the twin cannot run without has failed; what it can do without, or differs, is a note."""
+
+    def fail(*words: object) -> None:
+        raise RuntimeError("gone")
+
+    def no_library(name: str) -> None:
+        raise OSError(name)
+
+    assert (doctor._python().status, doctor._libatomic().status) == ("ok", "ok")
+    monkeypatch.setattr(doctor, "OLDEST_PYTHON", (99, 1))
+    assert (doctor._python().status, "needs 99.1 or newer" in doctor._python().detail) == ("failed", True)
+    monkeypatch.setattr("ctypes.CDLL", no_library)
+    assert (doctor._libatomic().status, doctor._llvm().status) == ("failed", "failed")
+    monkeypatch.setattr(doctor, "run_probe", fail)
+    assert (doctor._probe("kernel", [], str).status, doctor._gpu().status) == ("failed", "note")
+    for found, status in (({"available": False}, "note"), ({"version": "12", "compute_capability": "9.0"}, "ok")):
+        monkeypatch.setattr(doctor, "run_probe", lambda words, found=found: {"available": True, **found})
+        assert doctor._gpu().status == status
+
+
+@pytest.mark.parametrize(
+    ("missing", "other", "unknown", "status"),
+    [("", "", "", "ok"), ("", "", "c", "ok"), ("", "b 1, locked 2", "", "note"), ("a==1", "b 1", "", "failed")],
+)
+def test_packages_that_are_not_as_locked_are_told(missing, other, unknown, status, monkeypatch) -> None:
+    lists = [tuple(filter(None, [text])) for text in (missing, other, unknown)]
+    monkeypatch.setattr(lock_file, "FOLDER", Path("/"))
+    monkeypatch.setattr(lock_file, "differences", lambda own: lock_file.Differences(3, *lists))
+    (check,) = doctor._lock()
+    assert (check.name, check.status) == ("lock", status)
+    assert all(text in check.detail for text in (missing, other, unknown))
+    assert ("bash setup.sh" in check.detail) == (status != "ok")
+
+
+def test_lock_files_that_cannot_be_read_are_told(monkeypatch) -> None:
+    def fail(own: str) -> None:
+        raise lock_file.LockError("a.txt:3: not a hash")
+
+    monkeypatch.setattr(lock_file, "FOLDER", Path("/"))
+    monkeypatch.setattr(lock_file, "differences", fail)
+    assert [(one.status, one.detail) for one in doctor._lock()] == [("failed", "cannot be read: a.txt:3: not a hash")]
+    monkeypatch.setattr(lock_file, "FOLDER", Path("/nowhere"))
+    assert doctor._lock() == []

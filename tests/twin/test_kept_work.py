@@ -33,10 +33,7 @@ def test_a_folder_of_the_user_is_refused_and_stays(tmp_path: Path) -> None:
             kept.begin()
     assert own.read_text() == "my own data"
     (tmp_path / "x.samples").write_text("a file")
-    with (
-        KeptWork(tmp_path / "x", "x", "samples", False) as kept,
-        pytest.raises(RunFolderError, match="is in the way"),
-    ):
+    with KeptWork(tmp_path / "x", "x", "samples", False) as kept, pytest.raises(RunFolderError, match="is in the way"):
         kept.begin()
 
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import http.cookiejar
 import socket
 import time
-import urllib.error
-import urllib.request
 from contextlib import ExitStack, suppress
 
 import numpy as np
@@ -19,11 +16,32 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import Frame, Opcode
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
-from tests.twin.live_crowd import SOCKET, WRONG, crowded
-from tests.twin.live_page import CHROMIUM, FLAGS
 from twin.serving import guard
 from twin.serving.guard import COOKIE, MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS, Guard, names_of_this_machine
 
+WRONG = [
+    b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(256)),  # TLS
+    b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
+    b"\x00" * 3000,
+    b"GET / HTTP/9.9\r\nHost: x\r\n\r\n",
+    b"GET /\xff\xfe HTTP/1.1\r\nHost: x\r\n\r\n",
+    b"GET / HTTP/1.1\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: x\r\nCookie: \xff\xfe=\xfd; ;;=\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: x\r\n" + b"A: b\r\n" * 20_000,
+    b"GET / HTTP/1.1\r\nHost: x\r\nContent-Length: -5\r\n\r\n",
+    b"POST / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
+    b"GET / HTTP/1.1\r\nHost: x\r\n\r\nrubbish that comes while this is answered\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 50,
+    b"GET / HTTP/1.1\r\nHost: x\r\nConnection: upgrade\r\nUpgrade: h2c\r\n\r\n",
+    b"GET /live HTTP/1.1\r\nHost: x\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\r\n",
+    b"GET /live HTTP/1.1\r\nHost: x\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Key: \xe9\r\n\r\n",
+    b"A" * 70_000,
+]
+SOCKET = (
+    b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nOrigin: http://127.0.0.1\r\n"
+)
 PROMPT = 0.2
 """Seconds in which a user's page is answered."""
 
@@ -172,52 +190,6 @@ def test_text_that_is_not_utf_8_ends_the_page_without_a_traceback(pieces, capfd)
 
 
 # --- several servers, other names -------------------------------------------------------------------------------------
-def opened(browser: urllib.request.OpenerDirector, address: str) -> int:
-    """Status of a page."""
-    try:
-        with browser.open(address, timeout=5) as answer:
-            return answer.status
-    except urllib.error.HTTPError as error:
-        return error.code
-
-
-def a_browser() -> urllib.request.OpenerDirector:
-    """With a jar of cookies, which are a host's, whatever the port."""
-    jar = http.cookiejar.CookieJar()
-    return urllib.request.build_opener(urllib.request.ProxyHandler({}), urllib.request.HTTPCookieProcessor(jar))
-
-
-def test_two_servers_on_one_host_in_one_browser():
-    browser = a_browser()
-    tokens = ["the-token-of-the-first-server", "the-token-of-the-second-one"]
-    with ExitStack() as stack:
-        ports = [stack.enter_context(serving(StandIn(), secret=token))[0] for token in tokens]
-        for port, token in zip(ports, tokens, strict=True):
-            assert opened(browser, f"http://127.0.0.1:{port}/?token={token}") == 200
-        for _ in range(2):
-            for port in ports:
-                assert opened(browser, f"http://127.0.0.1:{port}/session") == 200
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_two_servers_on_one_host_in_chromium():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
-    tokens = ["the-token-of-the-first-server", "the-token-of-the-second-one"]
-    with ExitStack() as stack:
-        ports = [stack.enter_context(serving(StandIn(), secret=token))[0] for token in tokens]
-        browser = stack.enter_context(playwright.sync_playwright()).chromium.launch(
-            executable_path=CHROMIUM, args=FLAGS
-        )
-        context = browser.new_context()
-        tabs = [context.new_page() for _ in ports]
-        for tab, port, token in zip(tabs, ports, tokens, strict=True):
-            assert tab.goto(f"http://127.0.0.1:{port}/?token={token}").status == 200
-        for _ in range(2):
-            for tab in tabs:
-                assert tab.reload().status == 200
-                assert tab.evaluate("fetch('session').then((answer) => answer.status)") == 200
-        browser.close()
 
 
 def test_cookies_of_other_programs_do_not_hide_ours():
@@ -228,14 +200,16 @@ def test_cookies_of_other_programs_do_not_hide_ours():
             assert ask(port, "/session", cookie=None, **headers)[0] == 200
 
 
-def test_a_restart_with_the_same_token_keeps_the_browser_and_with_another_refuses_it():
-    browser = a_browser()
-    with serving(StandIn()) as (port, _):
-        assert opened(browser, f"http://127.0.0.1:{port}/?token={SECRET}") == 200
-    with serving(StandIn(), port=port):
-        assert opened(browser, f"http://127.0.0.1:{port}/session") == 200
-    with serving(StandIn(), port=port, secret="another-token-of-enough-letters"):
-        assert opened(browser, f"http://127.0.0.1:{port}/session") == 403
+def test_servers_on_one_host_and_a_restart_know_their_own_cookie():
+    """A browser keeps the cookies of a host, whatever the port; with the same token it is known after a restart."""
+    tokens = ["the-token-of-the-first-server", "the-token-of-the-second-one"]
+    with ExitStack() as stack:
+        ports = [stack.enter_context(serving(StandIn(), secret=token))[0] for token in tokens]
+        jar = "; ".join(f"{COOKIE.format(port=port)}={token}" for port, token in zip(ports, tokens, strict=True))
+        assert [ask(port, "/session", None, Cookie=jar)[0] for port in ports] == [200, 200]
+    for token, status in ((tokens[0], 200), ("another-token-of-enough-letters", 403)):
+        with serving(StandIn(), port=ports[0], secret=token):
+            assert ask(ports[0], "/session", None, Cookie=jar)[0] == status
 
 
 def test_every_name_of_this_machine_and_no_other():
@@ -255,6 +229,25 @@ def test_the_port_of_http_is_not_written():
     assert guard.refuses(headers, socket=True) == ""
 
 
+@pytest.mark.parametrize(
+    ("site", "refused"),
+    [
+        (None, ""),
+        ("none", ""),
+        ("same-origin", ""),
+        ("same-site", "elsewhere"),
+        ("cross-site", "elsewhere"),
+        ("", "elsewhere"),
+    ],
+)
+def test_a_request_of_another_site_is_refused(site, refused) -> None:
+    """Another port of this host is another page, though the browser calls it the same site."""
+    headers = {"host": "127.0.0.1:5", "cookie": f"space_camera_twin_5={SECRET}"}
+    headers |= {} if site is None else {"sec-fetch-site": site}
+    found = Guard.of(SECRET, "127.0.0.1", 5).refuses(headers)
+    assert (refused in found, bool(found)) == (True, bool(refused))
+
+
 @pytest.mark.skipif(not socket.has_ipv6, reason="no IPv6")
 def test_over_ipv6():
     try:
@@ -266,25 +259,3 @@ def test_over_ipv6():
 
 
 # --- all at once ------------------------------------------------------------------------------------------------------
-@pytest.mark.slow
-def test_a_thousand_connections_that_mean_no_good_beside_one_user(capfd):
-    """What computes is a stand-in: the figures are of the server, and of what else this machine does meanwhile."""
-    with serving(StandIn()) as (port, server), connect(port) as ws:
-        ws.recv(5)
-        alone = answered(port, ws, 100)
-        with crowded(port, 1000, 40.0) as crowd:
-            time.sleep(5.0)
-            among = answered(port, ws, 200)
-            held = len(server.connections)
-            told, _ = crowd.communicate()
-    most, came, served = map(int, told.split())
-    said = capfd.readouterr()
-    with capfd.disabled():
-        for name, seconds in (("alone", alone), (f"{most} open at once, {came} came", among)):
-            figures = ", ".join(f"{1e3 * np.quantile(seconds, q):.0f}" for q in (0.5, 0.95, 1.0))
-            print(f"\n{name}: {figures} ms (median, 95 in 100, longest)", end="")  # noqa: T201
-    assert served == 0
-    assert came >= 1000
-    assert held <= MOST_STRANGERS + MOST_KNOWN
-    assert np.quantile(among, 0.95) < PROMPT
-    assert (said.out, said.err) == ("", "")

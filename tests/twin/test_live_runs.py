@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +20,6 @@ from scenes.specs.resolved import resolve, resolve_camera, resolve_turntable
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.tiers import quick
-from tests.twin.test_course import JOB as COURSE
 from twin.live.live_bench import LiveBench
 from twin.live.messages import MOST_FRAMES, AskedState
 from twin.live.recording import job_text
@@ -127,29 +124,6 @@ def bench_experiment(pair: InstrumentTwin, folder: Path) -> Any:
     return InstrumentTwin.of(resolve(folder / "job.yaml"), like=pair).experiment
 
 
-@pytest.mark.slow
-def test_a_run_of_a_course_opens_at_its_detail(pair, backend, tmp_path):
-    """The time that is shown, all to the bit; and any other time as the run has it, and as its saved job repeats it."""
-    run = render_job(resolve(written(tmp_path, COURSE)), backend, experiment=bench_experiment(pair, tmp_path))
-    folder = run_folder(tmp_path / "run", "twin.render", config_text(run.resolved))
-    bench = bench_of(read_source(str(folder)), pair)
-    assert bench.greeting()["course"]["names"][bench.at_rest.time or 0] == "12 min"
-    shown, after = bench.state(bench.at_rest)
-    assert shown["readings"] == stated(run.recovered_dict())
-    assert shown["truth"] == run.truth_dict()
-    assert np.array_equal(after, run.after[:, 0])
-    assert np.array_equal(bench.before(bench.at_rest), run.before[:, 0])
-    assert run.series is not None
-    true = run.series.readings.row("forward", "d_f_um", "model").true
-    for time in (0, 2):
-        asked = AskedState(**{**bench.at_rest.model_dump(), "time": time})
-        other, frames = bench.state(asked)
-        assert np.array_equal(frames, run.series.frames[time])
-        assert other["truth"]["cameras"]["forward"]["d_f_um"] == true[time]
-    saved = render_job(resolve(written(tmp_path, job_text(bench, asked), "saved.yaml")), backend)
-    assert other["readings"] == stated(saved.recovered_dict())
-
-
 def test_what_was_changed_after_the_run_is_told(tmp_path):
     text = resolve(written(tmp_path, JOB)).to_yaml()
     folder = run_folder(tmp_path / "run", "twin.render", text)
@@ -168,23 +142,25 @@ def test_a_page_takes_so_many_frames_and_says_so(pair, tmp_path):
     assert read_source(str(written(tmp_path, JOB.replace("frames: 2", f"frames: {MOST_FRAMES}")))).notes == ()
 
 
-@pytest.mark.slow
-def test_a_seed_of_63_bits_is_known_by_its_last_ones(pair, backend, tmp_path):
-    """A number in JSON holds 53; the noise is that of all, and the saved job has all."""
+@pytest.mark.second
+def test_a_seed_of_63_bits_is_known_by_its_last_ones(pair, tmp_path):
+    """A number in JSON holds 53; the saved job has all."""
     seed = 2**62 + 2**55 + 12345
-    file = written(tmp_path, JOB.replace("seed: 1", f"seed: {seed}"))
-    bench = bench_of(read_source(str(file)), pair)
+    bench = bench_of(read_source(str(written(tmp_path, JOB.replace("seed: 1", f"seed: {seed}")))), pair)
     asked = AskedState(**json.loads(bench.at_rest.model_dump_json()))
-    assert asked.seed == 12345
-    assert bench.greeting()["seed"] == 12345
-    run = render_job(resolve(file), backend, experiment=bench_experiment(pair, tmp_path))
-    shown, after = bench.state(asked)
-    assert shown["readings"] == stated(run.recovered_dict())
-    assert np.array_equal(after, run.after[:, 0])
-    assert np.array_equal(bench.before(asked), run.before[:, 0])
-    assert resolve(written(tmp_path, job_text(bench, asked), "saved.yaml")).job.render.seed == seed
+    assert (asked.seed, bench.greeting()["seed"]) == (12345, 12345)
     other = AskedState(**{**asked.model_dump(), "seed": 12346})
-    assert resolve(written(tmp_path, job_text(bench, other), "saved.yaml")).job.render.seed == 12346
+    for one, wanted in ((asked, seed), (other, 12346)):
+        assert resolve(written(tmp_path, job_text(bench, one), "saved.yaml")).job.render.seed == wanted
+
+
+def test_an_address_that_is_taken_is_told():
+    server = pytest.importorskip("twin.serving.server", reason="the extra `live` is not installed")
+    with server.listen("127.0.0.1", 0) as taken:
+        taken.listen()
+        port = taken.getsockname()[1]
+        code, said = told("gf7_pair", "--port", port)
+    assert (code, f"cannot listen on 127.0.0.1:{port}: Address already in use" in said) == (2, True), said
 
 
 def test_a_folder_does_not_hide_an_instrument_of_the_library(tmp_path, monkeypatch):
@@ -436,41 +412,3 @@ def test_a_manifest_of_somebody_else_changes_nothing(tmp_path):
 
 
 # --- the commands themselves ------------------------------------------------------------------------------------------
-
-
-def commanded(*arguments: object) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", *map(str, arguments)], cwd=ROOT, check=False, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.slow
-def test_folders_that_the_commands_made(pair, tmp_path):
-    """A study's run is what the study wrote of it; a measurement and a list of limits open; a camera's run does not."""
-    text = STUDY.replace("[1, 4]", "[2, 4]").replace("runs: 8", "runs: 3")
-    text = text.replace("  light:", "  #").replace("[ml, gaussian]", "[ml, ml]")
-    written(tmp_path, JOB)
-    commanded("twin.study", written(tmp_path, text, "study.yaml"), "--out", tmp_path / "study", "--workers", 1)
-    import xarray as xr
-
-    with xr.open_dataset(tmp_path / "study" / "study.nc", engine="h5netcdf") as data:
-        for k in range(3):
-            bench = LiveBench(InstrumentTwin.of(read_source(str(tmp_path / "study"), k).resolved))
-            shown, _ = bench.state(bench.at_rest)
-            values = shown["readings"]["cameras"]["forward"]["model"]
-            # single precision beside double: a pixel in ten thousand counts another electron
-            assert abs(float(data.df[k]) - values["d_f_um"]) < 0.1 * values["d_f_um_sigma_noise"]
-    commanded("twin.render", tmp_path / "job.yaml", "--out", tmp_path / "render")
-    bench = bench_of(read_source(str(tmp_path / "render")), pair)
-    shown, _ = bench.state(bench.at_rest)
-    file = json.loads((tmp_path / "render" / "recovered.json").read_text())
-    assert shown["readings"] == {key: file[key] for key in shown["readings"]}
-    frames = f"instrument: gf7_pair\nframes: {tmp_path / 'render' / 'images'}\ndisturbances: launch\n"
-    commanded("twin.recover", written(tmp_path, frames, "measured.yaml"), "--out", tmp_path / "recover")
-    assert read_source(str(tmp_path / "recover")).about == "recover: a measurement"
-    commanded("twin.uncertainty", "gf7_pair", "--out", tmp_path / "limits")
-    assert read_source(str(tmp_path / "limits")).about == "limits: a job of the monitor"
-    commanded("twin.camera", "gf7", "--out", tmp_path / "camera")
-    code, said = told(tmp_path / "camera")
-    assert (code, "a run folder of twin.camera" in said) == (2, True)

@@ -44,6 +44,7 @@ def off(operation: Operation, life, k: int) -> float:
     return float(np.abs((now.values[0] - operation.model.rows @ life.changes[k]) / now.sigmas[0]).max())
 
 
+@pytest.mark.second
 def test_a_bad_reading_is_named_left_out_and_forgotten(known, tmp_path, monkeypatch) -> None:
     """With it, one reading later and at the end; the past is that of a record without it. What is kept in between does
     not matter, to the bit.
@@ -77,6 +78,7 @@ def test_a_bad_reading_is_named_left_out_and_forgotten(known, tmp_path, monkeypa
     assert Operation(whole, plan).follow().to_dict() == told.to_dict()
 
 
+@pytest.mark.second
 def test_a_slip_that_looks_like_an_error_is_taken_with_the_next_reading(known, tmp_path) -> None:
     """Far above what is stated of slips: set aside at first, and then neither left out nor forgotten."""
     plan, _, stated = known
@@ -162,6 +164,7 @@ def test_sensors_that_disagree_together_accuse_the_prior(known, tmp_path, togeth
     assert any("sensors of several bodies together" in text for text in texts) == together
 
 
+@pytest.mark.second
 def test_status_says_which_jumps_are_found(known, tmp_path) -> None:
     entries, _ = readings(known, 26, 0.0)
     history = record_of(tmp_path / "record", known[0])

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,23 +13,13 @@ import pytest
 from optics.numerics.backend import load_backend
 from scenes.specs.operation import OperationSpec, RequirementSpec
 from tests.twin.commands import invoke
-from tests.twin.operation_records import (
-    START,
-    given,
-    life_of,
-    monitor_entry,
-    plan_of,
-    record_of,
-    temperature_entry,
-)
-from tests.twin.record_bench import operating
+from tests.twin.operation_records import START, given, life_of, monitor_entry, plan_of, record_of, temperature_entry
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.alarms import AGAIN, alarms_of, raise_alarms
 from twin.operate.estimate.operation import Break, Following, FoundJump, Operation, SensorState
-from twin.operate.estimate.plans import keep_plan, kept_plan
-from twin.operate.followed import known_of
-from twin.operate.record.entries import MICRO, Alarm, Entry, utc_text
+from twin.operate.estimate.plans import keep_plan
+from twin.operate.record.entries import MICRO, Entry, utc_text
 from twin.operate.record.history import History
 from twin.run.provenance import negative_verdicts
 
@@ -96,6 +85,7 @@ def following(life: Path, tmp_path_factory: pytest.TempPathFactory) -> Following
 # --- without a plan, and with one ------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_without_a_plan_there_is_no_estimate(record: Path, life: Path) -> None:
     assert said("status", record)["estimate"] is None
     done = run("forecast", record)
@@ -131,25 +121,16 @@ def test_status_tells_how_the_instrument_stands(record: Path, life: Path) -> Non
     assert "2 alarms are open" in text
     told = said("status", record)
     assert told["open_alarms"] == 2
+    assert {one["degrees_of_freedom"] for one in told["estimate"]["innovations"]} == {8}
     (size, *_) = told["estimate"]["jumps"][0]["sizes"]
     # 120 micrometres, and a jump is found with its size within 4 of its sigmas
     assert abs(size["size"] - 120.0) < 4.0 * size["sigma"]
 
 
-def test_the_digits_are_those_that_sigma_deserves(record: Path, life: Path) -> None:
-    """Two of sigma, and the value to the same place."""
-    rows = [line for line in run("status", record, life / "plan.yaml").stdout.splitlines() if " ± " in line]
-    table = [line.split(" ± ") for line in rows if not line.startswith(("jump", "alarm"))]
-    assert len(table) == 12
-    for left, right in table:
-        value, sigma = left.split()[-1], right.split()[0]
-        assert len(sigma.replace(".", "").lstrip("0")) == 2
-        assert len(value.partition(".")[2]) == len(sigma.partition(".")[2])
-
-
 # --- forecast --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_forecast_begins_now_and_its_sigma_grows(record: Path, life: Path) -> None:
     run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
     told, now = said("forecast", record), said("status", record)["estimate"]["now"]
@@ -211,6 +192,7 @@ def test_an_estimate_that_fails_does_not_hide_what_was_taken(record: Path, life:
     assert "what was taken is in the record, and the estimate cannot be worked out: the record's plan" in said_so
 
 
+@pytest.mark.second
 def test_alarms_are_listed_and_acknowledged(record: Path, life: Path) -> None:
     run("status", record, life / "plan.yaml")
     assert "2 alarms are open, 2 in all" in run("alarms", record).stdout
@@ -239,26 +221,6 @@ def test_who_has_seen_which_alarm(words: tuple[object, ...], text: str, record: 
     assert (done.exit_code, text in done.stderr) == (2, True), done.stderr
 
 
-@pytest.mark.slow
-def test_kills_while_a_record_is_followed(record: Path, life: Path, tmp_path: Path) -> None:
-    """What the estimate is, and which alarms there are, does not depend on where it was killed before."""
-    run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
-    shutil.copytree(record, tmp_path / "whole")
-    start = time.monotonic()
-    process = operating("status", tmp_path / "whole", "--json")
-    whole = json.loads(process.communicate(timeout=120)[0])
-    seconds = time.monotonic() - start
-    for k in range(4):
-        place = shutil.copytree(record, tmp_path / f"killed{k}")
-        process = operating("status", place)
-        time.sleep(seconds * (0.4 + 0.17 * k))
-        process.kill()
-        process.communicate()
-        told = json.loads(operating("status", place, "--json").communicate(timeout=120)[0])
-        assert told["estimate"] == whole["estimate"]
-        assert told["open_alarms"] == whole["open_alarms"] == 2
-
-
 PLAN = OperationSpec(
     instrument="monitor_pair",
     disturbances="own",
@@ -277,8 +239,17 @@ def clean(following: Following) -> Following:
 
 
 def test_what_contradicts_the_plan_is_in_the_numbers(following: Following) -> None:
-    good = replace(clean(following), widened=1.0, too_many_jumps=False).to_dict()
+    calm = replace(clean(following), widened=1.0, too_many_jumps=False, bad_readings=((1, "x"), (2, "y")))
+    good = calm.to_dict()
     assert (good["agrees"], good["warnings"]) == (True, [])
+    for change, words in (
+        ({"undecided": True}, "the newest reading may be bad: y; until then sigmas count with both"),
+        ({"bad_readings": ((1, "x"),) * 3}, "3 readings were taken for bad ones"),
+        ({"too_small": ("heat", "mounts")}, "sensors of several bodies together disagree with heat, mounts"),
+        ({"widened": 1.01}, "all sigmas are 1.01 times as wide"),
+    ):
+        (text,) = replace(calm, **change).warnings
+        assert words in text
     bad = replace(clean(following), widened=2.5, too_many_jumps=True).to_dict()
     assert not bad["agrees"]
     assert [text.partition(";")[0] for text in bad["warnings"]] == [
@@ -315,6 +286,20 @@ def test_a_reading_that_contradicts_what_is_stated(following: Following) -> None
     jump = FoundJump("base/forward/M1", times[1], times[2], times[3], (), 30.0, 1e-9, {})
     kinds = [kind for kind, _ in told_of(replace(own, innovations=seen[1:], jumps=(jump,)))]
     assert kinds == ["jump"]
+    # it explains the reading with which it was told, and not the last one before it
+    for after, until, wanted in ((times[1], times[2], ["jump"]), (times[2], times[3], ["jump", "contradiction"])):
+        one = replace(jump, after_us=after, told_us=until)
+        alone = tuple((time, 50.0 if time == times[2] else 8.0, 8) for time in times)
+        assert [kind for kind, _ in told_of(replace(own, innovations=alone, jumps=(one,)))] == wanted
+
+
+def test_bodies_that_explain_a_jump_nearly_as_well_are_named(following: Following) -> None:
+    """Within a difference of log likelihoods of three, and three of them at most."""
+    (jump,) = following.jumps
+    many = {f"body{k}": 28.0 + k for k in range(5)}
+    for rivals, named in (({"a": 27.1, "b": 26.9}, "a"), ({"b": 26.9}, ""), (many, "body0, body1, body2")):
+        ((_, text),) = told_of(replace(clean(following), jumps=(replace(jump, log_ratio=30.0, rivals=rivals),)))
+        assert text.partition("; ")[2] == (f"{named} would explain it nearly as well" if named else "")
 
 
 def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(record: Path, following: Following) -> None:
@@ -335,7 +320,7 @@ def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(record: P
         assert raised(history, 0) == []
         assert raised(history, 29) == ["contradiction"]  # every reading is one of its own
         history.acknowledge(4, "Ann", "")
-        assert raised(history, 31) == ["broken", "sensor", "contradiction"]
+        assert raised(history, 30) == ["broken", "sensor", "contradiction"]
 
 
 def test_a_jump_whose_time_is_known_better_is_the_same(record: Path, following: Following) -> None:
@@ -348,15 +333,3 @@ def test_a_jump_whose_time_is_known_better_is_the_same(record: Path, following: 
         assert len(raise_alarms(history, PLAN, replace(clean(following), jumps=(jump, other)))) == 1
         history.acknowledge(1, "Ann", "")
         assert raise_alarms(history, PLAN, replace(clean(following), jumps=(jump, other))) == []
-
-
-def test_an_estimate_is_used_from_python(record: Path, life: Path) -> None:
-    """As the documentation shows it."""
-    with History(str(record)) as history:
-        keep_plan(plan_of(life), life / "plan.yaml", history)
-        plan = kept_plan(history)
-        assert plan is not None
-        operation = Operation(history, plan)
-        found, new = known_of(operation)
-        assert {type(one) for one in new} == {Alarm}
-        assert operation.forecast([found.time + DAY]).values.shape == (1, len(operation.quantities))

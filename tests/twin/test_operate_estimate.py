@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 from scenes.yaml.errors import Problem
-from tests.tiers import quick
 from tests.twin.operation_records import (
     DAY,
     START,
@@ -23,7 +22,9 @@ from tests.twin.operation_records import (
 )
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate import operation as operation_module
+from twin.operate.estimate.following import widening
 from twin.operate.estimate.operation import Operation, beyond
+from twin.operate.estimate.standing import Scores, Sensor, Standing
 from twin.operate.posterior import posterior
 from twin.operate.record.entries import MICRO, Entry
 
@@ -73,6 +74,7 @@ def test_the_instrument_is_as_warm_as_the_records_say(known) -> None:
     assert known[1].resolved.instrument.temperature == 293.15
 
 
+@pytest.mark.second
 def test_drawn_lives_are_covered(known, tmp_path) -> None:
     """Eight lives of 40 readings without a slip: the intersection angle, principal distances and turns, now, smoothed
     and 30 days ahead, counted within one and two sigma; lives are independent, times within one are not, so that the
@@ -137,7 +139,8 @@ def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> N
     assert estimate.again().follow().to_dict() == result
 
 
-@pytest.mark.parametrize(("slips", "apart", "wider"), quick(1, [(False, 0.2, 0.2), (True, 0.3, 2.0)]))
+@pytest.mark.second
+@pytest.mark.parametrize(("slips", "apart", "wider"), [(False, 0.2, 0.2), (True, 0.3, 2.0)])
 def test_a_part_of_the_past_is_that_of_the_whole(
     known, tmp_path, monkeypatch, slips: bool, apart: float, wider: float
 ) -> None:
@@ -183,9 +186,14 @@ def test_times_of_a_pass_go_together(known, tmp_path) -> None:
     cameras = posterior(estimate, times[3:])
     assert cameras.names[:4] == tuple(f"forward {key}" for key in KEYS)
     ahead = posterior(estimate, times[4:], ["forward d_f_um"])
-    assert ahead.mean[0, 0] == pytest.approx(estimate.forecast(times[4:]).values[0, 3], rel=1e-9)
-    with pytest.raises(Problem, match="out of order"):
-        posterior(estimate, times[::-1])
+    forecast = estimate.forecast(times[4:])
+    assert ahead.mean[0, 0] == pytest.approx(forecast.values[0, 3], rel=1e-9)
+    assert np.sqrt(ahead.covariance[0, 0, 0, 0]) == pytest.approx(forecast.sigmas[0, 3], rel=1e-6)
+    said = found.to_dict()
+    assert (said["mean"], said["covariance"]) == (found.mean.tolist(), found.covariance.tolist())
+    for wrong in (times[::-1], [first, first]):
+        with pytest.raises(Problem, match="out of order"):
+            posterior(estimate, wrong)
     with pytest.raises(Problem, match="no such quantity"):
         posterior(estimate, times, ["forward d_g_um"])
     with pytest.raises(Problem, match="before all readings"):
@@ -217,6 +225,10 @@ def test_what_a_slip_does_to_the_line_is_said_with_its_sigma(known, tmp_path) ->
     for name, true in zip(names, step.tolist(), strict=True):
         _, changed, sigma = jump.carried[name]
         assert abs(changed - true) < 5.0 * sigma + 1e-9, name
+    (one, *_) = jump.to_dict()["carried"]
+    assert one["sigma"] == jump.carried[one["quantity"]][2]
+    assert (one["share"], one["share_sigma"]) == (one["changed"] / one["read"], one["sigma"] / abs(one["read"]))
+    assert [each["sigma"] for each in jump.to_dict()["sizes"]] == [sigma for *_, sigma in jump.sizes]
     # three mirrors can have moved the spots so, and they do not turn the line alike
     read, _, sigma = jump.carried["forward d_alpha_arcsec"]
     true = float(step[names.index("forward d_alpha_arcsec")])
@@ -314,3 +326,78 @@ def test_readings_that_contradict_the_statement_widen_sigma(known, tmp_path) -> 
     assert np.all(wrong < 6.0)
     calm = life_of(stated, 60.0, 3.0, 12, {})
     assert followed(known, tmp_path, entries_of(known, calm, 12), "calm").follow().widened == 1.0
+
+
+# --- sensors and scores by themselves ----------------------------------------------------------------------------
+
+
+def test_a_sensor_is_dead_after_ten_of_its_intervals() -> None:
+    sensor = Sensor("base")
+    for k in range(5):
+        sensor = sensor.came(100 * k, 290.0 + 0.1 * k, 0.05)
+    assert [sensor.state(now, True)[:2] for now in (1400, 1401)] == [("ok", 0), ("dead", 400)]
+    assert Sensor("base").came(0, 290.0, 0.05).state(10**15, True)[0] == "ok"  # of one reading there is no interval
+
+
+@pytest.mark.parametrize(("step", "repeats"), [(0.1, 19), (0.01, 4), (1e-4, 3)])
+def test_a_sensor_is_stuck_when_chance_does_not_repeat_it_so_often(step: float, repeats: int) -> None:
+    """Rounded to a step, two readings of sigma 0.05 K agree with the chance erf(5 step / K): 0.52, 0.056 and 0.00056;
+    to the power of the repeats, over all readings, at most 1e-4, and never before the third.
+    """
+    sensor = Sensor("base")
+    for k in range(5):
+        sensor = sensor.came(k, 290.0 + step * k, 0.05)
+    for k in range(repeats):
+        assert not sensor.stuck
+        sensor = sensor.came(5 + k, sensor.value, 0.05)
+    state, since, why = sensor.state(5 + repeats, True)
+    assert (state, since, why.split()[0]) == ("stuck", 4, str(repeats + 1))
+    assert not sensor.came(99, 280.0, 0.05).stuck
+
+
+def test_a_sensor_is_doubtful_when_three_of_its_last_ten_readings_are_far() -> None:
+    sensor = Sensor("base")
+    for white in (7.0, -6.01, 6.0):  # six standard deviations are not yet far
+        sensor = sensor.judged(white)
+    assert (sensor.far, sensor.state(0, True)[0]) == (2, "ok")
+    sensor = sensor.judged(-8.0)
+    assert [sensor.state(0, alone)[0] for alone in (True, False)] == ["doubtful", "ok"]
+    for _ in range(7):
+        sensor = sensor.judged(0.0)
+    assert (sensor.far, len(sensor.recent)) == (2, 10)
+    limit = np.sqrt(chi2.isf(1e-3, 4) / 4)  # a false alarm in a thousand
+    for share, wrong in ((0.999, False), (1.001, True)):
+        assert Sensor("base", recent=(share * limit,) * 4).disagrees == wrong
+    assert not Sensor("base").disagrees
+
+
+def test_scores_count_what_lies_within_and_its_mean_density() -> None:
+    one = Scores().with_one(np.array([0.5, -1.0, 1.0, 1.99, -2.0, 3.0]), -4.0).with_one(np.array([0.0]), 2.0)
+    assert (one.readings, one.components, one.within_one, one.within_two) == (2, 7, 2, 5)
+    assert (one.log_score, one.chi_square) == (-1.0, pytest.approx(0.25 + 1.0 + 1.0 + 1.99**2 + 4.0 + 9.0))
+
+
+def test_what_temperatures_explain_is_a_share_of_the_variance() -> None:
+    whole, rest = np.random.default_rng(1).standard_normal((2, 9, 3)) + 5.0
+    spread = np.stack([whole.sum(0), (whole**2).sum(0), rest.sum(0), (rest**2).sum(0)])
+    found = Standing(None, 0, Scores(9), spread=spread).explained
+    assert found == pytest.approx(1.0 - np.var(rest, axis=0) / np.var(whole, axis=0), rel=1e-9)
+    assert np.all(np.isnan(Standing(None, 0, Scores(1), spread=spread).explained))
+
+
+def test_sigma_is_as_wide_as_the_last_readings_ask_for() -> None:
+    """The root of chi-square over its degrees of freedom, over 1, 3 or 10 readings, where chance does not explain it
+    once in 3000 times; from a reading on what lasts.
+    """
+    calm = np.tile([8.0, 8.0], (12, 1))
+    for share, wide in ((0.999, False), (1.001, True)):
+        square = share * chi2.isf(1e-3 / 3, 8)
+        found = widening(np.concatenate([calm, [[square, 8.0]]]), [12, 13], False)
+        assert found == pytest.approx([1.0, np.sqrt(square / 8.0) if wide else 1.0])
+    three = np.concatenate([calm, np.tile([20.0, 8.0], (3, 1)), calm])
+    assert widening(three, [14, 15, 16], False) == pytest.approx([1.0, np.sqrt(60.0 / 24.0), 1.0])
+    assert widening(three, [13, 14, 15], True) == pytest.approx([1.0, np.sqrt(60.0 / 24.0), 1.0])
+    lasting = [(3, np.array([[80.0, 8.0]]))]
+    assert widening(calm, [2, 3, 12], False, lasting) == pytest.approx([1.0, np.sqrt(10.0), np.sqrt(10.0)])
+    assert widening(np.zeros((2, 2)), [2], False).tolist() == [1.0]
+    assert beyond(np.array([0.0, 3.0]), np.array([1.0, 0.0]), 1.959964) == pytest.approx([0.05, 1.0], abs=1e-6)

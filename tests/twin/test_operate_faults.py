@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import signal
 import sqlite3
 import tempfile
 import time
@@ -70,68 +69,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float, bytes]
 def exported(place: Path | str) -> bytes:
     with History(str(place)) as history:
         return b"".join(TABLE_FORMATS["csv"](one) for one in tables(history))
-
-
-@pytest.mark.slow
-def test_kill_at_three_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
-    killed(3, tmp_path, whole)
-
-
-@pytest.mark.slow
-def test_kill_at_ten_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
-    killed(10, tmp_path, whole)
-
-
-def killed(moments: int, tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
-    """After SIGKILL each file is there in whole or not at all; taking them again gives what an undisturbed one does."""
-    file, seconds, expected = whole
-    made(tmp_path / "new").close()
-    found = []
-    for k in range(moments):
-        place = Path(shutil.copytree(tmp_path / "new", tmp_path / f"record{k}"))
-        process = ingesting(place, file)
-        # the first third of the time the program starts and reads
-        time.sleep(seconds * (0.4 + 0.55 * k / (moments - 1)))
-        process.kill()
-        process.communicate()
-        there = times(place)
-        assert len(there) == len(set(there))
-        assert len(there) % ROWS == 0
-        found.append(len(there))
-        assert invoke(app, "ingest", place, file, "--quiet").exit_code == 0
-        assert exported(place) == expected
-    assert len(set(found)) > (1 if moments == 3 else 3), found  # they were different moments
-
-
-@pytest.mark.second
-def test_a_power_cut_at_three_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
-    cut_off(3, tmp_path, whole)
-
-
-@pytest.mark.slow
-def test_a_power_cut_at_ten_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
-    cut_off(10, tmp_path, whole)
-
-
-def cut_off(moments: int, tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
-    """Files as they stand while a writer is at work are what a disk has after a power cut: a copy of them opens."""
-    file, seconds, expected = whole
-    made(tmp_path / "record").close()
-    process = ingesting(tmp_path / "record", file)
-    time.sleep(0.35 * seconds)
-    copies = []
-    for k in range(moments):
-        time.sleep(0.5 * seconds / moments)
-        os.kill(process.pid, signal.SIGSTOP)
-        copies.append(Path(shutil.copytree(tmp_path / "record", tmp_path / f"copy{k}")))
-        os.kill(process.pid, signal.SIGCONT)
-    process.communicate(timeout=120)
-    for copy in copies:
-        there = times(copy)
-        assert len(there) == len(set(there))
-        assert len(there) % ROWS == 0
-        assert invoke(app, "ingest", copy, file, "--quiet").exit_code == 0
-        assert exported(copy) == expected
 
 
 def two_writers(place: str, file: Path) -> None:
@@ -304,22 +241,3 @@ def test_what_is_derived_on_a_postgresql_server(server: str) -> None:
         assert base.execute(shape).fetchall() == new
     with History(url) as history:
         assert (history.status()["guarded"], history.alarms()) == (True, [])
-
-
-@HAS_SERVER
-@pytest.mark.slow
-def test_writers_and_kills_on_a_postgresql_server(server: str, whole: tuple[Path, float, bytes]) -> None:
-    url = database(server, "writers")
-    made(url).close()
-    two_writers(url, whole[0])
-    assert exported(url) == whole[2]
-    for k in range(4):
-        killed = database(server, f"killed{k}")
-        made(killed).close()
-        process = ingesting(killed, whole[0])
-        time.sleep(whole[1] * (0.4 + 0.2 * k))
-        process.kill()
-        process.communicate()
-        assert len(times(killed)) % ROWS == 0
-        assert invoke(app, "ingest", killed, whole[0], "--quiet").exit_code == 0
-        assert exported(killed) == whole[2]

@@ -36,7 +36,7 @@ from twin.operate.overview import Overview
 from twin.operate.record.entries import Alarm, Given, digest_of_data, micros
 from twin.operate.record.history import History
 from twin.operate.record.place import RecordFailed
-from twin.operate.serve import LONGEST_POST, PARTS, OperateServer
+from twin.operate.serve import OperateServer
 from twin.serving.guard import Guard
 from twin.serving.server import listen
 
@@ -170,16 +170,6 @@ def test_another_origin_is_refused(port, origin):
     assert ask(port, "/state", **{"Sec-Fetch-Site": "cross-site"})[0] == 403
 
 
-def test_every_answer_has_the_headers_of_a_page_that_loads_nothing_from_elsewhere(port):
-    for path in (*WAYS, *(f"/{name}" for name in PARTS)):
-        _, headers, body = ask(port, path)
-        assert "default-src 'none'" in headers["content-security-policy"]
-        assert headers["cache-control"] == "no-store"
-        if path.endswith((".js", ".css", ".html", "/")) and "three.min" not in path:
-            assert b"https://" not in body
-            assert body.count(b"http://") == body.count(b"http://www.w3.org/2000/svg")
-
-
 @pytest.mark.parametrize("path", ["/../../etc/passwd", "/%2e%2e/desk.py", "/page/operate.js", "/desk.py", "/live.js"])
 def test_no_path_leads_to_a_file(port, path):
     status, _, body = ask(port, path)
@@ -221,7 +211,8 @@ def test_a_server_without_a_second_token_takes_no_empty_one(fresh):
 @pytest.mark.parametrize("way", ["cookie", "header"])
 def test_an_alarm_is_acknowledged_once(fresh, way):
     history, desk = fresh
-    told = {"alarm": 1, "by": " A. Nurse ", "note": "looked at the images"}
+    told = {"alarm": 1, "by": f" A. Nurse{' ' * 4000}", "note": "looked at the images"}
+    told["by"] = told["by"][: 4096 - len(json.dumps(told | {"by": ""}))]  # a post has 4096 bytes at most
     bearer = {"Authorization": f"Bearer {WRITE}", "Origin": ""} if way == "header" else {}
     with serving(desk) as port:
         before = data(port, "/news")["version"]
@@ -250,8 +241,8 @@ def test_an_alarm_is_acknowledged_once(fresh, way):
         ({"alarm": 1, "by": "A\n"}, 400),
         ({"alarm": 1, "by": "A", "note": "x" * 501}, 400),
         ({"alarm": 1, "by": "A", "note": ["x"]}, 400),
-        (b" " * (LONGEST_POST + 1), 400),
-        ({"alarm": 99, "by": "A"}, 409),
+        (b" " * 4097, 400),
+        ({"alarm": 99, "by": 80 * "A", "note": 500 * "x"}, 409),
         ({"alarm": 10**30, "by": "A"}, 409),
     ],
 )
@@ -280,7 +271,7 @@ def test_the_state_is_that_of_the_estimate(port):
     first = told["quantities"][0]
     assert (first["name"], first["unit"]) == ("Δα of forward", "arcsec")
     assert first["value"] == pytest.approx(0.05 * (19.875 + 0.4))
-    assert first["required"]["limit"] == 0.4
+    assert (first["sigma"], first["required"]["limit"]) == (pytest.approx(0.05), 0.4)
     assert told["quantities"][8]["required"]["breaks"].startswith("2026-01-29")
     assert [one["id"] for one in told["alarms"]] == [1, 2]
     assert told["alarms"][0]["text"].endswith(EVIL)
@@ -299,6 +290,7 @@ def test_a_trend_is_cut_where_record_and_forecast_end(port):
     assert (past["times"][0], past["times"][-1], future["times"][0]) == (START, NEWEST, NEWEST)
     assert len(past["values"]) == len(told["points"]["values"]) == 12
     assert len(past["values"][0]) == len(past["times"])
+    assert set(told["points"]["sigmas"][0]) == {0.3}
     assert told["points"]["values"][11][0] is None  # of the ground a single reading says nothing
     late = data(port, f"/trend?from={NEWEST + DAY}&to={NEWEST + 2 * DAY}")
     assert late["past"]["times"][-1] == NEWEST
@@ -324,7 +316,7 @@ def test_a_reading_has_its_spots_and_its_neighbours(port):
 def test_motions_are_the_mean_of_the_estimate(port):
     told = data(port, f"/motions?time={NEWEST}")
     ratios = [abs(one["mean"]) / one["sigma"] for one in told["largest"]]
-    assert ratios == sorted(ratios, reverse=True)
+    assert (ratios, len(ratios)) == (sorted(ratios, reverse=True), 12)
     assert told["largest"][0]["mean"] / told["largest"][0]["sigma"] == pytest.approx(1.9875 / np.sqrt(0.3))
     moved = told["moved"]["base/forward"]
     assert moved["sure"]
@@ -407,14 +399,6 @@ def test_a_record_that_cannot_be_read_is_told_and_read_again(fresh, monkeypatch)
 def test_what_is_no_number_is_null_in_json():
     value = {"a": np.array([1.0, np.nan]), "b": (np.int64(3), float("inf")), "c": np.bool_(True)}
     assert plain(value) == {"a": [1.0, None], "b": [3, None], "c": True}
-
-
-def test_who_says_nothing_locks_nobody_out(port):
-    """Connections and their limits are those of the live twin, whose tests look at all of them."""
-    lines = [socket.create_connection(("127.0.0.1", port), 5) for _ in range(80)]
-    assert ask(port, "/news")[0] == 200
-    for line in lines:
-        line.close()
 
 
 # --- on the estimate itself -------------------------------------------------------------------------------------------
@@ -522,52 +506,6 @@ def opened(browser, port: int, words: str = "", width: int = 1300) -> Page:
     page = Page(browser, f"http://127.0.0.1:{port}/?token={READ}{words}", width)
     page.until("document.body.dataset.chosen !== undefined", 60.0)
     return page
-
-
-@pytest.mark.second
-def test_the_page_shows_the_state_and_fits_a_phone(browser, port):
-    for width in (1300, 390):
-        page = opened(browser, port, width=width)
-        text = page.page.inner_text("body")
-        for words in (
-            "1 of 2 requirements does not hold",
-            "160 readings",
-            "base/forward/M2",
-            "stuck",
-            "safe mode",
-            EVIL,
-        ):
-            assert words in text, words
-        assert "Read only here" in text
-        assert page.page.locator("#alarm-list button").count() == 0
-        assert page.page.locator("#chart path.past.line").count() == 1
-        assert page.page.locator("#chart path.future").count() == 3
-        assert page.page.locator("#chart rect.jump").count() == 1
-        assert page.page.locator("#innovations circle.far").count() == 1
-        assert page.page.locator("#spots figure").count() == 4
-        assert page.page.evaluate("document.documentElement.scrollWidth") <= width
-        page.until("document.getElementById('scene').dataset.ready === 'yes'", 40.0)
-        page.close()
-        assert page.wrong == []
-
-
-@pytest.mark.second
-def test_a_click_chooses_a_reading_and_a_row_a_quantity(browser, port):
-    page = opened(browser, port)
-    before = page.page.evaluate("document.body.dataset.chosen")
-    box = page.page.locator("#chart").bounding_box()
-    page.page.mouse.click(box["x"] + 0.3 * box["width"], box["y"] + 100)
-    page.until(f"document.body.dataset.chosen !== '{before}'")
-    assert page.page.inner_text("#reading-time").startswith("2026-01-")
-    assert page.page.inner_text("#reading-time") != "2026-01-20 21:00 UTC"
-    page.page.click("#now tbody tr.pick:nth-child(12)")
-    assert "Δθ between the cameras" in page.page.inner_text("#chart-said")
-    page.page.click("#jumps tbody tr")
-    page.until("document.getElementById('reading-time').textContent.startsWith('2026-01-13')")
-    page.page.click("#last")
-    page.until("document.getElementById('reading-time').textContent.startsWith('2026-01-20')")
-    page.close()
-    assert page.wrong == []
 
 
 @pytest.mark.second

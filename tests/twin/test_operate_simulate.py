@@ -6,7 +6,9 @@ import json
 import math
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
 from tests.twin.commands import invoke
 from twin.operate.__main__ import app
+from twin.operate.lives import simulation_run
 from twin.operate.lives.judged_life import covered
 from twin.operate.lives.judged_report import likely_shares
 from twin.operate.lives.simulate import Simulation, sensed_temperatures
@@ -261,6 +264,7 @@ def test_the_files_of_a_life_are_made_again_and_verified(made: tuple[Path, Path,
 # --- what is made of it ----------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_life_is_followed_and_held_against_its_truth(made: tuple[Path, Path, Mapping], tmp_path: Path) -> None:
     record, truth, _ = made
     done = run("judge", record, "--truth", truth, "--out", tmp_path / "judged", "--json")
@@ -359,6 +363,27 @@ def test_a_life_without_a_record_is_its_files_alone(tmp_path: Path) -> None:
     assert run("init", tmp_path / "record", "gf7_pair", "--simulated").exit_code == 0
     taken = json.loads(run("ingest", tmp_path / "record", tmp_path / "files/telemetry.yaml", "--json").stdout)
     assert (taken["new"], taken["refused"]) == (17, 0)  # a reading, 14 temperatures, two events
+
+
+@pytest.mark.second
+def test_readings_that_could_not_be_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the terminal, in the numbers and in the manifest; a life without any reading is refused."""
+    real, words = simulation_run.recorded, (*WORDS[:3], 1, *WORDS[4:8])
+    when = micros("2027-01-01T06:00:00Z")
+    monkeypatch.setattr(simulation_run, "recorded", lambda *a: replace(real(*a), lost=((when, "it misses"),)))
+    done = run("simulate", PLAN, *words, "--out", tmp_path / "files")
+    lost = "no reading at 2027-01-01T06:00:00Z: it misses"
+    assert f"warning: {lost}" in done.stdout
+    assert json.loads((tmp_path / "files/manifest.json").read_text("utf-8"))["warnings"] == [lost]
+    monkeypatch.setattr(
+        simulation_run, "recorded", lambda *a: SimpleNamespace(readings=(), lost=((when, "it misses"),))
+    )
+    done = run("simulate", PLAN, *words, "--out", tmp_path / "none")
+    assert (done.exit_code, "no state can be read, the first since it misses" in " ".join(done.stderr.split())) == (
+        2,
+        True,
+    )
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_sensor_on_a_body_that_is_not_stated_to_get_warmer(tmp_path: Path) -> None:

@@ -18,21 +18,9 @@ from tests.twin.study_bench import ROOT
 from twin.run.durable import exit_on_terminate
 
 FULL = "/dev/full"
-LIST = ("twin.validate", "--list")
-DOCTOR = ("twin.doctor", "--quick")
 SCHEMA = ("scenes.schema", "--out", "{tmp}")
-RENDER = ("twin.render", "scenes/examples/perturb.yaml", "--frames", "1", "--out", "{tmp}/run")
 LAB = ("twin.lab", "distortion", "scenes/lab/distortion.yaml", "--out", "{tmp}/run")
-COMMANDS = [
-    pytest.param((*LIST, "--json"), id="list-json", marks=pytest.mark.slow),
-    pytest.param(LIST, id="list", marks=pytest.mark.slow),
-    pytest.param(SCHEMA, id="schema"),
-    pytest.param((*DOCTOR, "--json"), id="doctor-json", marks=pytest.mark.slow),
-    pytest.param(DOCTOR, id="doctor", marks=pytest.mark.slow),
-    pytest.param((*RENDER, "--json"), id="render-json", marks=pytest.mark.slow),
-    pytest.param(RENDER, id="render", marks=pytest.mark.slow),
-    pytest.param((*LAB, "--json"), id="lab-json", marks=pytest.mark.slow),
-]
+COMMANDS = [(*LAB, "--json"), SCHEMA]
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from twin.run import durable, owned_files, run_folder
 
 _WRITTEN = re.compile(
     rf"{re.escape(owned_files.STUDY_LOCK)}|trials\.txt"
-    rf"|[^/]+/(of\.txt|chunks/(index\.txt|[0-9]+\.npz(\.corrupt)?|{durable.PARTIAL_NAME}))"
+    rf"|[^/]+/(of\.txt|(chunks/)?{durable.PARTIAL_NAME}|chunks/(index\.txt|[0-9]+\.npz(\.corrupt)?))"
 )
 """Files that commands keep there."""
 

@@ -19,6 +19,9 @@ from twin.run.durable import ending_later, make_folders, put_in_place, sync_fold
 from twin.run.owned_files import MANIFEST as MANIFEST
 from twin.run.provenance import Checksum, Provenance, versions
 
+_WAITING = f".{MANIFEST}{owned_files.PARTIAL}"
+"""Name of the manifest until all that it vouches for is on the disk."""
+
 
 class RunFolderError(Exception):
     """A run folder cannot be made; the message says why and what to do."""
@@ -155,14 +158,9 @@ class RunFolder:
 
     def _publish(self) -> None:
         assert self._unfinished is not None
-        # the manifest vouches for the rest, and has its name once that is on the disk
-        manifest, waiting = self.path / MANIFEST, self.path / f".{MANIFEST}{owned_files.PARTIAL}"
-        vouched = manifest.exists()
-        if vouched:
-            os.rename(manifest, waiting)
         sync_tree(self.path)
-        if vouched:
-            os.rename(waiting, manifest)
+        if (self.path / _WAITING).exists():
+            os.rename(self.path / _WAITING, self.path / MANIFEST)
             sync_folder(self.path)
         with ending_later():
             if self.force and self.target.exists():
@@ -218,7 +216,7 @@ class RunFolder:
         writer(self._place(name))
 
     def _place(self, name: str) -> Path:
-        place = self.path / name
+        place = self.path / (_WAITING if name == MANIFEST else name)
         place.parent.mkdir(parents=True, exist_ok=True)
         return place
 

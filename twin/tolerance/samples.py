@@ -304,16 +304,13 @@ def _journal(folder: Path, fingerprint: str) -> Iterator[None]:
     """
     try:
         durable.make_folders(folder)
-        with (folder / "of.txt").open("a+", encoding="utf-8") as head:
-            head.seek(0)
-            said = head.read()
-            if said and said != f"{fingerprint}\n":
-                text = "is of another budget, or of another version of this program; remove it to begin anew"
-                raise run_folder.RunFolderError(f"{folder} {text}")
-            if not said:
-                head.write(f"{fingerprint}\n")
-                head.flush()
-            yield
+        head = folder / "of.txt"
+        if head.exists() and head.read_text("utf-8") != f"{fingerprint}\n":
+            text = "is of another budget, or of another version of this program; remove it to begin anew"
+            raise run_folder.RunFolderError(f"{folder} {text}")
+        if not head.exists():
+            durable.write_safely(head, f"{fingerprint}\n".encode())
+        yield
     except OSError as error:
         raise run_folder.RunFolderError(
             f"{folder}: {error.strerror}; what is done is kept, go on with --resume"

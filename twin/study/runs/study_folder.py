@@ -185,6 +185,9 @@ class StudyFolder:
             # killed before it had begun
             self._take_lock(waiting)
             owned_files.remove_study(waiting)
+        if self._only_begun():
+            self._take_lock(self.target)
+            owned_files.remove_study(self.target)
         there = self._holds_something()
         if not there and not waiting.exists():
             return
@@ -202,11 +205,21 @@ class StudyFolder:
             self._check_replaced(waiting)
             if waiting.exists():
                 self._take_lock(waiting)
-                owned_files.remove_study(waiting)
+                # with what its manifest lists, if it was complete and only had to be put in place
+                owned_files.remove_files(waiting, {*(run_folder.unlisted(waiting) or ())})
             if there:
                 self.path = waiting
         if self.path == waiting and owned_files.is_study(self.target):
             self._take_lock(self.target)
+
+    def _only_begun(self) -> bool:
+        """Return whether a study was killed, or the power failed, before its folder said whose it is."""
+        names = (owned_files.STUDY_STATE, owned_files.MANIFEST)
+        return (
+            (self.target / owned_files.WRITTEN).is_file()
+            and not any((self.target / name).exists() for name in names)
+            and owned_files.foreign_files(self.target, None, study=True) == []
+        )
 
     def _holds_something(self) -> bool:
         """Whether there is anything at the target but a folder with nothing in it."""

@@ -1,0 +1,518 @@
+"""What stands on the disk after a power cut at any moment: only what was written through (fsync) can be relied on.
+
+A layer below the programs (``LD_PRELOAD``) reports every fsync of a file or folder and every change of a name before it
+happens. From what it saw the disk is made up again as it may be after a cut at each of these moments: the oldest that
+the file system may keep, the newest, and mixtures. It writes nothing through itself.
+
+    python -m tests.twin.test_power_cut SCENARIO FOLDER INPUTS FAULT
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import json
+import os
+import shutil
+import socket
+import stat
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.twin import record_bench, replacing, study_bench
+from tests.twin.commands import invoke
+from twin.operate.__main__ import app
+from twin.run import durable, owned_files
+from twin.run.kept_work import KeptWork
+from twin.run.run_folder import RunFolder, RunFolderError, read_manifest, remove_replaced, write_manifest
+from twin.study.runs.base_job import BlockResult
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
+from twin.study.runs.study_folder import StudyFolder
+from twin.tolerance.samples import _journal
+
+pytestmark = pytest.mark.second
+LAYER = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/un.h>
+#include <unistd.h>
+void power_cut_report(const char *what, int file) {
+    const char *place = getenv("POWER_CUT");
+    struct sockaddr_un to = {.sun_family = AF_UNIX};
+    struct stat about = {0};
+    char line[128];
+    int kept = errno, out = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
+    if (file >= 0) fstat(file, &about);
+    if (place) strncpy(to.sun_path, place, sizeof to.sun_path - 1);
+    if (place && connect(out, (void *)&to, sizeof to) == 0) {
+        int n = snprintf(line, sizeof line, "%s %ld %ld", what, (long)about.st_dev, (long)about.st_ino);
+        if (write(out, line, n) != n || read(out, line, 1) != 1) abort();
+    }
+    close(out);
+    errno = kept;
+}
+int fsync(int file) { power_cut_report("sync", file); return 0; }
+int fdatasync(int file) { power_cut_report("sync", file); return 0; }
+#define REPORTED(name, types, values) int name types { \\
+    int (*next) types = dlsym(RTLD_NEXT, #name); power_cut_report(#name, -1); return next values; }
+REPORTED(rename, (const char *a, const char *b), (a, b))
+REPORTED(renameat, (int i, const char *a, int j, const char *b), (i, a, j, b))
+REPORTED(renameat2, (int i, const char *a, int j, const char *b, unsigned k), (i, a, j, b, k))
+REPORTED(unlink, (const char *a), (a))
+REPORTED(unlinkat, (int i, const char *a, int k), (i, a, k))
+REPORTED(rmdir, (const char *a), (a))
+REPORTED(link, (const char *a, const char *b), (a, b))
+REPORTED(ftruncate, (int i, long n), (i, n))
+REPORTED(ftruncate64, (int i, long n), (i, n))
+"""
+ROOT = Path(__file__).resolve().parents[2]
+Inode = tuple[int, int]
+Tree = dict[str, bytes | None]
+"""Path -> content of a file, None of a folder."""
+
+
+@dataclass
+class Moment:
+    """What stood below the folder, reached the disk or not: names by folder, contents by file."""
+
+    event: str
+    inode: Inode
+    names: dict[Inode, dict[str, Inode]]
+    contents: dict[Inode, bytes]
+
+
+class Recorder:
+    """Hears the layer, one event at a time, and keeps what stands below a folder. No inode's number is used again."""
+
+    def __init__(self, base: Path, place: Path, scenario: str) -> None:
+        self.base, self.moments, self.heard, self.scenario = base, [], [], scenario
+        self.folders: set[Inode] = set()
+        self._held: dict[Inode, int] = {}
+        self._known: dict[bytes, bytes] = {}
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.bind(str(place))
+        self._socket.listen(64)
+        self.root = self._look(base, {}, {})
+        self._thread = threading.Thread(target=self._hear, daemon=True)
+        self._thread.start()
+
+    def _hear(self) -> None:
+        while True:
+            caller, _ = self._socket.accept()
+            with caller:
+                event, *inode = caller.recv(128).decode().rsplit(" ", 2)
+                if event == "end":
+                    return
+                names: dict[Inode, dict[str, Inode]] = {}
+                contents: dict[Inode, bytes] = {}
+                self._look(self.base, names, contents)
+                self.moments.append(Moment(event, (int(inode[0]), int(inode[1])), names, contents))
+                if event == "sync" and sum(one.event == "sync" for one in self.moments) == LOCKED[self.scenario][0]:
+                    self.heard.append(second_command(self.scenario, self.base))
+                with suppress(OSError):
+                    caller.send(b".")
+
+    def _look(self, place: Path, names: dict[Inode, dict[str, Inode]], contents: dict[Inode, bytes]) -> Inode:
+        file = os.open(place, os.O_PATH | os.O_NOFOLLOW)
+        about = os.fstat(file)
+        inode = about.st_dev, about.st_ino
+        if self._held.setdefault(inode, file) != file:
+            os.close(file)
+        if stat.S_ISDIR(about.st_mode):
+            self.folders.add(inode)
+            own = names[inode] = {}
+            for name in os.listdir(place):
+                with suppress(FileNotFoundError):
+                    own[name] = self._look(place / name, names, contents)
+        else:
+            content = place.read_bytes()
+            contents[inode] = self._known.setdefault(content, content)
+        return inode
+
+    def end(self) -> None:
+        """Hear no more."""
+        with socket.socket(socket.AF_UNIX) as last:
+            last.connect(self._socket.getsockname())
+            last.send(b"end 0 0")
+        self._thread.join(30)
+        for file in (*self._held.values(), self._socket.detach()):
+            os.close(file)
+
+
+def disks(recorder: Recorder, files: bool = True, folders: bool = True) -> Iterator[tuple[str, tuple[str, ...], Tree]]:
+    """Return moment, what was acknowledged until then, and the disk after a cut, each that is new.
+
+    Args:
+        recorder: has heard all.
+        files, folders: whether what was asked to be written through is; else a fault of the program's.
+    """
+    synced: dict[Inode, bytes] = {}
+    listed: dict[Inode, dict[str, Inode]] = {}
+    last: dict[Inode, bytes] = {}
+    acknowledged: tuple[str, ...] = ()
+    seen = set()
+    for number, moment in enumerate(recorder.moments):
+        last |= moment.contents
+        if moment.event.startswith("done "):
+            acknowledged += (moment.event.removeprefix("done "),)
+        old = dict.fromkeys(last, b"") | synced
+        zeros = {one: old[one][: len(new)].ljust(len(new), b"\0") for one, new in last.items()}
+        models = [
+            ("nothing more", listed, old),
+            ("names alone", moment.names, old),
+            ("names and sizes", moment.names, zeros),
+            ("sizes", listed, zeros),
+            ("contents alone", listed, last),
+            ("all", moment.names, last),
+        ]
+        dirty = [one for one, content in moment.contents.items() if old[one] != content]
+        models += [("one content", moment.names, old | {one: last[one]}) for one in dirty if len(dirty) in (2, 3)]
+        for model, names, contents in models:
+            tree = dict(_standing(recorder.root, names, recorder.folders, contents))
+            key = (acknowledged, frozenset(tree.items()))
+            if key not in seen:
+                seen.add(key)
+                yield f"moment {number} ({moment.event}, {model})", acknowledged, tree
+        if moment.event == "sync" and moment.inode in moment.names and folders:
+            listed[moment.inode] = moment.names[moment.inode]
+        elif moment.event == "sync" and moment.inode in last and files:
+            synced[moment.inode] = last[moment.inode]
+
+
+def _standing(folder: Inode, names: dict, folders: set[Inode], contents: dict, path: str = "") -> Iterator[tuple]:
+    for name, inode in names.get(folder, {}).items():
+        yield f"{path}{name}", None if inode in folders else contents[inode]
+        if inode in folders:
+            yield from _standing(inode, names, folders, contents, f"{path}{name}/")
+
+
+# --- programs, and what a disk must hold after them -----------------------------------------------------------------
+
+
+def done(step: str) -> None:
+    """Say that a step has been acknowledged to its user."""
+    ctypes.CDLL(None).power_cut_report(f"done {step}".encode(), -1)
+
+
+def commands(base: Path, inputs: Path) -> list[tuple[object, ...]]:
+    """Commands of twin.operate, and the number of entries in the record after each."""
+    record = base / "record"
+    return [
+        ("init", record, "gf7_pair", "--simulated"),
+        ("ingest", record, inputs / "a.yaml"),
+        ("ingest", record, inputs / "recover-1", "--time", "2026-01-01T01:00:00Z"),
+        ("exclude", record, 6, "--why", "a test"),
+        ("ingest", record, inputs / "b.yaml"),
+    ]
+
+
+ENTRIES = [0, 5, 6, 7, 12]
+
+
+def operate(base: Path, inputs: Path) -> None:
+    for number, words in enumerate(commands(base, inputs)):
+        result = invoke(app, *words)
+        assert result.exit_code == 0, result.output
+        done(str(number))
+
+
+def check_record(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
+    def status() -> int:
+        result = invoke(app, "status", base / "record", "--check-all", "--json")
+        if result.exit_code:
+            assert result.exit_code == 2, result.output
+            assert "Traceback" not in result.stderr
+            return -1
+        told = json.loads(result.stdout)
+        assert not told["warnings"], told["warnings"]
+        return told["entries"]
+
+    allowed, found = [-1, *ENTRIES], status()
+    assert found in allowed[len(steps) : len(steps) + 2], f"{found} entries after {len(steps)} commands"
+    if len(steps) < len(ENTRIES) and again:
+        result = invoke(app, *commands(base, inputs)[len(steps)])
+        assert result.exit_code == 0 or "excluded already" in result.stderr, result.output
+        assert status() == ENTRIES[len(steps)]
+
+
+def replace_run(base: Path, inputs: Path) -> None:
+    import h5py
+
+    for stem in ("1", "2"):
+        with RunFolder(base / "runs/run", force=True) as folder:
+            folder.write_bytes("which.txt", stem.encode())
+            (folder.path / "artefacts").mkdir()
+            with h5py.File(folder.path / "artefacts/numbers.nc", "w") as file:
+                file["numbers"] = list(range(2000))
+            write_manifest(folder, "twin.test", 1.5e9, 1.0)
+        done(stem)
+
+
+def check_run(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
+    target = base / "runs/run"
+    found = replacing.standing(target) if target.exists() and any(target.iterdir()) else ""
+    assert found in ("", "1", "2")[len(steps) : len(steps) + 2], f"{found!r} after {steps}"
+    for other in base.glob("runs/.run.*.partial"):
+        assert read_manifest(other) is None or replacing.standing(other) is not None, "taken for whole"
+    if again:
+        replacing.replace_run(target, "again", 1e-6)
+        assert replacing.standing(target) == "again"
+        owned_files.sweep(target.parent, remove_replaced)
+        assert [path.name for path in target.parent.iterdir()] == ["run"]
+
+
+def replace_study(base: Path, inputs: Path) -> None:
+    write, number = ChunkStore.write, iter(range(1000))
+
+    def acknowledged(store: ChunkStore, first: int, parts: list) -> None:
+        write(store, first, parts)
+        done(f"chunk {next(number)}")
+
+    ChunkStore.write = acknowledged
+    for stem in ("1", "2"):
+        replacing.replace_study(base / "run", stem, 1e-6)
+        done(stem)
+
+
+def check_study(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
+    target, plan = base / "run", _plan()
+    stands = [step for step in steps if step in ("1", "2")]
+    begun = len(steps) - 1 - steps.index(stands[-1]) if stands else len(steps)
+    place = owned_files.successor(target) if stands == ["1"] and owned_files.successor(target).exists() else target
+    found = replacing.standing(target)
+    assert found in ((None, "1"), ("1", "2"), ("2",))[len(stands)], f"{found!r} after {steps}"
+    if found != "2" and begun:
+        store = ChunkStore(place, plan)
+        store.open()
+        assert len(store.done) >= begun, f"{len(store.done)} chunks after {steps}"
+        assert not store.corrupt
+    if len(stands) < 2 and again:
+        begun = (place / "study_state.json").exists() and not (place / "manifest.json").exists()
+        replacing.replace_study(target, "again", 1e-6, resume=begun)
+        assert replacing.standing(target) == "again"
+
+
+def keep_work(base: Path, inputs: Path) -> None:
+    plan = _plan()
+    with KeptWork(base / "out", "out", "samples", resume=True) as kept:
+        folder = kept.begin() / "tested"
+        with _journal(folder, "this budget"):
+            store = ChunkStore(folder, plan)
+            store.open()
+            for block in store.missing[:2]:
+                n = len(plan.block(block))
+                numbers = np.zeros((n, len(plan.setup.study.responses)))
+                store.write(block, [BlockResult(numbers, numbers, numbers, ("",) * n, 1.0, ("",) * n)])
+                done(str(block))
+
+
+@cache
+def _plan() -> Plan:
+    return Plan.of(resolve_study(Path(os.environ["TWIN_STUDY"])))
+
+
+def check_kept(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
+    folder = base / "out.samples/tested"
+    if steps:
+        with pytest.raises(RunFolderError, match="of another budget"), _journal(folder, "another budget"):
+            pass
+    with _journal(folder, "this budget"):
+        store = ChunkStore(folder, _plan())
+        store.open()
+        assert len(store.done) >= len(steps), f"{len(store.done)} chunks after {steps}"
+        assert not store.corrupt
+
+
+SCENARIOS = {
+    "record": (operate, check_record),
+    "run": (replace_run, check_run),
+    "study": (replace_study, check_study),
+    "kept": (keep_work, check_kept),
+}
+
+
+def plant(fault: str) -> None:
+    """Leave out what keeps acknowledged work through a power cut."""
+    from twin.operate.record import database
+
+    if fault.startswith("synchronous"):
+        connect = database._on_connect
+        database._on_connect = lambda connection, record: (
+            connect(connection, record),
+            connection.execute(f"PRAGMA {fault}").close(),
+        )
+    elif fault == "rename first":
+
+        def write_one(file: tuple[Path, bytes]) -> None:
+            partial = file[0].with_name(f".{file[0].name}.01234567.partial")
+            partial.write_bytes(file[1])
+            partial.replace(file[0])
+            durable._sync_file(file[0])
+
+        durable._write_one = write_one
+    elif fault == "no lock":
+        fcntl.flock = lambda file, how: None
+
+
+@pytest.fixture(scope="module")
+def layer(tmp_path_factory) -> Path:
+    """The layer, compiled."""
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler here, which builds the layer that sees what is written through")
+    folder = tmp_path_factory.mktemp("layer")
+    (folder / "layer.c").write_text(LAYER)
+    line = [compiler, "-shared", "-fPIC", "-o", str(folder / "layer.so"), str(folder / "layer.c"), "-ldl"]
+    if subprocess.run(line, check=False, capture_output=True).returncode:
+        pytest.skip("the C compiler here does not build the layer that sees what is written through")
+    return folder / "layer.so"
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory) -> Path:
+    """Tables, a run folder and a study."""
+    folder = tmp_path_factory.mktemp("inputs")
+    for name, first in (("a", 0), ("b", 100)):
+        (folder / f"{name}_t.csv").write_text(record_bench.table(first, 5))
+        (folder / f"{name}.yaml").write_text(record_bench.TELEMETRY.replace("t_*.csv", f"{name}_t.csv"))
+    record_bench.run_folder(folder / "recover-1")
+    study_bench.write_study(folder / "study")
+    return folder
+
+
+def record_program(scenario: str, fault: str, layer: Path, inputs: Path, folder: Path) -> Recorder:
+    """Return what was seen of a program that ran to its end."""
+    (folder / "disk").mkdir()
+    recorder = Recorder(folder / "disk", folder / "socket", scenario)
+    words = [sys.executable, "-m", "tests.twin.test_power_cut", scenario, str(folder / "disk"), str(inputs), fault]
+    own = {
+        "LD_PRELOAD": str(layer),
+        "POWER_CUT": str(folder / "socket"),
+        "TWIN_STUDY": str(inputs / "study/study.yaml"),
+    }
+    try:
+        result = subprocess.run(
+            words, cwd=ROOT, env={**os.environ, **own}, capture_output=True, text=True, timeout=120, check=False
+        )
+    finally:
+        recorder.end()
+    assert result.returncode == 0, result.stderr
+    return recorder
+
+
+@pytest.fixture(scope="module")
+def recorded(layer, inputs, tmp_path_factory):
+    """Function: scenario and fault -> what was seen; each program runs once."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr("twin.operate.record.database.WAIT", 0.1)
+    yield cache(lambda *what: record_program(*what, layer, inputs, tmp_path_factory.mktemp("recorded")))
+    patch.undo()
+
+
+def check_all(scenario: str, recorder: Recorder, inputs: Path, folder: Path, **synced: bool) -> int:
+    """Check every disk that a power cut may leave; return how many there are."""
+    count, tried = 0, set()
+    for count, (moment, steps, tree) in enumerate(disks(recorder, **synced), 1):
+        kind = (steps, frozenset((name, content and not any(content)) for name, content in tree.items()))
+        base = folder / str(count)
+        base.mkdir(parents=True)
+        for path, content in tree.items():
+            (base / path).mkdir() if content is None else (base / path).write_bytes(content)
+        try:
+            SCENARIOS[scenario][1](base, inputs, steps, kind not in tried)
+        except (Exception, pytest.fail.Exception) as error:
+            raise AssertionError(f"{moment}, acknowledged {steps}: {sorted(tree)}: {error}") from error
+        tried.add(kind)
+        shutil.rmtree(base)
+    return count
+
+
+@pytest.fixture(autouse=True)
+def quick_checks(monkeypatch, inputs) -> None:
+    """The checks write nothing through: their disk is no one's."""
+    monkeypatch.setattr(os, "fsync", lambda file: None)
+    monkeypatch.setattr(replacing, "FILES", 2)
+    monkeypatch.setenv("TWIN_STUDY", str(inputs / "study/study.yaml"))
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_what_was_acknowledged_outlives_a_power_cut(scenario, recorded, inputs, tmp_path) -> None:
+    """At every moment what was acknowledged stands whole, all else is absent or refused, and the work goes on."""
+    assert check_all(scenario, recorded(scenario, "none"), inputs, tmp_path) > 20
+
+
+FAULTS = [
+    ("record", "synchronous = OFF", {}),
+    ("kept", "rename first", {}),
+    *((scenario, "none", {kind: False}) for scenario in SCENARIOS for kind in ("files", "folders")),
+]
+"""Program, what is planted in it, and what of that which it writes through is not."""
+
+
+@pytest.mark.parametrize(("scenario", "fault", "synced"), FAULTS)
+def test_a_missing_sync_is_noticed(scenario, fault, synced, recorded, inputs, tmp_path) -> None:
+    """Without any one of the syncs, or with the name before them, a disk loses or doctors what was acknowledged."""
+    with pytest.raises(AssertionError, match=r"moment .*, acknowledged"):
+        check_all(scenario, recorded(scenario, fault), inputs, tmp_path, **synced)
+
+
+def second_command(scenario: str, base: Path) -> str:
+    """What is told to another command that begins meanwhile; nothing to one that clears up."""
+    try:
+        if scenario == "record":
+            return invoke(app, "init", base / "record", "gf7_pair", "--simulated").stderr
+        if scenario == "run":
+            owned_files.sweep(base / "runs", remove_replaced)
+        elif scenario == "study":
+            StudyFolder(base / "run", _plan().setup, resume=True).__enter__()
+        else:
+            KeptWork(base / "out", "out", "samples", resume=True).begin()
+    except RunFolderError as error:
+        return str(error)
+    return ""
+
+
+LOCKED = {
+    "record": (4, "database is locked"),
+    "run": (3, ""),
+    "study": (12, "another command is working in"),
+    "kept": (6, "is in use by another command"),
+}
+"""At which sync another command begins, and what it says."""
+
+
+@pytest.mark.parametrize("scenario", LOCKED)
+def test_another_command_leaves_all_as_it_is(scenario, recorded) -> None:
+    """A lock holds while a program writes: another command is refused meanwhile."""
+    (heard,) = recorded(scenario, "none").heard
+    assert LOCKED[scenario][1] in heard
+
+
+@pytest.mark.parametrize("scenario", ["run", "study", "kept"])
+def test_a_missing_lock_is_noticed(scenario, recorded) -> None:
+    """Without it the other command is not refused, or spoils the work."""
+    with pytest.raises(AssertionError):
+        assert LOCKED[scenario][1] in recorded(scenario, "no lock").heard[0]
+
+
+if __name__ == "__main__":
+    replacing.FILES = 2
+    plant(sys.argv[4])
+    SCENARIOS[sys.argv[1]][0](Path(sys.argv[2]), Path(sys.argv[3]))
