@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 
 import numpy as np
+from tests.benchmarks.yardsticks import pace
 
 from scenes.specs.tolerance import resolve_tolerance
 from scenes.yaml.yaml_file import dump_yaml
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.workbench import Workbench
-from tests.benchmarks.yardsticks import pace
 from twin.run.memory import largest_memory
 from twin.tolerance.merit_models import sensitivities
 from twin.tolerance.samples import Workforce, draw_samples

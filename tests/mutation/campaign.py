@@ -170,7 +170,12 @@ def _collected(server: ForkServer) -> set[str]:
 @contextmanager
 def _copies(root: Path, workers: int) -> Iterator[list[Path]]:
     """Copies of the tree without what is made, with byte code that is checked by its source's hash."""
-    made = shutil.ignore_patterns(".*", "runs", "build", "dist", "__pycache__", "*.egg-info")
+    hidden = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info")
+
+    def made(folder: str, names: list[str]) -> set[str]:
+        """What is not source: hidden files, and the folders of results at the top."""
+        return {*hidden(folder, names), *({"runs", "build", "dist"} if Path(folder) == root else ())}
+
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
         copies = [Path(folder) / str(number) for number in range(workers)]
         for copy in copies:
