@@ -200,10 +200,7 @@ def test_spots_and_temperatures_of_a_pair(backend, tmp_path) -> None:
     names = list(bench.parameters.words)
     slope = bench.slope(np.zeros(len(names)))
     pivot = next(one.pivot for one in bench.parameters.components if one.name == "base/forward/M3 rotate y")
-    motions = [
-        ElementaryMotion("base/forward/M2", "shift", 0),
-        ElementaryMotion("base/forward/M3", "rotate", 1, pivot),
-    ]
+    motions = [ElementaryMotion("base/forward/M2", "shift", 0), ElementaryMotion("base/forward/M3", "rotate", 1, pivot)]
     exact = spot_jacobian(bench.experiment.path, motions).reshape(-1, 2)
     columns = [names.index("forward/M2 shift x"), names.index("forward/M3 rotate y")]
     assert np.max(np.abs(exact), axis=0) == pytest.approx(
@@ -224,10 +221,7 @@ def test_spots_of_recovered_frames_and_of_tables_are_read(backend, tmp_path) -> 
     (tmp_path / "recovered.json").write_text(json.dumps({"spots": spots}))
     rows = "".join(f"{camera},{channel},{40.0 + k},{50.0 - k}\n" for k, (camera, channel) in enumerate(channels))
     (tmp_path / "spots.csv").write_text(f"camera,channel,row_px,column_px\n{rows}")
-    prior = {
-        "name": "parts",
-        "causes": {"one": {"bodies": "base/forward/M2", "shift": "1 um", "reason": "a test"}},
-    }
+    prior = {"name": "parts", "causes": {"one": {"bodies": "base/forward/M2", "shift": "1 um", "reason": "a test"}}}
     measured = {
         "spots": {
             "frames": {"file": "recovered.json", "state": "after", "sigma": 0.02},
@@ -291,11 +285,7 @@ def test_moves_are_part_of_the_state(backend, tmp_path) -> None:
     two = {name: {"fields": FIVE, "sigma": "2 nm", "focus": "1 um"} for name in ("before", "later")}
     two["later"]["after"] = "poke"
     bench = bench_of(
-        backend,
-        tmp_path,
-        {"wavefronts": two},
-        actuators=actuators,
-        moves={"poke": {"by": {"z": "200 um"}}},
+        backend, tmp_path, {"wavefronts": two}, actuators=actuators, moves={"poke": {"by": {"z": "200 um"}}}
     )
     assert bench.parameters.labels[-2:] == ("response of z", "error of poke z")
     rng = np.random.default_rng(2)

@@ -14,9 +14,7 @@ THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXP
 MANIFEST = "manifest.json"
 PAGES = ("report.html",)
 """They name the manifest's times; of the manifest itself all but times and checksums is compared."""
-RUNS = {
-    "render": ("twin.render", "scenes/examples/perturb.yaml", "--frames", "2"),
-}
+RUNS = {"render": ("twin.render", "scenes/examples/perturb.yaml", "--frames", "2")}
 SLOW_RUNS = {
     "angle": ("twin.orbit", "angle", "scenes/orbit/angle.yaml"),
     "course": ("twin.render", "scenes/examples/orbit.yaml", "--frames", "1"),

@@ -603,7 +603,7 @@ def test_the_nodes_of_an_instrument_are_listed(tmp_path) -> None:
     focal_plane = {"pivots": ["origin", "rear_node", "line_centre"], "allows": ["rotate", "shift", "temperature"]}
     assert data["nodes"]["base/backward/focal_plane"] == focal_plane
     assert data["nodes"]["base/forward/M2"]["allows"] == [
-        *("rotate", "shift", "figure", "radius", "conic", "temperature"),
+        *("rotate", "shift", "figure", "radius", "conic", "temperature")
     ]
     # what a job may not name is not in the list, and what it may is
     path = tmp_path / "job.yaml"
