@@ -206,18 +206,6 @@ def test_a_response_that_the_results_do_not_have(study, backend, tmp_path) -> No
 
 
 @pytest.mark.second
-def test_other_keys_than_motions(study, backend) -> None:
-    """The number of photons changes the scatter that the analysis expects as the root of it."""
-    place = ("instrument", "monitor", "reticle", "photons_per_frame")
-    runs = [Run(k, ((place, value),), 7) for k, value in enumerate((4e6, 1e6))]
-    one, two = study.setup.job.evaluate(study.setup.tree, runs, backend)
-    sigma = [o["recovered"]["cameras"]["forward"]["model"]["d_f_um_sigma_noise"] for o in (one, two)]
-    # shot noise alone would give 2; read-out and fixed pattern noise change it a little
-    assert 1.5 < sigma[1] / sigma[0] < 2.6
-    assert np.isfinite(sigma).all()
-
-
-@pytest.mark.slow
 def test_what_is_stated_to_move_may_be_varied(tmp_path, backend, monkeypatch) -> None:
     """One number on all axes: readings of `posterior` and total sigmas of all estimators are those of a job that says
     it by hand; noise is not touched.
