@@ -82,32 +82,6 @@ BEYOND: dict[str, tuple[str, tuple[tuple[str, str], ...], str, str]] = {
     ),
 }
 """Command -> a file of ``scenes``, what stands there for what, the key that is named then, and the number's unit."""
-ELSEWHERE = {
-    "render": "the CCD, test_memory",
-    "uncertainty": "the monitor's own refusal, test_memory",
-    "orbit monitor": "the monitor's own refusal, test_memory",
-    "operate simulate": "an option, below",
-    "recover": "files that are no part of the sources, below",
-    "study": "the study's own limit beside it, test_memory",
-    "orbit match": "images of a run, tests/twin/test_orbit_match.py",
-}
-"""Command whose refusal is tested by itself -> how."""
-NEVER = (
-    "lab turntable",
-    "orbit jitter",
-    "orbit angle",
-    "orbit check",
-    "design camera",
-    "design monitor",
-    "operate judge",
-    "validate",
-)
-"""Models of commands whose memory no number of a file makes large: they tell their time."""
-
-
-def test_every_model_is_refused_or_never_large() -> None:
-    models = {name for name, cost in every_cost().items() if isinstance(cost, Named)}
-    assert models == {*BEYOND, *ELSEWHERE, *NEVER}
 
 
 def check_refused(done: object, file: Path | None, key: str, unit: str, folder: Path) -> None:

@@ -12,12 +12,12 @@ import pytest
 import twin.orbit.__main__ as command
 from optics.numerics.backend import load_backend
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit.setup import resolve_angle, resolve_simulate
+from scenes.specs.orbit.setup import resolve_simulate
 from tests.twin.commands import files, invoke
 from tests.twin.line_scanner_model import LineScannerModel
 from tests.twin.test_simulate import write
 from twin.orbit.export.export_report import export_files
-from twin.orbit.export.export_run import ExportSource, read_source, run_export
+from twin.orbit.export.export_run import read_source, run_export
 from twin.orbit.export.line_scanner import line_scanner
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
@@ -84,7 +84,7 @@ def test_a_sensor_model_sees_what_the_rigorous_sensor_sees(flight, name, effects
     assert all(max(e.sample_px, e.line_px) < allowed for e in scanner.errors if e.height_m == height)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_what_refraction_does_elsewhere_is_told(flight) -> None:
     sensor = _sensor(flight, "forward", LightEffects())
     scanner, model = _isd(sensor)
@@ -165,28 +165,6 @@ def test_polynomials_say_how_far_jitter_is_from_them(flight) -> None:
     for rms, stated in zip(np.sqrt(np.mean(away**2, axis=0)), rpc.rms_px, strict=True):
         assert 0.6 * stated < rms < 1.6 * stated
     assert 0.05 < max(rpc.rms_px) < 0.5
-
-
-@pytest.mark.slow
-def test_the_lines_of_a_mirror_camera() -> None:
-    path = SCENES / ORBIT / "angle_gf7.yaml"
-    setup = resolve_angle(path)
-    export = run_export(ExportSource(setup, "", None, 1, {}), load_backend("llvm"), (0.0, 2000.0))
-    assert set(export.lines) == {"forward", "backward"}
-    for line in export.lines.values():
-        sensor = line.window.sensor
-        at, pixel = _places(sensor)
-        ground = sensor.ground(at, pixel, HEIGHTS[1])
-        there = LineScannerModel(line.scanner.isd).image(ground)
-        stated = next(e for e in line.scanner.errors if e.height_m == HEIGHTS[1])
-        # what is left is the distortion, which is traced and no cubic
-        assert np.abs(there[0] - 0.5 - at).max() < 1.1 * stated.line_px + 1e-5 < 0.05
-        assert np.abs(there[1] - 0.5 - pixel).max() < 1.1 * stated.sample_px + 1e-5 < 0.05
-        assert line.polynomial is not None
-        longitude, latitude, height = sensor.earth.geodetic(ground)
-        points = np.stack([np.degrees(longitude), np.degrees(latitude), height], axis=-1)
-        there = _gdal(line.polynomial, (8, 8), points)
-        assert np.abs(there - np.stack([at, pixel], axis=-1)).max() < 0.01
 
 
 @pytest.mark.second
@@ -298,16 +276,3 @@ def test_a_file_is_exported_without_images() -> None:
     export = run_export(small, load_backend("llvm"), (0.0, 500.0))
     assert set(export_files(export)) == {"models/nadir.json", "models/nadir_RPC.TXT"}
     assert export.lines["nadir"].window.frame is None
-
-
-@pytest.mark.slow
-def test_the_run_folder_of_a_test_of_angles_is_its_file(tmp_path: Path) -> None:
-    """Camera, orbit and moment of the run; so are the models."""
-    file = tmp_path / "angle.yaml"
-    file.write_text((SCENES / ORBIT / "angle.yaml").read_text("utf-8").replace("passes: 200", "passes: 2"), "utf-8")
-    assert run("angle", file, "--out", tmp_path / "run", "--seed", 4, "--quiet").exit_code == 0
-    sources = [read_source(tmp_path / "run"), read_source(file, 4)]
-    assert sources[0].setup.camera == sources[1].setup.camera
-    assert [(one.seed, one.folder, dict(one.windows)) for one in sources] == [(4, None, {})] * 2
-    made = [export_files(run_export(one, load_backend("llvm"), (0.0, 500.0))) for one in sources]
-    assert made[0] == made[1]

@@ -122,21 +122,12 @@ def agrees_with_rebuilt_layouts(bench: LayoutBench, number: LayoutNumber) -> Non
         assert error <= 1e-5 * abs(value) + noise, (number.name, key)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_slope_against_layouts_that_are_built_anew(bench: LayoutBench) -> None:
     agrees_with_rebuilt_layouts(bench, LayoutNumber((FIRST,), 0, "pupil_x"))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CONTINUOUS)
-@pytest.mark.parametrize("beam", [0, 1])
-def test_every_slope_against_layouts_that_are_built_anew(bench: LayoutBench, name: str, beam: int) -> None:
-    # off the plane of symmetry, where prisms are exchanged for their mirror images and a layout jumps
-    beams = (replace(FIRST, pupil_y=0.01), replace(SECOND, pupil_y=0.015))
-    agrees_with_rebuilt_layouts(bench, LayoutNumber(beams, beam, name))
-
-
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_slope_across_a_jump_says_so(bench: LayoutBench) -> None:
     """A 180-deg prism of the second beam is exchanged for its mirror image within the first of the steps, of 1.2 mm:
     what small differences on this side of the jump find lies within the stated error, which is as large as the slope.
@@ -166,7 +157,7 @@ def test_a_layout_at_a_limit_has_slopes_and_one_beyond_tells_why(bench: LayoutBe
     assert not lost.values
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_spots_that_fill_their_pixels_are_refused(bench: LayoutBench) -> None:
     told = bench.try_beam(replace(FIRST, photons=1e8)).refused
     assert told.startswith("its spots are too bright")
