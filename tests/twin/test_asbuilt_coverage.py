@@ -17,7 +17,6 @@ from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.measured_kinds import View
 
 FIVE = [[x, 0.0] for x in (-1.0, -0.5, 0.0, 0.5, 1.0)]
-NINE = [[x, y] for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]
 TWENTY_FIVE = [[x, y] for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-1.0, -0.5, 0.0, 0.5, 1.0)]
 DRAWS = 200
 
@@ -111,25 +110,14 @@ def judged(bench: AsBuiltBench, rng: np.random.Generator, count: int, unknown_fi
     return tally
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("fields", [FIVE, NINE], ids=["five", "nine"])
-def test_sigmas_hold_for_200_cameras_of_another_law(backend, tmp_path, fields) -> None:
-    """Wavefronts at 25 fields, line of sight, principal distance and the eight best known combinations cover at 68 and
-    95 %, of cameras drawn from a uniform law with the prior's covariance, mirrors' figures among it.
-    """
-    tally = judged(coverage_bench(backend, tmp_path, fields), np.random.default_rng(1), 200)
-    tally.require()
-    assert np.sum(tally.agrees) >= binom.ppf(1e-4, 200, 0.99)
-
-
-@pytest.mark.slow
+@pytest.mark.second
 def test_figures_that_the_prior_does_not_have_are_told(backend, tmp_path) -> None:
     """40 nm of figure in terms beyond the prior's: the chi-square says so in nearly all cameras."""
-    tally = judged(coverage_bench(backend, tmp_path, NINE), np.random.default_rng(2), 12, 40e-9)
-    assert np.sum(tally.agrees) <= 1
+    tally = judged(coverage_bench(backend, tmp_path, FIVE), np.random.default_rng(2), 3, 40e-9)
+    assert not any(tally.agrees)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_sigmas_hold_for_some_cameras(backend, tmp_path) -> None:
     """The same for twelve cameras: nearly all lie within 95 %."""
     tally = judged(coverage_bench(backend, tmp_path, FIVE), np.random.default_rng(3), 12)
