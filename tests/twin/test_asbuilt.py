@@ -308,27 +308,6 @@ def test_moves_are_part_of_the_state(backend, tmp_path) -> None:
     assert not np.any(wanted_move(still, np.zeros(len(still.parameters.labels)), None).amounts)
 
 
-@pytest.mark.second
-def test_responses_of_actuators_are_found(backend, tmp_path) -> None:
-    """Real responses were 1.13, 0.92 and 0.87 of the traced ones (Rubin's M2, despace and decentres): three pokes tell
-    them, within three standard deviations that are below 2 %.
-    """
-    actuators = {
-        axis: {"motion": f"M2 shift {axis}", "range": "1 mm", "response": 0.1, "move_error": 0.002} for axis in "zxy"
-    }
-    one = {"fields": FIVE, "sigma": "3 nm", "focus": "1 um"}
-    measured = {"start": one, **{f"after_{axis}": {**one, "after": f"poke_{axis}"} for axis in "zxy"}}
-    moves = {f"poke_{axis}": {"by": {axis: "300 um" if axis == "z" else "500 um"}} for axis in "zxy"}
-    bench = bench_of(backend, tmp_path, {"wavefronts": measured}, actuators=actuators, moves=moves)
-    rng = np.random.default_rng(6)
-    true = bench.draw(rng, "normal")
-    own = [bench.parameters.labels.index(f"response of {axis}") for axis in "zxy"]
-    true[own] = [0.13, -0.08, -0.13]
-    found = bench.estimate(bench.measured(true, rng))
-    assert np.all(np.abs(found.mean - true)[own] < 3.0 * found.sigma[own])
-    assert np.all(found.sigma[own] < 0.02)
-
-
 def written_maps(folder: Path, coefficients: np.ndarray, orientation: Orientation) -> list[str]:
     """FITS files of wavefronts (F, 8) of Z4 to Z11, as an interferometer has them that lies so."""
     names = []
@@ -657,21 +636,3 @@ def test_a_prior_of_nothing_is_refused(backend, tmp_path) -> None:
     nothing = {"name": "parts", "causes": {"one": {"bodies": "base/*/M?", "shift": "0 um", "reason": "a test"}}}
     with pytest.raises(InputError, match="nothing is expected to move"):
         bench_of(backend, tmp_path, {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "5 nm"}}}, nothing)
-
-
-@pytest.mark.second
-def test_measurements_that_contradict_each_other_are_refused(backend, tmp_path) -> None:
-    """Ten readings of the line of sight by arcminutes apart, each with a sigma of an arcsecond."""
-    sight = {
-        f"reading_{k}": {
-            "alpha": f"{60 * (-1) ** k} arcsec",
-            "beta": f"{20 * k} arcsec",
-            "sigma_alpha": "1 arcsec",
-            "sigma_beta": "1 arcsec",
-        }
-        for k in range(10)
-    }
-    setup = resolve_asbuilt(written(tmp_path, {"sight": sight}, simulate=None))
-    with pytest.raises(InputError, match="contradict each other") as caught:
-        run_asbuilt(setup, backend)
-    assert "measurements.sight.reading_" in str(caught.value)

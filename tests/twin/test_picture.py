@@ -107,32 +107,6 @@ def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
     assert checked > 50
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
-def test_all_that_matters_can_be_seen(backend, instrument, name, seen):
-    model = instrument(name)
-    visible: dict[str, int] = {}
-    looks = list(seen.values())
-    if name != "gf7_pair":
-        rays = trace_light_paths(model, backend, {})
-        half = (Shot(s.name, s.width // 2, s.height // 2, 2, 2, s.shows) for s in SHOTS)
-        looks = [(*which_body(model, rays, backend, shot), None) for shot in half]
-    for index, bodies, _ in looks:
-        for number, count in zip(*np.unique(index[index >= 0], return_counts=True), strict=True):
-            visible[bodies[number]] = visible.get(bodies[number], 0) + int(count)
-    mirrors = [f"base/{camera}/{m}" for camera, built in model.cameras.items() for m in built.mirrors]
-    first = next(iter(model.cameras))
-    wanted = [*mirrors, *(s.path for s in model.solids), *(c.face_body for c in model.channels)]
-    wanted += [f"base/{first}/focal_plane", f"base/{first}/focal_plane/line"]
-    for body in wanted:
-        assert visible.get(body, 0) >= 20, body
-    # of a focal plane one sees either the board or its housing
-    for camera in model.cameras:
-        assert visible.get(f"base/{camera}/focal_plane", 0) + visible.get(f"baffles/{camera}_housing", 0) >= 20
-        assert {b for b in visible if b.startswith(f"light/{camera}/monitor")}
-        assert {b for b in visible if b.startswith(f"light/{camera}/imaging")}
-
-
 # --- how they look ----------------------------------------------------------------------------------------------------
 
 

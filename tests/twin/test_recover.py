@@ -65,30 +65,6 @@ def test_rendered_frames_give_the_main_jobs_numbers_to_the_last_digit(run, image
 
 
 @pytest.mark.second
-def test_packed_fits_and_listed_files_are_the_same_measurement(run, images, backend, tmp_path):
-    """LZW TIFF, FITS cubes, one file a frame, a CSV table: to the bit."""
-    first = tifffile.imread(images / "forward_left_before.tiff")
-    lines = ["channel,when,file"]
-    for number, path in enumerate(sorted(images.glob("*.tiff"))):
-        camera, side, when = path.stem.split("_")
-        frames = tifffile.imread(path)
-        if number % 3 == 0:
-            fits.PrimaryHDU(frames).writeto(tmp_path / f"{path.stem}.fits")
-            lines.append(f"{camera}/{side},{when},{path.stem}.fits")
-        elif number % 3 == 1:
-            tifffile.imwrite(tmp_path / path.name, frames, compression="lzw", byteorder=">", photometric="minisblack")
-            lines.append(f"{camera}/{side},{when},{path.name}")
-        else:
-            for k, frame in enumerate(frames):
-                tifffile.imwrite(tmp_path / f"{path.stem}_{k}.tif", frame)
-                lines.append(f"{camera}/{side},{when},{path.stem}_{k}.tif")
-    assert first.shape == (9, 96, 96)
-    (tmp_path / "frames.csv").write_text("\n".join(lines) + "\n")
-    found = measured(tmp_path, HEAD + "frames: frames.csv\n", backend, run)
-    assert found.last.recovered_dict() == run.recovered_dict()
-
-
-@pytest.mark.second
 def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
     """Parts of the CCD with their offsets, fewer frames after, three times of which the middle one is the state before:
     shifts agree with those of the whole frames within what the left out rings and frames say.

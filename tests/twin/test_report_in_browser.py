@@ -153,13 +153,3 @@ def test_a_drawing_stands_in_where_there_is_no_webgl(launcher, report) -> None:
         assert reader.wrong == []
     finally:
         browser.close()
-
-
-def test_a_table_is_downloaded_without_network(run, report, open_page) -> None:
-    reader = open_page(report, 1400, "light")
-    with reader.page.expect_download() as waiting:
-        reader.page.locator("#result a.csv").first.click()
-    assert waiting.value.suggested_filename == "results.csv"
-    lines = waiting.value.path().read_text("utf-8").splitlines()
-    assert len(lines) == 1 + 4 * len(run.crosstalk) + 1 + 3  # four of each camera, the angle, a point on the ground
-    assert lines[0].startswith("camera,parameter,unit,true,")

@@ -188,29 +188,6 @@ def test_folders_that_are_not_ones_own(done, tmp_path) -> None:
         assert files(tmp_path / "mine") == {"letter.txt"}
 
 
-BAD = [
-    (("m2z: {key: [job, perturb, base/forward/M2, shift, 2]", "m2z: {key: [job, pertrub, base/forward/M2, shift, 2]"),
-     "factors.m2z.key[1]", ("'perturb'",)),
-    (("shift, 2]", "shift, 3]"), "factors.m2z.key[4]", ("0 to 2",)),
-    (("normal: {mean: 0 um, sigma: 1 um}", "values: []"), "factors.m2z.values", ("empty",)),
-    (("[-1 um, 1 um]", "[-1 um, 1 km]"), "factors.m2x.uniform", ("outside the limits", "100 mm")),
-    (("[-1 um, 1 um]", "[-1 arcsec, 1 arcsec]"), "factors.m2x.uniform", ("angle", "length")),
-    (("runs: 100", "runs: 20001"), "limits.runs", ("20001", "--yes")),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("change", "key", "words"), BAD, ids=lambda value: value if isinstance(value, str) else "")
-def test_bad_input_is_refused_at_its_line(tmp_path, change, key, words) -> None:
-    path = write_study(tmp_path / "in", change)
-    result = run(path, "--out", tmp_path / "run")
-    assert result.exit_code == 2
-    assert f"{path}:" in result.stderr, result.stderr
-    assert f": {key}:" in result.stderr, result.stderr
-    for word in words:
-        assert word in result.stderr, result.stderr
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.second
 @pytest.mark.parametrize(
     ("address", "told"),

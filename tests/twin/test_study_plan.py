@@ -168,6 +168,10 @@ REFUSED = [
     ((NORMAL, "table: {file: none.csv, column: z}"), "factors.m2z.table.file", "no such file"),
     (("file: job.yaml", "file: jobs.yaml"), "base.file", "no such file"),
     (("file: job.yaml", "file: pertrub"), "base.file", "'perturb'"),
+    (("shift, 2]", "shift, 3]"), "factors.m2z.key[4]", "0 to 2"),
+    ((NORMAL, "values: []"), "factors.m2z.values", "empty"),
+    (("[-1 um, 1 um]", "[-1 um, 1 km]"), "factors.m2x.uniform", "outside the limits"),
+    (("[-1 um, 1 um]", "[-1 arcsec, 1 arcsec]"), "factors.m2x.uniform", "angle"),
 ]
 
 
