@@ -21,7 +21,7 @@ from optics.numerics.physical_error import UnphysicalError
 from scenes.specs.asbuilt import resolve_asbuilt
 from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.asbuilt_run import ASBUILT, _standing, _warnings, motions, require_agreement, run_asbuilt
 from twin.asbuilt.next_step import advice, align, expected, wanted_move
@@ -34,31 +34,13 @@ from twin.tolerance.merits import Merit
 
 FIVE = [[-1, 0], [-0.5, 0], [0, 0], [0.5, 0], [1, 0]]
 MERITS = {"wavefront": {"kind": "wavefront", "at_most": 0.0714}}
-PRIOR = {
-    "name": "parts",
-    "causes": {
-        "mirrors": {
-            "bodies": "base/*/M?",
-            "shift": "100 um",
-            "rotate": "20 arcsec",
-            "time": "constant",
-            "reason": "a test",
-        },
-        "figures": {
-            "bodies": "base/*/M?",
-            "figure": {f"Z{j}": "10 nm" for j in range(5, 9)},
-            "time": "constant",
-            "reason": "a test",
-        },
-        "focal_plane": {
-            "bodies": "base/*/focal_plane",
-            "shift": "200 um",
-            "rotate": "30 arcsec",
-            "time": "constant",
-            "reason": "a test",
-        },
-    },
-}
+PRIOR = parse_yaml("""
+name: parts
+causes:
+  mirrors: {bodies: base/*/M?, shift: 100 um, rotate: 20 arcsec, time: constant, reason: a test}
+  figures: {bodies: base/*/M?, figure: {Z5: 10 nm, Z6: 10 nm, Z7: 10 nm, Z8: 10 nm}, time: constant, reason: a test}
+  focal_plane: {bodies: base/*/focal_plane, shift: 200 um, rotate: 30 arcsec, time: constant, reason: a test}
+""").data
 HEAT = {"bodies": "base", "temperature": {"change": "2 K"}, "time": "constant", "reason": "a test"}
 
 
@@ -84,21 +66,15 @@ def bench_of(backend: Backend, folder: Path, measurements: dict, prior: dict | N
     return AsBuiltBench(resolve_asbuilt(written(folder, measurements, prior, **more)), backend)
 
 
-EVERY = {
-    "wavefronts": {"interferometer": {"fields": FIVE, "sigma": "5 nm"}},
-    "focus": {"collimator": {"fields": [[-1, 0], [0, 0], [1, 0]], "sigma": "3 um", "common": "2 um"}},
-    "mtf": {"mtf": {"fields": [[0, 0], [1, 0]], "frequency": 20.0, "sigma": 0.01}},
-    "distortion": {"turntable": {"fields": [-1.0, -0.5, 0.0, 0.5, 1.0], "sigma": "0.5 um"}},
-    "sight": {
-        "theodolite": {
-            "sigma_alpha": "1 arcsec",
-            "sigma_beta": "1 arcsec",
-            "sigma_gamma": "3 arcsec",
-            "sigma_principal_distance": "20 um",
-        }
-    },
-    "positions": {"tracker": {"bodies": ["M1", "M2", "M3", "focal_plane"], "sigma": "20 um", "frame": "free"}},
-}
+EVERY = parse_yaml("""
+wavefronts: {interferometer: {fields: [[-1, 0], [-0.5, 0], [0, 0], [0.5, 0], [1, 0]], sigma: 5 nm}}
+focus: {collimator: {fields: [[-1, 0], [0, 0], [1, 0]], sigma: 3 um, common: 2 um}}
+mtf: {mtf: {fields: [[0, 0], [1, 0]], frequency: 20.0, sigma: 0.01}}
+distortion: {turntable: {fields: [-1.0, -0.5, 0.0, 0.5, 1.0], sigma: 0.5 um}}
+sight:
+  theodolite: {sigma_alpha: 1 arcsec, sigma_beta: 1 arcsec, sigma_gamma: 3 arcsec, sigma_principal_distance: 20 um}
+positions: {tracker: {bodies: [M1, M2, M3, focal_plane], sigma: 20 um, frame: free}}
+""").data
 
 
 @pytest.fixture(scope="module")
@@ -599,36 +575,30 @@ def test_the_posterior_is_that_of_the_joint_normal_distribution(whole) -> None:
     np.testing.assert_allclose(np.std(draws, axis=0), found.sigma, rtol=0.05)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"measurements": {}}, "nothing was measured"),
-        ({"measurements": {"wavefronts": {"one": {"fields": [[0, 1.5]], "sigma": "5 nm"}}}}, "at most 1"),
-        ({"measurements": {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "5"}}}}, "unit"),
-        ({"measurements": {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "0 nm"}}}}, "greater than zero"),
-        (
-            {"measurements": {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "5 nm", "after": "x"}}}},
-            "no such move",
-        ),
-        ({"measurements": {"positions": {"one": {"bodies": ["M9"], "sigma": "5 um"}}}}, "M9"),
-        ({"measurements": {"spots": {"one": {"sigma": 0.1}}}}, "no monitor"),
-        ({"camera": "nadir"}, "no such camera"),
-        ({"actuators": {"z": {"motion": "M7 shift z", "range": "1 mm"}}}, "M7"),
-        ({"moves": {"one": {"by": {"z": "1 um"}}}}, "no such actuator"),
-        ({"simulate": None}, "no data"),
-        ({"merits": {"one": {"kind": "monitor_angle", "at_most": "1 arcsec"}}}, "twin.uncertainty"),
-    ],
-    ids=["nothing", "field", "unit", "zero", "move", "body", "monitor", "camera", "actuator", "moved", "data", "merit"],
-)
+BAD = [
+    ("{measurements: {}}", "nothing was measured"),
+    ("{measurements: {wavefronts: {one: {fields: [[0, 1.5]], sigma: 5 nm}}}}", "at most 1"),
+    ("{measurements: {wavefronts: {one: {fields: [[0, 0]], sigma: 5}}}}", "unit"),
+    ("{measurements: {wavefronts: {one: {fields: [[0, 0]], sigma: 0 nm}}}}", "greater than zero"),
+    ("{measurements: {wavefronts: {one: {fields: [[0, 0]], sigma: 5 nm, after: x}}}}", "no such move"),
+    ("{measurements: {positions: {one: {bodies: [M9], sigma: 5 um}}}}", "M9"),
+    ("{measurements: {spots: {one: {sigma: 0.1}}}}", "no monitor"),
+    ("{camera: nadir}", "no such camera"),
+    ("{actuators: {z: {motion: M7 shift z, range: 1 mm}}}", "M7"),
+    ("{moves: {one: {by: {z: 1 um}}}}", "no such actuator"),
+    ("{simulate: null}", "no data"),
+    ("{merits: {one: {kind: monitor_angle, at_most: 1 arcsec}}}", "twin.uncertainty"),
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), BAD, ids=[case[1] for case in BAD])
 def test_bad_input_has_one_message(backend, tmp_path, changes, words) -> None:
     """File, line, key and what is allowed."""
-    base = {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "5 nm"}}}
-    measured = changes.pop("measurements", base)
+    given = {"measurements": {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "5 nm"}}}} | parse_yaml(changes).data
     with pytest.raises(InputError) as caught:
-        AsBuiltBench(resolve_asbuilt(written(tmp_path, measured, **changes)), backend)
-    text = str(caught.value)
-    assert words in text
-    assert "asbuilt.yaml" in text
+        AsBuiltBench(resolve_asbuilt(written(tmp_path, **given)), backend)
+    assert words in str(caught.value)
+    assert "asbuilt.yaml" in str(caught.value)
 
 
 def test_a_prior_of_nothing_is_refused(backend, tmp_path) -> None:

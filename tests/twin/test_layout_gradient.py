@@ -128,23 +128,6 @@ def test_a_slope_against_layouts_that_are_built_anew(bench: LayoutBench) -> None
 
 
 @pytest.mark.second
-def test_a_slope_across_a_jump_says_so(bench: LayoutBench) -> None:
-    """A 180-deg prism of the second beam is exchanged for its mirror image within the first of the steps, of 1.2 mm:
-    what small differences on this side of the jump find lies within the stated error, which is as large as the slope.
-    """
-    number = LayoutNumber((FIRST, SECOND), 1, "pupil_y")
-    slope = slope_of(bench, number)
-    h = 2e-4
-    up, down = (known_of(bench, number.moved(bench, sign * h))[STATED_NAME] for sign in (1.0, -1.0))
-    for key in ("angle", "forward/d_f", "backward/d_f"):
-        value, error = slope.values[STATED_NAME][key], slope.errors[STATED_NAME][key]
-        plain = (up.sigma(key) - down.sigma(key)) / (2.0 * h)
-        # plain differences are wrong by h^2, 1e-5 of these slopes
-        assert abs(value - plain) < error + 1e-4 * abs(plain), key
-    assert slope.errors[STATED_NAME]["angle"] > abs(slope.values[STATED_NAME]["angle"])
-
-
-@pytest.mark.second
 def test_a_layout_at_a_limit_has_slopes_and_one_beyond_tells_why(bench: LayoutBench) -> None:
     names = [number.name for number in numbers_of(bench, (FIRST,))]
     assert names == list(CONTINUOUS)

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from analysis.short_repr import LONGEST, MOST, shows, summary
-from twin.scripting.procedures import TestResult
-from twin.scripting.results import Shot
+from analysis.short_repr import LONGEST, shows, summary
 
 
 @pytest.mark.parametrize(
@@ -73,16 +71,3 @@ def test_a_class_shows_its_fields() -> None:
     assert repr(Every(1, 2)) == "<Every: first 1>"
     with pytest.raises(ValueError, match="fields are written"):
         shows("rms um m")
-
-
-def test_a_shot_and_a_test() -> None:
-    frames = xr.DataArray(np.zeros((4, 9, 64, 64), np.uint16), dims=("channel", "frame", "row", "column"))
-    nothing: Any = None
-    truth = xr.Dataset({"d_f_um": 1.0})
-    shot = Shot(frames, frames, truth, truth, "Nothing moved. " * 20, ("careful",), nothing, nothing, 0.0, 0.0)
-    assert repr(shot).startswith("<Shot: verdict Nothing moved.")
-    assert "before 4 channel x 9 frame x 64 row x 64 column, all 0 DN" in repr(shot)
-    assert len(repr(shot)) <= MOST
-    report: Any = SimpleNamespace(verdict="The plane is flat.", warnings=())
-    result = TestResult("lab focus", {}, report, nothing, nothing, nothing, "focus")
-    assert repr(result) == "<TestResult: name lab focus; verdict The plane is flat.>"

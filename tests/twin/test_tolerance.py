@@ -16,7 +16,7 @@ from scenes.specs.resolved import resolve
 from scenes.specs.tolerance import AllocationSpec, ToleranceSetup, ToleranceSpec, amount_si, resolve_tolerance
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
-from scenes.yaml.yaml_file import YamlFile, dump_yaml
+from scenes.yaml.yaml_file import YamlFile, dump_yaml, parse_yaml
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.tolerance import allocation, tolerance_run
@@ -418,76 +418,38 @@ def test_each_warning_is_there_where_it_holds_and_no_other() -> None:
         assert said.startswith(text), said
 
 
-BAD = {
-    "costs that rise with the limit": (
-        {"tolerances": {"a": {"motion": "M2 shift z", "limit": "1 um", "costs": [["1 um", 1.0], ["2 um", 3.0]]}}},
+BAD = [
+    (
+        "{tolerances: {a: {motion: M2 shift z, limit: 1 um, costs: [[1 um, 1.0], [2 um, 3.0]]}}}",
         "costs no more",
         "tolerances",
     ),
-    "costs said twice": (
-        {
-            "tolerances": {
-                "a": {"motion": "M2 shift z", "limit": "1 um", "cost": 2.0, "costs": [["1 um", 3.0], ["2 um", 1.0]]}
-            }
-        },
+    (
+        "{tolerances: {a: {motion: M2 shift z, limit: 1 um, cost: 2.0, costs: [[1 um, 3.0], [2 um, 1.0]]}}}",
         "in place of cost",
         "tolerances",
     ),
-    "no such body": ({"tolerances": {"a": {"motion": "M7 shift z", "limit": "1 um"}}}, "no such node", "tolerances"),
-    "an amount in the motion": (
-        {"tolerances": {"a": {"motion": "M2 shift z 3 um", "limit": "1 um"}}},
-        "without an amount",
-        "tolerances",
-    ),
-    "no unit": ({"tolerances": {"a": {"motion": "M2 shift z", "limit": 3.0}}}, "unit", "tolerances"),
-    "another unit": ({"tolerances": {"a": {"motion": "M2 shift z", "limit": "3 arcsec"}}}, "length", "tolerances"),
-    "nothing": ({"tolerances": {"a": {"motion": "M2 shift z", "limit": "0 um"}}}, "greater than zero", "tolerances"),
-    "a unit on a pure number": (
-        {"tolerances": {"a": {"motion": "M2 conic", "limit": "3 um"}}},
-        "pure number",
-        "tolerances",
-    ),
-    "a body that does not allow it": (
-        {"tolerances": {"a": {"motion": "focal_plane radius", "limit": "3 ppm"}}},
-        "does not allow radius",
-        "tolerances",
-    ),
-    "an unknown camera": ({"camera": "gf9"}, "no such camera", "camera"),
-    "an MTF that is at most": ({"merits": {"m": {"kind": "mtf", "at_most": 0.3}}}, "at_least", "merits"),
-    "beyond the cut-off": (
-        {"merits": {"m": {"kind": "mtf", "at_least": 0.3, "frequency": 5000.0}}},
-        "cut-off",
-        "merits",
-    ),
-    "compensators without fields": (
-        {"merits": {"b": {"kind": "boresight", "at_most": "1 arcsec"}}},
-        "need fields",
-        "merits",
-    ),
-    "carried twice": (
-        {"tolerances": {"a": {"motion": "gf7 shift z", "limit": "1 um", "carrying": ["M2"]}}},
-        "already",
-        "tolerances",
-    ),
-    "terms of no figure": (
-        {"tolerances": {"a": {"motion": "M2 shift z", "limit": "1 um", "terms": ["Z5", "Z9"]}}},
-        "figure",
-        "tolerances",
-    ),
-    "a negative range": (
-        {"compensators": {"c": {"motion": "M2 shift z", "range": "-1 um"}}},
-        "not negative",
-        "compensators",
-    ),
-}
+    ("{tolerances: {a: {motion: M7 shift z, limit: 1 um}}}", "no such node", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z 3 um, limit: 1 um}}}", "without an amount", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z, limit: 3.0}}}", "unit", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z, limit: 3 arcsec}}}", "length", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z, limit: 0 um}}}", "greater than zero", "tolerances"),
+    ("{tolerances: {a: {motion: M2 conic, limit: 3 um}}}", "pure number", "tolerances"),
+    ("{tolerances: {a: {motion: focal_plane radius, limit: 3 ppm}}}", "does not allow radius", "tolerances"),
+    ("{camera: gf9}", "no such camera", "camera"),
+    ("{merits: {m: {kind: mtf, at_most: 0.3}}}", "at_least", "merits"),
+    ("{merits: {m: {kind: mtf, at_least: 0.3, frequency: 5000.0}}}", "cut-off", "merits"),
+    ("{merits: {b: {kind: boresight, at_most: 1 arcsec}}}", "need fields", "merits"),
+    ("{tolerances: {a: {motion: gf7 shift z, limit: 1 um, carrying: [M2]}}}", "already", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z, limit: 1 um, terms: [Z5, Z9]}}}", "figure", "tolerances"),
+    ("{compensators: {c: {motion: M2 shift z, range: -1 um}}}", "not negative", "compensators"),
+]
+"""Keys in place of the budget's own, what the message says, and the key that it names."""
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_told_with_its_key(case: str, backend, tmp_path) -> None:
-    changes, words, key = BAD[case]
+@pytest.mark.parametrize(("changes", "words", "key"), BAD, ids=[case[1] for case in BAD])
+def test_bad_input_is_told_with_its_key(changes: str, words: str, key: str, backend, tmp_path) -> None:
     with pytest.raises(InputError) as caught:
-        ToleranceBench(budget(tmp_path, **changes), backend)
-    told = str(caught.value)
-    assert words in told
-    assert key in told
-    assert "budget.yaml:" in told
+        ToleranceBench(budget(tmp_path, **parse_yaml(changes).data), backend)
+    for part in (words, key, "budget.yaml:"):
+        assert part in str(caught.value)
