@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from optics.geometry import zernike
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import UnphysicalError
 from scenes.specs.asbuilt import resolve_asbuilt
+from scenes.specs.load import EXAMPLES
 from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
@@ -606,3 +608,55 @@ def test_a_prior_of_nothing_is_refused(backend, tmp_path) -> None:
     nothing = {"name": "parts", "causes": {"one": {"bodies": "base/*/M?", "shift": "0 um", "reason": "a test"}}}
     with pytest.raises(InputError, match="nothing is expected to move"):
         bench_of(backend, tmp_path, {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "5 nm"}}}, nothing)
+
+
+FILES = {
+    "focus.json": '{"rounds": [{}]}',
+    "places.json": '{"points": [{}]}',
+    "far.json": '{"points": [{"field_deg": 80.0, "position_mm": 1.0, "distortion_compensated_um_sigma": 1.0}]}',
+    "spots.json": '{"spots": 3}',
+    "few.json": '{"spots": {"forward": {"left": {"after": {"row": 1.0, "column": 2.0}}}}}',
+    "short.csv": "# order: noll\n# normalised: rms\n# unit: nm\nZ4,Z5\n1,2\n",
+    "rows.csv": "# order: noll\n# normalised: rms\n# unit: nm\nZ4,Z5,Z6\n1,2,3\n1,2,3\n",
+    "no.csv": "x",
+    "no.fits": "x",
+}
+ONE = "fields: [[0, 0]], sigma: 5 nm, terms: [Z4, Z5, Z6]"
+UNREAD = [
+    ("focus: {one: {file: focus.json, sigma: 3 um}}", "no best foci in it"),
+    ("distortion: {one: {file: places.json}}", "no places in it"),
+    ("distortion: {one: {file: far.json}}", "angles beyond the camera's field"),
+    ("spots: {one: {file: spots.json, state: after, sigma: 0.02}}", "no spots in it"),
+    ("spots: {one: {file: few.json, state: after, sigma: 0.02}}", "no spot right of forward"),
+    (f"wavefronts: {{one: {{{ONE}, zernikes: short.csv}}}}", "the table has no Z6"),
+    (f"wavefronts: {{one: {{{ONE}, zernikes: rows.csv}}}}", "2 wavefronts in the table, 1 fields in the test"),
+    (f"wavefronts: {{one: {{{ONE}, zernikes: no.csv}}}}", "measurements.wavefronts.one.zernikes"),
+    (f"wavefronts: {{one: {{{ONE}, maps: [no.fits]}}}}", "map 1: "),
+]
+
+
+@pytest.mark.parametrize(("measured", "words"), UNREAD, ids=[case[1] for case in UNREAD])
+def test_files_that_hold_no_measurement_are_refused(backend, tmp_path, measured, words) -> None:
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    prior = {"name": "parts", "causes": {"one": {"bodies": "base/forward/M2", "shift": "1 um", "reason": "a test"}}}
+    pair = {"instrument": "gf7_pair", "camera": "forward"} if measured.startswith("spots") else {}
+    with pytest.raises(InputError, match=re.escape(words)):
+        bench_of(backend, tmp_path, parse_yaml(measured).data, prior if pair else None, simulate=None, **pair).data()
+
+
+def test_what_no_state_can_be_estimated_of_is_refused(backend, tmp_path) -> None:
+    one = {"wavefronts": {"one": {"fields": [[0, 0]], "sigma": "5 nm"}}}
+    prior = {"name": "parts", "causes": {"one": {"bodies": "base/forward/M2", "shift": "1 um", "reason": "a test"}}}
+    with pytest.raises(InputError, match="an instrument as built already"):
+        bench_of(backend, tmp_path, one, instrument=str(EXAMPLES / "as_built_pair.yaml"))
+    with pytest.raises(InputError, match="the instrument has several cameras"):
+        bench_of(backend, tmp_path, one, prior, instrument="gf7_pair")
+    focus = {"focus": {"one": {"fields": [[0, 0]], "sigma": "3 um"}}}
+    with pytest.raises(InputError, match="no wavefronts whose orientation could be told"):
+        run_check(resolve_asbuilt(written(tmp_path, focus)), backend)
+    two = {
+        "wavefronts": {**one["wavefronts"], "two": {"fields": [[0, 0]], "sigma": "5 nm", "orientation": "turned 90"}}
+    }
+    with pytest.raises(InputError, match="other terms or another orientation than the first wavefronts"):
+        run_check(resolve_asbuilt(written(tmp_path, two)), backend)

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -12,6 +13,7 @@ import tifffile
 from typer.testing import CliRunner
 
 from scenes.yaml.errors import InputError
+from twin.compare import compare_report
 from twin.compare.__main__ import app
 from twin.compare.compare_report import compare, verdict
 from twin.compare.run_differences import read_run, sigma_of
@@ -208,3 +210,19 @@ def test_numbers_at_the_end_of_the_range_are_compared_without_a_warning() -> Non
     assert far.largest == 2e200
     assert far.rms == pytest.approx(2e200 / np.sqrt(2.0))
     assert np.isinf(beyond.largest)
+
+
+def test_other_versions_and_warnings_of_a_run_are_told(runs: Path) -> None:
+    folders = [runs / "a", runs / "again"]
+    comparison = compare(folders, 1e-9, None)
+    assert compare_report._warnings(comparison) == ()
+    first, other = comparison.runs
+    manifest = other.manifest.model_copy(
+        update={"warnings": ("dim",), "versions": {**other.manifest.versions, "numpy": "1"}}
+    )
+    changed = replace(comparison, runs=(first, replace(other, manifest=manifest)))
+    said = compare_report._warnings(changed)
+    assert said[0] == f"again was made with other versions: numpy {first.manifest.versions['numpy']} and 1"
+    assert said[1:] == ("again: dim",)
+    turned = compare_report._warnings(replace(changed, runs=(changed.runs[1], first)))
+    assert turned[1:] == ("a only: dim",)

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.spots.likelihood import EDGE_PX
 from optics.numerics.backend import Backend, load_backend
+from optics.numerics.physical_error import PhysicalError
 from scenes.models.monitor_layout import (
     CONTINUOUS,
     Beam,
@@ -21,10 +23,12 @@ from scenes.models.monitor_layout import (
     resolve_monitor_design,
     start_beams,
 )
+from twin.design import monitor_design
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
 from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
 from twin.design.layout_search import Candidate, End, Found, merit, optima, spread
 from twin.monitor.information import Information
+from twin.run.procedure import BenchError
 
 STATED = """
 name: mirrors
@@ -298,3 +302,43 @@ def test_ends_are_told_apart_by_two_percent(bench: LayoutBench) -> None:
     assert [[one.name for one in group] for group in optima(found, bench)] == [["a", "b"], ["c"], ["d"]]
     assert found.refused == {"a": 5}
     assert (found.beams, found.standing, found.compared, found.built) == (5, 5, 5, 5)
+
+
+def test_layouts_beyond_their_limits_say_which() -> None:
+    """Each limit by itself; a layout that stands on it is within."""
+    limits = SimpleNamespace(pupil_share=0.2, mass=3.0, spot_sigmas=4.0)
+    own = SimpleNamespace(setup=SimpleNamespace(test=SimpleNamespace(limits=limits)))
+    ccd = SimpleNamespace(rows=96, columns=120)
+    instrument = SimpleNamespace(spec=SimpleNamespace(autocollimator=SimpleNamespace(area_ccd=ccd)))
+    room = 48.0 - EDGE_PX
+
+    def spots(reach: float, fullest: float) -> None:
+        found = SimpleNamespace(spot_sigma=np.array([0.1, reach / 4.0]), brightest=np.array([0.1, fullest]))
+        LayoutBench._check_spots(own, {"a": found}, instrument)
+
+    LayoutBench._check_limits(own, 0.2, 3.0)
+    spots(room, FULLEST)
+    for act, told in (
+        (lambda: LayoutBench._check_limits(own, 0.21, 3.0), "its prisms take 21 percent of the imaging pupil"),
+        (lambda: LayoutBench._check_limits(own, 0.2, 3.1), r"its prisms have a mass of 3\.1 kg"),
+        (lambda: spots(room + 0.1, FULLEST), "its spots leave their area CCDs"),
+        (lambda: spots(room, FULLEST + 0.01), "its spots are too bright"),
+    ):
+        with pytest.raises(PhysicalError, match=told):
+            act()
+
+
+def test_a_search_without_a_layout_that_stands_is_refused(setup: MonitorDesignSetup, monkeypatch) -> None:
+    found = SimpleNamespace(layouts=(), refused={"dark": 2, "in the way": 7}, beams=5, built=4)
+    monkeypatch.setattr(monitor_design, "LayoutBench", lambda *_: None)
+    monkeypatch.setattr(monitor_design, "_check_start", lambda *_: None)
+    monkeypatch.setattr(monitor_design, "Search", lambda *_: SimpleNamespace(run=lambda: found))
+    with pytest.raises(
+        BenchError, match="none of 5 beams and 4 layouts that were tried can stand; 7 times since in the"
+    ):
+        monitor_design.run_monitor_design(setup, None)
+    found.layouts = ("a layout",)
+    monkeypatch.setattr(monitor_design, "_front", lambda layouts, bench: layouts)
+    monkeypatch.setattr(monitor_design, "_ghosts", lambda *_: True)
+    with pytest.raises(BenchError, match="every layout on the front throws ghosts"):
+        monitor_design.run_monitor_design(setup, None)

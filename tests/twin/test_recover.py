@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,12 +17,13 @@ from analysis.images.image_file import recorded
 from analysis.spots.noise import NoiseModel
 from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.resolved import resolve
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, Issue
 from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
+from twin.recover import measured_frames
 from twin.recover.__main__ import app
 from twin.recover.measured_frames import ChannelFrames, StateFrames, order_warnings
 from twin.recover.recover_report import recover_numbers, recover_report
@@ -406,3 +408,18 @@ def test_a_job_is_told_from_a_measurement(images, tmp_path):
     result = call(JOB, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "this is a job of the monitor, which twin.recover does not read; python -m twin.render" in result.stderr
+
+
+def test_files_that_are_no_raw_frames_are_refused(tmp_path):
+    """Frames of two sizes in one state, an image that is stored turned, and a file that is not there."""
+    for name, size in (("a", 30), ("b", 32)):
+        tifffile.imwrite(tmp_path / f"{name}.tif", np.zeros((size, 30), np.uint16), photometric="minisblack")
+    Image.fromarray(np.full((24, 24), 7, np.uint16)).save(tmp_path / "turned.tif", tiffinfo={274: 3})
+    test = SimpleNamespace(error=lambda text, key, allowed=None: InputError(Issue(text, allowed=allowed)))
+    for names, told in (
+        (("a.tif", "b.tif"), "have frames of different sizes, 30 x 30 and 32 x 30"),
+        (("turned.tif",), "is stored turned or mirrored"),
+        (("none.tif",), "there is no image"),
+    ):
+        with pytest.raises(InputError, match=told):
+            measured_frames._stacked(test, tuple(str(tmp_path / name) for name in names), ("frames",))

@@ -264,6 +264,15 @@ def test_nasty_values_come_back(form, tmp_path) -> None:
     assert found["text"] == ([*texts[:2], None] if form == "parquet" else ['a, "b"', "d alpha +- 3 um", ""])
 
 
+def test_files_that_are_no_frames_of_a_run_are_refused(tmp_path) -> None:
+    colours = np.zeros((8, 8, 3), np.uint8)
+    tifffile.imwrite(tmp_path / "a.tiff", colours, photometric="rgb", description="{}", metadata=None)
+    tifffile.imwrite(tmp_path / "b.tiff", colours[..., 0], description="[1]", metadata=None)
+    for name, told in (("a", "pages of uint8 with 3 axes are no recorded frames"), ("b", "what no page of a run does")):
+        with pytest.raises(ValueError, match=told):
+            read_frames(tmp_path / f"{name}.tiff")
+
+
 def test_columns_that_make_no_table_are_refused() -> None:
     one = DataColumn.of("a", [1.0], "", "one")
     for columns in ((one, one), (one, DataColumn.of("b", [1.0, 2.0], "", "two"))):

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from distributed.scheduler import KilledWorker
 
 import twin.study.__main__ as command
 from analysis.measurement_error import MeasurementError
@@ -13,11 +14,12 @@ from tests.twin.commands import invoke
 from tests.twin.study_bench import write_study
 from twin.sensors.area_detector import EmvaDetector
 from twin.study import study_command
-from twin.study.runs.base_job import Failure, ProcedureBase, Run
+from twin.study.runs.base_job import BlockResult, Failure, ProcedureBase, Run
 from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.engine import Engine, ProgramFault
+from twin.study.runs.engine import Engine, IncompleteError, ProgramFault, Progress
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
+from twin.study.runs.task import Pilot
 from twin.study.study_command import StudyRun
 
 
@@ -97,3 +99,57 @@ def test_a_study_all_of_whose_runs_failed_ends_with_1(tmp_path, monkeypatch) -> 
         said = invoke(command.app, tmp_path / "study.yaml")
         assert said.exit_code == code
         assert ("all 100 runs failed" in said.stderr) == bool(code)
+
+
+def test_what_workers_make_of_a_study_is_told(tmp_path, monkeypatch) -> None:
+    """Workers that die, a pilot that fails, a first block without a good run, and processes that need much memory."""
+    plan = Plan.of(resolve_study(write_study(tmp_path / "in", ("runs: 100", "runs: 75"))))
+    dead = KilledWorker("task", SimpleNamespace(address="here"), 3)
+    lost = BlockResult.of([Failure("no light")] * 25, plan.setup.study.responses)
+
+    def begun(pilot: object, evaluate: object = None) -> tuple[Engine, list[str]]:
+        def done(what: object) -> object:
+            if isinstance(what, Exception):
+                raise what
+            return what
+
+        monkeypatch.setattr("twin.study.runs.task.pilot", lambda _: done(pilot))
+        monkeypatch.setattr("twin.study.runs.task.evaluate", lambda _: done(evaluate))
+        told: list[str] = []
+        store = ChunkStore(tmp_path / f"store{len(list(tmp_path.iterdir()))}", plan)
+        store.folder.parent.mkdir()
+        store.open()
+        return Engine(plan, store, progress=Progress(warn=told.append), chunk_blocks=1), told
+
+    for pilot, error, text in (
+        (dead, IncompleteError, "the workers died in the first block, runs 0-24"),
+        (ValueError("x"), ProgramFault, "the program failed: ValueError: x"),
+    ):
+        with pytest.raises(error, match=text):
+            begun(pilot)[0].run(Here())
+    engine, told = begun(Pilot(lost, None, 0.0, 1e12), [lost])
+    engine.run(Here())
+    assert told[0] == "all runs of the first block fail: no light"
+    assert told[1].startswith("the processes need about 1000.0 GB, more than the study's")
+    assert len(told) == 2
+    engine, told = begun(Pilot(lost, None, 0.0, 1e6), dead)
+    with pytest.raises(IncompleteError, match=r"not computed: runs 25-49, 50-74 \(the workers died\)"):
+        engine.run(Here())
+    assert len(told) == 1
+
+
+def test_options_that_do_not_go_together_are_refused(tmp_path) -> None:
+    file = tmp_path / "study.yaml"
+    for words, told in (
+        (("--resume", "--force", "--out", tmp_path / "x"), "choose one of them"),
+        (("--resume",), "--resume needs the folder to go on with"),
+        (("--workers", 2, "--scheduler", "tcp://127.0.0.1:1"), "--workers and --scheduler exclude each other"),
+    ):
+        said = invoke(command.app, file, *words)
+        assert (said.exit_code, told in " ".join(said.stderr.split())) == (2, True), said.stderr
+    small = resolve_study(write_study(tmp_path / "in", ("seed: 3}", "seed: 3}\nlimits: {memory: 1 GB}")))
+    told = []
+    for workers in (8, 1):
+        with study_command._workers(study_command.StudyOptions(workers=workers), small, told.append):
+            pass
+    assert told == ["2 workers instead of 8: no more fit into the study's 1 GB"]

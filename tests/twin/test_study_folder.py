@@ -304,3 +304,14 @@ def test_what_makes_other_numbers_may_not(setup, tmp_path, change) -> None:
     other = resolve_study(write_study(tmp_path / "other", change))
     with pytest.raises(RunFolderError, match="holds another study"):
         work(path, other, resume=True)
+
+
+def test_a_file_and_a_folder_in_use_are_no_place_for_a_study(setup, tmp_path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(RunFolderError, match="exists and is not a folder"):
+        work(tmp_path / "file", setup)
+    with (
+        StudyFolder(tmp_path / "run", setup),
+        pytest.raises(RunFolderError, match=r"another command is working in .*run; wait"),
+    ):
+        work(tmp_path / "run", setup, resume=True)

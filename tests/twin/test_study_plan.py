@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm, truncnorm
 
-from scenes.yaml.errors import InputError
+from scenes.specs.study import ResponseSpec
+from scenes.yaml.errors import InputError, Problem
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.twin.study_bench import STUDY, write_study
 from twin.live.knobs import factor_knobs
 from twin.study.gradient.study_gradient import GradientFactor
 from twin.study.runs import setup
-from twin.study.runs.base_job import leaf, with_values
+from twin.study.runs.base_job import BlockResult, check_response, leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK, read_job
 from twin.study.runs.sampling import unit_cube
@@ -169,6 +171,11 @@ REFUSED = [
     (("file: job.yaml", "file: jobs.yaml"), "base.file", "no such file"),
     (("file: job.yaml", "file: pertrub"), "base.file", "'perturb'"),
     (("shift, 2]", "shift, 3]"), "factors.m2z.key[4]", "0 to 2"),
+    (
+        ("[job, perturb, base/forward/M2, shift, 2]", "[job, render, seed, 0]"),
+        "factors.m2z.key",
+        "has nothing below it",
+    ),
     ((NORMAL, "values: []"), "factors.m2z.values", "empty"),
     (("[-1 um, 1 um]", "[-1 um, 1 km]"), "factors.m2x.uniform", "outside the limits"),
     (("[-1 um, 1 um]", "[-1 arcsec, 1 arcsec]"), "factors.m2x.uniform", "angle"),
@@ -273,6 +280,9 @@ def test_a_cell_is_what_yaml_reads(monkeypatch) -> None:
         ("a,b\n\n", "names, then a row or more"),
         ("", "names, then a row or more"),
         ("c,b\n1 um,2\n", "no such column"),
+        ("a,b\x07\n1 um,2\n", "row 1 of the table"),
+        ("a,b\n1 um\x07,2\n", "row 2 of the table"),
+        ('a,b\n"' + "x" * 200_000 + '",2\n', "cannot be read: field larger than"),
     ],
 )
 def test_tables_that_are_none_for_a_study(table: str, told: str, tmp_path: Path, monkeypatch) -> None:
@@ -283,3 +293,40 @@ def test_tables_that_are_none_for_a_study(table: str, told: str, tmp_path: Path,
         resolve_study(path)
     assert caught.value.key[:3] == ("factors", "m2z", "table")
     assert caught.value.allowed is not None
+
+
+def test_a_config_yaml_that_is_damaged_is_refused(tmp_path, monkeypatch) -> None:
+    (tmp_path / "t.csv").write_text("z\n1 um\n2 um\n", "utf-8")
+    path = write_study(tmp_path, (NORMAL, "table: {file: t.csv, column: z}"))
+    whole = parse_yaml(resolve_study(path).to_yaml()).data
+    bare = {**whole["study"], "factors": {**whole["study"]["factors"]}}
+    bare["factors"]["m2z"] = {**bare["factors"]["m2z"], "table": {"file": "t.csv", "column": "z"}}
+    for data, told in (
+        ({**whole, "more": 1}, "unknown key"),
+        ({"study": whole["study"]}, "the resolved base is missing"),
+        ({**whole, "study": bare}, "the table's values are missing"),
+    ):
+        with pytest.raises(InputError, match=told):
+            study_from_text(dump_yaml(data))
+    with pytest.raises(InputError, match="cannot run 'orbit nothing' in a study"):
+        setup._job("orbit nothing")
+    monkeypatch.setattr(setup.yaml_file, "LARGEST_BYTES", 3000)
+    with pytest.raises(InputError, match="larger than 1 MB"):
+        resolve_study(path)
+
+
+def test_places_of_results_that_are_no_numbers_are_refused() -> None:
+    sample = {"a": {"list": [1, 2], "text": "x", "number": 1.0}}
+    check_response(sample, ("a", "number"))
+    check_response(sample, ("a", "list", 1))
+    for key, told in (
+        (("a",), "not a single number"),
+        (("a", "list"), "not a single number"),
+        (("a", "text"), "not a number"),
+        (("a", "number", "x"), "a single value has nothing below it"),
+        (("a", "list", 2), "no such place in a list"),
+    ):
+        with pytest.raises(Problem, match=told):
+            check_response(sample, key)
+    result = BlockResult.of([sample], {"r": ResponseSpec(key=("a", "text"))})
+    assert result.messages[0].endswith("the response 'r' is not a number but str")

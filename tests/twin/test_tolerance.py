@@ -19,7 +19,8 @@ from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml, parse_yaml
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.tolerance import allocation, tolerance_run
+from twin.run.run_folder import RunFolderError
+from twin.tolerance import allocation, samples, tolerance_run
 from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
 from twin.tolerance.samples import Workforce, draw_samples
@@ -443,6 +444,7 @@ BAD = [
     ("{tolerances: {a: {motion: gf7 shift z, limit: 1 um, carrying: [M2]}}}", "already", "tolerances"),
     ("{tolerances: {a: {motion: M2 shift z, limit: 1 um, terms: [Z5, Z9]}}}", "figure", "tolerances"),
     ("{compensators: {c: {motion: M2 shift z, range: -1 um}}}", "not negative", "compensators"),
+    ("{instrument: gf7_pair}", "the instrument has several cameras", "camera"),
 ]
 """Keys in place of the budget's own, what the message says, and the key that it names."""
 
@@ -453,3 +455,18 @@ def test_bad_input_is_told_with_its_key(changes: str, words: str, key: str, back
         ToleranceBench(budget(tmp_path, **parse_yaml(changes).data), backend)
     for part in (words, key, "budget.yaml:"):
         assert part in str(caught.value)
+
+
+def test_a_design_without_light_and_a_strange_journal_are_refused(tmp_path) -> None:
+    setup = budget(tmp_path)
+    tolerance_run._require_light(setup, SimpleNamespace(nominal=np.ones(2)))
+    with pytest.raises(InputError, match="the designed camera has no light at these fields"):
+        tolerance_run._require_light(setup, SimpleNamespace(nominal=np.array([1.0, np.nan])))
+    for _ in range(2):
+        with samples._journal(tmp_path / "journal", "a" * 64):
+            pass
+    with pytest.raises(RunFolderError, match="is of another budget"), samples._journal(tmp_path / "journal", "b" * 64):
+        pass
+    (tmp_path / "file").touch()
+    with pytest.raises(RunFolderError, match="go on with --resume"), samples._journal(tmp_path / "file", "a" * 64):
+        pass

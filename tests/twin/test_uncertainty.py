@@ -17,6 +17,7 @@ from optics.geometry.tree import Motion
 from optics.numerics.backend import load_backend
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
+from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.twin.commands import invoke
@@ -359,3 +360,12 @@ def test_without_a_statement_the_section_says_how_to_make_one():
     assert "noise" in section.text[0]
     assert "disturbances: orbit" in section.text[0]
     assert section.artefacts == ()
+
+
+def test_disturbances_that_change_no_camera_leave_nothing_to_measure(monkeypatch):
+    experiment, _ = bench("gf7_pair", "orbit")
+    monkeypatch.setattr(coverage, "MonitorExperiment", lambda *given: experiment)
+    monkeypatch.setattr(coverage, "expected_covariance", lambda *given: None)
+    monkeypatch.setattr(coverage, "find_limits", lambda *given, **more: None)
+    with pytest.raises(InputError, match="nothing that is stated to move changes a camera"):
+        coverage.run_uncertainty(experiment.resolved, load_backend())

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import twin.main_job.render_job as render_job_module
 from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE, GROUND
 from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
@@ -349,3 +350,18 @@ def test_a_job_that_moves_what_it_does_not_state_says_so(job) -> None:
     assert "base/central_prism/forward_left rotate x (1 arcsec, not stated), but there is no prior" in warning
     assert "of forward" in warning
     assert "of backward" not in warning
+
+
+def test_full_pixels_and_lost_light_are_warnings_of_the_main_job(job) -> None:
+    """A twentieth of the light on one CCD, and a frame whose brightest pixel is full; else nothing."""
+    run = job("{}")
+    nominal = run.photons_before
+    given = (nominal, run.photons_after, run.before, run.after)
+    assert render_job_module._warnings(run.experiment, *given) == ()
+    dim, full = run.photons_after.copy(), run.after.copy()
+    dim[1] *= 0.05
+    full[2, 0][full[2, 0] == full[2, 0].max()] = run.experiment.detector.saturation_dn
+    (lost,) = render_job_module._warnings(run.experiment, nominal, dim, run.before, run.after)
+    assert lost == "forward/right: only 5% of the nominal light reaches the CCD"
+    (bright,) = render_job_module._warnings(run.experiment, nominal, run.photons_after, run.before, full)
+    assert bright.startswith("saturated pixels in the spots backward/left (after)")

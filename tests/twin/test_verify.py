@@ -465,3 +465,21 @@ def test_inputs_that_changed_since_end_with_two(compared) -> None:
         assert f"have changed since: {compared}/two/numbers.json" in result.stdout
     finally:
         (compared / "two/numbers.json").write_bytes(kept)
+
+
+def test_runs_that_cannot_be_made_again_are_told(tmp_path) -> None:
+    """Its folder is gone, its command fails; and what is still being written is no run."""
+    (tmp_path / ".run.0123.partial").mkdir()
+    cases = [(tmp_path / ".run.0123.partial", "a run that was broken off, or is still being written")]
+    for name, facts, said in (
+        ("gone", {"started_in": str(tmp_path / "none")}, "the folder in which it was started is gone"),
+        ("fails", {"started_in": str(tmp_path)}, "config.yaml ended with exit code 1"),
+    ):
+        with RunFolder(tmp_path / name) as made:
+            made.write_text("config.yaml", "a: 1\n")
+            write_manifest(made, "twin.nothing", 1.5e9, 2.0, again=["twin.nothing", "config.yaml"], **facts)
+        cases.append((tmp_path / name, said))
+    for place, said in cases:
+        result = invoke(app, place)
+        assert result.exit_code == 2, result.output
+        assert said in " ".join(result.output.split()), result.output
