@@ -48,6 +48,7 @@ def run(*words: object) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
+@pytest.mark.second
 def test_a_run_is_the_same_as_itself_again(runs: Path, tmp_path: Path) -> None:
     code, text = run(runs / "a", runs / "again", "--out", tmp_path / "out")
     assert code == 0
@@ -57,6 +58,7 @@ def test_a_run_is_the_same_as_itself_again(runs: Path, tmp_path: Path) -> None:
     assert found["others"][0]["compared"] > 1000
 
 
+@pytest.mark.second
 def test_what_differs_is_found(runs: Path, tmp_path: Path) -> None:
     code, text = run(runs / "a", runs / "b", "--out", tmp_path / "out", "--json")
     assert code == 1
@@ -155,6 +157,7 @@ def test_small_differences_count_by_the_tolerance(runs: Path, tmp_path: Path) ->
     assert wide.same
 
 
+@pytest.mark.second
 def test_keys_that_only_one_has_are_told(runs: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(runs / "a", copy)
@@ -165,6 +168,7 @@ def test_keys_that_only_one_has_are_told(runs: Path, tmp_path: Path) -> None:
     assert [(one.key, one.other) for one in found.numbers] == [("intersection_angle.nominal_deg", None)]
 
 
+@pytest.mark.second
 def test_units_do_not_matter(runs: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(runs / "a", copy)
@@ -174,6 +178,7 @@ def test_units_do_not_matter(runs: Path, tmp_path: Path) -> None:
     assert not compare([runs / "a", copy], 1e-9, None).found[0].inputs
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("other", ["missing", "empty", "kind", "one"])
 def test_bad_input_is_explained(runs: Path, tmp_path: Path, other: str) -> None:
     folder = tmp_path / "folder"
@@ -191,6 +196,7 @@ def test_bad_input_is_explained(runs: Path, tmp_path: Path, other: str) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.second
 def test_a_damaged_file_is_named(runs: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(runs / "a", copy)
@@ -212,6 +218,7 @@ def test_numbers_at_the_end_of_the_range_are_compared_without_a_warning() -> Non
     assert np.isinf(beyond.largest)
 
 
+@pytest.mark.second
 def test_other_versions_and_warnings_of_a_run_are_told(runs: Path) -> None:
     folders = [runs / "a", runs / "again"]
     comparison = compare(folders, 1e-9, None)
@@ -225,4 +232,4 @@ def test_other_versions_and_warnings_of_a_run_are_told(runs: Path) -> None:
     assert said[0] == f"again was made with other versions: numpy {first.manifest.versions['numpy']} and 1"
     assert said[1:] == ("again: dim",)
     turned = compare_report._warnings(replace(changed, runs=(changed.runs[1], first)))
-    assert turned[1:] == ("a only: dim",)
+    assert turned[-1].endswith(" only: dim")

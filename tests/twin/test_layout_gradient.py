@@ -12,7 +12,6 @@ import pytest
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.spots.likelihood import EDGE_PX
 from optics.numerics.backend import Backend, load_backend
-from optics.numerics.physical_error import PhysicalError
 from scenes.models.monitor_layout import (
     CONTINUOUS,
     Beam,
@@ -24,7 +23,7 @@ from scenes.models.monitor_layout import (
     start_beams,
 )
 from twin.design import monitor_design
-from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
+from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts, _OutsideLimitsError
 from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
 from twin.design.layout_search import Candidate, End, Found, merit, optima, spread
 from twin.monitor.information import Information
@@ -324,7 +323,7 @@ def test_layouts_beyond_their_limits_say_which() -> None:
         (lambda: spots(room + 0.1, FULLEST), "its spots leave their area CCDs"),
         (lambda: spots(room, FULLEST + 0.01), "its spots are too bright"),
     ):
-        with pytest.raises(PhysicalError, match=told):
+        with pytest.raises(_OutsideLimitsError, match=told):
             act()
 
 

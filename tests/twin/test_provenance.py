@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+import pytest
 import tifffile
 
 from twin.run import provenance
@@ -23,6 +24,7 @@ def digest_with(root: Path) -> str:
     return ran.stdout.strip()
 
 
+@pytest.mark.second
 def test_the_digest_is_of_all_files_and_follows_each(tmp_path):
     """Copies without what Git, editors and Python leave have the same one; a line of the library changes it."""
     for package in provenance.SOURCES:

@@ -95,6 +95,7 @@ def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
     assert len(recover_numbers(found)["series"]) == 3
 
 
+@pytest.mark.second
 def test_frames_of_different_sizes_say_where_they_begin(run, images, backend, tmp_path):
     """Frames before and after that begin at other pixels of the CCD read as a shift of the spot; so do the times of a
     series with one offset.
@@ -117,6 +118,7 @@ def test_frames_of_different_sizes_say_where_they_begin(run, images, backend, tm
     np.testing.assert_allclose(found.last.recovery.after, run.recovery.after, atol=0.01)
 
 
+@pytest.mark.second
 def test_without_an_instrument_its_geometry_and_a_learnt_shape_will_do(run, images, backend):
     """The formulas with the three numbers that a data sheet has, and the spot's shape from its own frames."""
     text = "template: measured\ndetector: monitor_ccd\nexposure: 10 ms\nframes: images\ngeometry:\n"

@@ -84,6 +84,7 @@ def dicts(run_or_series) -> tuple:
     return found.changes.groups(), found.between_dict(), found.to_dict()
 
 
+@pytest.mark.second
 def test_the_smoothed_series_is_the_main_jobs_to_the_last_bit(course, backend):
     found = course.measured(backend, course.text())
     assert dicts(found) == dicts(course.series)

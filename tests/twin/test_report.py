@@ -35,6 +35,7 @@ def page(run, tmp_path_factory) -> str:
     return render_report(run, scene=scene.read_bytes())
 
 
+@pytest.mark.second
 def test_a_page_needs_nothing_else_and_misses_nothing(page):
     """No script, link, font or picture from outside; tags are closed in order, and no number is missing."""
     text = re.sub(r'"http://www.w3.org/(1999/xlink|2000/svg)"', "", page)
@@ -58,6 +59,7 @@ def tables_of(page: str) -> dict[str, list[list[str]]]:
     return {name: list(csv.reader(io.StringIO(base64.b64decode(data).decode()))) for name, data in found}
 
 
+@pytest.mark.second
 def test_tables_of_the_page_have_all_digits(run, page):
     handed, recovered = tables_of(page), run.recovered_dict()["cameras"]
     heads, *rows = handed["results"]
@@ -75,6 +77,7 @@ def test_tables_of_the_page_have_all_digits(run, page):
         np.testing.assert_allclose(shown, 1e6 * run.experiment.path.pitch * table.spot_shift[:, k], rtol=1e-14)
 
 
+@pytest.mark.second
 def test_crosstalk_explains_the_systematic_residuals(run):
     """What the table predicts is what is left beside noise: 4.5 sigma in one of eight is a false alarm of 5e-5."""
     checked = 0

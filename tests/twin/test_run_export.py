@@ -74,6 +74,7 @@ def exported(run, tmp_path_factory) -> dict[str, Path]:
 # --- frames ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_exported_frames_give_the_same_readings_to_the_bit(job, exported, backend, tmp_path) -> None:
     file = tmp_path / "measurement.yaml"
     file.write_text(f"instrument: gf7_pair\ndisturbances: orbit\nframes: {exported['fits'] / 'images'}\n")
@@ -84,6 +85,7 @@ def test_exported_frames_give_the_same_readings_to_the_bit(job, exported, backen
     assert found.last.recovered_dict() == job.recovered_dict()
 
 
+@pytest.mark.second
 def test_cards_of_the_files_of_frames_are_what_the_run_says(job, exported) -> None:
     """Numbers with their units in the comment; the unit is one that FITS knows."""
     detector, ccd = job.resolved.detector, job.resolved.instrument.monitor.area_ccd
@@ -124,6 +126,7 @@ def test_cards_of_the_files_of_frames_are_what_the_run_says(job, exported) -> No
     assert abs(corner - header["PEDESTAL"]) < 3.0 * header["RDNOISE"] / header["GAIN"]
 
 
+@pytest.mark.second
 def test_expected_images_are_those_of_the_run(run, exported) -> None:
     with (
         xr.open_dataset(run / "irradiance.nc", engine="h5netcdf") as data,
@@ -200,6 +203,7 @@ def read_back(path: Path) -> dict[str, list]:
     return {name: [None if isinstance(v, float) and math.isnan(v) else v for v in col] for name, col in out.items()}
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("tables", ["parquet", "fits"])
 def test_spots_and_readings_are_those_of_the_run(run, exported, tables) -> None:
     """Tables and the long list of all numbers, with unit and sigma."""
@@ -283,6 +287,7 @@ def test_columns_that_make_no_table_are_refused() -> None:
         DataTable("t", "a title", (one,)).column("b")
 
 
+@pytest.mark.second
 def test_without_pyarrow_parquet_is_refused_with_what_to_do(run, tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(MissingPackage):
@@ -296,6 +301,7 @@ def test_without_pyarrow_parquet_is_refused_with_what_to_do(run, tmp_path, monke
 # --- the command -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_file_that_was_changed_since_is_told(run, tmp_path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
@@ -308,6 +314,7 @@ def test_a_file_that_was_changed_since_is_told(run, tmp_path) -> None:
     np.testing.assert_array_equal(fits.getdata(tmp_path / "out/images/forward_left_after.fits"), frames + 1)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("spoil", "options", "said"),
     [

@@ -173,6 +173,7 @@ def test_a_response_may_be_a_difference(study, backend) -> None:
     assert BlockResult.of(outcomes, asked).failed.all()
 
 
+@pytest.mark.second
 def test_a_response_that_the_results_do_not_have(study, backend, tmp_path) -> None:
     (sample,) = study.setup.job.evaluate(study.setup.tree, [study.plan.run(0)], backend)
     check_responses(study.setup, sample)

@@ -273,7 +273,7 @@ def test_a_budget_from_a_script(backend, tmp_path) -> None:
     good = np.stack([values[:, 0] <= 0.06, values[:, 1] >= 0.35, values[:, 2] <= 0.5e-3], axis=1)
     assert (numbers["yield"]["passed"], numbers["yield"]["of"]) == (int(np.sum(good.all(axis=1))), 20)
     assert numbers["merits"]["wavefront"]["variance_shares"]["tilt"] > 0.0
-    for k, (name, unit) in enumerate((("wavefront", 1.0), ("mtf", 1.0), ("f", 1e-3))):
+    for k, (name, unit) in enumerate((("wavefront", 1.0), ("mtf", 1.0), ("f", 1e-6))):
         told, own = numbers["merits"][name], values[:, k] / unit
         assert told["yield"]["passed"] == np.sum(good[:, k])
         # of an MTF the share exceeds the value

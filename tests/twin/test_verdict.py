@@ -263,6 +263,7 @@ def test_the_share_of_a_body_is_that_of_its_errors() -> None:
     assert sum(shares.values()) == pytest.approx(float(left @ left), rel=1e-12)
 
 
+@pytest.mark.second
 def test_a_change_is_what_the_cameras_parameters_make_of_it(job) -> None:
     """The combination of all parameters gives, of the true ones, the true angle and errors on the ground."""
     run = job(EXAMPLE, LAUNCH, frames=9)
@@ -278,6 +279,7 @@ def test_a_change_is_what_the_cameras_parameters_make_of_it(job) -> None:
         assert row[4 + k] != 0.0
 
 
+@pytest.mark.second
 def test_a_change_that_no_cause_makes_has_no_posterior(job, tmp_path) -> None:
     """Focal planes that are heated evenly lengthen lines and principal distances alike: nothing turns, and a posterior
     of 0 ± 0 was told of the turns. Files, table and verdict leave it out; the other estimators read on.
@@ -295,6 +297,7 @@ def test_a_change_that_no_cause_makes_has_no_posterior(job, tmp_path) -> None:
     assert json.loads(json.dumps(numbers, allow_nan=False)) == numbers
 
 
+@pytest.mark.second
 def test_sigma_holds_where_there_are_no_doubts_and_each_is_a_warning(job) -> None:
     for motion in ("{shift: 0 0 0.1 um}", "{shift: 0 0 60 um}"):
         run = job(f"{{base/forward/M2: {motion}}}", "disturbances: launch")

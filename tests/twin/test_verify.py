@@ -420,6 +420,7 @@ def compared(tmp_path_factory) -> Path:
     return place
 
 
+@pytest.mark.second
 def test_a_run_made_again_is_the_same_to_the_byte(compared, tmp_path) -> None:
     """By its own words, in the folder where it was typed; a numpy.py there is not imported."""
     (compared / "numpy.py").write_text("raise SystemExit('executed')")
