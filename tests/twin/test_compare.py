@@ -1,7 +1,6 @@
 """`python -m twin.compare`: what differs is found, what does not is not, and the exit code says which."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -115,27 +114,6 @@ def test_a_sigma_says_what_it_is_of() -> None:
     assert found["x"] == (pytest.approx(0.1 * 2**0.5), "noise")
     assert found["y"] == (pytest.approx(0.3 * 2**0.5), "stated")
     assert found["z"] == (None, "")
-
-
-@pytest.mark.second
-def test_files_without_a_sigma_of_the_noise_are_compared_by_the_one_they_have(runs: Path, tmp_path: Path) -> None:
-    """As runs wrote them before there were stated disturbances: `_sigma` alone, of the noise."""
-    old = []
-    for name in ("a", "seed"):
-        folder = tmp_path / name
-        shutil.copytree(runs / name, folder)
-        text = (folder / "recovered.json").read_text()
-        text = re.sub(r'\n *"(?!row_|column_)[a-z_]+_sigma": [^\n]*', "", text).replace("_sigma_noise", "_sigma")
-        (folder / "recovered.json").write_text(text)
-        old.append(folder)
-    now, then = (compare(pair, 1e-9, None).found[0].numbers for pair in ([runs / "a", runs / "seed"], old))
-    key = "cameras.forward.model.d_f_um"
-    one, other = (next(n for n in numbers if n.key == key) for numbers in (now, then))
-    assert one.sigma == other.sigma is not None
-    assert (one.sigma_of, other.sigma_of) == ("noise", "stated")
-    for pair, kind in ((old, "as stated"), ([runs / "a", runs / "seed"], "(as stated|of the noise alone)")):
-        assert re.search(rf"[+-]\d\S* sigma {kind}", " ".join(verdict(compare(pair, 1e-9, None))))
-    assert compare(old, 1e-9, 5.0).same
 
 
 @pytest.mark.second

@@ -5,20 +5,14 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from scenes.specs.load import ORBIT, SCENES, load_named
+from scenes.specs.load import ORBIT, load_named
 from scenes.specs.orbit.adjust import OrbitAdjustSpec
-from scenes.specs.orbit.setup import resolve_simulate
-from scenes.specs.procedures import PROCEDURES
-from scenes.specs.resolved import resolve, resolve_with
 from scenes.yaml.errors import InputError
-from tests.twin.study_bench import ROOT
-from twin.main_job.render_cost import render_cost
 from twin.run import cost
 from twin.run.cli import time_text
 from twin.run.command import tell_cost
 from twin.run.cost import LONG, MUCH_MEMORY, Cost, Lowered, require_memory, told
 from twin.run.memory import LIMIT
-from twin.uncertainty.coverage_cost import coverage_cost
 
 
 @pytest.fixture
@@ -65,19 +59,3 @@ def test_more_memory_than_there_is_is_refused(monkeypatch: pytest.MonkeyPatch) -
     # so little is always there, whatever is said to be
     monkeypatch.setenv(LIMIT, "100 MB")
     require_memory(Cost(0.5e9, 1.0, lower))
-
-
-@pytest.mark.second
-def test_what_grows_costs_more() -> None:
-    """In proportion to the number that the file states, where that decides the cost."""
-    resolved = resolve_with("gf7_pair")
-    few, many, more = (coverage_cost(resolved, states).seconds for states in (0, 1000, 2000))
-    assert more - many == pytest.approx(many - few)
-    assert render_cost(resolved, 2000).seconds > 1.5 * render_cost(resolved, 9).seconds
-    course = resolve(ROOT / "scenes/examples/orbit.yaml")
-    assert render_cost(course).seconds > render_cost(resolved).seconds
-    setup = resolve_simulate(SCENES / "orbit/simulate.yaml")
-    simulated = PROCEDURES["orbit simulate"].cost
-    patch = setup.test.patch.model_copy(update={"lines": 2000})
-    long = setup.model_copy(update={"test": setup.test.model_copy(update={"patch": patch})})
-    assert simulated(long).bytes > 1.2 * simulated(setup).bytes

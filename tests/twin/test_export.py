@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
-from optics.numerics.backend import load_backend
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.setup import resolve_simulate
 from tests.twin.commands import invoke
 from tests.twin.line_scanner_model import LineScannerModel
 from tests.twin.test_simulate import write
-from twin.orbit.export.export_report import export_files
-from twin.orbit.export.export_run import read_source, run_export
 from twin.orbit.export.line_scanner import line_scanner
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
@@ -82,20 +79,6 @@ def test_a_sensor_model_sees_what_the_rigorous_sensor_sees(flight, name, effects
     assert np.abs(there[0] - 0.5 - line).max() < allowed
     assert np.abs(there[1] - 0.5 - pixel).max() < allowed
     assert all(max(e.sample_px, e.line_px) < allowed for e in scanner.errors if e.height_m == height)
-
-
-@pytest.mark.second
-def test_what_refraction_does_elsewhere_is_told(flight) -> None:
-    sensor = _sensor(flight, "forward", LightEffects())
-    scanner, model = _isd(sensor)
-    line, pixel = _places(sensor, 200)
-    for told in scanner.errors:
-        there = model.image(sensor.ground(line, pixel, told.height_m))
-        # random places do not reach the image's corners, where a grid has its largest
-        for found, stated in ((there[0] - 0.5 - line, told.line_px), (there[1] - 0.5 - pixel, told.sample_px)):
-            assert np.abs(found).max() < stated + 1e-5
-            assert np.abs(found).max() > 0.7 * stated - 1e-5
-    assert max(e.line_px for e in scanner.errors) > 0.01
 
 
 def test_a_trajectory_that_jitters_takes_more_nodes(flight) -> None:
@@ -251,17 +234,3 @@ def _told(folder: Path, word: str) -> bool:
     assert result.exit_code == 2
     assert not (folder / "out").exists()
     return word in result.stderr
-
-
-@pytest.mark.second
-def test_a_file_is_exported_without_images() -> None:
-    source = read_source(SCENES / ORBIT / "simulate.yaml", seed=2)
-    assert source.seed == 2
-    assert source.folder is None
-    small = replace(
-        source,
-        setup=source.setup.model_copy(update={"test": source.setup.test.model_copy(update={"lines": ("nadir",)})}),
-    )
-    export = run_export(small, load_backend("llvm"), (0.0, 500.0))
-    assert set(export_files(export)) == {"models/nadir.json", "models/nadir_RPC.TXT"}
-    assert export.lines["nadir"].window.frame is None

@@ -126,23 +126,6 @@ def test_cards_of_the_files_of_frames_are_what_the_run_says(job, exported) -> No
     assert abs(corner - header["PEDESTAL"]) < 3.0 * header["RDNOISE"] / header["GAIN"]
 
 
-@pytest.mark.second
-def test_expected_images_are_those_of_the_run(run, exported) -> None:
-    with (
-        xr.open_dataset(run / "irradiance.nc", engine="h5netcdf") as data,
-        fits.open(exported["fits"] / "expected_photons.fits", checksum=True) as file,
-    ):
-        file.verify("exception")
-        assert len(file) == 1 + data.sizes["channel"]
-        for k, channel in enumerate(data["channel"].values):
-            unit = file[f"{channel} photons"]
-            np.testing.assert_array_equal(unit.data, data["photons"].values[:, k])
-            assert unit.header["BUNIT"] == "photon"
-            assert [unit.header["STATE1"], unit.header["STATE2"]] == ["before", "after"]
-            assert unit.header["XPIXSZ"] == pytest.approx(1e6 * data.attrs["pitch_m"], rel=1e-12)
-        assert file[0].header["WAVELEN"] == data.attrs["wavelength_m"]
-
-
 def test_times_maps_and_heights_say_where_and_when_they_are(tmp_path) -> None:
     shape = (2, 5, 4)
     frames = np.arange(math.prod(shape), dtype=np.uint16).reshape(shape)

@@ -179,19 +179,6 @@ def _with(perturb: dict, amount: str) -> dict:
     return json.loads(text)
 
 
-def test_the_jacobians_readings_are_those_of_the_crosstalk(pair: twin.InstrumentTwin, shot: twin.Shot) -> None:
-    table = shot.run.crosstalk["forward"]
-    found = pair.jacobian(["base/forward/M2 shift z about centre", "base/forward/M2 rotate y about centre"])
-    for k, label in enumerate(("M2 along Z", "M2 about Y")):
-        column = next(c for c, motion in enumerate(table.motions) if motion.label == label)
-        own = found.isel(motion=k)
-        assert own.spots.values[:2].ravel() == pytest.approx(table.spot_shift[:, column], rel=1e-12, abs=1e-15)
-        assert own.true.sel(camera="forward").values == pytest.approx(table.true[:, column], rel=1e-9, abs=1e-12)
-        for name in ESTIMATORS:
-            read = own.readings.sel(camera="forward", estimator=name).values
-            assert read == pytest.approx(table.readings[name][:, column], rel=1e-9, abs=1e-12)
-
-
 @pytest.mark.parametrize(
     ("motion", "found", "says"),
     [

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, norm, truncnorm
+from scipy.stats import kstest, norm
 
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError, Problem
@@ -53,17 +53,6 @@ def test_drawn_designs_follow_their_distributions(tmp_path, kind) -> None:
     assert np.array_equal(column(again, "m2z"), z)
     other = plan_of(tmp_path / "other", *changes, ("seed: 3}", "seed: 4}"))
     assert not np.any(column(other, "m2z") == z)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("limits", [(-1.0, 0.5), (2.0, 3.0), (-4.0, -3.5)])
-def test_truncated_distributions(tmp_path, limits) -> None:
-    text = f"truncated: {{mean: 1 um, sigma: 1 um, limits: [{limits[0]} um, {limits[1]} um]}}"
-    values = column(plan_of(tmp_path, (NORMAL, text), ("runs: 100", f"runs: {RUNS}")), "m2z")
-    assert values.min() >= limits[0]
-    assert values.max() <= limits[1]
-    known = truncnorm(limits[0] - 1.0, limits[1] - 1.0, loc=1.0, scale=1.0)
-    assert kstest(values, known.cdf).pvalue > FALSE_ALARM
 
 
 def test_a_grid_is_every_combination(tmp_path) -> None:

@@ -446,42 +446,6 @@ def test_a_share_of_noise_above_one_is_an_error_and_not_cut_off() -> None:
     assert impossible(shared) is None
 
 
-@pytest.mark.second
-def test_true_noise_is_possible_where_nothing_else_varies() -> None:
-    """Half of such studies have a share above 1; chances are even, so that none of 100 is below 1e-6 (1e-4 a run, of
-    fixed seeds), and a tenth of variance too much in 20 000 runs is found.
-    """
-    found = [noise_share(one.responses[0], one.study) for one in (noisy_runs(60, k, 1.0) for k in range(100))]
-    assert 0.25 < np.mean([one.share > 1.0 for one in found]) < 0.75
-    assert all(one.possible for one in found)
-    assert stats.kstest([one.chance for one in found], "uniform").pvalue > 1e-6
-    assert impossible(noisy_runs(20_000, 3, 1.0)) is None
-    assert impossible(noisy_runs(20_000, 3, 1.06)) is not None
-    half = noisy_runs(20_000, 3, 1.0, slope=math.sqrt(3.0))
-    # the line has the same variance as the noise
-    assert noise_share(half.responses[0], half.study).share == pytest.approx(0.5, rel=0.05)
-
-
-@pytest.mark.second
-def test_failures_that_go_with_the_response() -> None:
-    """Runs fail where the response is bad: the interval of the others misses the truth, that of all runs does not."""
-    held = missed = 0
-    for seed in range(30):
-        study = study_of(
-            "{a: {key: [job, a], uniform: [-1 um, 1 um]}}",
-            f"{{kind: monte_carlo, runs: 40, seed: {seed}}}",
-            report="{thresholds: {t: {response: y, at_most: -0.5}}}",
-        )
-        y = columns(study)["a"]
-        (one,) = summary(dataset(study, {"y": y}, y > 0.0), study)["requirements"]
-        # a quarter of all; of those that do not fail a half
-        missed += not one["interval"][0] <= 0.25 <= one["interval"][1]
-        held += one["bounds_interval"][0] <= 0.25 <= one["bounds_interval"][1]
-    assert missed >= 10
-    assert held >= stats.binom.ppf(FALSE_ALARM, 30, 0.95)
-    assert "bounds" in one
-
-
 @pytest.mark.parametrize("limits", [(-0.5, 2.0), (6.0, 7.0), (12.0, 15.0), (-60.0, -45.0), (1e3, 1e3 + 1.0)])
 def test_a_normal_distribution_cut_far_from_its_mean(limits) -> None:
     """Draws by scipy's distribution, which works in logarithms; polynomials orthonormal on it, by exact quantiles."""

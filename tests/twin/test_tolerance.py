@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import checked_nodes
-from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
 from scenes.specs.tolerance import AllocationSpec, ToleranceSetup, ToleranceSpec, amount_si, resolve_tolerance
 from scenes.yaml.errors import InputError
@@ -102,19 +100,6 @@ def test_a_camera_is_that_of_the_main_program(bench: ToleranceBench, drawn: np.n
     assert values[2] == pytest.approx(np.hypot(alpha, beta), rel=1e-9)
     assert values[3] == pytest.approx(abs(d_f), rel=1e-6)
     assert values[6] == pytest.approx(abs(gamma), rel=1e-6, abs=1e-12)
-
-
-@pytest.mark.second
-def test_order_and_company_do_not_matter(bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path) -> None:
-    turned = dict(reversed(BUDGET["tolerances"].items()))
-    other = ToleranceBench(budget(tmp_path, tolerances=turned), backend)
-    place = [[n.name for n in bench.numbers].index(number.name) for number in other.numbers]
-    own = bench.try_out(drawn * bench.sizes)
-    again = other.try_out(drawn[:, place] * other.sizes)
-    np.testing.assert_allclose(again.parts, own.parts, rtol=1e-9, atol=1e-15)
-    alone = np.concatenate([bench.try_out(row[None] * bench.sizes).parts for row in drawn[:3]])
-    # matrix products of other sizes round otherwise, and a path of ten metres has no digits below 3e-9 waves
-    np.testing.assert_allclose(alone, own.parts[:3], rtol=1e-8, atol=1e-15)
 
 
 def test_a_compensator_without_a_range_changes_nothing(
@@ -235,25 +220,6 @@ def test_an_obscured_camera_is_that_of_the_camera_program(backend, tmp_path) -> 
         assert values[0] == pytest.approx(max(wave.rms for wave in camera.wavefronts(bench.fields)), rel=1e-4)
         least = min(float(np.min(mtf.at(camera.nyquist))) for mtf in camera.mtfs(bench.fields))
         assert values[1] == pytest.approx(least, abs=1e-4)
-
-
-@pytest.mark.second
-def test_the_example_of_a_zemax_file_is_collimated_by_its_secondary(backend) -> None:
-    """Its turns take out the coma of a decentre, and what it is tilted by itself."""
-    setup = resolve_tolerance(EXAMPLES / "tolerance_cassegrain.yaml")
-    focus = {"focus": setup.test.compensators["focus"]}
-    alone = setup.model_copy(update={"test": setup.test.model_copy(update={"compensators": FrozenMap(focus)})})
-    both, only = (ToleranceBench(one, backend) for one in (setup, alone))
-    names = list(both.entries)
-    x = np.zeros((3, len(both.numbers)))
-    for row, name in enumerate(("M2_decentre_x", "M2_tilt_y"), start=1):
-        x[row, both.entries[name][0]] = 1.0
-    with_turns, without = (one.values(one.try_out(x * one.sizes).parts)[:, 0] for one in (both, only))
-    assert names == list(setup.test.tolerances)
-    assert without[1] > 0.1
-    assert without[2] > 0.08
-    assert with_turns[1] < 0.03
-    assert with_turns[2] == pytest.approx(with_turns[0], abs=1e-5)
 
 
 def test_shares_of_a_figure_and_of_a_yield() -> None:

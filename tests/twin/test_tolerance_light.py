@@ -17,7 +17,6 @@ from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.scenes.lens.colour_cameras import colour_camera
-from twin.camera.camera_optics import CameraOptics
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance
 from twin.tolerance.variations import states_of
@@ -221,27 +220,6 @@ def test_light_of_a_band_takes_as_many_wavelengths_as_it_needs(backend: Backend,
     assert design.colours.tolist() == [D_LINE]
     alone = design.values(design.try_out(np.zeros((1, 4))).parts)[0]
     assert alone[0] < 0.8 * values[0]
-
-
-@pytest.mark.second
-def test_mirrors_have_their_mtf_over_a_spectrum_where_it_is_asked(backend: Backend, tmp_path: Path) -> None:
-    """Their wavefronts are the same at all wavelengths, and traced once."""
-    merits = {
-        "w": {"kind": "wavefront", "at_most": 0.1, "fields": [[0.0, 0.0]]},
-        "m": {"kind": "mtf", "at_least": 0.1, "fields": [[0.0, 0.0]]},
-    }
-    tolerances = {"despace": {"motion": "M2 shift z", "limit": "20 um"}}
-    plain: dict[str, Any] = {"instrument": "gf7", "merits": merits, "tolerances": tolerances, "compensators": {}}
-    one = ToleranceBench(budget(tmp_path, **plain), backend)
-    light = ToleranceBench(budget(tmp_path, light="spectrum", **plain), backend)
-    ours, wide = (bench.values(bench.try_out(bench.sizes[None]).parts)[0] for bench in (one, light))
-    assert len(one.colours) == 1
-    assert ours[0] == wide[0]
-    state = states_of(light.numbers, light.sizes[None])[0]
-    camera = CameraOptics.within(light.instrument, "gf7", backend, state)
-    (mtf,) = camera.mtfs([(0.0, 0.0)], np.array([0.0, camera.nyquist]), light.colours, light.shares)
-    assert wide[1] == pytest.approx(float(np.min(mtf.values[:, 1])), abs=1e-4)
-    assert abs(wide[1] - ours[1]) > 1e-3
 
 
 @pytest.mark.second

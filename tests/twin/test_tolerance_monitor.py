@@ -257,21 +257,3 @@ def test_bad_input_is_told_with_its_key(text: str, words: str, key: str, backend
         ToleranceBench(budget(tmp_path, **changes), backend)
     for part in (words, key, "budget.yaml:"):
         assert part in str(caught.value)
-
-
-@pytest.mark.second
-def test_readings_alone_need_no_fields_and_no_compensators(backend, tmp_path) -> None:
-    """Of an instrument that is warmer than designed: with nothing drawn they are those of the designed one."""
-    warmer = {"warmer": {"motion": "base temperature", "limit": "0.5 K"}}
-    merits = {name: BUDGET["merits"][name] for name in ("angle", "f")}
-    bench = ToleranceBench(budget(tmp_path, tolerances=warmer, compensators={}, merits=merits), backend)
-    nominal, warm = bench.values(bench.try_out(np.array([[0.0], [1.0]]) * bench.sizes).parts)
-    assert bench.monitor is not None
-    rows = quantity_rows(bench.experiment.instrument, None)
-    stated, noise = bench.monitor.stated, bench.monitor.noise
-    for m, key in enumerate(("angle", "forward/d_f")):
-        sigma = split(rows[key], stated, noise, stated.best_gain(noise)).sigma[0]
-        assert nominal[m] == pytest.approx(sigma, rel=1e-6)
-    assert 0.0 < np.max(np.abs(warm / nominal - 1.0)) < 1e-3
-    x = np.array([[1.0]]) * bench.sizes
-    assert max(bench.monitor.missed(x, states_of(bench.numbers, x)).values()) < 1e-9
