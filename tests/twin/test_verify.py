@@ -1,6 +1,6 @@
 """`python -m twin.verify`: whatever is done to a run folder is found, and a run made again is compared in every number.
 
-Every kind of run folder is in test_verify_kinds.py.
+Run folders of other commands are in test_verify_kinds.py.
 """
 
 import csv

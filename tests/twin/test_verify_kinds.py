@@ -1,6 +1,7 @@
-"""Which files a run has read, as its manifest names them for `python -m twin.verify`."""
+"""`python -m twin.verify` on run folders of several commands, and which files a run has read."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -8,8 +9,31 @@ from pathlib import Path
 
 import pytest
 
-from tests.golden.jobs import ROOT
+from tests.golden.jobs import BY_NAME, ROOT, SET, UNSET, run
+from twin.run.owned_files import MANIFEST
 from twin.verify.folder_state import folder_state
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("name", ["lab_turntable", "orbit_adjust", "study_lab"])
+def test_a_changed_byte_is_found_and_the_run_comes_out_the_same(name, tmp_path) -> None:
+    """A byte in the middle of each file, one file after the other; then the run is made again."""
+    done = run(BY_NAME[name], tmp_path)
+    assert (done.out / MANIFEST).exists(), done.stderr
+    for path in [path for path in done.out.rglob("*") if path.is_file() and path.name != MANIFEST]:
+        kept = path.read_bytes()
+        content = bytearray(kept or b"x")
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+        assert path.relative_to(done.out).as_posix() in folder_state(done.out).changed
+        path.write_bytes(kept)
+    environment = {key: value for key, value in os.environ.items() if key not in UNSET} | SET
+    command = [sys.executable, "-m", "twin.verify", str(done.out), "--json"]
+    found = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
+    told = json.loads(found.stdout)["made_again"]
+    assert (told["state"], told["other_program"], told["other_processor"]) == ("same", [], [])
+
 
 AUDITED = """
 import json, os, runpy, sys
