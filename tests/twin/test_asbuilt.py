@@ -24,6 +24,7 @@ from scenes.specs.load import EXAMPLES
 from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from twin.asbuilt import asbuilt_run
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.asbuilt_run import ASBUILT, _standing, _warnings, motions, require_agreement, run_asbuilt
 from twin.asbuilt.next_step import advice, align, expected, wanted_move
@@ -461,7 +462,12 @@ def test_a_run_from_file_to_numbers(backend, tmp_path) -> None:
             draws=40,
         )
     )
-    run = run_asbuilt(setup, backend)
+    streams = []
+    with pytest.MonkeyPatch.context() as patch:
+        own = asbuilt_run.stream
+        patch.setattr(asbuilt_run, "stream", lambda *numbers: streams.append(numbers) or own(*numbers))
+        run = run_asbuilt(setup, backend)
+    assert len(set(streams)) == len(streams) == 5
     told = ASBUILT(run)
     assert told["whole"]["agrees"]
     assert run.warnings == ()

@@ -11,16 +11,24 @@ import pytest
 
 from scenes.specs.job import checked_nodes
 from scenes.specs.resolved import resolve
-from scenes.specs.tolerance import AllocationSpec, ToleranceSetup, ToleranceSpec, amount_si, resolve_tolerance
+from scenes.specs.tolerance import (
+    AllocationSpec,
+    MeritSpec,
+    ToleranceSetup,
+    ToleranceSpec,
+    amount_si,
+    resolve_tolerance,
+)
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml, parse_yaml
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.run_folder import RunFolderError
-from twin.tolerance import allocation, samples, tolerance_run
+from twin.tolerance import allocation, merit_models, samples, tolerance_run
 from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
+from twin.tolerance.merits import Merit
 from twin.tolerance.samples import Workforce, draw_samples
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.tolerance_run import TOLERANCE, Yield, run_tolerance, worst_jobs
@@ -436,3 +444,77 @@ def test_a_design_without_light_and_a_strange_journal_are_refused(tmp_path) -> N
     (tmp_path / "file").touch()
     with pytest.raises(RunFolderError, match="go on with --resume"), samples._journal(tmp_path / "file", "a" * 64):
         pass
+
+
+def merit_of(kind: str, column: int = 0, **asked: Any) -> Merit:
+    return Merit(kind, MeritSpec.model_validate({"kind": kind, **asked}), np.array([0]), slice(column, column + 1))
+
+
+def test_margins_losses_and_verdicts_of_merits() -> None:
+    """A value on its limit passes; a loss is what is left over the root of the number of tolerances."""
+    error, mtf = merit_of("wavefront", at_most=0.05), merit_of("mtf", at_least=0.4)
+    assert error.passes(np.array([0.05, 0.0501, np.nan])).tolist() == [True, False, False]
+    assert mtf.passes(np.array([0.4, 0.399, np.nan])).tolist() == [True, False, False]
+    assert (float(error.margin(np.array(0.06))), float(mtf.margin(np.array(0.32)))) == pytest.approx((0.2, 0.2))
+    assert (float(error.worse(np.array(0.06), 0.04)), float(mtf.worse(np.array(0.32), 0.4))) == pytest.approx(
+        (0.02, 0.08)
+    )
+    bench = SimpleNamespace(entries=dict.fromkeys("abcd"), merits=(error, mtf, merit_of("wavefront", at_most=0.02)))
+    losses = merit_models.default_losses(bench, np.array([0.03, 0.5, 0.03]))
+    assert losses[:2] == pytest.approx([0.01, 0.05])
+    assert np.isnan(losses[2])
+    one = Yield.count(np.arange(100) < 90)
+    assert [one.judged(p) for p in (one.low, one.low + 1e-9, one.high, one.high + 1e-9)] == [
+        "met",
+        "open",
+        "open",
+        "missed",
+    ]
+
+
+def test_models_of_scaled_tolerances_are_the_model_of_scaled_draws() -> None:
+    """Two tolerances of two and one numbers; derivatives by the logarithms of the scales against differences."""
+    rng = np.random.default_rng(6)
+    bent = rng.standard_normal((4, 3, 3))
+    model = MeritModel(rng.standard_normal(4), rng.standard_normal((4, 3)), bent + bent.transpose(0, 2, 1))
+    x, scales = rng.standard_normal((7, 3)), np.array([0.7, 1.6])
+    scaled = merit_models.ScaledModel.of(model, x, [(0, 2), (1,)])
+    wide = x * scales[[0, 1, 0]]
+    exact = [
+        model.nominal + model.slope @ row + 0.5 * np.einsum("k,pkl,l->p", row, model.curvature, row) for row in wide
+    ]
+    np.testing.assert_allclose(scaled.parts(scales), exact, rtol=1e-12)
+    np.testing.assert_allclose(model.quadratic(wide), exact, rtol=1e-12)
+    steps = np.exp(1e-6 * np.eye(2))
+    slope = np.stack([(scaled.parts(scales * s) - scaled.parts(scales / s)) / 2e-6 for s in steps], axis=-1)
+    np.testing.assert_allclose(scaled.slope(scales, np.arange(7)), slope, rtol=1e-6, atol=1e-8)
+    # the rms of what the terms of a figure do to a turn, and the mean of what they do to a wavefront
+    bench = SimpleNamespace(
+        parts=4, merits=(merit_of("wavefront", 0, at_most=1.0), merit_of("roll", 1, at_most="1 rad"))
+    )
+    (spread,) = merit_models._spread(bench, model, np.array([0, 2]), np.array([0.5]))
+    assert spread[1] == pytest.approx(model.nominal[1] + 0.5 * np.hypot(model.slope[1, 0], model.slope[1, 2]))
+
+
+def test_cameras_have_errors_of_their_own(backend, tmp_path, monkeypatch) -> None:
+    """Errors of adjustments go by the camera's seed; an allocation is judged by other cameras than it was made with."""
+    made = SimpleNamespace(grid_steps=np.array([0.0, 1e-6]), accuracies=np.zeros(2), ranges=np.ones(2))
+    first, second, again = samples.adjustment_errors(made, [1, 2, 1])
+    assert np.array_equal(first, again)
+    assert not np.any(first == second)
+    assert first[0] != first[1]
+    made.grid_steps = np.zeros(2)
+    assert samples.adjustment_errors(made, [1]) is None
+    asked = []
+
+    def drawn(*given: Any) -> SimpleNamespace:
+        asked.append(given[4])
+        return SimpleNamespace(values=np.zeros((4, 1)))
+
+    monkeypatch.setattr(
+        tolerance_run, "ToleranceBench", lambda *_: SimpleNamespace(passing=lambda values: values < 1.0)
+    )
+    monkeypatch.setattr(tolerance_run, "draw_samples", drawn)
+    found = tolerance_run._judged(budget(tmp_path), backend, SimpleNamespace(limits={}), 3, None, None)
+    assert (found.passed, found.of) == (4, 4)
+    assert asked != [3]

@@ -147,14 +147,27 @@ def test_states_whose_spots_leave_their_ccd_are_left_out_and_counted():
 
 
 @pytest.mark.second
+def test_every_state_has_noise_of_its_own():
+    """Frames before and after of two states in equal light; whichever others are exposed with it."""
+    experiment, _ = bench("gf7_pair", "orbit")
+    light = np.stack([experiment.nominal_photons] * 2)
+    frames = np.concatenate(coverage._exposed(experiment, light, 1, 5, np.array([0, 7])))
+    for k in range(4):
+        for other in range(k):
+            assert np.mean(frames[k] == frames[other]) < 0.2
+    alone = np.concatenate(coverage._exposed(experiment, light[:1], 1, 5, np.array([7])))
+    np.testing.assert_array_equal(alone, frames[1::2])
+
+
+@pytest.mark.second
 def test_states_do_not_depend_on_how_many_are_drawn_at_once(monkeypatch):
     experiment, limits = bench("gf7_pair", "orbit")
-    whole = run_states(experiment, limits.quantities, 4, 1, seed=3)
-    monkeypatch.setattr("twin.uncertainty.coverage.CHUNK", 3)
-    parts = run_states(experiment, limits.quantities, 4, 1, seed=3)
+    whole = run_states(experiment, limits.quantities, 6, 1, seed=3)
+    monkeypatch.setattr("twin.uncertainty.coverage.CHUNK", 4)
+    parts = run_states(experiment, limits.quantities, 6, 1, seed=3)
     np.testing.assert_array_equal(whole.truth, parts.truth)
     np.testing.assert_array_equal(whole.errors[BEST], parts.errors[BEST])
-    other = run_states(experiment, limits.quantities, 4, 1, seed=4)
+    other = run_states(experiment, limits.quantities, 6, 1, seed=4)
     assert np.all(other.errors[BEST] != whole.errors[BEST])
 
 
