@@ -23,7 +23,6 @@ from twin.pictures.picture import (
     Shot,
     Studio,
     colour_variant,
-    displayed,
     render_shot,
     staged,
     still_patches,
@@ -138,13 +137,6 @@ def test_grain_is_taken_off_matt_patches_only():
     assert smooth[:, :39].std() < 0.03
     assert smooth[:, :39].mean() == pytest.approx(0.5, abs=0.01)  # nothing comes over the border
     assert smooth[:, 41:69].mean() == pytest.approx(0.9, abs=0.01)
-
-
-def test_grey_values_rise_with_light():
-    grey = displayed(np.linspace(0.0, 4.0, 400)).astype(int)
-    assert grey[0] == 0
-    assert grey[-1] == 255
-    assert np.all(np.diff(grey) >= 0)
 
 
 # --- Mitsuba's variants -----------------------------------------------------------------------------------------------

@@ -358,20 +358,3 @@ def test_the_nodes_of_an_instrument_are_listed(tmp_path) -> None:
     assert table.exit_code == 0
     assert all(name in table.stdout for name in data["nodes"])
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.second
-def test_a_prior_that_moves_one_change_alone_has_a_posterior_of_it_alone(tmp_path) -> None:
-    """The paper's ranges move the principal distance alone; every table of the run has its rows all the same."""
-    job = tmp_path / "alone.yaml"
-    job.write_text(
-        "instrument: gf7_pair\ndisturbances: paper_001\n"
-        "perturb:\n  base/backward/focal_plane: {rotate: [2 arcsec, -1.5 arcsec, 10 arcsec], pivot: rear_node}\n"
-        "render: {images: [spots], frames: 9, seed: 1}\n"
-    )
-    result = run(job, "--out", tmp_path / "run")
-    assert result.exit_code == 0, result.stderr
-    camera = json.loads((tmp_path / "run" / "recovered.json").read_text())["cameras"]["backward"]["posterior"]
-    assert camera["d_alpha_arcsec"] is None
-    assert camera["d_alpha_arcsec_sigma"] is None
-    assert camera["d_f_um_sigma"] > 0.0

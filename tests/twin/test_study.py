@@ -10,15 +10,13 @@ import subprocess
 import sys
 import time
 from functools import partial
+from typing import Any
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import numpy as np
-import psutil
 import pytest
 import xarray as xr
-from distributed.core import rpc
-from distributed.security import Security
 
 import twin.study.__main__ as command
 from tests.twin.commands import files, invoke
@@ -121,6 +119,8 @@ def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch
 @pytest.mark.second
 def test_nobody_else_can_talk_to_the_workers(workers) -> None:
     """Whoever may send them a task runs programs as this user: without the study's own key nobody may."""
+    from distributed.security import Security
+
     facts = workers.client.scheduler_info(n_workers=-1)
     addresses = [facts["address"]]
     for address, worker in facts["workers"].items():
@@ -143,13 +143,17 @@ def test_nobody_else_can_talk_to_the_workers(workers) -> None:
 
 def listening() -> set[tuple[str, int]]:
     """Where this process and those below it can be reached from outside of them."""
+    import psutil
+
     own = psutil.Process()
     found = [c for process in (own, *own.children(recursive=True)) for c in process.net_connections()]
     return {tuple(c.laddr) for c in found if c.status == psutil.CONN_LISTEN}
 
 
-async def greet(address: str, security: Security | None) -> object:
+async def greet(address: str, security: Any) -> object:
     """What a server of Dask says of itself."""
+    from distributed.core import rpc
+
     async with rpc(address, connection_args={} if security is None else security.get_connection_args("client")) as it:
         return await asyncio.wait_for(it.identity(), 5)
 
@@ -230,6 +234,8 @@ def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
 @pytest.mark.second
 def test_a_real_scheduler_with_two_workers(done, tmp_path) -> None:
     """A cluster by TLS, as a user sets it up by hand, gives the numbers of the local processes."""
+    from distributed.security import Security
+
     folder, path, _ = done
     key, options, environment = Security.temporary(), [], dict(os.environ)
     for name, variable, text in (

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from distributed.scheduler import KilledWorker
 
 import twin.study.__main__ as command
 from analysis.measurement_error import MeasurementError
@@ -103,6 +102,8 @@ def test_a_study_all_of_whose_runs_failed_ends_with_1(tmp_path, monkeypatch) -> 
 
 def test_what_workers_make_of_a_study_is_told(tmp_path, monkeypatch) -> None:
     """Workers that die, a pilot that fails, a first block without a good run, and processes that need much memory."""
+    from distributed.scheduler import KilledWorker
+
     plan = Plan.of(resolve_study(write_study(tmp_path / "in", ("runs: 100", "runs: 75"))))
     dead = KilledWorker("task", SimpleNamespace(address="here"), 3)
     lost = BlockResult.of([Failure("no light")] * 25, plan.setup.study.responses)

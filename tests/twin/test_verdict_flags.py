@@ -23,7 +23,6 @@ from tests.twin.test_procedure import FILE, LEVEL
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
 from twin.main_job.verdict import judge, recovered_numbers
-from twin.orbit.block.block_numbers import CHANGE
 from twin.run import reference_frames
 from twin.run.command import add_test
 from twin.run.provenance import VERDICT, negative_verdicts
@@ -169,25 +168,6 @@ def test_a_course_that_contradicts_its_prior_says_so(tmp_path: Path, backend) ->
     # one time whose shifts are beyond the prior by themselves is no time at which sigma holds
     shaken = replace(quiet, series=replace(quiet.series, agrees=np.array([True, False, True])))
     assert shaken.series.to_dict()["sigma_holds"] == [True, False, True]
-
-
-def test_a_camera_of_a_block_is_in_the_units_of_its_keys() -> None:
-    """All its numbers, the sigma before the block and the truth too: three times the source, three times the number."""
-
-    class Change:
-        def __init__(self, size: float) -> None:
-            self.found, self.sigma = size * np.arange(1.0, 5.0), size * np.arange(5.0, 9.0)
-            self.before, self.truth = size * np.arange(9.0, 13.0), size * np.arange(13.0, 17.0)
-
-    one, three = CHANGE(Change(1e-6)), CHANGE(Change(3e-6))
-    assert len(one) == 16
-    for k, (name, unit) in enumerate(
-        (("d_alpha", "arcsec"), ("d_beta", "arcsec"), ("d_gamma", "arcsec"), ("d_f", "um"))
-    ):
-        for start, ending in ((1, ""), (5, "_sigma"), (9, "_sigma_before"), (13, "_true")):
-            key = f"{name}_{unit}{ending}"
-            assert one[key] == pytest.approx(1e-6 * (start + k) * PER_SI[unit], rel=1e-14), key
-            assert three[key] == pytest.approx(3.0 * one[key], rel=1e-14), key
 
 
 @pytest.mark.second
