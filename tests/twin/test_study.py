@@ -259,11 +259,11 @@ def test_a_real_scheduler_with_two_workers(done, tmp_path) -> None:
             name = ["--local-directory", str(tmp_path), "--name", f"w{k}"]
             others.append(subprocess.Popen([*program, *options, *name], **quiet))
         study = [sys.executable, "-m", "twin.study", str(path), "--out", str(tmp_path / "run"), "--scheduler", address]
-        ran = subprocess.run(study, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
+        ran = subprocess.run(study, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900, check=False)
         assert ran.returncode == 0, ran.stderr
         assert same_bytes(tmp_path / "run") == same_bytes(folder)
     finally:
         for process in others:
             process.terminate()
         for process in others:
-            process.wait(20)
+            process.wait(60)
