@@ -173,7 +173,7 @@ def test_the_command_writes_them_or_says_why_not(backend, tmp_path, monkeypatch)
     """Pictures that cannot be made cost the exit code and nothing else."""
     example = EXAMPLES / "perturb.yaml"
     done = render_job(resolve(example), backend, frames=1)
-    monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments: done)
+    monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: done)
     # imported where they are asked for
     monkeypatch.setattr(picture_light, "write_pictures", partial(write_pictures, shots=SMALL))
     words = ["--frames", "1", "--picture", "--quiet"]
