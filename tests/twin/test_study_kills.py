@@ -6,37 +6,6 @@ import signal
 import pytest
 
 from tests.twin.study_bench import alive, children, chunks, same_bytes, start, wait_for, write_study
-from twin.run.cluster import local_workers
-from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.engine import Engine, IncompleteError
-from twin.study.runs.plan import Plan
-from twin.study.runs.setup import resolve_study
-
-
-@pytest.mark.second
-def test_runs_that_kill_their_worker_are_named(tmp_path, monkeypatch) -> None:
-    """One block of five takes its process down each time; the others are done, and the message says which it is."""
-    plan = Plan.of(resolve_study(write_study(tmp_path / "in", ("runs: 100", "runs: 125"))))
-
-    # inside the test, so that Dask hands the code itself over: workers cannot import this file
-    def deadly(task):
-        import os
-
-        from twin.study.runs.task import evaluate
-
-        if task.first <= 3 < task.first + len(task.blocks):
-            os._exit(9)
-        return evaluate(task)
-
-    monkeypatch.setattr("twin.study.runs.task.evaluate", deadly)
-    store = ChunkStore(tmp_path, plan)
-    store.open()
-    before = dict(os.environ)
-    with local_workers(1) as workers, pytest.raises(IncompleteError, match=r"runs 75-99 .*workers died"):
-        Engine(plan, store, chunk_blocks=2).run(workers)
-    assert store.missing == [3]
-    # what workers are told by the environment is not left to this process
-    assert dict(os.environ) == before
 
 
 @pytest.mark.second
