@@ -10,7 +10,7 @@ import pytest
 
 from tests.twin.study_bench import write_study
 from twin.study.runs.base_job import BlockResult
-from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.chunk_store import ChunkError, ChunkStore
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 
@@ -204,3 +204,12 @@ def test_only_files_in_the_folder_are_read(store, tmp_path, kind) -> None:
     assert again.missing == [0]
     assert len(again.corrupt) == 1
     assert elsewhere.is_file()
+
+
+def test_a_chunk_of_another_checksum_is_computed_again(store) -> None:
+    (store.folder / "00000.npz").write_bytes(packed())
+    again = opened(store)
+    assert (again.missing, len(again.corrupt)) == ([0], 1)
+    entry = store.entries[0]
+    with pytest.raises(ChunkError, match=r"00000\.npz"):
+        store.read(entry)

@@ -6,16 +6,12 @@ import pytest
 from analysis.monitor import monitoring
 from analysis.monitor.monitoring import MonitorGeometry
 from optics.geometry import zernike
-from optics.geometry.pose import rotation_matrix, rotation_vector
-from optics.geometry.tree import Body, Motion, RigidTree
+from optics.geometry.tree import Motion
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.thermal.heat import Temperature
-from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.wavefront import path_difference
 from scenes.models.camera_model import collimated, field_direction
-from scenes.models.thermal_model import ThermalModel
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import ElementaryMotion, line_family
@@ -130,24 +126,6 @@ def test_an_image_point_at_plus_y_looks_to_minus_y(gf7_pair, backend):
 
 
 # --- motions --------------------------------------------------------------------------------------------------------
-
-
-def test_rotation_vectors_are_right_handed():
-    quarter = 0.5 * np.pi
-    for axis, (start, end) in enumerate((([0, 1, 0], [0, 0, 1]), ([0, 0, 1], [1, 0, 0]), ([1, 0, 0], [0, 1, 0]))):
-        vector = quarter * np.eye(3)[axis]
-        assert rotation_matrix(vector) @ start == pytest.approx(end, abs=1e-15)
-        assert rotation_vector(rotation_matrix(vector)) == pytest.approx(vector)
-
-
-def test_motion_turns_about_the_pivot_and_then_shifts_in_the_nominal_axes():
-    turned = rotation_matrix(np.array([0.0, 0.0, 0.5 * np.pi]))
-    tree = RigidTree((Body("a"), Body("a/b", pivots={"p": (1.0, 0.0, 0.0)})))
-    motion = Motion(rotate=(0.0, 0.0, 0.5 * np.pi), shift=(0.1, 0.0, 0.0), pivot="p", scale=0.5)
-    pose = tree.place([{"a/b": motion}]).pose("a/b")
-    assert pose.rotation == pytest.approx(turned, abs=1e-15)
-    # the pivot ends where the shift alone brings it: the shift is along the axes before the turn
-    assert pose.apply(1.5 * np.array([1.0, 0.0, 0.0])) == pytest.approx([1.1, 0.0, 0.0], abs=1e-15)
 
 
 def test_a_motion_is_in_the_bodys_own_frame(gf7_pair):
@@ -321,15 +299,6 @@ def test_printed_formulas_have_the_right_sign(spots, truth, geometry, name, moti
     assert reading / truth[motion][which] == pytest.approx(factor, rel=0.035)
 
 
-def test_columns_along_plus_x_would_break_two_printed_signs(spots, truth, geometry):
-    mirrored = {name: shift * [1, -1] for name, shift in spots.items()}
-    signs = [
-        np.sign(monitoring.coefficients(name, geometry)[which] @ mirrored[motion].ravel() / truth[motion][which])
-        for name, motion, which, _ in PRINTED[:4]
-    ]
-    assert signs == [-1, 1, -1, 1]
-
-
 def test_table_1_needs_two_signs_of_its_y(spots, truth, geometry, path):
     """With Y = before - after, as in (2), the printed (Y_L - Y_R) has the sign opposite to (7)."""
     y_left, y_right = -spots["scale"][:, ROW]
@@ -339,13 +308,6 @@ def test_table_1_needs_two_signs_of_its_y(spots, truth, geometry, path):
 
 
 # --- waves ----------------------------------------------------------------------------------------------------------
-
-
-def test_less_path_is_a_positive_opd():
-    position = np.zeros((3, 3))
-    direction = np.broadcast_to([0.0, 0.0, 1.0], (3, 3))
-    difference = path_difference(position, direction, np.array([1.0, 1.0 - 1e-7, 1.0 + 1e-7]), chief=0)
-    assert difference == pytest.approx([0.0, +1e-7, -1e-7], abs=1e-15)
 
 
 def test_a_figure_is_sag_along_the_surfaces_z_and_delays_by_twice_itself_on_m1(gf7_pair, backend):
@@ -374,27 +336,6 @@ def test_a_figure_is_sag_along_the_surfaces_z_and_delays_by_twice_itself_on_m1(g
     assert (change @ bump) / (bump @ bump) == pytest.approx(-2.0, rel=0.03)
 
 
-def test_zernike_order_is_nolls():
-    """(n, m) of the first eleven terms; unit rms over the disk; even indices are cosines."""
-    expected = [(0, 0), (1, 1), (1, -1), (2, 0), (2, -2), (2, 2), (3, -1), (3, 1), (3, -3), (3, 3), (4, 0)]
-    assert [zernike.noll_to_nm(j) for j in range(1, 12)] == expected
-    values = zernike.basis(4, np.array([0.5, 0.0]), np.array([0.0, 0.5]))
-    assert values[:, 1] == pytest.approx([1.0, 0.0])  # Z2 = 2 x
-    assert values[:, 2] == pytest.approx([0.0, 1.0])  # Z3 = 2 y
-    assert values[:, 3] == pytest.approx([np.sqrt(3) * (2 * 0.25 - 1)] * 2)  # Z4, positive at the rim
-
-
-def test_phase_grows_with_the_path():
-    """exp(-i w t) and exp(+i k L): waves of direction cosine u and optical path L = -u x0 meet in phase at +x0."""
-    u, v = (grid.ravel()[None] for grid in np.meshgrid(np.linspace(-0.01, 0.01, 15), np.linspace(-0.01, 0.01, 15)))
-    target = 30e-6
-    field = PupilField(u, v, -u * target, np.ones_like(u), 650e-9)
-    grid = Grid(-60e-6, 2e-6, 61)
-    irradiance = image(field, grid, grid)[0]
-    row, column = np.unravel_index(np.argmax(irradiance), irradiance.shape)
-    assert (grid.points()[row], grid.points()[column]) == pytest.approx((0.0, target), abs=1e-9)
-
-
 def test_an_index_gradient_bends_toward_the_higher_index(backend, instrument):
     """In the 180-deg prism of one channel; the beam runs along its x for most of the way."""
     model = instrument("gf7_pair")
@@ -410,11 +351,3 @@ def test_an_index_gradient_bends_toward_the_higher_index(backend, instrument):
     place = traced.numpy(traced.world)[0][:, 0]
     across = model.assembly.nominal_pose(prism).rotation[:, 1]
     assert (place[1] - place[0]) @ across > 0.0
-
-
-def test_a_warm_structure_is_longer(instrument):
-    model = instrument("gf7_pair")
-    state = ThermalModel(model).state({"base/forward": Temperature(10.0)})
-    nominal, warm = (model.assembly.place([s]) for s in ({}, state))
-    away = [p.pose("base/forward/M2").translation - p.pose("base/forward").translation for p in (nominal, warm)]
-    assert np.linalg.norm(away[1]) > np.linalg.norm(away[0])

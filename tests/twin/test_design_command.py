@@ -124,7 +124,6 @@ def test_a_run_folder(tmp_path, monkeypatch) -> None:
     again = resolve_design(out / "config.yaml")
     assert again.camera == gf7
     page = (out / "report.html").read_text("utf-8")
-    assert "<svg" in page
     told = json.loads((out / "design.json").read_text("utf-8"))
     assert told["improved"]  # by 0.1 %
     assert "Improved: small has a wavefront error of 0.0237 waves" in page
@@ -178,7 +177,7 @@ def test_an_anamorphism_is_a_share(backend) -> None:
     assert off == pytest.approx(100.0 * (abs(along / across - 1.0) - 0.005), rel=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_what_a_constraint_is_worth(tmp_path) -> None:
     """The clearance eased by 0.1 mm: the error falls by what its multiplier says, to the next order."""
     found = []
@@ -212,24 +211,3 @@ def test_what_is_wrong_with_a_file(tmp_path, old: str, new: str, message: str) -
     file.write_text(text.replace(old, new), "utf-8")
     with pytest.raises(InputError, match=message):
         resolve_design(file)
-
-
-@pytest.mark.slow
-def test_the_example_makes_the_camera_of_the_library(tmp_path) -> None:
-    """Radii, places and conics to a thousandth: other roundings stop the search a little elsewhere in a flat valley."""
-    result = CliRunner().invoke(app, [str(EXAMPLE), "--out", str(tmp_path / "out"), "--quiet"])
-    assert result.exit_code == 0, result.output
-    made = validate(CameraSpec, read_yaml(tmp_path / "out" / "artefacts" / "gf7_short.yaml"))
-    told = json.loads((tmp_path / "out" / "design.json").read_text("utf-8"))
-    reached = [start["wfe_rms_waves"] for start in told["starts"]]
-    assert len(reached) == 6
-    # growing penalties stopped at 0.0223, scipy's least squares on batoid reach 0.0149
-    assert min(reached) == pytest.approx(0.01489, abs=0.00002)
-    assert told["starts_at_best"] >= 3
-    assert "local optimum" in told["verdict"]
-    kept = load_camera("gf7_short")
-    assert made.image.z == pytest.approx(kept.image.z, rel=1e-3)
-    for name, mirror in made.mirrors.items():
-        assert mirror.radius == pytest.approx(kept.mirrors[name].radius, rel=1e-3)
-        assert mirror.conic == pytest.approx(kept.mirrors[name].conic, rel=1e-2)
-        assert mirror.z == pytest.approx(kept.mirrors[name].z, abs=1e-3)

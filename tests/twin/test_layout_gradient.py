@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.spots.likelihood import EDGE_PX
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.monitor_layout import (
     CONTINUOUS,
@@ -21,10 +22,12 @@ from scenes.models.monitor_layout import (
     resolve_monitor_design,
     start_beams,
 )
-from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
+from twin.design import monitor_design
+from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts, _OutsideLimitsError
 from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
 from twin.design.layout_search import Candidate, End, Found, merit, optima, spread
 from twin.monitor.information import Information
+from twin.run.procedure import BenchError
 
 STATED = """
 name: mirrors
@@ -122,35 +125,9 @@ def agrees_with_rebuilt_layouts(bench: LayoutBench, number: LayoutNumber) -> Non
         assert error <= 1e-5 * abs(value) + noise, (number.name, key)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_slope_against_layouts_that_are_built_anew(bench: LayoutBench) -> None:
     agrees_with_rebuilt_layouts(bench, LayoutNumber((FIRST,), 0, "pupil_x"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CONTINUOUS)
-@pytest.mark.parametrize("beam", [0, 1])
-def test_every_slope_against_layouts_that_are_built_anew(bench: LayoutBench, name: str, beam: int) -> None:
-    # off the plane of symmetry, where prisms are exchanged for their mirror images and a layout jumps
-    beams = (replace(FIRST, pupil_y=0.01), replace(SECOND, pupil_y=0.015))
-    agrees_with_rebuilt_layouts(bench, LayoutNumber(beams, beam, name))
-
-
-@pytest.mark.slow
-def test_a_slope_across_a_jump_says_so(bench: LayoutBench) -> None:
-    """A 180-deg prism of the second beam is exchanged for its mirror image within the first of the steps, of 1.2 mm:
-    what small differences on this side of the jump find lies within the stated error, which is as large as the slope.
-    """
-    number = LayoutNumber((FIRST, SECOND), 1, "pupil_y")
-    slope = slope_of(bench, number)
-    h = 2e-4
-    up, down = (known_of(bench, number.moved(bench, sign * h))[STATED_NAME] for sign in (1.0, -1.0))
-    for key in ("angle", "forward/d_f", "backward/d_f"):
-        value, error = slope.values[STATED_NAME][key], slope.errors[STATED_NAME][key]
-        plain = (up.sigma(key) - down.sigma(key)) / (2.0 * h)
-        # plain differences are wrong by h^2, 1e-5 of these slopes
-        assert abs(value - plain) < error + 1e-4 * abs(plain), key
-    assert slope.errors[STATED_NAME]["angle"] > abs(slope.values[STATED_NAME]["angle"])
 
 
 @pytest.mark.second
@@ -166,7 +143,7 @@ def test_a_layout_at_a_limit_has_slopes_and_one_beyond_tells_why(bench: LayoutBe
     assert not lost.values
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_spots_that_fill_their_pixels_are_refused(bench: LayoutBench) -> None:
     told = bench.try_beam(replace(FIRST, photons=1e8)).refused
     assert told.startswith("its spots are too bright")
@@ -324,3 +301,43 @@ def test_ends_are_told_apart_by_two_percent(bench: LayoutBench) -> None:
     assert [[one.name for one in group] for group in optima(found, bench)] == [["a", "b"], ["c"], ["d"]]
     assert found.refused == {"a": 5}
     assert (found.beams, found.standing, found.compared, found.built) == (5, 5, 5, 5)
+
+
+def test_layouts_beyond_their_limits_say_which() -> None:
+    """Each limit by itself; a layout that stands on it is within."""
+    limits = SimpleNamespace(pupil_share=0.2, mass=3.0, spot_sigmas=4.0)
+    own = SimpleNamespace(setup=SimpleNamespace(test=SimpleNamespace(limits=limits)))
+    ccd = SimpleNamespace(rows=96, columns=120)
+    instrument = SimpleNamespace(spec=SimpleNamespace(autocollimator=SimpleNamespace(area_ccd=ccd)))
+    room = 48.0 - EDGE_PX
+
+    def spots(reach: float, fullest: float) -> None:
+        found = SimpleNamespace(spot_sigma=np.array([0.1, reach / 4.0]), brightest=np.array([0.1, fullest]))
+        LayoutBench._check_spots(own, {"a": found}, instrument)
+
+    LayoutBench._check_limits(own, 0.2, 3.0)
+    spots(room, FULLEST)
+    for act, told in (
+        (lambda: LayoutBench._check_limits(own, 0.21, 3.0), "its prisms take 21 percent of the imaging pupil"),
+        (lambda: LayoutBench._check_limits(own, 0.2, 3.1), r"its prisms have a mass of 3\.1 kg"),
+        (lambda: spots(room + 0.1, FULLEST), "its spots leave their area CCDs"),
+        (lambda: spots(room, FULLEST + 0.01), "its spots are too bright"),
+    ):
+        with pytest.raises(_OutsideLimitsError, match=told):
+            act()
+
+
+def test_a_search_without_a_layout_that_stands_is_refused(setup: MonitorDesignSetup, monkeypatch) -> None:
+    found = SimpleNamespace(layouts=(), refused={"dark": 2, "in the way": 7}, beams=5, built=4)
+    monkeypatch.setattr(monitor_design, "LayoutBench", lambda *_: None)
+    monkeypatch.setattr(monitor_design, "_check_start", lambda *_: None)
+    monkeypatch.setattr(monitor_design, "Search", lambda *_: SimpleNamespace(run=lambda: found))
+    with pytest.raises(
+        BenchError, match="none of 5 beams and 4 layouts that were tried can stand; 7 times since in the"
+    ):
+        monitor_design.run_monitor_design(setup, None)
+    found.layouts = ("a layout",)
+    monkeypatch.setattr(monitor_design, "_front", lambda layouts, bench: layouts)
+    monkeypatch.setattr(monitor_design, "_ghosts", lambda *_: True)
+    with pytest.raises(BenchError, match="every layout on the front throws ghosts"):
+        monitor_design.run_monitor_design(setup, None)

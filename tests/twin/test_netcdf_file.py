@@ -67,9 +67,8 @@ def test_without_xarray_the_file_is_the_same_to_the_byte() -> None:
         netcdf(GridData({"n": ("x", np.arange(3), {})}, {}, {"title": "whole numbers"}))
 
 
-@pytest.mark.parametrize("unit", sorted({*UNITS.values(), *SPELT, *COUNTS}))
-def test_every_unit_of_results_is_known_or_a_count(unit: str) -> None:
-    data = xr.Dataset({"a": ("x", np.zeros(2), {"units": unit})})
-    found = follow_cf(data)["a"].attrs
-    assert found["units"] in UDUNITS
-    assert (found.get("counted_in") == unit) == (unit in COUNTS)
+def test_every_unit_of_results_is_known_or_a_count() -> None:
+    for unit in {*UNITS.values(), *SPELT, *COUNTS}:
+        found = follow_cf(xr.Dataset({"a": ("x", np.zeros(2), {"units": unit})}))["a"].attrs
+        assert found["units"] in UDUNITS, unit
+        assert (found.get("counted_in") == unit) == (unit in COUNTS), unit

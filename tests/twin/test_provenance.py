@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+import pytest
 import tifffile
 
 from twin.run import provenance
@@ -23,6 +24,7 @@ def digest_with(root: Path) -> str:
     return ran.stdout.strip()
 
 
+@pytest.mark.second
 def test_the_digest_is_of_all_files_and_follows_each(tmp_path):
     """Copies without what Git, editors and Python leave have the same one; a line of the library changes it."""
     for package in provenance.SOURCES:
@@ -32,14 +34,6 @@ def test_the_digest_is_of_all_files_and_follows_each(tmp_path):
     sheet = tmp_path / "scenes/library/detectors/monitor_ccd.yaml"
     sheet.write_text(sheet.read_text("utf-8") + "\n", "utf-8")
     assert digest_with(tmp_path) != provenance.program_digest()
-
-
-def test_every_kind_of_file_of_the_program_counts():
-    # of the folders themselves, as a bare system that runs the tests has no git
-    found = (path for package in provenance.SOURCES for path in (ROOT / package).rglob("*") if path.is_file())
-    endings = {path.suffix for path in found if "__pycache__" not in path.parts}
-    # py.typed tells type checkers that there are types, and computes nothing
-    assert endings - {".typed"} == set(provenance.ENDINGS)
 
 
 def test_what_rounds_numbers_is_named():

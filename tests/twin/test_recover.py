@@ -1,11 +1,10 @@
 """python -m twin.recover: the closed loop through files, other kinds of files, series, geometry, refusals."""
 
-import json
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,17 +17,17 @@ from analysis.images.image_file import recorded
 from analysis.spots.noise import NoiseModel
 from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.resolved import resolve
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, Issue
 from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
+from twin.recover import measured_frames
 from twin.recover.__main__ import app
 from twin.recover.measured_frames import ChannelFrames, StateFrames, order_warnings
 from twin.recover.recover_report import recover_numbers, recover_report
 from twin.recover.recover_run import run_recover
-from twin.render import app as render_app
 from twin.run.data_files import FrameFacts, tiff
 
 JOB = ROOT / "scenes/examples/perturb.yaml"
@@ -64,33 +63,7 @@ def test_rendered_frames_give_the_main_jobs_numbers_to_the_last_digit(run, image
     numbers, expected = recover_numbers(found), stated(run.recovered_dict())
     assert {key: numbers[key] for key in expected} == expected
     assert found.last.recovered_dict() == run.recovered_dict()
-    report = recover_report(found)
-    assert "The frames are clean." in report.lead
-    assert "truth" not in report.verdict
-
-
-@pytest.mark.second
-def test_packed_fits_and_listed_files_are_the_same_measurement(run, images, backend, tmp_path):
-    """LZW TIFF, FITS cubes, one file a frame, a CSV table: to the bit."""
-    first = tifffile.imread(images / "forward_left_before.tiff")
-    lines = ["channel,when,file"]
-    for number, path in enumerate(sorted(images.glob("*.tiff"))):
-        camera, side, when = path.stem.split("_")
-        frames = tifffile.imread(path)
-        if number % 3 == 0:
-            fits.PrimaryHDU(frames).writeto(tmp_path / f"{path.stem}.fits")
-            lines.append(f"{camera}/{side},{when},{path.stem}.fits")
-        elif number % 3 == 1:
-            tifffile.imwrite(tmp_path / path.name, frames, compression="lzw", byteorder=">", photometric="minisblack")
-            lines.append(f"{camera}/{side},{when},{path.name}")
-        else:
-            for k, frame in enumerate(frames):
-                tifffile.imwrite(tmp_path / f"{path.stem}_{k}.tif", frame)
-                lines.append(f"{camera}/{side},{when},{path.stem}_{k}.tif")
-    assert first.shape == (9, 96, 96)
-    (tmp_path / "frames.csv").write_text("\n".join(lines) + "\n")
-    found = measured(tmp_path, HEAD + "frames: frames.csv\n", backend, run)
-    assert found.last.recovered_dict() == run.recovered_dict()
+    assert "The frames are clean." in recover_report(found).lead
 
 
 @pytest.mark.second
@@ -122,6 +95,7 @@ def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
     assert len(recover_numbers(found)["series"]) == 3
 
 
+@pytest.mark.second
 def test_frames_of_different_sizes_say_where_they_begin(run, images, backend, tmp_path):
     """Frames before and after that begin at other pixels of the CCD read as a shift of the spot; so do the times of a
     series with one offset.
@@ -144,6 +118,7 @@ def test_frames_of_different_sizes_say_where_they_begin(run, images, backend, tm
     np.testing.assert_allclose(found.last.recovery.after, run.recovery.after, atol=0.01)
 
 
+@pytest.mark.second
 def test_without_an_instrument_its_geometry_and_a_learnt_shape_will_do(run, images, backend):
     """The formulas with the three numbers that a data sheet has, and the spot's shape from its own frames."""
     text = "template: measured\ndetector: monitor_ccd\nexposure: 10 ms\nframes: images\ngeometry:\n"
@@ -437,36 +412,16 @@ def test_a_job_is_told_from_a_measurement(images, tmp_path):
     assert "this is a job of the monitor, which twin.recover does not read; python -m twin.render" in result.stderr
 
 
-@pytest.mark.second
-def test_random_changes_of_the_file_never_end_in_a_traceback(images, tmp_path):
-    """Bytes of a measurement's YAML changed, left out and doubled."""
-    text = (HEAD + f"frames:\n  {PLAIN}\nvibration: none\ntemplate: twin\ndark: {{all: [a.tif]}}\n").encode()
-    random = np.random.default_rng(5)
-    for _ in range(150):
-        data = bytearray(text)
-        for _ in range(random.integers(1, 4)):
-            at = int(random.integers(len(data)))
-            kind = random.integers(3)
-            data[at : at + int(kind > 0)] = bytes([random.integers(256)] * int(kind < 2) * int(random.integers(1, 3)))
-        path = tmp_path / "measurement.yaml"
-        path.write_bytes(data)
-        with pytest.raises(InputError) as error:
-            resolve_measurement(path)
-        assert "measurement.yaml" in str(error.value) or "no such" in str(error.value)
-
-
-@pytest.mark.slow
-def test_the_closed_loop_of_both_commands(tmp_path):
-    """Run folder of twin.render -> its images -> twin.recover -> the same recovered.json; and again by config.yaml."""
-    assert invoke(render_app, JOB, "--out", tmp_path / "run", "--quiet").exit_code == 0
-    (tmp_path / "m.yaml").write_text(HEAD + "frames: run/images\n")
-    assert call(tmp_path / "m.yaml", "--out", tmp_path / "one", "--quiet").exit_code == 0
-    assert call(tmp_path / "one/config.yaml", "--out", tmp_path / "two", "--quiet").exit_code == 0
-    job, one, two = (json.loads((tmp_path / name / "recovered.json").read_text()) for name in ("run", "one", "two"))
-    assert one == two
-    for key in ("schema", "reference_frames", "cameras", "spots", "intersection_angle", "ground", "disturbances",
-                "centroid", "frames"):  # fmt: skip
-        assert one[key] == job[key]
-    page = (tmp_path / "one/report.html").read_text()
-    assert "What the fitted shape leaves over" in page
-    assert Path(tmp_path / "one/artefacts/spots-forward.svg").exists()
+def test_files_that_are_no_raw_frames_are_refused(tmp_path):
+    """Frames of two sizes in one state, an image that is stored turned, and a file that is not there."""
+    for name, size in (("a", 30), ("b", 32)):
+        tifffile.imwrite(tmp_path / f"{name}.tif", np.zeros((size, 30), np.uint16), photometric="minisblack")
+    Image.fromarray(np.full((24, 24), 7, np.uint16)).save(tmp_path / "turned.tif", tiffinfo={274: 3})
+    test = SimpleNamespace(error=lambda text, key, allowed=None: InputError(Issue(text, allowed=allowed)))
+    for names, told in (
+        (("a.tif", "b.tif"), "have frames of different sizes, 30 x 30 and 32 x 30"),
+        (("turned.tif",), "is stored turned or mirrored"),
+        (("none.tif",), "there is no image"),
+    ):
+        with pytest.raises(InputError, match=told):
+            measured_frames._stacked(test, tuple(str(tmp_path / name) for name in names), ("frames",))

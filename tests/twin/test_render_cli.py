@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 import pickle
-import re
 import resource
 import signal
 import subprocess
@@ -19,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-import xarray as xr
 
 import twin.main_job.render_command
 import twin.main_job.render_drawings
@@ -47,26 +45,6 @@ run = partial(invoke, command.app)
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = EXAMPLES / "perturb.yaml"
 FRAMES = 2
-CAMERAS, SIDES, STATES = ("forward", "backward"), ("left", "right"), ("before", "after")
-PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
-ESTIMATORS = ("paper_single", "paper_joint", "derived", "model", "posterior")
-IMAGES = {f"images/{c}_{s}_{t}" for c in CAMERAS for s in SIDES for t in STATES}
-FILES = {
-    "manifest.json",
-    "config.yaml",
-    "truth.json",
-    "recovered.json",
-    "crosstalk.json",
-    "uncertainty.json",
-    *("artefacts/limits.svg", "artefacts/limits-remedies.csv", "artefacts/limits-hidden.csv"),
-    "artefacts/limits-motions.csv",
-    "irradiance.nc",
-    "report.html",
-    "scene.glb",
-    "summary.png",
-    *(f"{image}.tiff" for image in IMAGES),
-    *(f"{image}.png" for image in IMAGES),
-}
 # Signals that a shell set to "ignore" for a background job stay so in its children; a user's terminal has the default.
 AS_FROM_A_TERMINAL = (
     "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
@@ -80,10 +58,6 @@ def start(*arguments: object, **options: object) -> "subprocess.Popen[str]":
     code = [sys.executable, "-c", AS_FROM_A_TERMINAL, *map(str, arguments)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(code, cwd=ROOT, env=environment, start_new_session=True, **pipes, **options)
-
-
-def frames_of(folder: Path) -> dict[str, np.ndarray]:
-    return {image: tifffile.imread(folder / f"{image}.tiff") for image in sorted(IMAGES)}
 
 
 @pytest.fixture(scope="module")
@@ -101,24 +75,6 @@ def computed(tmp_path_factory):
         done = run(EXAMPLE, "--out", place / "run", "--frames", FRAMES, "--seed", 5, "--json")
     assert done.exit_code == 0, done.stderr
     return place / "run", done.stdout, done.stderr, kept[0]
-
-
-@pytest.fixture(scope="module")
-def first(computed):
-    """Its folder and what was printed."""
-    return computed[:3]
-
-
-@pytest.fixture(scope="module")
-def repeated(first, tmp_path_factory):
-    """Two more runs, one folder each: the first run again, and another seed."""
-    place = tmp_path_factory.mktemp("repeated")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(LIMIT, "1")  # without a second process
-        again = run(first[0] / "config.yaml", "--out", place / "again", "--quiet")
-        patch.delenv(LIMIT)
-        other = run(EXAMPLE, "--out", place / "other", "--frames", FRAMES, "--seed", 6)
-    return place, again, other
 
 
 @pytest.fixture
@@ -154,24 +110,6 @@ def test_a_drawing_that_fails_is_a_note_and_a_file_that_fails_is_left_out():
     assert "no such font &lt;x&gt;</text>" in drawn["side"]
 
 
-@pytest.mark.slow
-def test_what_cannot_be_drawn_costs_nothing_else(computed, tmp_path, monkeypatch):
-    """A figure has a note in its place, a file is left out; exit code and manifest say so."""
-    kept = computed[3]
-    for name in ("summary_plot.summary_png", "spot_plots.motion_map_svg"):
-        monkeypatch.setattr(f"twin.main_job.{name}", no_font)
-    monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept)
-    done = run(EXAMPLE, "--out", tmp_path / "run", "--frames", FRAMES, "--quiet")
-    assert done.exit_code == 1
-    told = ["the figure 'motions'", "the file summary.png"]
-    told = [f"{what} could not be drawn: RuntimeError: no such font <x>" for what in told]
-    assert all(text in " ".join(done.stderr.split()) for text in told)
-    assert files(tmp_path / "run") == FILES - {"summary.png"}
-    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
-    assert set(told) <= set(manifest["warnings"])
-    assert "no such font &lt;x&gt;</text>" in (tmp_path / "run" / "report.html").read_text("utf-8")
-
-
 def test_all_that_is_drawn_can_be_sent_to_the_second_process(computed):
     """What cannot is drawn by the first process alone: a run that is right and takes twice as long."""
     kept = computed[3]
@@ -181,229 +119,66 @@ def test_all_that_is_drawn_can_be_sent_to_the_second_process(computed):
     assert sent[0]["side"]() == early["side"]()
 
 
+@pytest.mark.second
+def test_what_cannot_be_drawn_costs_nothing_else(ready, tmp_path, monkeypatch):
+    """A file that cannot be drawn is not there; all else is, and exit code and manifest say so."""
+    monkeypatch.setattr(twin.main_job.render_folder, "drawings", lambda _: {SUMMARY: partial(_tried, SUMMARY, no_font)})
+    done = run(EXAMPLE, "--out", tmp_path / "run", "--frames", FRAMES, "--quiet")
+    told = "the file summary.png could not be drawn: RuntimeError: no such font <x>"
+    assert (done.exit_code, told in " ".join(done.stderr.split())) == (1, True)
+    assert {"truth.json", "recovered.json", "report.html"} <= files(tmp_path / "run")
+    assert told in json.loads((tmp_path / "run" / "manifest.json").read_text())["warnings"]
+
+
 # --- a run that works -------------------------------------------------------------------------------------------------
 
 
-def test_the_run_folder_is_complete(first):
-    folder, _, _ = first
-    assert files(folder) == FILES
-    assert files(folder.parent) == {f"run/{name}" for name in FILES}
+def test_the_manifest_has_the_checksum_of_every_file(computed):
+    folder, out, errors, _ = computed
     manifest = json.loads((folder / "manifest.json").read_text())
-    assert set(manifest["sha256"]) == FILES - {"manifest.json"}
+    assert set(manifest["sha256"]) == files(folder) - {"manifest.json"}
     for name, digest in manifest["sha256"].items():
         assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
     assert (manifest["seed"], manifest["frames"], manifest["backend"]) == (5, FRAMES, "llvm")
-    assert manifest["wall_time_s"] > 0
-    assert {"python", "drjit", "numpy"} <= set(manifest["versions"])
-
-
-def test_json_is_all_that_is_printed(first):
-    folder, out, errors = first
-    assert errors == ""
-    assert out.count("\n") == 1
-    printed = json.loads(out)
-    assert set(printed) == {"truth", "recovered", "verdict", "warnings"}
-    for name in ("truth", "recovered"):
-        assert printed[name] == json.loads((folder / f"{name}.json").read_text())
-
-
-def test_keys_of_truth(first):
-    truth = json.loads((first[0] / "truth.json").read_text())
-    assert set(truth["cameras"]) == set(CAMERAS)
-    for camera in truth["cameras"].values():
-        assert set(PARAMETERS) <= set(camera)
-        assert all(np.isfinite(value) for value in camera.values())
-    assert np.isfinite(truth["intersection_angle"]["change_arcsec"])
+    assert (errors, out.count("\n")) == ("", 1)
     # 2 arcsec about X, and what 10 arcsec about Z add because the rear node is not straight behind the line
-    assert truth["cameras"]["backward"]["d_beta_arcsec"] == pytest.approx(-2.0, abs=0.01)
-
-
-def test_keys_of_recovered(first):
-    recovered = json.loads((first[0] / "recovered.json").read_text())
-    endings = ("", "_sigma", "_sigma_noise")
-    with_sigma = {f"{key}{ending}" for key in PARAMETERS for ending in endings}
-    for camera in CAMERAS:
-        assert set(recovered["cameras"][camera]) == set(ESTIMATORS)
-        for values in recovered["cameras"][camera].values():
-            assert set(values) == with_sigma
-            assert all(values[f"{key}_sigma"] > values[f"{key}_sigma_noise"] > 0 for key in PARAMETERS)
-        assert set(recovered["spots"][camera]) == set(SIDES)
-        for side in SIDES:
-            assert set(recovered["spots"][camera][side]) == set(STATES)
-            for spot in recovered["spots"][camera][side].values():
-                squares = {f"{part}_chi_square{end}" for part in ("reduced", "core") for end in ("", "_sigma_noise")}
-                fit = {*squares, "sigma_widened"}
-                assert set(spot) == {"row", "column", "row_sigma", "column_sigma", *fit}
-                assert 0 < spot["row"] < 95
-                assert spot["sigma_widened"] == 1.0
-    assert set(recovered["intersection_angle"]) == set(ESTIMATORS)
-    for values in recovered["intersection_angle"].values():
-        assert set(values) == {f"change_arcsec{ending}" for ending in endings}
-    assert set(recovered["ground"]) == set(ESTIMATORS)
-    for values in recovered["ground"].values():
-        assert {f"{axis}_m{ending}" for axis in ("along", "across", "height") for ending in endings} <= set(values)
-    stated = recovered["disturbances"]
-    assert (stated["name"], stated["degrees_of_freedom"], stated["agrees"], stated["suspects"]) == (
-        "launch",
-        8,
-        True,
-        [],
-    )
-    assert stated["chi_square"] < stated["limit"]
-    assert recovered["sigma_holds"]
-    assert recovered["doubts"] == []
-    for found in recovered["retraced"].values():
-        assert not found["relinearised"]
-        assert found["off_in_sigma"] < 0.1
-    for camera in CAMERAS:
-        assert set(recovered["from_statement"][camera]) == set(PARAMETERS)
-        # of the posterior's variance the noise of the images is next to nothing
-        assert all(0.99 < share <= 1.0 for share in recovered["from_statement"][camera].values())
-
-
-def test_images_are_the_frames(first):
-    folder, _, _ = first
-    for image in sorted(IMAGES):
-        with tifffile.TiffFile(folder / f"{image}.tiff") as file:
-            assert len(file.pages) == FRAMES
-            assert file.pages[0].dtype == np.uint16
-            assert file.pages[0].shape == (96, 96)
-        assert (folder / f"{image}.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_irradiance_opens(first):
-    with xr.open_dataset(first[0] / "irradiance.nc", engine="h5netcdf") as data:
-        assert data.photons.dims == ("state", "channel", "row", "column")
-        assert data.photons.shape == (2, 4, 96, 96)
-        assert list(data.state.values) == list(STATES)
-        assert list(data.channel.values) == [f"{c}/{s}" for c in CAMERAS for s in SIDES]
-        assert bool(np.isfinite(data.photons).all())
-        assert bool((data.photons >= 0).all())
-        assert data.attrs["wavelength_m"] == 650e-9
-
-
-def test_report_needs_nothing_from_outside(first):
-    text = (first[0] / "report.html").read_text("utf-8")
-    assert len(text) > 10_000
-    for reference in ('src="http', "src='http", '<link rel="stylesheet"', "@import", "<script src"):
-        assert reference not in text
+    assert json.loads(out)["truth"]["cameras"]["backward"]["d_beta_arcsec"] == pytest.approx(-2.0, abs=0.01)
 
 
 @pytest.mark.second
-def test_config_repeats_the_run_bit_for_bit(first, repeated):
-    """The config of a run with --seed and --frames holds both, so that it alone repeats the run."""
-    folder, _, _ = first
-    place, again, _ = repeated
-    assert again.exit_code == 0
-    for name in ("truth.json", "recovered.json", "config.yaml"):
-        assert (place / "again" / name).read_bytes() == (folder / name).read_bytes()
-    one, two = frames_of(folder), frames_of(place / "again")
-    for image in one:
-        assert np.array_equal(one[image], two[image])
-
-
-@pytest.mark.second
-def test_what_is_drawn_does_not_depend_on_who_draws_it(first, repeated):
-    """The first run has a second process where there are two cores, the other never. All else is compared above."""
-    folder, place = first[0], repeated[0] / "again"
-    files = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
-    drawn = [name for name in files if name.suffix in (".svg", ".png", ".glb", ".nc", ".csv")]
-    assert len(drawn) > 10
-    for name in drawn:
-        assert (place / name).read_bytes() == (folder / name).read_bytes(), name
-    assert (place / "report.html").read_text() == (folder / "report.html").read_text()
-
-
-@pytest.mark.second
-def test_quiet_says_nothing(repeated):
-    _, again, _ = repeated
-    assert (again.stdout, again.stderr) == ("", "")
-
-
-@pytest.mark.second
-def test_another_seed_is_other_noise_on_the_same_truth(first, repeated):
-    folder, _, _ = first
-    place, _, other = repeated
-    assert other.exit_code == 0
-    assert (place / "other/truth.json").read_bytes() == (folder / "truth.json").read_bytes()
-    one, two = frames_of(folder), frames_of(place / "other")
-    for image in one:
-        assert np.mean(one[image] != two[image]) > 0.8
-
-
-@pytest.mark.second
-def test_the_table_is_readable_in_a_narrow_terminal(repeated):
-    """No number is cut, and the table fits into 80 columns."""
-    place, _, other = repeated
-    assert "…" not in other.stdout
-    assert str(place / "other") in other.stdout.replace("\n", "")
-    truth = json.loads((place / "other/truth.json").read_text())
-    for camera in CAMERAS:
-        assert camera in other.stdout
-        assert f"{truth['cameras'][camera]['d_alpha_arcsec']:.4f}" in other.stdout
-    table = [
-        line
-        for line in other.stdout.splitlines()
-        if re.match(r"Δ[αβγθ] \[arcsec\] |Δf \[µm\] |(along|across|height) \[m\] ", line)
-    ]
-    assert len(table) == 2 * 4 + 1 + 3
-    assert max(len(line) for line in table) <= 80
-    # what the sigmas assume stands below it
-    assert "σ: noise and the prior launch; the shifts agree with it (chi-square" in other.stdout
-
-
-@pytest.mark.slow
-def test_a_wide_terminal_also_has_the_noise_and_a_job_without_disturbances_says_so(tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")
-    shown = run(EXAMPLE, "--out", tmp_path / "wide", "--frames", FRAMES).stdout
-    assert "noise" in shown[shown.index("poste-") : shown.index("forward  ")]
-    assert max(len(line) for line in shown.splitlines() if "[arcsec] " in line and "Δα [arcsec] " == line[:12]) <= 100
-    job = tmp_path / "job.yaml"
-    job.write_text(EXAMPLE.read_text().replace("disturbances: launch", "disturbances: none"))
-    alone = run(job, "--out", tmp_path / "alone", "--frames", FRAMES)
-    assert alone.exit_code == 0, alone.output
-    assert "No disturbances are stated: σ is that of the noise of the images alone." in alone.stdout
-    recovered = json.loads((tmp_path / "alone" / "recovered.json").read_text())
-    assert set(recovered["cameras"]["forward"]) == set(ESTIMATORS) - {"posterior"}
-    assert "disturbances" not in recovered
-    assert "No disturbances are stated" in (tmp_path / "alone" / "report.html").read_text("utf-8")
-
-
-@pytest.mark.second
-def test_numbers_are_whole_however_narrow_the_terminal(ready, tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "30")
-    result = run(EXAMPLE, "--out", tmp_path / "run")
-    assert result.exit_code == 0
-    assert "…" not in result.stdout
-    truth = json.loads((tmp_path / "run" / "truth.json").read_text())
-    assert f"{truth['cameras']['backward']['d_beta_arcsec']:.4f}" in result.stdout
-
-
-@pytest.mark.second
-def test_default_folder_counts_up(ready, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for number in (1, 2):
-        assert run(EXAMPLE, "--quiet").exit_code == 0
-        assert (tmp_path / f"runs/perturb-00{number}/manifest.json").is_file()
+def test_config_repeats_the_run_bit_for_bit(computed, tmp_path, monkeypatch):
+    """The config of a run with --seed and --frames holds both; the run may have a second process or none. Another seed
+    is other noise on the same truth.
+    """
+    folder = computed[0]
+    with monkeypatch.context() as patch:
+        patch.setenv(LIMIT, "1")  # without a second process
+        again = run(folder / "config.yaml", "--out", tmp_path / "again", "--quiet")
+    assert (again.exit_code, again.stdout, again.stderr) == (0, "", "")
+    for name in files(folder) - {"manifest.json"}:
+        assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
+    assert run(EXAMPLE, "--out", tmp_path / "other", "--frames", FRAMES, "--seed", 6).exit_code == 0
+    assert (tmp_path / "other/truth.json").read_bytes() == (folder / "truth.json").read_bytes()
+    for image in folder.glob("images/*.tiff"):
+        other = tifffile.imread(tmp_path / "other/images" / image.name)
+        assert np.mean(other != tifffile.imread(image)) > 0.8
 
 
 @pytest.mark.second
 def test_force_replaces_a_run(ready, tmp_path):
     assert run(EXAMPLE, "--out", tmp_path / "run", "--quiet").exit_code == 0
+    whole = files(tmp_path / "run")
     (tmp_path / "run/note.txt").touch()
     complains(run(EXAMPLE, "--out", tmp_path / "run", "--quiet", "--force"), "did not write: note.txt", "--out")
-    assert files(tmp_path / "run") == {*FILES, "note.txt"}
+    assert files(tmp_path / "run") == {*whole, "note.txt"}
     (tmp_path / "run/note.txt").unlink()
     assert run(EXAMPLE, "--out", tmp_path / "run", "--quiet", "--force").exit_code == 0
-    assert files(tmp_path / "run") == FILES
+    assert files(tmp_path / "run") == whole
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
 
 HEAD = "instrument: gf7_pair\nperturb:\n"
-BOMB = "\n".join(
-    ["a: &a [x, x, x]", *(f"{chr(98 + k)}: &{chr(98 + k)} [*{chr(97 + k)}, *{chr(97 + k)}]" for k in range(20))]
-)
 BAD_FILES = {
     "unknown node": (
         HEAD + "  base/forwards/M2: {shift: [0 um, 0 um, 3 um]}",
@@ -413,18 +188,9 @@ BAD_FILES = {
     "unknown key": (HEAD + "  base/forward/M2: {shfit: [0 um, 0 um, 3 um]}", ("unknown key", "shift", ":3")),
     "unknown instrument": ("instrument: gf7_par", ("no such name in instruments", "gf7_pair")),
     "unknown unit": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 3 umm]}", ("unknown unit", "umm", ":3")),
-    "wrong unit": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 3 deg]}", ("unit of an angle", ":3")),
-    "missing unit": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 3]}", ("without a unit", "shift[2]")),
     "NaN": (HEAD + "  base/forward/M2: {shift: [0 um, .nan, 3 um]}", ("not a finite number", "shift[1]")),
-    "NaN with a unit": (HEAD + "  base/forward/M2: {shift: [0 um, nan um, 3 um]}", ("not a finite number",)),
-    "infinite": (HEAD + "  base/forward/M2: {shift: [0 um, .inf, 3 um]}", ("not a finite number",)),
-    "overflow": (HEAD + "  base/forward/M2: {shift: [0 um, 1e999 um, 3 um]}", ("not a finite number",)),
     "absurd": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 10 m]}", ("outside the limits", "10 m", "100 mm")),
     "duplicate keys": (HEAD + "  base/forward/M2: {}\n  base/forward/M2: {}", ("duplicate key", "line 3", ":4")),
-    "YAML bomb": (BOMB, ("anchors are not allowed",)),
-    "tags": ("instrument: !!python/object/apply:os.system ['echo']", ("tags are not allowed",)),
-    "not YAML": ("instrument: [", ("not valid YAML",)),
-    "empty": ("", ("empty",)),
     "binary": (b"\xff\xfe\x00", ("not UTF-8",)),
     "too large": ("#" * 1_000_001, ("too large", "1 MB")),
 }
@@ -463,31 +229,15 @@ def test_files_that_cannot_be_read(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--seed", "-1"],
-        ["--seed", "1.5"],
-        ["--seed", str(2**63)],
-        ["--frames", "0"],
-        ["--frames", "100000"],
-        ["--bakend", "llvm"],
-        ["--backend", "nonsense"],
-    ],
-)
-def test_bad_options(options, tmp_path):
-    result = run(EXAMPLE, "--out", tmp_path / "run", *options)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert options[0].strip("-") in result.stderr
-    assert "Traceback" not in result.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_no_job_at_all():
-    result = run()
-    assert result.exit_code == 2
-    assert "Missing argument" in result.stderr
+def test_bad_options(tmp_path):
+    seeds, frames = ("-1", "1.5", str(2**63)), ("0", "100000")
+    cases = [("--seed", seed) for seed in seeds] + [("--frames", count) for count in frames]
+    for options in (*cases, ("--bakend", "llvm"), ("--backend", "nonsense"), ()):
+        result = run(*((EXAMPLE, "--out", tmp_path / "run", *options) if options else ()))
+        assert (result.exit_code, result.stdout) == (2, ""), options
+        assert options[0].strip("-") in result.stderr if options else "Missing argument" in result.stderr
+        assert "Traceback" not in result.stderr
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_output_that_exists(tmp_path):
@@ -498,13 +248,6 @@ def test_output_that_exists(tmp_path):
     (tmp_path / "file").touch()
     complains(run(EXAMPLE, "--out", tmp_path / "file", "--force"), "is not a folder")
     assert files(tmp_path) == {"mine/thesis.txt", "file"}
-
-
-def test_output_that_cannot_be_written(tmp_path):
-    (tmp_path / "file").touch()
-    for place in (tmp_path / "file/run", tmp_path / ("n" * 300), "/proc/run", "/dev/null/run"):
-        complains(run(EXAMPLE, "--out", place), "the output folder")
-    assert files(tmp_path) == {"file"}
 
 
 TOO_MUCH = {
@@ -567,7 +310,7 @@ def test_a_missing_library_is_explained(tmp_path, monkeypatch):
 @pytest.mark.second
 @pytest.mark.parametrize(
     ("number", "code"),
-    [(signal.SIGINT, 130), (signal.SIGHUP, 129), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143)],
 )
 def test_an_interrupt_leaves_nothing(number, code, tmp_path):
     # on a busy machine the run may be over before this process sends the signal: once more, sooner
@@ -603,7 +346,7 @@ def test_the_nodes_of_an_instrument_are_listed(tmp_path) -> None:
     focal_plane = {"pivots": ["origin", "rear_node", "line_centre"], "allows": ["rotate", "shift", "temperature"]}
     assert data["nodes"]["base/backward/focal_plane"] == focal_plane
     assert data["nodes"]["base/forward/M2"]["allows"] == [
-        *("rotate", "shift", "figure", "radius", "conic", "temperature"),
+        *("rotate", "shift", "figure", "radius", "conic", "temperature")
     ]
     # what a job may not name is not in the list, and what it may is
     path = tmp_path / "job.yaml"
@@ -615,20 +358,3 @@ def test_the_nodes_of_an_instrument_are_listed(tmp_path) -> None:
     assert table.exit_code == 0
     assert all(name in table.stdout for name in data["nodes"])
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.second
-def test_a_prior_that_moves_one_change_alone_has_a_posterior_of_it_alone(tmp_path) -> None:
-    """The paper's ranges move the principal distance alone; every table of the run has its rows all the same."""
-    job = tmp_path / "alone.yaml"
-    job.write_text(
-        "instrument: gf7_pair\ndisturbances: paper_001\n"
-        "perturb:\n  base/backward/focal_plane: {rotate: [2 arcsec, -1.5 arcsec, 10 arcsec], pivot: rear_node}\n"
-        "render: {images: [spots], frames: 9, seed: 1}\n"
-    )
-    result = run(job, "--out", tmp_path / "run")
-    assert result.exit_code == 0, result.stderr
-    camera = json.loads((tmp_path / "run" / "recovered.json").read_text())["cameras"]["backward"]["posterior"]
-    assert camera["d_alpha_arcsec"] is None
-    assert camera["d_alpha_arcsec_sigma"] is None
-    assert camera["d_f_um_sigma"] > 0.0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pydoc
-import re
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -12,17 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import twin
-from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
-from analysis.short_repr import LONGEST, MOST, shows, summary
-from twin.camera.camera_view import CameraView
-from twin.scripting.procedures import TestResult
-from twin.scripting.results import Shot
-
-
-@pytest.fixture(scope="module")
-def gf7_view(backend, gf7) -> CameraView:
-    return CameraView.alone(gf7, backend)
+from analysis.short_repr import LONGEST, shows, summary
 
 
 @pytest.mark.parametrize(
@@ -83,65 +71,3 @@ def test_a_class_shows_its_fields() -> None:
     assert repr(Every(1, 2)) == "<Every: first 1>"
     with pytest.raises(ValueError, match="fields are written"):
         shows("rms um m")
-
-
-def test_views_of_a_camera(gf7_view: CameraView) -> None:
-    shown = {
-        repr(gf7_view): ["CameraView: name gf7; mirrors M1, M2, M3; focal length 5.422 m; entrance pupil 595.8 mm"],
-        repr(gf7_view.wavefront()): [
-            "WavefrontView: field (0, 0); rms 0.0159",
-            "waves; strehl 0.99",
-            "map 129 x 129, -0.03",
-        ],
-        repr(gf7_view.spot((1, 0))): ["SpotView: field (1, 0); rms 1.094 um", "airy 7.401 um; rays 217 x 2"],
-        repr(gf7_view.mtf()): ["MtfView: field (0, 0); at nyquist (0.4701, 0.4545); nyquist 71.43 cycles/mm", "650 nm"],
-        repr(gf7_view.pupils([(0.0, 0.0)])[0]): ["PupilFunction(centre="],
-        repr(gf7_view.rays([(0.0, 0.0)], np.zeros((1, 2)))): ["LineRays: position 1 x 1 x 3"],
-    }
-    for text, parts in shown.items():
-        assert len(text) <= MOST
-        assert text.count("\n") <= 1
-        for part in parts:
-            assert part in text
-
-
-@pytest.mark.parametrize("what", ["camera", "wavefront", "spot", "mtf"])
-def test_views_have_their_figure_in_a_notebook(gf7_view: CameraView, what: str) -> None:
-    view: Any = gf7_view if what == "camera" else getattr(gf7_view, what)()
-    html = view._repr_html_()
-    assert html.startswith("<p>&lt;")
-    assert re.search(r"<svg [^>]*viewBox", html)
-    assert "<script" not in html
-
-
-def test_a_shot_and_a_test() -> None:
-    frames = xr.DataArray(np.zeros((4, 9, 64, 64), np.uint16), dims=("channel", "frame", "row", "column"))
-    nothing: Any = None
-    truth = xr.Dataset({"d_f_um": 1.0})
-    shot = Shot(frames, frames, truth, truth, "Nothing moved. " * 20, ("careful",), nothing, nothing, 0.0, 0.0)
-    assert repr(shot).startswith("<Shot: verdict Nothing moved.")
-    assert "before 4 channel x 9 frame x 64 row x 64 column, all 0 DN" in repr(shot)
-    assert len(repr(shot)) <= MOST
-    report: Any = SimpleNamespace(verdict="The plane is flat.", warnings=())
-    result = TestResult("lab focus", {}, report, nothing, nothing, nothing, "focus")
-    assert repr(result) == "<TestResult: name lab focus; verdict The plane is flat.>"
-
-
-def test_monitor_results() -> None:
-    geometry = MonitorGeometry(5.512, 0.2347, 12e-6, 0.0, np.deg2rad(1.22))
-    assert repr(geometry) == (
-        "<MonitorGeometry: principal distance 5.512 m; separation 234.7 mm; pitch 12 um; field alpha 0 deg; "
-        "field beta 1.22 deg>"
-    )
-    changes = CameraParameters.from_vector(np.zeros((50, 4)), np.tile(np.eye(4), (50, 1, 1)))
-    assert repr(changes) == (
-        "<CameraParameters: d alpha 50, all 0 arcsec; d beta 50, all 0 arcsec; d gamma 50, all 0 arcsec; "
-        "d f 50, all 0 um>"
-    )
-
-
-def test_help_leads_with_what_is_called() -> None:
-    told = pydoc.plain(pydoc.render_doc(twin))
-    contents = told.index("PACKAGE CONTENTS")
-    for name in twin.__all__:
-        assert re.search(rf"\b{name}\b", told[:contents]), name

@@ -2,29 +2,23 @@
 
 import asyncio
 import csv
-import hashlib
 import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
 from functools import partial
-from pathlib import Path
+from typing import Any
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import numpy as np
-import psutil
 import pytest
 import xarray as xr
-from distributed.core import rpc
-from distributed.security import Security
 
 import twin.study.__main__ as command
-from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import ROOT, children, chunks, same_bytes, start, wait_for, write_study
 from twin.run.cluster import local_workers
@@ -32,7 +26,6 @@ from twin.study import study_command
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.engine import Engine
 from twin.study.runs.plan import Plan
-from twin.study.runs.render_base import BLOCK
 from twin.study.runs.setup import resolve_study
 from twin.study.study_command import StudyRun
 
@@ -68,64 +61,35 @@ def done(tmp_path_factory):
 
 
 @pytest.mark.second
-def test_files(done) -> None:
-    folder, _, numbers = done
-    assert {"study.nc", "study.csv", "study.json", "config.yaml", "report.html", "manifest.json"} <= files(folder)
-    written = json.loads((folder / "study.json").read_text("utf-8"))
-    assert written == {key: value for key, value in numbers.items() if key not in ("verdict", "warnings")}
-    manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
-    for name, checksum in manifest["sha256"].items():
-        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == checksum
-    assert {"study.nc", "study.csv", "study.json", "report.html"} <= set(manifest["sha256"])
-
-
-@pytest.mark.second
 def test_dataset(done) -> None:
-    folder, path, numbers = done
+    folder, _, numbers = done
     with xr.open_dataset(folder / "study.nc", engine="h5netcdf") as data:
         assert dict(data.sizes) == {"run": 110}
         assert data["m2z"].attrs["units"] == "um"
         # the table's values, in the unit of the first of them
         np.testing.assert_allclose(data["m2z"].values, [*(0.01 * k for k in range(109)), 3000.0], rtol=1e-12)
         np.testing.assert_allclose(data["m2x"].values[:9], [0, 1, 2, 3, 4, 5, 6, 0, 1])
-        assert data["df"].attrs == {
-            "units": "um",
-            "role": "response",
-            "key": "recovered cameras forward model d_f_um",
-            "long_name": "response df, recovered cameras forward model d_f_um",
-        }
+        assert data["df"].attrs["units"] == "um"
         assert data["failed"].values.tolist() == [0] * 109 + [1]
         assert str(data["message"].values[-1])
         assert not any(data["message"].values[:-1])
-        assert np.isnan(data["df"].values[-1])
+        assert np.flatnonzero(np.isnan(data["df"].values)).tolist() == [109]
         off = (data["df"] - data["true_df"]).values[:-1] / data["df_sigma"].values[:-1]
         # 109 errors in units of their sigma; 4.5 sigma is passed once in 1300 such sets
         assert np.max(np.abs(off)) < 4.5
         assert len(set(data["seed"].values.tolist())) == 110
-        assert data.attrs["seed"] == 3
-        assert "instrument" in data.attrs["study"]
-    assert numbers["runs"] == 110
-    assert numbers["failed"] == 1
-    assert numbers["responses"]["df"]["unit"] == "um"
+    assert (numbers["runs"], numbers["failed"]) == (110, 1)
     with (folder / "study.csv").open(encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
     assert len(table) == 110
     assert table[-1]["df [um]"] == ""
     assert table[-1]["failed"] == "1"
-    assert path.exists()
 
 
 @pytest.mark.second
-def test_a_block_that_loses_a_run_keeps_the_others(done) -> None:
-    """The last run moves a mirror by 3 mm; the runs of its block are there all the same."""
-    with xr.open_dataset(done[0] / "study.nc", engine="h5netcdf") as data:
-        assert np.all(np.isfinite(data["df"].values[4 * BLOCK : -1]))
-        assert len(data["df"].values[4 * BLOCK :]) == 10
-
-
-@pytest.mark.parametrize("chunk_blocks", quick(0, [pytest.param(1, marks=pytest.mark.slow), 3]))
-def test_two_workers_and_other_chunks_give_the_same_numbers(done, workers, tmp_path, chunk_blocks) -> None:
+def test_two_workers_and_other_chunks_give_the_same_numbers(done, workers, tmp_path) -> None:
     folder, _, _ = done
+    chunk_blocks = 3
     # from the config.yaml, which needs no other file
     plan = Plan.of(resolve_study(folder / "config.yaml"))
     store = ChunkStore(tmp_path, plan)
@@ -155,6 +119,8 @@ def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch
 @pytest.mark.second
 def test_nobody_else_can_talk_to_the_workers(workers) -> None:
     """Whoever may send them a task runs programs as this user: without the study's own key nobody may."""
+    from distributed.security import Security
+
     facts = workers.client.scheduler_info(n_workers=-1)
     addresses = [facts["address"]]
     for address, worker in facts["workers"].items():
@@ -177,37 +143,19 @@ def test_nobody_else_can_talk_to_the_workers(workers) -> None:
 
 def listening() -> set[tuple[str, int]]:
     """Where this process and those below it can be reached from outside of them."""
+    import psutil
+
     own = psutil.Process()
     found = [c for process in (own, *own.children(recursive=True)) for c in process.net_connections()]
     return {tuple(c.laddr) for c in found if c.status == psutil.CONN_LISTEN}
 
 
-async def greet(address: str, security: Security | None) -> object:
+async def greet(address: str, security: Any) -> object:
     """What a server of Dask says of itself."""
+    from distributed.core import rpc
+
     async with rpc(address, connection_args={} if security is None else security.get_connection_args("client")) as it:
         return await asyncio.wait_for(it.identity(), 5)
-
-
-@pytest.mark.slow
-def test_a_corrupt_chunk_is_computed_again(done) -> None:
-    """A damaged chunk, a half-written file and a torn line of the index; afterwards every byte is as it was."""
-    folder, path, _ = done
-    before = same_bytes(folder)
-    chunk = sorted((folder / "chunks").glob("*.npz"))[1]
-    content = bytearray(chunk.read_bytes())
-    content[len(content) // 2] ^= 1
-    chunk.write_bytes(content)
-    (folder / "chunks" / ".00099.npz.0123abcd.partial").write_bytes(b"half")
-    with (folder / "chunks" / "index.txt").open("ab") as index:
-        index.write(b'0123456789abcdef {"file": "00')
-    result = run(path, "--out", folder, "--resume", "--workers", 1)
-    assert result.exit_code == 0, result.stderr
-    assert chunk.name in result.stderr
-    assert "corrupt" in result.stderr
-    assert "are there already" in result.stderr
-    assert chunk.with_name(f"{chunk.name}.corrupt").exists()
-    assert not list((folder / "chunks").glob("*.partial"))
-    assert same_bytes(folder) == before
 
 
 @pytest.mark.second
@@ -244,58 +192,6 @@ def test_folders_that_are_not_ones_own(done, tmp_path) -> None:
         assert files(tmp_path / "mine") == {"letter.txt"}
 
 
-BAD = [
-    (("m2z: {key: [job, perturb, base/forward/M2, shift, 2]", "m2z: {key: [job, pertrub, base/forward/M2, shift, 2]"),
-     "factors.m2z.key[1]", ("'perturb'",)),
-    (("shift, 2]", "shift, 3]"), "factors.m2z.key[4]", ("0 to 2",)),
-    (("normal: {mean: 0 um, sigma: 1 um}", "values: []"), "factors.m2z.values", ("empty",)),
-    (("[-1 um, 1 um]", "[-1 um, 1 km]"), "factors.m2x.uniform", ("outside the limits", "100 mm")),
-    (("[-1 um, 1 um]", "[-1 arcsec, 1 arcsec]"), "factors.m2x.uniform", ("angle", "length")),
-    (("runs: 100", "runs: 20001"), "limits.runs", ("20001", "--yes")),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("change", "key", "words"), BAD, ids=lambda value: value if isinstance(value, str) else "")
-def test_bad_input_is_refused_at_its_line(tmp_path, change, key, words) -> None:
-    path = write_study(tmp_path / "in", change)
-    result = run(path, "--out", tmp_path / "run")
-    assert result.exit_code == 2
-    assert f"{path}:" in result.stderr, result.stderr
-    assert f": {key}:" in result.stderr, result.stderr
-    for word in words:
-        assert word in result.stderr, result.stderr
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_what_only_the_pilot_finds(tmp_path) -> None:
-    """A response that the results do not have, and a node that the instrument does not; nothing is left behind."""
-    path = write_study(tmp_path / "a", ("truth, cameras, forward, d_f_um]", "truth, cameras, forward, d_f_mm]"))
-    result = run(path, "--out", tmp_path / "run", "--workers", 1)
-    assert result.exit_code == 2
-    assert "responses.true_df.key[3]" in result.stderr
-    assert "'d_f_um'" in result.stderr
-    assert "d_alpha_arcsec" in result.stderr
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_a_scheduler_that_is_not_there(tmp_path) -> None:
-    path = write_study(tmp_path / "in")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    begun = time.monotonic()
-    result = run(path, "--out", tmp_path / "run", "--scheduler", f"tcp://127.0.0.1:{port}")
-    assert result.exit_code == 2
-    assert "cannot be reached" in result.stderr
-    assert time.monotonic() - begun < 20.0  # 5 s are waited; the rest is for a busy machine
-    assert not (tmp_path / "run").exists()
-    result = run(path, "--out", tmp_path / "run", "--scheduler", "nowhere")
-    assert result.exit_code == 2
-    assert "tcp://" in result.stderr
-
-
 @pytest.mark.second
 @pytest.mark.parametrize(
     ("address", "told"),
@@ -311,28 +207,10 @@ def test_a_scheduler_that_cannot_be_reached_by_what_is_given(tmp_path, address, 
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("later", [0.0, 0.5, 1.5])
-def test_ctrl_c_while_workers_start_is_one_sentence(tmp_path, later) -> None:
-    """To the whole group: the workers are importing, and the command waits for them."""
-    process = start(write_study(tmp_path / "in"), "--out", tmp_path / "run", "--workers", 2, "--quiet")
-    try:
-        wait_for(lambda: len(children(process.pid)) >= 1)
-        time.sleep(later)
-        os.killpg(process.pid, signal.SIGINT)
-        output, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 130, errors
-    assert output == ""
-    assert errors == "error: interrupted; nothing was kept\n"
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.second
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
-    """To the whole group of processes, as the terminal's Ctrl-C is, and to the command alone, as kill is."""
+    """A signal to the whole group of processes, as the terminal's Ctrl-C is, or to the command alone, as kill is."""
     path = write_study(tmp_path / "in", ("runs: 100", "runs: 4000"))
     process = start(path, "--out", tmp_path / "run", "--workers", 1)
     try:
@@ -353,65 +231,39 @@ def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
     assert not (tmp_path / "run" / "study.nc").exists()
 
 
-def certificates(folder: Path) -> tuple[list[str], dict[str, str]]:
-    """Options of Dask's programs and environment of the command, with an authority and a certificate for each."""
-    key = Security.temporary()
-    files = {"ca-file": key.tls_ca_file, "cert": key.tls_client_cert, "key": key.tls_client_key}
-    for name, text in files.items():
-        (folder / f"{name}.pem").write_text(text, "utf-8")
-    place = {name: str(folder / f"{name}.pem") for name in files}
-    options = [word for name in files for word in (f"--tls-{name}", place[name])]
-    start = "DASK_DISTRIBUTED__COMM__TLS__"
-    variables = {"CA_FILE": place["ca-file"], "CLIENT__CERT": place["cert"], "CLIENT__KEY": place["key"]}
-    return options, {f"{start}{name}": value for name, value in variables.items()}
+@pytest.mark.second
+def test_a_real_scheduler_with_two_workers(done, tmp_path) -> None:
+    """A cluster by TLS, as a user sets it up by hand, gives the numbers of the local processes."""
+    from distributed.security import Security
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize("protocol", ["tcp", "tls"])
-def test_a_real_scheduler_with_two_workers(done, tmp_path, protocol) -> None:
-    """As a user sets it up by hand; the numbers are those of the local processes."""
     folder, path, _ = done
-    own, client = certificates(tmp_path) if protocol == "tls" else ([], {})
-    program = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    key, options, environment = Security.temporary(), [], dict(os.environ)
+    for name, variable, text in (
+        ("ca-file", "CA_FILE", key.tls_ca_file),
+        ("cert", "CLIENT__CERT", key.tls_client_cert),
+        ("key", "CLIENT__KEY", key.tls_client_key),
+    ):
+        (tmp_path / f"{name}.pem").write_text(text, "utf-8")
+        options += [f"--tls-{name}", str(tmp_path / f"{name}.pem")]
+        environment[f"DASK_DISTRIBUTED__COMM__TLS__{variable}"] = str(tmp_path / f"{name}.pem")
     place = tmp_path / "scheduler.json"
     quiet = {"cwd": ROOT, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen(
-        [
-            *program,
-            "--protocol",
-            protocol,
-            *own,
-            "--host",
-            "127.0.0.1",
-            "--port",
-            "0",
-            "--no-dashboard",
-            "--scheduler-file",
-            str(place),
-        ],
-        **quiet,
-    ) as scheduler:
+    words = ["--protocol", "tls", *options, "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    words += ["--scheduler-file", str(place)]
+    others = [subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_scheduler", *words], **quiet)]
+    try:
         wait_for(lambda: place.exists() and place.stat().st_size > 0)
         address = json.loads(place.read_text("utf-8"))["address"]
-        assert address.startswith(f"{protocol}://")
         program = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
-        program += own
-        two = [
-            subprocess.Popen([*program, "--local-directory", str(tmp_path), "--name", f"w{k}"], **quiet)
-            for k in range(2)
-        ]
-        try:
-            # the command reads where the certificates are when it starts
-            words = [str(path), "--out", str(tmp_path / "run"), "--scheduler", address]
-            command = [sys.executable, "-m", "twin.study", *words]
-            environment = {**os.environ, **client}
-            study = subprocess.run(
-                command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False
-            )
-            assert study.returncode == 0, study.stderr
-            assert same_bytes(tmp_path / "run") == same_bytes(folder)
-        finally:
-            for process in (*two, scheduler):
-                process.terminate()
-            for process in two:
-                process.wait(20)
+        for k in range(2):
+            name = ["--local-directory", str(tmp_path), "--name", f"w{k}"]
+            others.append(subprocess.Popen([*program, *options, *name], **quiet))
+        study = [sys.executable, "-m", "twin.study", str(path), "--out", str(tmp_path / "run"), "--scheduler", address]
+        ran = subprocess.run(study, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900, check=False)
+        assert ran.returncode == 0, ran.stderr
+        assert same_bytes(tmp_path / "run") == same_bytes(folder)
+    finally:
+        for process in others:
+            process.terminate()
+        for process in others:
+            process.wait(60)

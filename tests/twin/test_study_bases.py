@@ -5,21 +5,9 @@ import math
 import pytest
 
 from scenes.specs.study import ResponseSpec
-from tests.tiers import quick
 from twin.study.runs.base_job import BlockResult, leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
-
-QUICK = [("lab distortion", "distortion")]
-SMALLER = {"distortion": [(("test", "points"), 11), (("test", "sets"), 2)]}
-"""Changes of a base that make it quicker."""
-SLOW = [
-    ("lab turntable", "turntable"),
-    ("lab focus", "focus"),
-    ("orbit angle", "angle"),
-    ("orbit calibrate", "calibrate"),
-    ("orbit monitor", "monitor"),
-]
 
 
 def numbers(tree, path=()):
@@ -30,9 +18,12 @@ def numbers(tree, path=()):
     return {path: tree} if isinstance(tree, int | float) and not isinstance(tree, bool) else {}
 
 
-@pytest.mark.parametrize(
-    ("command", "file"), [*quick(0, QUICK), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
-)
+SMALLER = {"distortion": [(("test", "points"), 11), (("test", "sets"), 2)], "angle": [(("test", "passes"), 3)]}
+"""Changes of a base that make it quicker."""
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(("command", "file"), [("lab distortion", "distortion"), ("orbit angle", "angle")])
 def test_two_seeds(tmp_path, backend, command, file) -> None:
     """Both runs are good, have the same keys, and numbers that noise changes; what the base's seed gives comes back."""
     path = tmp_path / "study.yaml"
@@ -46,7 +37,7 @@ responses: {{r: {{key: [x]}}}}
     setup = resolve_study(path)
     plan = Plan.of(setup)
     assert plan.blocks == 2  # slow runs are kept, and shared out, one by one
-    tree = with_values(setup.tree, SMALLER.get(file, []))
+    tree = with_values(setup.tree, SMALLER[file])
     outcomes = [setup.job.evaluate(tree, runs, backend)[0] for runs in plan.runs_of(range(2))]
     one, two = (numbers(outcome) for outcome in outcomes)
     assert set(one) == set(two)

@@ -1,11 +1,5 @@
 """What physics forbids is a run that failed; a fault of the program stops the study, and says where it is."""
 
-import os
-import re
-import shutil
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,21 +10,16 @@ from analysis.measurement_error import MeasurementError
 from optics.numerics.physical_error import PhysicalError
 from scenes.specs.procedures import Procedure
 from tests.twin.commands import invoke
-from tests.twin.study_bench import ROOT, wait_for, write_study
+from tests.twin.study_bench import write_study
 from twin.sensors.area_detector import EmvaDetector
 from twin.study import study_command
-from twin.study.runs.base_job import Failure, ProcedureBase, Run
+from twin.study.runs.base_job import BlockResult, Failure, ProcedureBase, Run
 from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.engine import Engine, ProgramFault
+from twin.study.runs.engine import Engine, IncompleteError, ProgramFault, Progress
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
+from twin.study.runs.task import Pilot
 from twin.study.study_command import StudyRun
-
-OF_OTHERS = {
-    *("BackendUnavailable", "LibraryMissing", "VariantUnavailable", "ImageError", "_Wrong"),
-    *("InputError", "Problem"),
-}
-"""Errors of what is installed and of what is read."""
 
 
 class Here:
@@ -101,23 +90,6 @@ def test_only_named_errors_are_failures(fault) -> None:
         base.evaluate({"what": "fault"}, [Run(0, (), None)], None)
 
 
-def test_every_error_of_optics_and_analysis_says_whether_it_is_one_of_physics() -> None:
-    """A new class of error that is not derived from one of both would stop studies."""
-    bases: dict[str, set[str]] = {}
-    for package in ("optics", "analysis", "scenes", "twin/monitor", "twin/targets", "twin/path_tracing"):
-        for path in (ROOT / package).rglob("*.py"):
-            for name, above in re.findall(r"^class (\w+)\((.+)\):", path.read_text("utf-8"), re.M):
-                bases.setdefault(name, set()).update(word.strip() for word in above.split(","))
-
-    def above(name: str) -> set[str]:
-        return {name}.union(*(above(base) for base in bases.get(name, ())))
-
-    found = {name for name in bases if above(name) & {"Exception", "ValueError", "RuntimeError", "ImportError"}}
-    physical = {name for name in found if above(name) & {"PhysicalError", "MeasurementError"}}
-    assert found - physical == OF_OTHERS
-    assert {"AimError", "MisplacedError", "SpotError", "RankError", "TargetLostError", "NominalPathLost"} <= physical
-
-
 def test_a_study_all_of_whose_runs_failed_ends_with_1(tmp_path, monkeypatch) -> None:
     for failed, code in ((99, 0), (100, 1)):
         numbers = {"name": "study", "runs": 100, "failed": failed, "responses": {}}
@@ -128,69 +100,57 @@ def test_a_study_all_of_whose_runs_failed_ends_with_1(tmp_path, monkeypatch) -> 
         assert ("all 100 runs failed" in said.stderr) == bool(code)
 
 
-@pytest.fixture(scope="module")
-def faulty(tmp_path_factory) -> Path:
-    """The program, with frames that lose a row in its detector."""
-    root = tmp_path_factory.mktemp("faulty")
-    for package in ("optics", "scenes", "twin", "analysis"):
-        shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
-    place = root / "twin/sensors/area_detector.py"
-    text, line = place.read_text("utf-8"), "        lead, (height, width) = light.shape[:-2], light.shape[-2:]\n"
-    assert text.count(line) == 1
-    place.write_text(text.replace(line, f"{line}        height = height - 1\n"), "utf-8")
-    return root
+def test_what_workers_make_of_a_study_is_told(tmp_path, monkeypatch) -> None:
+    """Workers that die, a pilot that fails, a first block without a good run, and processes that need much memory."""
+    from distributed.scheduler import KilledWorker
+
+    plan = Plan.of(resolve_study(write_study(tmp_path / "in", ("runs: 100", "runs: 75"))))
+    dead = KilledWorker("task", SimpleNamespace(address="here"), 3)
+    lost = BlockResult.of([Failure("no light")] * 25, plan.setup.study.responses)
+
+    def begun(pilot: object, evaluate: object = None) -> tuple[Engine, list[str]]:
+        def done(what: object) -> object:
+            if isinstance(what, Exception):
+                raise what
+            return what
+
+        monkeypatch.setattr("twin.study.runs.task.pilot", lambda _: done(pilot))
+        monkeypatch.setattr("twin.study.runs.task.evaluate", lambda _: done(evaluate))
+        told: list[str] = []
+        store = ChunkStore(tmp_path / f"store{len(list(tmp_path.iterdir()))}", plan)
+        store.folder.parent.mkdir()
+        store.open()
+        return Engine(plan, store, progress=Progress(warn=told.append), chunk_blocks=1), told
+
+    for pilot, error, text in (
+        (dead, IncompleteError, "the workers died in the first block, runs 0-24"),
+        (ValueError("x"), ProgramFault, "the program failed: ValueError: x"),
+    ):
+        with pytest.raises(error, match=text):
+            begun(pilot)[0].run(Here())
+    engine, told = begun(Pilot(lost, None, 0.0, 1e12), [lost])
+    engine.run(Here())
+    assert told[0] == "all runs of the first block fail: no light"
+    assert told[1].startswith("the processes need about 1000.0 GB, more than the study's")
+    assert len(told) == 2
+    engine, told = begun(Pilot(lost, None, 0.0, 1e6), dead)
+    with pytest.raises(IncompleteError, match=r"not computed: runs 25-49, 50-74 \(the workers died\)"):
+        engine.run(Here())
+    assert len(told) == 1
 
 
-def begin(root: Path, *words: object) -> subprocess.Popen:
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    return subprocess.Popen(
-        [sys.executable, *map(str, words)],
-        cwd=root,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scheduler", [False, True])
-def test_a_fault_in_the_source(faulty, tmp_path, scheduler) -> None:
-    """In processes of its own and on a cluster."""
-    path = write_study(tmp_path / "in")
-    others, where = [], ["--workers", "2"]
-    if scheduler:
-        place = tmp_path / "scheduler.json"
-        tool = ["--scheduler-file", place]
-        others.append(begin(faulty, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard", *tool))
-        wait_for(place.exists)
-        others.append(begin(faulty, "-m", "distributed.cli.dask_worker", *tool, "--nthreads", "1"))
-        import json
-
-        wait_for(lambda: place.read_text("utf-8").strip() != "")
-        where = ["--scheduler", json.loads(place.read_text("utf-8"))["address"]]
-    try:
-        study = begin(faulty, "-m", "twin.study", path, "--out", tmp_path / "run", *where)
-        _, said = study.communicate(timeout=120)
-    finally:
-        for one in others:
-            one.kill()
-            one.communicate()
-    assert study.returncode == 1, said
-    assert "Traceback" in said
-    assert "area_detector.py" in said or "analysis" in said
-    assert "the program failed: ValueError" in said
-    assert not (tmp_path / "run" / "manifest.json").exists()
-
-
-@pytest.mark.slow
-def test_all_runs_fail(tmp_path) -> None:
-    """Mirrors far off: everything is written, and the exit code says that nothing came of it."""
-    path = write_study(
-        tmp_path / "in", ("mean: 0 um, sigma: 1 um", "mean: 90 mm, sigma: 1 um"), ("runs: 100", "runs: 25")
-    )
-    study = begin(ROOT, "-m", "twin.study", path, "--out", tmp_path / "run", "--workers", "1")
-    _, said = study.communicate(timeout=120)
-    assert study.returncode == 1, said
-    assert "all 25 runs failed" in said
-    assert (tmp_path / "run" / "manifest.json").exists()
+def test_options_that_do_not_go_together_are_refused(tmp_path) -> None:
+    file = tmp_path / "study.yaml"
+    for words, told in (
+        (("--resume", "--force", "--out", tmp_path / "x"), "choose one of them"),
+        (("--resume",), "--resume needs the folder to go on with"),
+        (("--workers", 2, "--scheduler", "tcp://127.0.0.1:1"), "--workers and --scheduler exclude each other"),
+    ):
+        said = invoke(command.app, file, *words)
+        assert (said.exit_code, told in " ".join(said.stderr.split())) == (2, True), said.stderr
+    small = resolve_study(write_study(tmp_path / "in", ("seed: 3}", "seed: 3}\nlimits: {memory: 1 GB}")))
+    told = []
+    for workers in (8, 1):
+        with study_command._workers(study_command.StudyOptions(workers=workers), small, told.append):
+            pass
+    assert told == ["2 workers instead of 8: no more fit into the study's 1 GB"]

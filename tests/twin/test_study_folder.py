@@ -2,9 +2,6 @@
 
 import json
 import re
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +10,7 @@ import pytest
 import twin.run.durable
 import twin.run.provenance
 from tests.twin.commands import files
-from tests.twin.study_bench import ROOT, write_study
+from tests.twin.study_bench import write_study
 from twin.run.durable import exchange
 from twin.run.provenance import source_digest, sources
 from twin.run.run_folder import Numbered, RunFolder, RunFolderError, is_run_folder, unlisted, write_manifest
@@ -59,31 +56,6 @@ def finish(path: Path, setup: StudySetup, report: str = "found", **options: bool
 def is_whole(path: Path, report: str) -> bool:
     """Whether a finished study stands there with all its files as they were written."""
     return is_run_folder(path) and unlisted(path) == [] and (path / "report.html").read_text() == report
-
-
-@pytest.mark.second
-def test_sources_are_all_that_can_compute() -> None:
-    """Everything that the program of a worker may import, wherever in a file the import stands."""
-    from scenes.specs.procedures import BASES
-    from tests.test_architecture import PACKAGES, imported_modules
-
-    named = [base.path.partition(":")[0] for base in BASES.values()]
-    todo, seen = ["twin.study.runs.task", "twin.study.runs.plan", *named], set()
-    while todo:
-        name = todo.pop()
-        place = ROOT.joinpath(*name.split("."))
-        path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
-        if name in seen or not path.is_file():
-            continue
-        seen.add(name)
-        assert path.relative_to(ROOT).as_posix() in sources()
-        todo += [other for other in imported_modules(path) if other.split(".")[0] in PACKAGES]
-    assert {
-        "twin.sensors.area_detector",
-        "optics.raytrace.trace",
-        "scenes.models.thermal_model",
-        "analysis.monitor.recovery",
-    } <= seen
 
 
 @pytest.mark.second
@@ -194,10 +166,9 @@ def test_a_run_that_came_meanwhile_is_not_replaced(setup, tmp_path) -> None:
 
 
 class Killed(BaseException):
-    """In place of SIGKILL: nothing is cleared up."""
+    """Stands in for SIGKILL: nothing is cleared up."""
 
 
-@pytest.mark.second
 @pytest.mark.parametrize("at", ["durable.put_in_place", "run_folder.remove_run"])
 def test_killed_while_it_is_put_in_place(setup, tmp_path, monkeypatch, at) -> None:
     """Just before both change places, and just after: a whole study stands there, and --resume comes to the end."""
@@ -335,24 +306,12 @@ def test_what_makes_other_numbers_may_not(setup, tmp_path, change) -> None:
         work(path, other, resume=True)
 
 
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from twin.study.runs.study_folder import StudyFolder
-from twin.study.runs.setup import resolve_study
-with StudyFolder(Path(sys.argv[1]), resolve_study(sys.argv[2]), force=True):
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-@pytest.mark.second
-def test_a_study_that_a_killed_command_was_replacing_is_not_lost(setup, tmp_path) -> None:
-    path = finish(tmp_path / "run", setup, "old")
-    file = write_study(tmp_path / "in")
-    done = subprocess.run([sys.executable, "-c", KILLED, str(path), str(file)], cwd=ROOT, timeout=120)
-    assert done.returncode == -signal.SIGKILL
-    assert is_whole(path, "old")
-    assert (tmp_path / ".run.next").exists()
-    finish(path, setup, "new", resume=True)
-    assert is_whole(path, "new")
-    assert {place.name for place in tmp_path.iterdir()} == {"run", "in"}
+def test_a_file_and_a_folder_in_use_are_no_place_for_a_study(setup, tmp_path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(RunFolderError, match="exists and is not a folder"):
+        work(tmp_path / "file", setup)
+    with (
+        StudyFolder(tmp_path / "run", setup),
+        pytest.raises(RunFolderError, match=r"another command is working in .*run; wait"),
+    ):
+        work(tmp_path / "run", setup, resume=True)

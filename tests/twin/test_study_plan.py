@@ -5,18 +5,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, norm, truncnorm
+from scipy.stats import kstest, norm
 
-from scenes.yaml.errors import InputError
+from scenes.specs.study import ResponseSpec
+from scenes.yaml.errors import InputError, Problem
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.twin.study_bench import STUDY, write_study
 from twin.live.knobs import factor_knobs
 from twin.study.gradient.study_gradient import GradientFactor
 from twin.study.runs import setup
-from twin.study.runs.base_job import leaf, with_values
+from twin.study.runs.base_job import BlockResult, check_response, leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK, read_job
 from twin.study.runs.sampling import unit_cube
-from twin.study.runs.setup import StudySetup, resolve_study, study_from_text
+from twin.study.runs.setup import resolve_study, study_from_text
 
 FACTORS = STUDY[STUDY.index("factors:") : STUDY.index("design:")]
 NORMAL = "normal: {mean: 0 um, sigma: 1 um}"
@@ -51,17 +53,6 @@ def test_drawn_designs_follow_their_distributions(tmp_path, kind) -> None:
     assert np.array_equal(column(again, "m2z"), z)
     other = plan_of(tmp_path / "other", *changes, ("seed: 3}", "seed: 4}"))
     assert not np.any(column(other, "m2z") == z)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("limits", [(-1.0, 0.5), (2.0, 3.0), (-4.0, -3.5)])
-def test_truncated_distributions(tmp_path, limits) -> None:
-    text = f"truncated: {{mean: 1 um, sigma: 1 um, limits: [{limits[0]} um, {limits[1]} um]}}"
-    values = column(plan_of(tmp_path, (NORMAL, text), ("runs: 100", f"runs: {RUNS}")), "m2z")
-    assert values.min() >= limits[0]
-    assert values.max() <= limits[1]
-    known = truncnorm(limits[0] - 1.0, limits[1] - 1.0, loc=1.0, scale=1.0)
-    assert kstest(values, known.cdf).pvalue > FALSE_ALARM
 
 
 def test_a_grid_is_every_combination(tmp_path) -> None:
@@ -116,13 +107,6 @@ def test_a_table_of_other_than_text_is_told_with_its_line(tmp_path) -> None:
         resolve_study(write_study(tmp_path, (NORMAL, "table: {file: t.csv, column: z}")))
 
 
-def test_a_new_node_and_a_new_figure_term_are_made(tmp_path) -> None:
-    plan = plan_of(tmp_path, ("base/forward/M2, shift, 2]", "base/forward/M3, figure, Z11]"))
-    made = leaf(plan.setup.tree, ("job", "perturb", "base/forward/M3"))
-    assert made["shift"] == ["0 m"] * 3 or made["shift"][0].startswith("0 ")
-    assert "Z11" in made["figure"]
-
-
 M2 = "base/forward/M2"
 NEUTRAL = {
     "figure, Z11": ("30 nm", "10 nm"),
@@ -175,6 +159,15 @@ REFUSED = [
     ((NORMAL, "table: {file: none.csv, column: z}"), "factors.m2z.table.file", "no such file"),
     (("file: job.yaml", "file: jobs.yaml"), "base.file", "no such file"),
     (("file: job.yaml", "file: pertrub"), "base.file", "'perturb'"),
+    (("shift, 2]", "shift, 3]"), "factors.m2z.key[4]", "0 to 2"),
+    (
+        ("[job, perturb, base/forward/M2, shift, 2]", "[job, render, seed, 0]"),
+        "factors.m2z.key",
+        "has nothing below it",
+    ),
+    ((NORMAL, "values: []"), "factors.m2z.values", "empty"),
+    (("[-1 um, 1 um]", "[-1 um, 1 km]"), "factors.m2x.uniform", "outside the limits"),
+    (("[-1 um, 1 um]", "[-1 arcsec, 1 arcsec]"), "factors.m2x.uniform", "angle"),
 ]
 
 
@@ -248,76 +241,24 @@ def test_changed_values_leave_the_tree_alone() -> None:
     assert new["c"] is tree["c"]
 
 
-def test_every_base_command_is_known(tmp_path) -> None:
-    """Every command that the schema names can be resolved, and a value of it be a factor."""
-    for command, file, key in (
-        ("lab turntable", "turntable", "[test, seed]"),
-        ("orbit angle", "angle", "[test, errors, station]"),
-    ):
-        value = "values: [1, 2]" if "seed" in key else "range: [0 m, 2 m], count: 2"
-        path = tmp_path / "s.yaml"
-        path.write_text(
-            f"name: s\nbase: {{command: {command}, file: {file}}}\nfactors: {{f: {{key: {key}, {value}}}}}\n"
-            "responses: {r: {key: [x, y]}}\n",
-            "utf-8",
-        )
-        setup = resolve_study(path)
-        assert isinstance(setup, StudySetup)
-        assert Plan.of(setup).runs == 2
-
-
 def test_a_design_that_does_not_exist_draws_no_points() -> None:
     """It was drawn as monte_carlo."""
     with pytest.raises(KeyError, match="halton"):
         unit_cube("halton", 4, 2, 0)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "1",
-        " 2.5 ",
-        "-3e-4",
-        "+.5",
-        "1_000",
-        "true",
-        "null",
-        "",
-        "2 um",
-        "-1.5 arcsec",
-        "1 um/m",
-        "- 1",
-        "-",
-        "--- a",
-        "a: b",
-        "# c",
-        "'quoted'",
-        '"1"',
-        "[1, 2]",
-        "{a: 1}",
-        "*a",
-        "&a",
-        "!t",
-        "? x",
-        "x, y",
-        ".inf",
-        "nan",
-        "0x10",
-        "N-BK7",
-        "a\tb",
-        "a  b",
-        "1e400",
-    ],
+CELLS = (
+    *("1", " 2.5 ", "-3e-4", "+.5", "1_000", "true", "null", "", "2 um", "-1.5 arcsec", "1 um/m", "- 1", "-", "--- a"),
+    *("a: b", "# c", "'quoted'", '"1"', "[1, 2]", "{a: 1}", "*a", "&a", "!t", "? x", "x, y", ".inf", "nan", "0x10"),
+    *("N-BK7", "a\tb", "a  b", "1e400"),
 )
-def test_a_cell_is_what_yaml_reads(text: str) -> None:
+
+
+def test_a_cell_is_what_yaml_reads(monkeypatch) -> None:
     """The short way, which most cells take, and the parser give the same."""
-    short, setup._PLAIN = setup._PLAIN, re.compile(r"(?!)")
-    try:
-        want = setup._cell(text)
-    finally:
-        setup._PLAIN = short
-    got = setup._cell(text)
-    assert (type(got), got) == (type(want), want)
+    short = [setup._cell(text) for text in CELLS]
+    monkeypatch.setattr(setup, "_PLAIN", re.compile(r"(?!)"))
+    assert [(type(one), repr(one)) for one in short] == [(type(w), repr(w)) for w in map(setup._cell, CELLS)]
 
 
 @pytest.mark.parametrize(
@@ -328,6 +269,9 @@ def test_a_cell_is_what_yaml_reads(text: str) -> None:
         ("a,b\n\n", "names, then a row or more"),
         ("", "names, then a row or more"),
         ("c,b\n1 um,2\n", "no such column"),
+        ("a,b\x07\n1 um,2\n", "row 1 of the table"),
+        ("a,b\n1 um\x07,2\n", "row 2 of the table"),
+        ('a,b\n"' + "x" * 200_000 + '",2\n', "cannot be read: field larger than"),
     ],
 )
 def test_tables_that_are_none_for_a_study(table: str, told: str, tmp_path: Path, monkeypatch) -> None:
@@ -338,3 +282,40 @@ def test_tables_that_are_none_for_a_study(table: str, told: str, tmp_path: Path,
         resolve_study(path)
     assert caught.value.key[:3] == ("factors", "m2z", "table")
     assert caught.value.allowed is not None
+
+
+def test_a_config_yaml_that_is_damaged_is_refused(tmp_path, monkeypatch) -> None:
+    (tmp_path / "t.csv").write_text("z\n1 um\n2 um\n", "utf-8")
+    path = write_study(tmp_path, (NORMAL, "table: {file: t.csv, column: z}"))
+    whole = parse_yaml(resolve_study(path).to_yaml()).data
+    bare = {**whole["study"], "factors": {**whole["study"]["factors"]}}
+    bare["factors"]["m2z"] = {**bare["factors"]["m2z"], "table": {"file": "t.csv", "column": "z"}}
+    for data, told in (
+        ({**whole, "more": 1}, "unknown key"),
+        ({"study": whole["study"]}, "the resolved base is missing"),
+        ({**whole, "study": bare}, "the table's values are missing"),
+    ):
+        with pytest.raises(InputError, match=told):
+            study_from_text(dump_yaml(data))
+    with pytest.raises(InputError, match="cannot run 'orbit nothing' in a study"):
+        setup._job("orbit nothing")
+    monkeypatch.setattr(setup.yaml_file, "LARGEST_BYTES", 3000)
+    with pytest.raises(InputError, match="larger than 1 MB"):
+        resolve_study(path)
+
+
+def test_places_of_results_that_are_no_numbers_are_refused() -> None:
+    sample = {"a": {"list": [1, 2], "text": "x", "number": 1.0}}
+    check_response(sample, ("a", "number"))
+    check_response(sample, ("a", "list", 1))
+    for key, told in (
+        (("a",), "not a single number"),
+        (("a", "list"), "not a single number"),
+        (("a", "text"), "not a number"),
+        (("a", "number", "x"), "a single value has nothing below it"),
+        (("a", "list", 2), "no such place in a list"),
+    ):
+        with pytest.raises(Problem, match=told):
+            check_response(sample, key)
+    result = BlockResult.of([sample], {"r": ResponseSpec(key=("a", "text"))})
+    assert result.messages[0].endswith("the response 'r' is not a number but str")

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from scenes.specs.job import PerturbationSpec
-from scenes.specs.resolved import resolve
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import write_study
 from twin.main_job.render_job import render_job
 from twin.monitor import monitor_memory
@@ -66,17 +64,6 @@ def test_one_run_is_what_the_command_gives(study, backend, monkeypatch) -> None:
             assert one[key] == pytest.approx(value, rel=1e-9, abs=1e-12), key
         else:
             assert one[key] == value, key
-
-
-@pytest.mark.second
-def test_a_state_among_others_has_the_truth_that_it_has_alone(study, backend) -> None:
-    runs = [study.plan.run(k) for k in range(6)]
-    together = study.setup.job.evaluate(study.setup.tree, runs, backend)
-    for run, outcome in zip(runs, together, strict=True):
-        (alone,) = study.setup.job.evaluate(study.setup.tree, [run], backend)
-        for key, value in numbers(alone["truth"]).items():
-            # traced with others a state differs by rounding: 1e-16 of metres and radians, in um and arcsec
-            assert numbers(outcome["truth"])[key] == pytest.approx(value, rel=1e-8, abs=1e-8), key
 
 
 @pytest.mark.second
@@ -186,6 +173,7 @@ def test_a_response_may_be_a_difference(study, backend) -> None:
     assert BlockResult.of(outcomes, asked).failed.all()
 
 
+@pytest.mark.second
 def test_a_response_that_the_results_do_not_have(study, backend, tmp_path) -> None:
     (sample,) = study.setup.job.evaluate(study.setup.tree, [study.plan.run(0)], backend)
     check_responses(study.setup, sample)
@@ -203,67 +191,6 @@ def test_a_response_that_the_results_do_not_have(study, backend, tmp_path) -> No
         check_responses(resolve_study(wrong), sample)
     right = write_study(tmp_path / "d", ("sigma: [rec", "noise: [rec"), ("d_f_um_sigma]", "d_f_um_sigma_noise]"))
     check_responses(resolve_study(right), sample)
-
-
-@pytest.mark.second
-def test_other_keys_than_motions(study, backend) -> None:
-    """The number of photons changes the scatter that the analysis expects as the root of it."""
-    place = ("instrument", "monitor", "reticle", "photons_per_frame")
-    runs = [Run(k, ((place, value),), 7) for k, value in enumerate((4e6, 1e6))]
-    one, two = study.setup.job.evaluate(study.setup.tree, runs, backend)
-    sigma = [o["recovered"]["cameras"]["forward"]["model"]["d_f_um_sigma_noise"] for o in (one, two)]
-    # shot noise alone would give 2; read-out and fixed pattern noise change it a little
-    assert 1.5 < sigma[1] / sigma[0] < 2.6
-    assert np.isfinite(sigma).all()
-
-
-@pytest.mark.slow
-def test_what_is_stated_to_move_may_be_varied(tmp_path, backend, monkeypatch) -> None:
-    """One number on all axes: readings of `posterior` and total sigmas of all estimators are those of a job that says
-    it by hand; noise is not touched.
-    """
-    text = """name: study
-base: {command: render, file: job.yaml}
-factors:
-  heat:
-    keys:
-      - [disturbances, causes, prism_180_heat, temperature, gradient, 0]
-      - [disturbances, causes, prism_180_heat, temperature, gradient, 1]
-      - [disturbances, causes, prism_180_heat, temperature, gradient, 2]
-    values: [1 mK/m, 30 mK/m]
-  m2z: {key: [job, perturb, base/forward/M2, shift, 2], values: [2 um]}
-design: {kind: grid}
-responses:
-  df:
-    key: [recovered, cameras, forward, posterior, d_f_um]
-    sigma: [recovered, cameras, forward, posterior, d_f_um_sigma]
-  total: {key: [recovered, cameras, forward, model, d_f_um_sigma]}
-  noise: {key: [recovered, cameras, forward, model, d_f_um_sigma_noise]}
-"""
-    setup = resolve_study(write_study(tmp_path, text=text))
-    plan = Plan.of(setup)
-    outcomes = setup.job.evaluate(setup.tree, [plan.run(k) for k in range(2)], backend)
-    check_responses(setup, outcomes[0])
-    df, total, noise = (
-        [leaf(outcome, setup.study.responses[name].key) for outcome in outcomes] for name in ("df", "total", "noise")
-    )
-    assert total[1] > 2.0 * total[0] > 10.0 * noise[0]
-    assert noise[1] == pytest.approx(noise[0], rel=0.05)
-    assert df[0] != pytest.approx(df[1], rel=0.01)
-    for k, (outcome, amount) in enumerate(zip(outcomes, ("1 mK/m", "30 mK/m"), strict=True)):
-        job = {
-            "instrument": str(tmp_path / "small.yaml"),
-            "perturb": {"base/forward/M2": {"shift": "0 0 2 um"}},
-            "disturbances": {"causes": {"prism_180_heat": {"temperature": {"gradient": amount}}}},
-            "render": {"frames": 1, "seed": plan.run(k).seed or 1},
-        }
-        (tmp_path / "hand.yaml").write_text(dump_yaml(job), "utf-8")
-        by_hand = render_job(resolve(tmp_path / "hand.yaml"), backend).recovered_dict()
-        # single precision of a study's images: a hundredth of the noise
-        for estimator in ("model", "posterior"):
-            one, two = (r["cameras"]["forward"][estimator] for r in (outcome["recovered"], by_hand))
-            assert one["d_f_um"] == pytest.approx(two["d_f_um"], abs=0.02 * two["d_f_um_sigma_noise"])
-            assert one["d_f_um_sigma"] == pytest.approx(two["d_f_um_sigma"], rel=1e-3)
 
 
 @pytest.mark.parametrize("key", ["[job, disturbances, causes, mirror_mounts, shift, 0]", "[job, instrument]"])

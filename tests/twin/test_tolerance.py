@@ -2,36 +2,38 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
-import time
-from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import checked_nodes
-from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
-from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec, resolve_tolerance
+from scenes.specs.tolerance import (
+    AllocationSpec,
+    MeritSpec,
+    ToleranceSetup,
+    ToleranceSpec,
+    amount_si,
+    resolve_tolerance,
+)
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
-from scenes.yaml.yaml_file import YamlFile, dump_yaml
+from scenes.yaml.yaml_file import YamlFile, dump_yaml, parse_yaml
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.run.run_folder import RunFolderError
+from twin.tolerance import allocation, merit_models, samples, tolerance_run
 from twin.tolerance.allocation import CostCurve
-from twin.tolerance.merit_models import inverse_limits, sensitivities
+from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
+from twin.tolerance.merits import Merit
 from twin.tolerance.samples import Workforce, draw_samples
 from twin.tolerance.tolerance_bench import ToleranceBench
-from twin.tolerance.tolerance_run import TOLERANCE, Yield, run_tolerance, with_limits, worst_jobs
+from twin.tolerance.tolerance_run import TOLERANCE, Yield, run_tolerance, worst_jobs
 from twin.tolerance.variations import spectrum_shares, states_of
 
-ROOT = Path(__file__).parents[2]
 BUDGET: dict[str, Any] = {
     "instrument": "gf7",
     "tolerances": {
@@ -106,19 +108,6 @@ def test_a_camera_is_that_of_the_main_program(bench: ToleranceBench, drawn: np.n
     assert values[2] == pytest.approx(np.hypot(alpha, beta), rel=1e-9)
     assert values[3] == pytest.approx(abs(d_f), rel=1e-6)
     assert values[6] == pytest.approx(abs(gamma), rel=1e-6, abs=1e-12)
-
-
-@pytest.mark.second
-def test_order_and_company_do_not_matter(bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path) -> None:
-    turned = dict(reversed(BUDGET["tolerances"].items()))
-    other = ToleranceBench(budget(tmp_path, tolerances=turned), backend)
-    place = [[n.name for n in bench.numbers].index(number.name) for number in other.numbers]
-    own = bench.try_out(drawn * bench.sizes)
-    again = other.try_out(drawn[:, place] * other.sizes)
-    np.testing.assert_allclose(again.parts, own.parts, rtol=1e-9, atol=1e-15)
-    alone = np.concatenate([bench.try_out(row[None] * bench.sizes).parts for row in drawn[:3]])
-    # matrix products of other sizes round otherwise, and a path of ten metres has no digits below 3e-9 waves
-    np.testing.assert_allclose(alone, own.parts[:3], rtol=1e-8, atol=1e-15)
 
 
 def test_a_compensator_without_a_range_changes_nothing(
@@ -241,25 +230,6 @@ def test_an_obscured_camera_is_that_of_the_camera_program(backend, tmp_path) -> 
         assert values[1] == pytest.approx(least, abs=1e-4)
 
 
-@pytest.mark.second
-def test_the_example_of_a_zemax_file_is_collimated_by_its_secondary(backend) -> None:
-    """Its turns take out the coma of a decentre, and what it is tilted by itself."""
-    setup = resolve_tolerance(EXAMPLES / "tolerance_cassegrain.yaml")
-    focus = {"focus": setup.test.compensators["focus"]}
-    alone = setup.model_copy(update={"test": setup.test.model_copy(update={"compensators": FrozenMap(focus)})})
-    both, only = (ToleranceBench(one, backend) for one in (setup, alone))
-    names = list(both.entries)
-    x = np.zeros((3, len(both.numbers)))
-    for row, name in enumerate(("M2_decentre_x", "M2_tilt_y"), start=1):
-        x[row, both.entries[name][0]] = 1.0
-    with_turns, without = (one.values(one.try_out(x * one.sizes).parts)[:, 0] for one in (both, only))
-    assert names == list(setup.test.tolerances)
-    assert without[1] > 0.1
-    assert without[2] > 0.08
-    assert with_turns[1] < 0.03
-    assert with_turns[2] == pytest.approx(with_turns[0], abs=1e-5)
-
-
 def test_shares_of_a_figure_and_of_a_yield() -> None:
     shares = spectrum_shares(tuple(range(5, 37)), 3.0)
     assert np.sum(shares**2) == pytest.approx(1.0)
@@ -270,33 +240,24 @@ def test_shares_of_a_figure_and_of_a_yield() -> None:
 
 
 def test_a_budget_from_a_script(backend, tmp_path) -> None:
-    """Whole, in this process: numbers, warnings, and the same again from its config.yaml."""
-    merits = {k: BUDGET["merits"][k] for k in ("wavefront", "f")}
-    setup = budget(tmp_path, merits=merits, samples=20)
-    run = run_tolerance(setup, backend)
-    numbers = TOLERANCE(run)
-    assert numbers["yield"]["of"] == 20
-    assert set(numbers["merits"]) == set(merits)
-    assert numbers["merits"]["wavefront"]["variance_shares"]["tilt"] > 0.0
-    again = tmp_path / "config.yaml"
-    again.write_text(setup.to_yaml(), "utf-8")
-    assert TOLERANCE(run_tolerance(resolve_tolerance(again), backend)) == numbers
-
-
-@pytest.mark.slow
-def test_the_yield_of_an_allocation_is_that_of_other_cameras(backend, tmp_path) -> None:
+    """Whole, in this process: its numbers are those of the cameras that it has drawn."""
     merits = {k: BUDGET["merits"][k] for k in ("wavefront", "mtf", "f")}
-    setup = budget(tmp_path, merits=merits, samples=1000, allocation={"target": 0.9})
-    run = run_tolerance(setup, backend)
-    assert run.allocation is not None
-    assert run.judged is not None
-    assert run.allocation.reached
-    assert run.judged.low <= run.allocation.predicted[1] <= run.judged.high
-    assert run.judged.high >= 0.9
-    again = with_limits(setup, run.allocation.limits)
-    assert again.test.tolerances["despace"].limit_si == pytest.approx(
-        run.allocation.rounded[0] * setup.test.tolerances["despace"].limit_si
-    )
+    run = run_tolerance(budget(tmp_path, merits=merits, samples=20), backend)
+    numbers, values = TOLERANCE(run), run.samples.values
+    good = np.stack([values[:, 0] <= 0.06, values[:, 1] >= 0.35, values[:, 2] <= 0.5e-3], axis=1)
+    assert (numbers["yield"]["passed"], numbers["yield"]["of"]) == (int(np.sum(good.all(axis=1))), 20)
+    assert numbers["merits"]["wavefront"]["variance_shares"]["tilt"] > 0.0
+    for k, (name, unit) in enumerate((("wavefront", 1.0), ("mtf", 1.0), ("f", 1e-6))):
+        told, own = numbers["merits"][name], values[:, k] / unit
+        assert told["yield"]["passed"] == np.sum(good[:, k])
+        # of an MTF the share exceeds the value
+        shares = [100.0 - p if name == "mtf" else p for p in (50.0, 90.0, 95.0)]
+        assert list(told["monte_carlo"].values()) == pytest.approx(np.percentile(own, shares).tolist(), rel=1e-9)
+        assert (told["mean"], told["std"]) == pytest.approx((np.mean(own), np.std(own)), rel=1e-9)
+    focus = run.samples.moves[:, 0]
+    told = numbers["compensators"]["focus"]
+    for key, size in (("std", np.std(focus)), ("largest", np.max(np.abs(focus)))):
+        assert float(told[key].removesuffix(" um")) == pytest.approx(1e6 * size, rel=1e-6), key
 
 
 def test_costs_of_grades_are_those_stated_and_fall_between_them() -> None:
@@ -317,149 +278,243 @@ def test_costs_of_grades_are_those_stated_and_fall_between_them() -> None:
     assert [np.exp(curve(np.log(x))[0]) for x in (0.1, 0.5, 1.0, 3.0)] == pytest.approx([300.0, 12.0, 3.0, 1.0 / 3.0])
 
 
-@pytest.mark.second
-def test_an_allocation_pays_where_it_is_cheap(backend, tmp_path) -> None:
-    """Two alike errors, of which one can hardly be bought: the other is tightened."""
-    ways = {"cheap": [["200 um", 1.0], ["50 um", 1.1], ["20 um", 1.2]], "dear": [["200 um", 1.0], ["50 um", 50.0]]}
-    tolerances = {
-        name: {"motion": f"M1 shift {axis}", "limit": "200 um", "costs": costs}
-        for axis, (name, costs) in zip("xy", ways.items(), strict=True)
-    }
-    changed = {
-        "tolerances": tolerances,
-        "merits": {"wavefront": {"kind": "wavefront", "at_most": 0.06, "fields": [[0.0, 0.0]]}},
-        "compensators": {"focus": BUDGET["compensators"]["focus"]},
-    }
-    loose = budget(tmp_path, **changed, samples=200, allocation={"target": 0.9})
-    run = run_tolerance(loose, backend)
-    assert run.allocation is not None
-    assert run.allocation.reached
-    ratio = dict(zip(tolerances, run.allocation.scales.tolist(), strict=True))
-    assert ratio["cheap"] < 0.5
-    assert ratio["dear"] > 2.0 * ratio["cheap"]
-    np.testing.assert_allclose(run.allocation.costs[0], [1.0, 1.0])
+class Straight:
+    """A bench whose only merit is the size of a weighted sum of its numbers; real cameras are ``real`` times worse."""
+
+    def __init__(self, slope: np.ndarray, real: float = 1.0) -> None:
+        self.slope, self.real, self.sizes = slope, real, np.ones(len(slope))
+        self.entries = {name: (k,) for k, name in enumerate("abc"[: len(slope)])}
+        count = len(slope)
+        self.model = MeritModel(np.zeros(1), slope[None], np.zeros((1, count, count)))
+
+    def values(self, parts: np.ndarray) -> np.ndarray:
+        return np.abs(parts)
+
+    def worst_margins(self, values: np.ndarray) -> np.ndarray:
+        return values[:, 0] - 1.0
+
+    def scaled(self, scales: np.ndarray) -> Straight:
+        return Straight(self.slope * scales, self.real)
+
+    def try_out(self, x: np.ndarray, errors: Any) -> SimpleNamespace:
+        return SimpleNamespace(parts=self.real * x @ self.slope[:, None])
 
 
-BAD = {
-    "costs that rise with the limit": (
-        {"tolerances": {"a": {"motion": "M2 shift z", "limit": "1 um", "costs": [["1 um", 1.0], ["2 um", 3.0]]}}},
-        "costs no more",
-        "tolerances",
-    ),
-    "costs said twice": (
-        {
-            "tolerances": {
-                "a": {"motion": "M2 shift z", "limit": "1 um", "cost": 2.0, "costs": [["1 um", 3.0], ["2 um", 1.0]]}
-            }
-        },
-        "in place of cost",
-        "tolerances",
-    ),
-    "no such body": ({"tolerances": {"a": {"motion": "M7 shift z", "limit": "1 um"}}}, "no such node", "tolerances"),
-    "an amount in the motion": (
-        {"tolerances": {"a": {"motion": "M2 shift z 3 um", "limit": "1 um"}}},
-        "without an amount",
-        "tolerances",
-    ),
-    "no unit": ({"tolerances": {"a": {"motion": "M2 shift z", "limit": 3.0}}}, "unit", "tolerances"),
-    "another unit": ({"tolerances": {"a": {"motion": "M2 shift z", "limit": "3 arcsec"}}}, "length", "tolerances"),
-    "nothing": ({"tolerances": {"a": {"motion": "M2 shift z", "limit": "0 um"}}}, "greater than zero", "tolerances"),
-    "a unit on a pure number": (
-        {"tolerances": {"a": {"motion": "M2 conic", "limit": "3 um"}}},
-        "pure number",
-        "tolerances",
-    ),
-    "a body that does not allow it": (
-        {"tolerances": {"a": {"motion": "focal_plane radius", "limit": "3 ppm"}}},
-        "does not allow radius",
-        "tolerances",
-    ),
-    "an unknown camera": ({"camera": "gf9"}, "no such camera", "camera"),
-    "an MTF that is at most": ({"merits": {"m": {"kind": "mtf", "at_most": 0.3}}}, "at_least", "merits"),
-    "beyond the cut-off": (
-        {"merits": {"m": {"kind": "mtf", "at_least": 0.3, "frequency": 5000.0}}},
-        "cut-off",
-        "merits",
-    ),
-    "compensators without fields": (
-        {"merits": {"b": {"kind": "boresight", "at_most": "1 arcsec"}}},
-        "need fields",
-        "merits",
-    ),
-    "carried twice": (
-        {"tolerances": {"a": {"motion": "gf7 shift z", "limit": "1 um", "carrying": ["M2"]}}},
-        "already",
-        "tolerances",
-    ),
-    "terms of no figure": (
-        {"tolerances": {"a": {"motion": "M2 shift z", "limit": "1 um", "terms": ["Z5", "Z9"]}}},
-        "figure",
-        "tolerances",
-    ),
-    "a negative range": (
-        {"compensators": {"c": {"motion": "M2 shift z", "range": "-1 um"}}},
-        "not negative",
-        "compensators",
-    ),
+@pytest.mark.parametrize(("target", "real"), [(0.9, 1.0), (0.7, 1.0), (0.9, 1.3)])
+def test_an_allocation_is_the_cheapest_that_keeps_its_margin(target: float, real: float, monkeypatch) -> None:
+    """Against a search over all pairs of limits, of the same 2000 draws: by so much the yield is to exceed what is
+    asked that the 1000 cameras which are traced may miss it by one of their standard deviations.
+    """
+    slope, x = np.array([1.0, 0.5]), np.random.default_rng(3).standard_normal((2000, 2))
+    monkeypatch.setattr(allocation, "sensitivities", lambda bench: bench)
+    monkeypatch.setattr(allocation, "adjustment_errors", lambda bench, seeds: None)
+    stated = {"a": {"motion": "M2 shift x", "cost": 3.0}, "b": {"motion": "M2 shift y"}}
+    entries = {
+        name: validate(ToleranceSpec, YamlFile("", {**one, "limit": "20 um"}, {})) for name, one in stated.items()
+    }
+    setup = SimpleNamespace(test=SimpleNamespace(tolerances=entries))
+    bench = Straight(slope, real)
+    values = np.abs(bench.try_out(x, None).parts)
+    samples = SimpleNamespace(x=x, values=values, seeds=np.zeros(2000, int))
+    fine = tuple(np.arange(1.0, 10.0, 0.01).round(2).tolist())
+    spec = AllocationSpec(target=target, grades=fine)
+    found = allocation.allocate(setup, bench, bench.model, samples, spec)
+    share = target + np.sqrt(target * (1.0 - target) / 1000.0)
+
+    def price(ratio: float) -> tuple[float, np.ndarray]:
+        drawn = real * np.abs(x @ (slope * [1.0, np.exp(ratio)]))
+        # the model is exact but for a factor, which the first half of the cameras tells
+        scales = np.array([1.0, np.exp(ratio)]) / np.quantile(drawn[:1000] if real > 1.0 else drawn, share)
+        return float(3.0 / scales[0] + 1.0 / scales[1]), scales
+
+    least = min(price(ratio)[0] for ratio in np.linspace(-2.0, 3.0, 501))
+    assert found.cost[0] == pytest.approx(4.0)
+    assert least * 0.99 < float(3.0 / found.scales[0] + 1.0 / found.scales[1]) < least * 1.03
+    passing = np.mean(real * np.abs(x @ (slope * found.scales))[:1000] <= 1.0)
+    assert share - 0.012 < passing < share + 0.012
+    if real == 1.0:
+        # before rounding and after it, where one limit may go up when another went down
+        everyone = [np.mean(np.abs(x @ (slope * one)) <= 1.0) for one in (found.scales, found.rounded)]
+        assert share - 1e-9 <= min(everyone) <= max(everyone) < share + 0.004
+        assert found.predicted == (np.mean(values <= 1.0), everyone[1])
+    assert found.cost[1] == pytest.approx(float(np.sum([3.0, 1.0] / found.rounded)), rel=1e-9)
+    assert [amount_si(limit, "shift") for limit in found.limits.values()] == pytest.approx(found.rounded * 20e-6)
+    assert (found.reached, found.unrounded) == (True, True)
+
+
+def told_warnings(**changes: Any) -> list[str]:
+    """Return the warnings of a run of 40 good cameras with one compensator, but for what is changed."""
+    own: dict[str, Any] = {
+        "problems": ("",) * 40, "unlit": "", "settled": 0.0, "paired": True, "level": 1.0, "moves": 0.5, "plan": None,
+    }  # fmt: skip
+    own |= changes
+    merit = SimpleNamespace(merit=SimpleNamespace(name="w"), levels=(1.0,) * 3, linear=(own["level"],) * 3)
+    merit.quadratic = (1.0,) * 3
+    return tolerance_run._warnings(
+        SimpleNamespace(
+            entries={"tilt": (0,)},
+            numbers=(None,),
+            ranges=np.array([1.0]),
+            compensators=(SimpleNamespace(name="focus"),),
+        ),
+        SimpleNamespace(problems=(own["unlit"],), model=SimpleNamespace(paired=own["paired"])),
+        SimpleNamespace(
+            problems=own["problems"], settled=np.full(40, own["settled"]), moves=np.full((40, 1), own["moves"])
+        ),
+        (merit,),
+        own["plan"],
+        None if own["plan"] is None else Yield.count(np.arange(40) < 36),
+        AllocationSpec(target=0.9),
+    )
+
+
+PLAN = {"reached": True, "unrounded": True, "predicted": (0.5, 0.92)}
+SAID = {
+    "1 of 40 cameras have no light and count as failed: dark": {"problems": ("dark",) + ("",) * 39},
+    "tolerance tilt: no light at its limit (dark)": {"unlit": "dark"},
+    "the adjustments of 40 cameras have not settled": {"settled": 1.0},
+    "1 numbers vary: the second order has no products": {"paired": False},
+    "w: the linear model's value for 90 % of the cameras differs by 6 %": {"level": 1.06},
+    "compensator focus stands at the end of its range in 100.0 %": {"moves": -1.0},
+    "limits rounded to the grades do not reach a yield of 90 %": {"plan": PLAN | {"reached": False}},
+    "no limits that were found": {"plan": PLAN | {"reached": False, "unrounded": False}},
+    "the allocated limits yield 90.0 % of cameras of their own, and the model 99.9 %": {
+        "plan": PLAN | {"predicted": (0.5, 0.999)}
+    },
 }
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_told_with_its_key(case: str, backend, tmp_path) -> None:
-    changes, words, key = BAD[case]
+def test_each_warning_is_there_where_it_holds_and_no_other() -> None:
+    assert told_warnings(level=1.04, moves=0.99, settled=0.0) == []
+    assert told_warnings(plan=SimpleNamespace(**PLAN)) == []
+    for text, case in SAID.items():
+        plan = {"plan": SimpleNamespace(**case["plan"])} if "plan" in case else {}
+        (said,) = told_warnings(**case | plan)
+        assert said.startswith(text), said
+
+
+BAD = [
+    (
+        "{tolerances: {a: {motion: M2 shift z, limit: 1 um, costs: [[1 um, 1.0], [2 um, 3.0]]}}}",
+        "costs no more",
+        "tolerances",
+    ),
+    (
+        "{tolerances: {a: {motion: M2 shift z, limit: 1 um, cost: 2.0, costs: [[1 um, 3.0], [2 um, 1.0]]}}}",
+        "in place of cost",
+        "tolerances",
+    ),
+    ("{tolerances: {a: {motion: M7 shift z, limit: 1 um}}}", "no such node", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z 3 um, limit: 1 um}}}", "without an amount", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z, limit: 3.0}}}", "unit", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z, limit: 3 arcsec}}}", "length", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z, limit: 0 um}}}", "greater than zero", "tolerances"),
+    ("{tolerances: {a: {motion: M2 conic, limit: 3 um}}}", "pure number", "tolerances"),
+    ("{tolerances: {a: {motion: focal_plane radius, limit: 3 ppm}}}", "does not allow radius", "tolerances"),
+    ("{camera: gf9}", "no such camera", "camera"),
+    ("{merits: {m: {kind: mtf, at_most: 0.3}}}", "at_least", "merits"),
+    ("{merits: {m: {kind: mtf, at_least: 0.3, frequency: 5000.0}}}", "cut-off", "merits"),
+    ("{merits: {b: {kind: boresight, at_most: 1 arcsec}}}", "need fields", "merits"),
+    ("{tolerances: {a: {motion: gf7 shift z, limit: 1 um, carrying: [M2]}}}", "already", "tolerances"),
+    ("{tolerances: {a: {motion: M2 shift z, limit: 1 um, terms: [Z5, Z9]}}}", "figure", "tolerances"),
+    ("{compensators: {c: {motion: M2 shift z, range: -1 um}}}", "not negative", "compensators"),
+    ("{instrument: gf7_pair}", "the instrument has several cameras", "camera"),
+]
+"""Keys in place of the budget's own, what the message says, and the key that it names."""
+
+
+@pytest.mark.parametrize(("changes", "words", "key"), BAD, ids=[case[1] for case in BAD])
+def test_bad_input_is_told_with_its_key(changes: str, words: str, key: str, backend, tmp_path) -> None:
     with pytest.raises(InputError) as caught:
-        ToleranceBench(budget(tmp_path, **changes), backend)
-    told = str(caught.value)
-    assert words in told
-    assert key in told
-    assert "budget.yaml:" in told
+        ToleranceBench(budget(tmp_path, **parse_yaml(changes).data), backend)
+    for part in (words, key, "budget.yaml:"):
+        assert part in str(caught.value)
 
 
-COMMAND = """
-import sys
-sys.argv = ["twin.tolerance", *sys.argv[1:]]
-from twin.tolerance.__main__ import app
-app()
-"""
+def test_a_design_without_light_and_a_strange_journal_are_refused(tmp_path) -> None:
+    setup = budget(tmp_path)
+    tolerance_run._require_light(setup, SimpleNamespace(nominal=np.ones(2)))
+    with pytest.raises(InputError, match="the designed camera has no light at these fields"):
+        tolerance_run._require_light(setup, SimpleNamespace(nominal=np.array([1.0, np.nan])))
+    for _ in range(2):
+        with samples._journal(tmp_path / "journal", "a" * 64):
+            pass
+    with pytest.raises(RunFolderError, match="is of another budget"), samples._journal(tmp_path / "journal", "b" * 64):
+        pass
+    (tmp_path / "file").touch()
+    with pytest.raises(RunFolderError, match="go on with --resume"), samples._journal(tmp_path / "file", "a" * 64):
+        pass
 
 
-@pytest.mark.slow
-def test_killed_at_five_moments_and_resumed_it_gives_the_same_bytes(tmp_path) -> None:
-    budget(tmp_path, samples=2000)
-    file = tmp_path / "budget.yaml"
-
-    def command(out: str, *more: str) -> list[str]:
-        return [
-            sys.executable,
-            "-c",
-            COMMAND,
-            str(file),
-            "--out",
-            str(tmp_path / out),
-            "--workers",
-            "2",
-            "--quiet",
-            *more,
-        ]
-
-    start = time.monotonic()
-    subprocess.run(command("whole"), check=True, cwd=ROOT)
-    took = time.monotonic() - start
-    wanted = result_bytes(tmp_path / "whole")
-    for k, share in enumerate((0.2, 0.4, 0.6, 0.75, 0.9)):
-        process = subprocess.Popen(command(f"killed{k}"), cwd=ROOT, start_new_session=True)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(share * took)
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        if not (tmp_path / f"killed{k}").exists():
-            subprocess.run(command(f"killed{k}", "--resume"), check=True, cwd=ROOT)
-        assert result_bytes(tmp_path / f"killed{k}") == wanted
-        assert not (tmp_path / f"killed{k}.samples").exists()
+def merit_of(kind: str, column: int = 0, **asked: Any) -> Merit:
+    return Merit(kind, MeritSpec.model_validate({"kind": kind, **asked}), np.array([0]), slice(column, column + 1))
 
 
-def result_bytes(folder: Path) -> dict[str, bytes]:
-    """All files of a run folder but those with times in them."""
-    files = [folder / "tolerance.json", folder / "config.yaml", *(folder / "artefacts").iterdir()]
-    return {path.name: path.read_bytes() for path in files}
+def test_margins_losses_and_verdicts_of_merits() -> None:
+    """A value on its limit passes; a loss is what is left over the root of the number of tolerances."""
+    error, mtf = merit_of("wavefront", at_most=0.05), merit_of("mtf", at_least=0.4)
+    assert error.passes(np.array([0.05, 0.0501, np.nan])).tolist() == [True, False, False]
+    assert mtf.passes(np.array([0.4, 0.399, np.nan])).tolist() == [True, False, False]
+    assert (float(error.margin(np.array(0.06))), float(mtf.margin(np.array(0.32)))) == pytest.approx((0.2, 0.2))
+    assert (float(error.worse(np.array(0.06), 0.04)), float(mtf.worse(np.array(0.32), 0.4))) == pytest.approx(
+        (0.02, 0.08)
+    )
+    bench = SimpleNamespace(entries=dict.fromkeys("abcd"), merits=(error, mtf, merit_of("wavefront", at_most=0.02)))
+    losses = merit_models.default_losses(bench, np.array([0.03, 0.5, 0.03]))
+    assert losses[:2] == pytest.approx([0.01, 0.05])
+    assert np.isnan(losses[2])
+    one = Yield.count(np.arange(100) < 90)
+    assert [one.judged(p) for p in (one.low, one.low + 1e-9, one.high, one.high + 1e-9)] == [
+        "met",
+        "open",
+        "open",
+        "missed",
+    ]
+
+
+def test_models_of_scaled_tolerances_are_the_model_of_scaled_draws() -> None:
+    """Two tolerances of two and one numbers; derivatives by the logarithms of the scales against differences."""
+    rng = np.random.default_rng(6)
+    bent = rng.standard_normal((4, 3, 3))
+    model = MeritModel(rng.standard_normal(4), rng.standard_normal((4, 3)), bent + bent.transpose(0, 2, 1))
+    x, scales = rng.standard_normal((7, 3)), np.array([0.7, 1.6])
+    scaled = merit_models.ScaledModel.of(model, x, [(0, 2), (1,)])
+    wide = x * scales[[0, 1, 0]]
+    exact = [
+        model.nominal + model.slope @ row + 0.5 * np.einsum("k,pkl,l->p", row, model.curvature, row) for row in wide
+    ]
+    np.testing.assert_allclose(scaled.parts(scales), exact, rtol=1e-12)
+    np.testing.assert_allclose(model.quadratic(wide), exact, rtol=1e-12)
+    steps = np.exp(1e-6 * np.eye(2))
+    slope = np.stack([(scaled.parts(scales * s) - scaled.parts(scales / s)) / 2e-6 for s in steps], axis=-1)
+    np.testing.assert_allclose(scaled.slope(scales, np.arange(7)), slope, rtol=1e-6, atol=1e-8)
+    # the rms of what the terms of a figure do to a turn, and the mean of what they do to a wavefront
+    bench = SimpleNamespace(
+        parts=4, merits=(merit_of("wavefront", 0, at_most=1.0), merit_of("roll", 1, at_most="1 rad"))
+    )
+    (spread,) = merit_models._spread(bench, model, np.array([0, 2]), np.array([0.5]))
+    assert spread[1] == pytest.approx(model.nominal[1] + 0.5 * np.hypot(model.slope[1, 0], model.slope[1, 2]))
+
+
+def test_cameras_have_errors_of_their_own(backend, tmp_path, monkeypatch) -> None:
+    """Errors of adjustments go by the camera's seed; an allocation is judged by other cameras than it was made with."""
+    made = SimpleNamespace(grid_steps=np.array([0.0, 1e-6]), accuracies=np.zeros(2), ranges=np.ones(2))
+    first, second, again = samples.adjustment_errors(made, [1, 2, 1])
+    assert np.array_equal(first, again)
+    assert not np.any(first == second)
+    assert first[0] != first[1]
+    made.grid_steps = np.zeros(2)
+    assert samples.adjustment_errors(made, [1]) is None
+    asked = []
+
+    def drawn(*given: Any) -> SimpleNamespace:
+        asked.append(given[4])
+        return SimpleNamespace(values=np.zeros((4, 1)))
+
+    monkeypatch.setattr(
+        tolerance_run, "ToleranceBench", lambda *_: SimpleNamespace(passing=lambda values: values < 1.0)
+    )
+    monkeypatch.setattr(tolerance_run, "draw_samples", drawn)
+    found = tolerance_run._judged(budget(tmp_path), backend, SimpleNamespace(limits={}), 3, None, None)
+    assert (found.passed, found.of) == (4, 4)
+    assert asked != [3]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,6 @@ import pytest
 from scenes.specs.load import LIBRARY
 from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
-from twin.run.artefact import Table
 from twin.study.runs.plan import Plan
 from twin.tolerance import allocation, given_warnings, samples, tolerance_run
 from twin.tolerance.merit_models import sensitivities
@@ -127,25 +124,11 @@ def test_moves_of_compensators_stand_beside_each_sensitivity(backend, tmp_path) 
     assert numbers["despace"]["moves_at_plus"]["focus"].endswith(" um")
     assert float(numbers["despace"]["moves_at_plus"]["focus"].split()[0]) == pytest.approx(1e6 * moved[1, 0], rel=1e-6)
     assert numbers["figure"]["moves_at_plus"] == {"focus": None, "turn": None}
-    table = next(
-        one
-        for section in tolerance_report(run).sections
-        for one in section.artefacts
-        if isinstance(one, Table) and one.name == "sensitivities"
-    )
-    assert table.full is not None
-    head, first, *rest = csv.reader(io.StringIO(table.full.content().decode("utf-8")))
-    assert len(set(head)) == len(head)
-    minus, plus = (head.index(f"move of focus [mm] {sign}") for sign in ("\N{MINUS SIGN}", "+"))
-    assert [float(first[minus]), float(first[plus])] == pytest.approx(list(1e3 * moved[:, 0]), rel=1e-6)
-    assert rest[-1][minus] == ""
-    shown = table.rows[0][table.heads.index("limit") + 1 + 2 * len(run.merits)]
-    assert shown == f"{1e3 * moved[0, 0]:.3g} mm"
 
 
 @pytest.mark.parametrize("loose", [30.0, pytest.param(1.0, marks=pytest.mark.second)])
 def test_an_allocation_is_reached_by_the_limits_of_its_table(loose: float, backend, tmp_path, monkeypatch) -> None:
-    """Graded limits that come out too loose are not told as if they were those before rounding."""
+    """Graded limits that come out too loose are not reported as if they were those before rounding."""
     setup = budget(tmp_path, allocation={"target": 0.8})
     bench = ToleranceBench(setup, backend)
     found = sensitivities(bench)
@@ -164,5 +147,3 @@ def test_an_allocation_is_reached_by_the_limits_of_its_table(loose: float, backe
     assert told.unrounded
     assert told.reached == (loose == 1.0)
     assert (told.predicted[1] >= spec.target) == told.reached
-    text = tolerance_run._allocation_warnings(told, tolerance_run.Yield.count(np.arange(60) < 30), spec)
-    assert ("limits rounded to the grades" in text[0]) == (loose != 1.0)

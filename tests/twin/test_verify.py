@@ -1,6 +1,6 @@
 """`python -m twin.verify`: whatever is done to a run folder is found, and a run made again is compared in every number.
 
-Every kind of run folder is in test_verify_kinds.py.
+Run folders of other commands are in test_verify_kinds.py.
 """
 
 import csv
@@ -78,11 +78,10 @@ def test_every_changed_byte_of_a_file_is_found(folder, name) -> None:
     assert folder_state(folder).whole
 
 
-@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
-def test_every_changed_byte_of_the_manifest_is_found(folder, step) -> None:
+def test_every_changed_byte_of_the_manifest_is_found(folder) -> None:
     """Whatever it hits: a number, a checksum, a name of a file or of a key, white space, a bracket."""
     kept = (folder / MANIFEST).read_bytes()
-    damaged = 0
+    damaged, step = 0, 11
     for at in range(0, len(kept), step):
         flip(folder / MANIFEST, at)
         try:
@@ -196,13 +195,7 @@ def test_chunks_that_were_taken_out_with_their_lines_are_missed(study, tmp_path)
     assert folder_state(copy).additional == ("chunks/00007.npz",)
 
 
-def test_nothing_in_a_study_is_touched(study) -> None:
-    before = {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in study.rglob("*")}
-    folder_state(study)
-    assert before == {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in study.rglob("*")}
-
-
-@pytest.mark.slow
+@pytest.mark.second
 def test_numbers_that_no_run_gave_are_found(study) -> None:
     """The chunks' checksums are right, and study.nc holds what they hold; only computing tells."""
     made = repeat_chunk(folder_state(study))
@@ -396,14 +389,16 @@ def test_the_files_alone_take_no_computing(folder) -> None:
 
 
 def test_a_folder_of_an_older_program_is_told(folder) -> None:
+    """Nor is it touched: without its command it cannot be made again."""
     told = json.loads((folder / MANIFEST).read_text())
-    for key in ("digest", "provenance", "again"):
-        del told[key]
-    (folder / MANIFEST).write_text(json.dumps(told, indent=2) + "\n")
+    old = {key: value for key, value in told.items() if key not in ("digest", "provenance", "again")}
+    (folder / MANIFEST).write_text(json.dumps(old, indent=2) + "\n")
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     result = invoke(app, folder)
     assert result.exit_code == 2
     assert "older version, whose manifest does not say by which command" in result.stdout
     assert "no checksum of itself" in result.stdout
+    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
 @pytest.fixture(scope="module")
@@ -425,6 +420,7 @@ def compared(tmp_path_factory) -> Path:
     return place
 
 
+@pytest.mark.second
 def test_a_run_made_again_is_the_same_to_the_byte(compared, tmp_path) -> None:
     """By its own words, in the folder where it was typed; a numpy.py there is not imported."""
     (compared / "numpy.py").write_text("raise SystemExit('executed')")
@@ -470,3 +466,21 @@ def test_inputs_that_changed_since_end_with_two(compared) -> None:
         assert f"have changed since: {compared}/two/numbers.json" in result.stdout
     finally:
         (compared / "two/numbers.json").write_bytes(kept)
+
+
+def test_runs_that_cannot_be_made_again_are_told(tmp_path) -> None:
+    """Its folder is gone, its command fails; and what is still being written is no run."""
+    (tmp_path / ".run.0123.partial").mkdir()
+    cases = [(tmp_path / ".run.0123.partial", "a run that was broken off, or is still being written")]
+    for name, facts, said in (
+        ("gone", {"started_in": str(tmp_path / "none")}, "the folder in which it was started is gone"),
+        ("fails", {"started_in": str(tmp_path)}, "config.yaml ended with exit code 1"),
+    ):
+        with RunFolder(tmp_path / name) as made:
+            made.write_text("config.yaml", "a: 1\n")
+            write_manifest(made, "twin.nothing", 1.5e9, 2.0, again=["twin.nothing", "config.yaml"], **facts)
+        cases.append((tmp_path / name, said))
+    for place, said in cases:
+        result = invoke(app, place)
+        assert result.exit_code == 2, result.output
+        assert said in " ".join(result.output.split()), result.output
