@@ -2,7 +2,6 @@
 
 import importlib
 import inspect
-import json
 import re
 import typing
 from collections.abc import Iterator
@@ -28,9 +27,8 @@ from docs.site.spec_examples import accepted, examples, kinds_of, shipped
 from docs.site.spec_keys import flow
 from scenes.schema import MODELS, json_schema
 from scenes.yaml.yaml_file import parse_yaml
-from tests.golden.fields import fields_file, fields_of, json_fields, kept_fields
-from tests.golden.golden import golden_file
-from tests.golden.jobs import ALL
+from tests.golden.digest import condensed, sorts
+from tests.golden.fields import kept_fields
 from twin.run.page import checksum
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -209,17 +207,6 @@ def test_everything_in_the_library_stands_in_the_reference_and_has_a_docstring()
 # --- run folders -----------------------------------------------------------------------------------------
 
 
-def test_fields_are_kept_of_every_golden_run() -> None:
-    """Of each the same files as its golden file lists, so that neither is renewed without the other."""
-    for job in ALL:
-        if golden_file(job.name).exists():
-            files = json.loads(golden_file(job.name).read_text("utf-8"))["run"]["files"]
-            kept = kept_fields(job.name)
-            assert sorted(kept) == sorted(files) or (not kept and job.name == "schema"), job.name
-    names = {job.name for job in ALL}
-    assert {path.stem for path in fields_file("x").parent.glob("*.json")} <= names
-
-
 @pytest.mark.second
 def test_every_file_of_every_command_is_described(folders: dict[str, str]) -> None:
     for command, jobs in golden_commands().items():
@@ -266,21 +253,17 @@ def test_no_file_is_described_that_no_command_leaves() -> None:
 
 def test_fields_of_json_are_found_in_lists_and_under_names() -> None:
     tree = {"a": 1, "b": [{"c_um": 1.5}, {"c_um": None, "d": "x"}], "cameras": {"p": {"f": 1}, "q": {"f": 2}}, "e": []}
-    assert json_fields(tree) == {
-        "a": "number",
-        "b[].c_um": "number or null",
-        "b[].d": "text",
-        "cameras.{p|q}.f": "number",
-        "e[]": "",
-    }
-
-
-def test_fields_of_a_folder_are_those_of_its_files(tmp_path: Path) -> None:
-    (tmp_path / "numbers.json").write_text('{"x_um": 1}')
-    (tmp_path / "table.csv").write_text("a,b\n1,2\n")
-    (tmp_path / "chunks").mkdir()
-    (tmp_path / "chunks/1.npz").write_bytes(b"")
-    assert fields_of(tmp_path) == {"numbers.json": {"fields": {"x_um": "number"}}, "table.csv": {"columns": ["a", "b"]}}
+    assert (
+        sorts(tree)
+        == sorts(condensed(tree))
+        == {
+            "a": "number",
+            "b[].c_um": "number or null",
+            "b[].d": "text",
+            "cameras.{p|q}.f": "number",
+            "e[]": "",
+        }
+    )
 
 
 # --- the site --------------------------------------------------------------------------------------------

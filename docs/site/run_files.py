@@ -62,7 +62,9 @@ def commands() -> dict[str, list[str]]:
         if kept_fields(job.name):
             words = [word for word in job.words[1:2] if re.fullmatch(r"[a-z]+", word)]
             words += [word for word in job.words if word == "--gradient"]
-            out.setdefault(" ".join([job.words[0], *words]), []).append(job.name)
+            command = " ".join([job.words[0], *words])
+            if command in FILES:
+                out.setdefault(command, []).append(job.name)
     return out
 
 
