@@ -351,7 +351,7 @@ def test_a_time_at_which_the_light_is_lost_is_named(prepared, tmp_path) -> None:
         run_series(prepared, resolved, series_states(prepared, resolved.job))
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_an_interrupt_leaves_nothing(tmp_path) -> None:
     """Ctrl-C while the times are under way."""
     steps = ", ".join(f"{k} s" for k in range(300))
@@ -371,7 +371,7 @@ def test_an_interrupt_leaves_nothing(tmp_path) -> None:
             assert process.poll() is None, process.stderr.read()
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        time.sleep(2.5)
+        time.sleep(1.0)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
     finally:
