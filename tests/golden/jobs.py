@@ -147,7 +147,7 @@ ALL = (
     _job("uncertainty", "twin.uncertainty gf7_pair --states 4 --seed 5 --out {out}"),
     _job("lab_focus", f"twin.lab focus {RUN % 'focus'} --seed 5"),
     _job("lab_distortion", f"twin.lab distortion {RUN % 'distortion'}"),
-    _job("lab_turntable", f"twin.lab turntable {RUN % 'turntable'} --json"),
+    _job("lab_turntable", f"twin.lab turntable {RUN % 'turntable'} --json --seed 3"),
     _job("lab_focus_measured", "twin.lab focus scenes/lab/measured/focus.yaml --out {out}"),
     _job("lab_turntable_measured", "twin.lab turntable scenes/lab/measured/turntable.yaml --out {out} --json"),
     _job("orbit_simulate", f"twin.orbit simulate {RUN % 'simulate'}"),
