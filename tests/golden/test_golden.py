@@ -276,7 +276,7 @@ def test_a_wrong_number_is_found_wherever_it_stands() -> None:
     assert percent <= SMALL_PERCENT * total, (percent, total)
 
 
-MOST_NUMBERS, SMALL_TENFOLD, SMALL_PERCENT = 40_000, 0.03, 0.07
+MOST_NUMBERS, SMALL_TENFOLD, SMALL_PERCENT = 50_000, 0.015, 0.05
 """Real numbers of all golden files at least, and shares of those that are so small beside what they stand with."""
 
 

@@ -10,9 +10,8 @@ import yaml
 
 import twin.render as command
 from analysis.mtf.slanted_edge import measure_edge
-from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY
-from scenes.specs.resolved import resolve, resolve_job
+from scenes.specs.resolved import resolve
 from tests.twin.commands import files, invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.reference_frames import described
@@ -141,14 +140,6 @@ def test_config_repeats_the_run(folder, mtf, backend):
             images[name.removeprefix("images/")], tifffile.imread(folder / "run" / f"{name}.tiff")
         )
     assert described("mtf", repeated.to_dict()) == mtf
-
-
-def test_jobs_without_targets_are_as_before(gf7_pair):
-    resolved = resolve_job(JobSpec(instrument="gf7_pair"))
-    assert resolved.line_detectors is None
-    text = resolved.to_yaml()
-    assert "line_detectors" not in text
-    assert "targets" not in text
 
 
 @pytest.mark.second
