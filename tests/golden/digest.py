@@ -206,6 +206,23 @@ def _flat(tree: list[Any]) -> tuple[list[int], list[Any]]:
     return [len(tree), *rest], [item for _, items in below for item in items]
 
 
+def expanded(tree: Any) -> Any:
+    """Return a condensed tree with its columns as mappings again; of an array of truth values whether all are true."""
+    if isinstance(tree, list):
+        return [expanded(one) for one in tree]
+    if not isinstance(tree, dict):
+        return tree
+    if "#each" not in tree:
+        return bool(tree["min"]) if tree.get("kind") == "b1" else {key: expanded(one) for key, one in tree.items()}
+    columns = {key: expanded(column) for key, column in tree["#each"].items()}
+    count = tree.get("#count") or len(tree["#names"])
+    rows = [
+        {key: one[k] if isinstance(one, list) and len(one) == count else one for key, one in columns.items()}
+        for k in range(count)
+    ]
+    return dict(zip(tree["#names"], rows, strict=True)) if "#names" in tree else rows
+
+
 def flattened(tree: Any, place: str = "") -> dict[str, Any]:
     """Return place -> value of every leaf of a condensed tree, in its order."""
     if isinstance(tree, dict) and tree and "#free" not in tree:
