@@ -16,6 +16,7 @@ from docs.site.api_page import api_page
 from docs.site.build import NEEDED, BuildError, build, index_page, written_pages
 from docs.site.command_pages import NOT_FOR_USERS, command_page, commands, parser, programs
 from docs.site.file_pages import READ_BY, file_pages
+from docs.site.golden_fields import kept_fields
 from docs.site.link_check import faults
 from docs.site.markdown import slug
 from docs.site.node_pages import ACTIONS, node_table
@@ -28,7 +29,6 @@ from docs.site.spec_keys import flow
 from scenes.schema import MODELS, json_schema
 from scenes.yaml.yaml_file import parse_yaml
 from tests.golden.digest import condensed, sorts
-from tests.golden.fields import kept_fields
 from twin.run.page import checksum
 
 ROOT = Path(__file__).resolve().parent.parent

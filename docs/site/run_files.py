@@ -14,10 +14,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from docs.site.golden_fields import kept_fields
 from docs.site.spec_keys import attributes, summary
 from scenes.specs.study import UNITS, unit_of
 from scenes.yaml.yaml_file import read_yaml
-from tests.golden.fields import kept_fields
 from tests.golden.jobs import ALL
 from twin.run.quantity import Record
 from twin.run.run_folder import Manifest

@@ -16,23 +16,6 @@ from tests.golden.compare import BITWISE, DIFFERENT
 from tests.golden.golden import NotComparable, Outcome, check, write
 from tests.golden.jobs import ALL, BY_NAME, Job, Runner
 
-HELP = """Run every command on a small job and compare all that it computes with what it computed before.
-
-Compared are exit codes, printed texts, names of files, and what is in them: numbers and texts of JSON, CSV and YAML,
-variables of netCDF, pixels, texts and lines of drawings, tables and prose of reports, geometry of scenes. Times,
-versions, paths and checksums of files are not.
-
-Examples:
-
-  python -m tests.golden --check                      all jobs; every difference, with the old and the new value\n
-  python -m tests.golden --check --only design,schema some of them\n
-  python -m tests.golden --write --only design        after a change that is meant to change numbers\n
-
-Any processor and any versions of the packages will do: a number may move by a thousandth of its standard deviation, or
-by 1e-7 of itself (tests/golden/compare.py). Where a machine differs from the one that made a golden file is said.
-
-Exit code: 0 nothing differs by more than that, 1 something does or could not be compared, 2 bad input.
-"""
 T = TypeVar("T")
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -75,7 +58,7 @@ def checked(job: Job, runner: Runner) -> Outcome | NotComparable:
         return problem
 
 
-@app.command(help=HELP)
+@app.command()
 def main(
     checking: Annotated[bool, typer.Option("--check", help="Run and compare.")] = False,
     writing: Annotated[bool, typer.Option("--write", help="Run and write the golden files anew.")] = False,
@@ -83,7 +66,23 @@ def main(
     workers: Annotated[int, typer.Option(min=1, help="How many jobs at once.")] = 1,
     bitwise: Annotated[bool, typer.Option("--bitwise", help="With --check: nothing may differ at all.")] = False,
 ) -> None:
-    """Run, then write or compare."""
+    """Run every command on a small job and compare all that it computes with what it computed before.
+
+    Compared are exit codes, printed texts, names of files, and what is in them: numbers and texts of JSON, CSV and
+    YAML, variables of netCDF, pixels, texts and lines of drawings, tables and prose of reports, geometry of scenes.
+    Times, versions, paths and checksums of files are not.
+
+    Examples:
+
+      python -m tests.golden --check                      all jobs; every difference, with both values
+      python -m tests.golden --check --only design,schema some of them
+      python -m tests.golden --write --only design        after a change that is meant to change numbers
+
+    Any processor and any versions of the packages will do: a number may move by a thousandth of its standard deviation
+    or by 1e-7 of itself (tests/golden/compare.py). Other packages are named.
+
+    Exit code: 0 nothing differs by more than that, 1 something does or could not be compared, 2 bad input.
+    """
     if checking == writing:
         typer.echo("error: say either --check or --write", err=True)
         raise typer.Exit(2)

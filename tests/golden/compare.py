@@ -6,7 +6,10 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+
+from ruamel.yaml import YAML
 
 from tests.golden.digest import flattened, is_number, skeleton
 
@@ -43,27 +46,9 @@ class Allowance:
         return re.search(self.place, place) is not None
 
 
-NETWORK = "training a network stops where rounding lets it: other weights that fit as well"
-MATCHED = "a pixel's grey value may round the other way, and what is measured in the images follows"
-EXCEPTIONS = (
-    Allowance(
-        r"/ manifest.json / checks / #each / value", 0.0, "what a solver leaves of an equation, in its unit", 3e-6
-    ),
-    Allowance(r"^lab_turntable\w* / turntable.json / fits / #each / \w+\[4\]", 0.1, NETWORK),
-    Allowance(r"^lab_turntable\w* / turntable.json / .* / network / ", 0.1, NETWORK, 0.01),
-    Allowance(r"^lab_turntable / artefacts/turntable-fits.csv / columns / .*\[2\]", 0.1, NETWORK),
-    Allowance(r"^lab_turntable_measured / artefacts/turntable-fits.csv / columns / .*\[1\]", 0.1, NETWORK),
-    Allowance(r"^lab_turntable\w* / (artefacts/turntable-\w+.svg / ink|report.html / tables\[3\])", math.inf, NETWORK),
-    Allowance(
-        r"/ artefacts/effects.csv / columns / .*corrected", 0.0, "differences of angles in seconds of arc", ZERO_ANGLE
-    ),
-    Allowance(r"/ figure_nm / ", 0.0, "a Zernike term beside ones of nanometres", 1e-9),
-    Allowance(
-        r"/ calibration.json / (light / .*parameter_change|null_vectors)", 1e-4, "small changes of large unknowns"
-    ),
-    Allowance(r"/ (block|calibration).json / open / ", 1e-5, "directions that the data leave open, of nearly one size"),
-    Allowance(r"^orbit_(simulate|match|calibrate_images) / .*(points|images.csv|lines)", 1e-3, MATCHED, 2e-5),
-)
+EXCEPTIONS = [
+    Allowance(**one) for one in YAML(typ="safe").load(Path(__file__).with_name("exceptions.yaml").read_text())
+]
 
 
 @dataclass(frozen=True)

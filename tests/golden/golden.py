@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,9 @@ from tests.golden.snapshot import Reader
 
 FOLDER = Path(__file__).parent
 PACKAGES = (
-    "drjit",
-    "h5netcdf",
-    "karellen-llvm-core",
-    "matplotlib",
-    "mitsuba",
-    "numpy",
-    "opencv-python-headless",
-    "pyerfa",
-    "pyproj",
-    "salib",
-    "scikit-fem",
-    "scikit-learn",
-    "scipy",
-    "tifffile",
-    "trimesh",
-    "xarray",
-)
+    "drjit h5netcdf karellen-llvm-core matplotlib mitsuba numpy opencv-python-headless pyerfa pyproj salib scikit-fem"
+    " scikit-learn scipy tifffile trimesh xarray"
+).split()
 """Those that numbers, pictures or files come from."""
 
 
@@ -42,28 +29,15 @@ class NotComparable(Exception):
 
 
 def machine() -> dict[str, Any]:
-    """What numbers depend on beside the program: kind of processor, and versions."""
-    told: dict[str, str] = {}
-    try:
-        for line in Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines():
-            key, _, value = line.partition(":")
-            told[key.strip()] = value.strip()
-    except OSError:
-        told["model name"] = platform.processor()
-    flags = " ".join(sorted(told.get("flags", "").split()))
-    kernels = " ".join(os.environ.get(name, "") for name in ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"))
-    parts = (*(told.get(key, "") for key in ("vendor_id", "cpu family", "model", "stepping")), flags, kernels.strip())
+    """Return what the last digits depend on beside the program: kind of processor, and versions."""
+    place = Path("/proc/cpuinfo")
+    told = place.read_text().split("\n\n")[0] if place.exists() else platform.processor()
+    kept = sorted(set(re.findall(r"^(?:vendor_id|cpu family|model.*?|stepping|flags)\s*:.*", told, re.M)))
+    kernels = [os.environ.get(name, "") for name in ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")]
     return {
-        "processor": f"{platform.machine()}, {told.get('model name', '')}, {checksum(' '.join(parts))}",
-        "packages": {name: _version(name) for name in PACKAGES},
+        "processor": f"{platform.machine()} {checksum(' '.join([*kept, *kernels]))}",
+        "packages": {name: metadata.version(name) for name in PACKAGES},
     }
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "none"
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import io
 import json
 import re
 import struct
-from html.parser import HTMLParser
+from html import unescape
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -293,75 +293,38 @@ def scene(data: bytes) -> Any:
     }
 
 
-class _Page(HTMLParser):
-    """Splits a report into sections, headings, tables and prose; drawings are only counted."""
+TAG = r"(?s)<{0}\b[^>]*>.*?</{0}>"
+HEADING = re.compile(r"(?s)<h[1-4]\b[^>]*>(.*?)</h[1-4]>")
 
-    HEADINGS = ("h1", "h2", "h3", "h4")
-    HIDDEN = ("style", "script", "svg")
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.ids: list[str] = []
-        self.headings: list[str] = []
-        self.tables: list[list[list[str]]] = []
-        self.figures = {"svg": 0, "img": 0}
-        self.prose: dict[str, str] = {}
-        self._hidden = 0
-        self._cell: list[str] | None = None
-        self._heading: list[str] | None = None
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag in self.figures and not self._hidden:
-            self.figures[tag] += 1
-        if tag in self.HIDDEN:
-            self._hidden += 1
-        if self._hidden:
-            return
-        named = dict(attrs).get("id")
-        if named:
-            self.ids.append(named)
-        if tag == "table":
-            self.tables.append([])
-        elif tag == "tr" and self.tables:
-            self.tables[-1].append([])
-        elif tag in ("td", "th") and self.tables:
-            self._cell = []
-        elif tag in self.HEADINGS:
-            self._heading = []
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag in self.HIDDEN:
-            self._hidden -= 1
-        elif tag in ("td", "th") and self._cell is not None:
-            self.tables[-1][-1].append(" ".join(self._cell))
-            self._cell = None
-        elif tag in self.HEADINGS and self._heading is not None:
-            self.headings.append("".join(self._heading))
-            self._heading = None
-
-    def handle_data(self, data: str) -> None:
-        if self._hidden or not data.strip():
-            return
-        if self._heading is not None:
-            self._heading.append(data)
-        elif self._cell is not None:
-            self._cell.append(data.strip())
-        else:
-            last = self.headings[-1] if self.headings else ""
-            self.prose[last] = self.prose.get(last, "") + data
+def _pieces(text: str) -> list[str]:
+    """Return the texts between tags, without those that are blank."""
+    return [unescape(part) for part in re.split(r"<[^>]*>", text) if part.strip()]
 
 
 def page(text: str, clean: Any) -> Any:
     """Return ids, headings, number of figures of a report, and of each table and of the prose below each heading the
     digest of its texts with the numbers that are printed in it. A row of versions is left out.
     """
-    parser = _Page()
-    parser.feed(text)
-    tables = [[[clean(cell) for cell in row] for row in rows if row and row[0] != "Versions"] for rows in parser.tables]
+    for hidden in ("style", "script"):
+        text = re.sub(TAG.format(hidden), "", text)
+    text, drawn = re.subn(TAG.format("svg"), "", text)
+    tables = []
+    for table in re.findall(TAG.format("table"), text):
+        cells = [re.findall(r"(?s)<t[dh]\b[^>]*>(.*?)</t[dh]>", row) for row in re.split(r"<tr\b[^>]*>", table)[1:]]
+        rows = [[clean(" ".join(part.strip() for part in _pieces(cell))) for cell in row] for row in cells]
+        tables.append(texts(["\t".join(row) for row in rows if row and row[0] != "Versions"] or [""]))
+    rest = re.sub(r"(?s)<t[dh]\b[^>]*>.*?</t[dh]>", "", text)
+    parts = HEADING.split(rest)
+    headings = [clean("".join(_pieces(one))) for one in parts[1::2]]
+    prose: dict[str, str] = {}
+    for under, said in zip(["", *headings], parts[::2], strict=True):
+        if pieces := _pieces(said):
+            prose[under] = prose.get(under, "") + "".join(pieces)
     return {
-        "ids": condensed(parser.ids),
-        "headings": condensed([clean(one) for one in parser.headings]),
-        "figures": parser.figures,
-        "tables": [texts(["\t".join(row) for row in rows] or [""]) for rows in tables],
-        "prose": {clean(under): texts([clean(said)]) for under, said in parser.prose.items()},
+        "ids": condensed(re.findall(r'<\w+\b[^>]*?\bid="([^"]*)"', text)),
+        "headings": condensed(headings),
+        "figures": {"svg": drawn, "img": len(re.findall(r"<img\b", text))},
+        "tables": tables,
+        "prose": {under: texts([clean(said)]) for under, said in prose.items()},
     }

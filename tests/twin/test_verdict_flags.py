@@ -15,11 +15,11 @@ import pytest
 import typer
 
 import twin
+from docs.site.golden_fields import kept_fields
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.resolved import resolve
 from scenes.specs.study import UNITS, unit_of
 from tests.golden.digest import expanded
-from tests.golden.fields import kept_fields
 from tests.twin.commands import invoke
 from tests.twin.test_procedure import FILE, LEVEL
 from twin.main_job.render_job import render_job
