@@ -34,7 +34,16 @@ from tests.golden.digest import array, checksum, condensed, sorts, texts
 from tests.golden.jobs import ROOT, Done
 
 LEFT_OUT = {
-    "": {"versions", "started_unix_s", "wall_time_s", "seconds", "worker_seconds", "states_per_second", "raised_utc"},
+    "": {
+        "versions",
+        "started_unix_s",
+        "wall_time_s",
+        "seconds",
+        "worker_seconds",
+        "states_per_second",
+        "raised_utc",
+        "ms",
+    },
     "manifest.json": {"workers", "provenance", "digest"},
     "study_state.json": {"fingerprint", "content", "sources"},
     "study.nc": {"fingerprint"},
@@ -113,7 +122,7 @@ class Reader:
             (ROOT, "ROOT"),
         ):
             text = text.replace(str(place), name)
-        text = " ".join(text.split())
+        text = re.sub("─+", "─", " ".join(text.split()))
         for pattern in DURATIONS:
             text = pattern.sub("TIME", text)
         return VERSION.sub(FIRST, text)
