@@ -276,7 +276,7 @@ def test_every_command_has_a_golden_run() -> None:
     for module in started - set(NO_RESULT):
         below = getattr(parser(module), "commands", {})
         for command in below or [""]:
-            words = f"{module} {command}".strip()
+            words = f"{module} {command}".strip().removesuffix(" camera")  # that is meant where none is said
             assert any(f"{words} " in f"{one} " for one in run), words
 
 
