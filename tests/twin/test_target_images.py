@@ -160,7 +160,7 @@ def test_noise_bias(perfect):
     view = replace(perfect, column=0, region=64)
     ccd = line_ccd(pixels=64)
     imager = view.edge(ALONG, np.radians(5.0))
-    share, count = view.edge_image(imager), 400
+    share, count = view.edge_image(imager), 900
     light = ccd.white_photons(0.005) * share
     f = np.array([0.0, 0.45, 0.5, 0.55])
     quiet = measure_edge(ccd.detector.expected_dn(light, ccd.exposure), noise=ccd.noise, frequency=f)
