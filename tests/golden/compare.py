@@ -207,27 +207,29 @@ def allowed(job: str, tree: Any) -> dict[str, float]:
     """Return the limits of a job's tree with the EXCEPTIONS; infinite where something is not compared."""
     found, values = limits(tree), flattened(tree)
     for one in EXCEPTIONS:
-        for place in values:
-            if (place in found or math.isinf(one.limit)) and one.matches(f"{job} / {place}"):
-                size = abs(values[place]) if is_number(values[place]) else 0.0
-                found[place] = max(found.get(place, 0.0), one.limit if math.isinf(one.limit) else one.limit * size)
-                found[place] = max(found[place], one.floor)
+        for place, value in values.items():
+            known = place in found or isinstance(value, str) or math.isinf(one.limit)
+            if known and one.matches(f"{job} / {place}"):
+                size = abs(value) if is_number(value) and not math.isinf(one.limit) else 1.0
+                found[place] = max(found.get(place, 0.0), one.limit * size, one.floor)
     return found
 
 
-def printed_close(old: Any, new: Any) -> bool:
-    """Return whether two texts are the same but for printed numbers that differ by one unit of their last digit."""
+def printed_close(old: Any, new: Any, limit: float = DOUBLE) -> bool:
+    """Return whether two texts are the same but for printed numbers that differ by one unit of their last digit, or by
+    a limit of themselves.
+    """
     if not (isinstance(old, str) and isinstance(new, str)):
         return False
     (form, numbers), (other, others) = skeleton(old), skeleton(new)
-    return form == other and all(_digit_close(a, b) for a, b in zip(numbers, others, strict=True))
+    return form == other and all(_digit_close(a, b, limit) for a, b in zip(numbers, others, strict=True))
 
 
-def _digit_close(old: str, new: str) -> bool:
+def _digit_close(old: str, new: str, limit: float) -> bool:
     if old == new:
         return True
     (a, unit), (b, other) = _printed(old), _printed(new)
-    return abs(a - b) <= max(1.001 * max(unit, other), DOUBLE * abs(a), ZERO_ANGLE)
+    return abs(a - b) <= max(1.001 * max(unit, other), max(limit, DOUBLE) * abs(a), ZERO_ANGLE)
 
 
 def _printed(text: str) -> tuple[float, float]:
@@ -247,7 +249,7 @@ def compare_flat(before: dict[str, Any], after: dict[str, Any], limit: dict[str,
         if is_number(was) and is_number(now) and place in limit:
             same = abs(was - now) <= own or (math.isnan(was) and math.isnan(now))
         else:
-            same = (type(was) is type(now) and was == now) or printed_close(was, now)
+            same = (type(was) is type(now) and was == now) or printed_close(was, now, own)
         if not same:
             far.append(Difference(place, was, now, own))
     return far

@@ -51,8 +51,8 @@ FACTS = frozenset(
     # keys of truth values that describe a result and judge none of its numbers; a new one is added here by whoever
     # has seen that nothing rests on it, or is called as VERDICT says
     "alpha before best beta blind controlled corrected drawn enough_runs fast found gradient held high_resolution "
-    "improved in_search kept light_corrected line_axis local_optimum mesh_prints_through multispectral near_vertical "
-    "open possible principal_point_observable relinearised same schemes stated told truth value".split()
+    "improved in_search kept known light_corrected line_axis local_optimum mesh_prints_through multispectral "
+    "near_vertical open other possible principal_point_observable relinearised same schemes stated sure told truth value".split()
 )
 PER_SI = {
     "mas": 206264806.24709636,
@@ -114,6 +114,8 @@ def test_a_result_with_a_negative_verdict_warns(file: Path) -> None:
     for name, condensed in [*results, *(("stdout", one) for one in run["stdout"])]:
         content = expanded(condensed)
         if name in ("manifest.json", "validation.json") or not isinstance(content, dict) or "validat" in file.stem:
+            continue
+        if name.startswith("served/"):  # what a page shows beside the record's own alarms
             continue
         negative = negative_verdicts(content)
         assert not negative or manifest, (name, negative)
