@@ -203,9 +203,11 @@ def _array_limits(tree: dict[str, Any], place: str, sigma: Any) -> dict[str, flo
     return places | {f"{place} / at[{k}]": step for k, step in enumerate(steps) if tree["at"][k] is not None}
 
 
-def allowed(job: str, tree: Any) -> dict[str, float]:
-    """Return the limits of a job's tree with the EXCEPTIONS; infinite where something is not compared."""
-    found, values = limits(tree), flattened(tree)
+def allowed(job: str, tree: Any, new: dict[str, Any] | None = None) -> dict[str, float]:
+    """Return the limits of a job's tree, and of a new one's leaves, with the EXCEPTIONS; infinite where something is not
+    compared.
+    """
+    found, values = limits(tree), {**(new or {}), **flattened(tree)}
     for one in EXCEPTIONS:
         for place, value in values.items():
             known = place in found or isinstance(value, str) or math.isinf(one.limit)
@@ -259,4 +261,4 @@ def compare(job: str, old: Any, new: Any) -> Comparison:
     """Return how a job's new tree differs from the golden one."""
     before, after = flattened(old), flattened(new)
     bitwise = before.pop("exact", None) == after.pop("exact", None)
-    return Comparison(compare_flat(before, after, allowed(job, old)), bitwise)
+    return Comparison(compare_flat(before, after, allowed(job, old, after)), bitwise)
