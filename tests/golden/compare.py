@@ -204,9 +204,7 @@ def _array_limits(tree: dict[str, Any], place: str, sigma: Any) -> dict[str, flo
 
 
 def allowed(job: str, tree: Any, new: dict[str, Any] | None = None) -> dict[str, float]:
-    """Return the limits of a job's tree, and of a new one's leaves, with the EXCEPTIONS; infinite where something is not
-    compared.
-    """
+    """Return the limits of the leaves of a job, with the EXCEPTIONS; infinite where something is not compared."""
     found, values = limits(tree), {**(new or {}), **flattened(tree)}
     for one in EXCEPTIONS:
         for place, value in values.items():
