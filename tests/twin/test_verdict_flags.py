@@ -50,8 +50,8 @@ WARNED_ELSEWHERE = {
 FACTS = frozenset(
     # keys of truth values that describe a result and judge none of its numbers; a new one is added here by whoever
     # has seen that nothing rests on it, or is called as VERDICT says
-    "like_the_best allowed alpha before best beta blind controlled corrected drawn enough_runs fast found gradient held "
-    "high_resolution improved in_search kept known light_corrected line_axis local_optimum mesh_prints_through "
+    "like_the_best allowed alpha before best beta blind controlled corrected drawn enough_runs fast found gradient "
+    "held high_resolution improved in_search kept known light_corrected line_axis local_optimum mesh_prints_through "
     "multispectral near_vertical open other possible principal_point_observable relinearised same schemes "
     "searched stated sure told truth value".split()
 )
