@@ -14,10 +14,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from docs.site.golden_fields import kept_fields
 from docs.site.spec_keys import attributes, summary
 from scenes.specs.study import UNITS, unit_of
 from scenes.yaml.yaml_file import read_yaml
-from tests.golden.fields import kept_fields
 from tests.golden.jobs import ALL
 from twin.run.quantity import Record
 from twin.run.run_folder import Manifest
@@ -62,7 +62,9 @@ def commands() -> dict[str, list[str]]:
         if kept_fields(job.name):
             words = [word for word in job.words[1:2] if re.fullmatch(r"[a-z]+", word)]
             words += [word for word in job.words if word == "--gradient"]
-            out.setdefault(" ".join([job.words[0], *words]), []).append(job.name)
+            command = " ".join([job.words[0], *words])
+            if command in FILES:
+                out.setdefault(command, []).append(job.name)
     return out
 
 

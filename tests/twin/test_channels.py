@@ -195,7 +195,7 @@ def turned_by_heat(own: MonitorExperiment, prism: str) -> tuple[float, float]:
     return float(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=(1, 2))) / 2.0)), float(np.abs(moved[:, 3]).max())
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_frames_keep_what_glass_turns(backend, tmp_path) -> None:
     """What docs/monitor_layout.md says: by how much a gradient turns the beams, in proportion to the expansion of a
     frame; 1 K everywhere turns nothing.

@@ -32,7 +32,7 @@ def seen(backend):
     return target_camera(backend, ["440 nm", "680 nm"])
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_view_has_the_mtf_over_its_light(seen) -> None:
     """Two ways to it: of the camera at its fields, and of the place on the line that images the target."""
     camera, optics = seen

@@ -156,7 +156,7 @@ def digest(processors: set[int]) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.second
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot bind a process to processors")
 def test_same_bytes_on_one_processor_and_on_all() -> None:
     every = os.sched_getaffinity(0)

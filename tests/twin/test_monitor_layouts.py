@@ -253,7 +253,7 @@ def whole(setup: MonitorDesignSetup, backend: Backend) -> MonitorDesignRun:
     return run_monitor_design(setup, backend, seed=1)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_short_search_finds_a_better_layout(whole: MonitorDesignRun, tmp_path: Path) -> None:
     best = whole.points[0]
     assert whole.merit(best.facts) < whole.merit(whole.found.start)
@@ -296,7 +296,7 @@ def test_a_journal_keeps_every_bit_and_is_of_one_search(facts: tuple[BeamFacts, 
         assert np.array_equal(getattr(again.seen["mirrors.yaml"], name), getattr(facts[0].seen["mirrors.yaml"], name))
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_a_search_that_is_broken_off_goes_on_to_the_same_end(
     setup: MonitorDesignSetup, backend: Backend, whole: MonitorDesignRun, tmp_path: Path
 ) -> None:
@@ -315,7 +315,7 @@ def test_a_search_that_is_broken_off_goes_on_to_the_same_end(
     assert LAYOUTS(again) == LAYOUTS(whole)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_layouts_with_ghosts_are_left_out(whole: MonitorDesignRun, monkeypatch: pytest.MonkeyPatch) -> None:
     """The path tracer is not run: what it says of the layouts is what is tested elsewhere."""
     limits = whole.setup.test.limits.model_copy(update={"ghost_paths": 20_000})
@@ -362,12 +362,6 @@ def test_a_start_that_throws_a_ghost_is_refused_with_both_bodies_and_the_line(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
-def test_workers_change_nothing(setup: MonitorDesignSetup, backend: Backend, whole: MonitorDesignRun) -> None:
-    again = run_monitor_design(setup, backend, 1, workers=2)
-    assert LAYOUTS(again) == LAYOUTS(whole)
-
-
 @pytest.mark.parametrize(
     ("change", "to", "told"),
     [
@@ -410,11 +404,11 @@ def test_the_file_says_which_design_it_is(tmp_path: Path) -> None:
         assert "what is the layout to reach?" in " ".join(result.output.split())
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
-    ("name", "less", "pupil"), [("gf7_pair_two", (12.0, 10.0), 1.3), ("gf7_pair_best", (18.0, 30.0), 1.4)]
+    ("name", "less", "pupil", "disturbances"),
+    [("gf7_pair_two", (12.0, 10.0), 1.3, "launch"), ("gf7_pair_best", (18.0, 30.0), 1.4, "orbit")],
 )
-@pytest.mark.parametrize("disturbances", ["orbit", "launch"])
-@pytest.mark.slow
 def test_the_shipped_layouts_know_more(backend, name, less, pupil, disturbances):
     """What their page says: how many times less the posterior leaves of the angle and of d_f, at about the same share
     of the imaging pupils, and a fifteenth of the mass.

@@ -1,4 +1,4 @@
-"""With the default light and nine frames: stated sigmas against the scatter over 200 seeds; the Cramer-Rao bound."""
+"""With the default light and nine frames: stated sigmas against the scatter over 40 seeds; the Cramer-Rao bound."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.instrument import BASE
 
-SEEDS = 200
+SEEDS = 40
 FRAMES = 9
 FALSE_ALARM = 1e-4  # per quantity, both sides; 8 parameters and 1 angle: 9e-4 in all
 STATE = {
@@ -42,22 +42,20 @@ def assert_chi_square(values, sigma, expected):
     assert low < total < high, (total / len(values), low / len(values), high / len(values))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("camera", ["forward", "backward"])
-@pytest.mark.parametrize("parameter", range(4))
-def test_scatter_of_parameters_agrees_with_sigma(runs, camera, parameter):
+@pytest.mark.second
+def test_scatter_of_parameters_agrees_with_sigma(runs):
     setup, _, recovered, clean_before, clean_after = runs
-    k = list(setup.calibration.cameras).index(camera)
-    calibration = setup.calibration.cameras[camera]
-    shift = (clean_after.position - clean_before.position)[2 * k : 2 * k + 2].reshape(4)
-    gain = calibration.parameter_jacobian @ np.linalg.inv(calibration.spot_jacobian)
-    values = np.array([r.parameters[camera]["model"].vector[0, parameter] for r in recovered])
-    sigma = np.array([r.parameters[camera]["model"].sigma[0, parameter] for r in recovered])
-    assert np.std(values) > 0
-    assert_chi_square(values, sigma, (gain @ shift)[parameter])
+    for k, (camera, calibration) in enumerate(setup.calibration.cameras.items()):
+        shift = (clean_after.position - clean_before.position)[2 * k : 2 * k + 2].reshape(4)
+        expected = calibration.parameter_jacobian @ np.linalg.inv(calibration.spot_jacobian) @ shift
+        values = np.array([r.parameters[camera]["model"].vector[0] for r in recovered])
+        sigma = np.array([r.parameters[camera]["model"].sigma[0] for r in recovered])
+        assert np.all(np.std(values, axis=0) > 0)
+        for parameter in range(4):
+            assert_chi_square(values[:, parameter], sigma[:, parameter], expected[parameter])
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_scatter_of_the_intersection_angle_agrees_with_sigma(runs):
     _, _, recovered, *_ = runs
     values = np.array([r.angle["model"].change_rad[0] for r in recovered])
@@ -67,9 +65,9 @@ def test_scatter_of_the_intersection_angle_agrees_with_sigma(runs):
     assert low < total < high
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_maximum_likelihood_reaches_the_cramer_rao_bound(runs):
-    """Pooled over 16 coordinates: 3200 deviations, standard error of the ratio 1.3%; limits 10% above, 5% below."""
+    """Pooled over 16 coordinates: 640 deviations, standard error of the ratio 2.8 %; four of them, and 3 % above."""
     setup, _, recovered, clean_before, clean_after = runs
     ratios = []
     for clean, pick in ((clean_before, "before"), (clean_after, "after")):
@@ -82,7 +80,7 @@ def test_maximum_likelihood_reaches_the_cramer_rao_bound(runs):
         ratios.append((measured - clean.position) / sigma)
     spread = float(np.sqrt(np.mean(np.square(ratios))))
     assert np.size(ratios) == 16 * SEEDS
-    assert 0.95 < spread < 1.10, spread
+    assert 0.89 < spread < 1.14, spread
 
 
 def test_frames_before_and_after_have_noise_of_their_own(experiment):

@@ -179,16 +179,16 @@ def test_a_blurred_camera_is_told_to_scripts(pair, blurred, monkeypatch) -> None
     assert asked == [pair.resolved]
 
 
-@pytest.mark.slow
-def test_false_alarms_of_2000_clean_runs(orbit) -> None:
-    """Of all checks of a reading, over states drawn from the statement: expected images of 200, ten times each with
+@pytest.mark.second
+def test_no_false_alarm_in_200_clean_runs(orbit) -> None:
+    """Of all checks of a reading, over states drawn from the statement: expected images of 20, ten times each with
     noise drawn for the mean of nine frames, fixed patterns included, before and after.
 
     Fits: 2e-7 a run by their limits; a second start and curvature have no chance of their own; motions that no spot
     sees are told of from four sigma of a reading on, which a body as stated does in one of 20 000 runs. None is
-    expected, and none may be. Contradictions of the statement have their own rate, 1e-3 a state: 5 of 200 have 2e-6.
+    expected, and none may be. Contradictions of the statement have their own rate, 1e-3 a state: 3 of 20 have 1e-6.
     """
-    experiment, frames, each, draws = orbit.experiment, 9, 50, 10
+    experiment, frames, each, draws = orbit.experiment, 9, 10, 10
     calibration, stated, known = experiment.calibration, experiment.stated, experiment.disturbances
     noise, spots, shape = calibration.noise, calibration.spots, experiment.path.shape
     rng = np.random.default_rng(77)
@@ -204,7 +204,7 @@ def test_false_alarms_of_2000_clean_runs(orbit) -> None:
 
     start = experiment.expected_frames(experiment.nominal_photons)[None]
     runs = alarms = contradictions = 0
-    for _ in range(4):
+    for _ in range(2):
         amounts = stated.draw(rng, each)
         states = [state_of(row, stated.components, experiment.thermal) for row in amounts]
         light = experiment.expected_frames(experiment.path.expected_photons(states))
@@ -230,6 +230,6 @@ def test_false_alarms_of_2000_clean_runs(orbit) -> None:
                     bad |= np.any(np.abs(wrong) > BLIND * sigma, axis=1)
             alarms += int(np.count_nonzero(bad))
             runs += each
-    assert runs == 2000
+    assert runs == 200
     assert alarms == 0
-    assert contradictions < 5
+    assert contradictions < 3

@@ -151,7 +151,7 @@ def test_aberrated_field(aberrated, direction):
     assert np.max(worst) < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_noise_bias(perfect):
     """Mean excess over the noise-free measurement, of frames at 0.5% of the full well, against what is reported.
 
@@ -381,14 +381,13 @@ def test_bars_agree_with_the_traced_pupil_within_their_sigma(before_gf7):
     assert_no_chance_of(readings)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("band", ["P", "B1", "B2", "B3", "B4"])
-def test_bars_of_every_band_agree_with_the_traced_pupil(before_gf7, band):
-    """Sharp, aberrated, and shifted on the pixels; 180 readings of each band."""
-    spec = before_gf7.path.model.spec.bands[band]
+@pytest.mark.second
+def test_bars_of_another_band_agree_with_the_traced_pupil(before_gf7):
+    """Sharp, aberrated, and shifted on the pixels; 54 readings of the band that is farthest from the panchromatic."""
+    spec = before_gf7.path.model.spec.bands["B1"]
     camera = TargetCamera(before_gf7.path, LineCcd.from_specs(spec, load_detector(spec.detector)), REGION)
     assert_no_chance_of(
-        bar_readings(camera, [{}, ABERRATED, {"base/forward": Motion(rotate=(1.1e-6, 0.7e-6, 0.0))}], 10, 9)
+        bar_readings(camera, [{}, ABERRATED, {"base/forward": Motion(rotate=(1.1e-6, 0.7e-6, 0.0))}], 3, 9)
     )
 
 
