@@ -30,6 +30,7 @@ from twin.run.command import add_test
 from twin.run.provenance import VERDICT, negative_verdicts
 from twin.run.quantity import Quantity, Record
 
+GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 WARNED_ELSEWHERE = {
     # verdicts without a warning in their record -> where it is made, or why there is none
     ("Sensitivity to a factor", "rbd_fast_agrees"): "twin.study.report.study_analysis",
