@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.tiers import LONGEST, longest_first, one_of_each, quick, shuffled
+from tests.tiers import LONGEST, longest_first, quick, shuffled
 
 
 def item(name: str) -> SimpleNamespace:
@@ -33,5 +33,3 @@ def test_cases_of_the_second_tier() -> None:
     first, second = quick(1, [(1, "a"), pytest.param(2, "b", id="two")])
     assert (first.values, list(first.marks)) == ((1, "a"), [])
     assert (second.values, second.id, [mark.name for mark in second.marks]) == ((2, "b"), "two", ["second"])
-    each = one_of_each(lambda case: case % 2, [1, 2, 3, 4])
-    assert [(one.values, [mark.name for mark in one.marks]) for one in each] == [((1,), ["second"]), ((2,), ["second"])]

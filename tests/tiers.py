@@ -2,7 +2,7 @@
 
 import random
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
@@ -18,17 +18,6 @@ def quick(count: int, cases: Iterable[Any]) -> list[Any]:
     sets = [c if isinstance(c, _set) else pytest.param(*(c if isinstance(c, tuple) else (c,))) for c in cases]
     rest = (pytest.param(*c.values, marks=c.marks or pytest.mark.second, id=c.id) for c in sets[count:])
     return [*sets[:count], *rest]
-
-
-def one_of_each(key: Callable[[Any], Any], cases: Iterable[Any]) -> list[Any]:
-    """Cases for ``parametrize``: the first case of each key, in the second tier.
-
-    A case of several parameters is a tuple; ``key`` gets the case as it is.
-    """
-    first: dict[Any, Any] = {}
-    for case in cases:
-        first.setdefault(key(case), pytest.param(*(case if isinstance(case, tuple) else (case,))))
-    return [pytest.param(*case.values, marks=pytest.mark.second) for case in first.values()]
 
 
 def shuffled(items: list[pytest.Item], seed: int) -> list[pytest.Item]:

@@ -96,7 +96,7 @@ class Job:
         return self.commands[0]
 
 
-SET = {"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb", "PYTHONUTF8": "1", "PYTHONHASHSEED": "0"}
+SET = {"COLUMNS": "500", "NO_COLOR": "1", "TERM": "dumb", "PYTHONUTF8": "1", "PYTHONHASHSEED": "0"}
 SET |= {"OPENBLAS_CORETYPE": os.environ.get("OPENBLAS_CORETYPE", "Haswell")}
 UNSET = ("FORCE_COLOR", "TTY_COMPATIBLE")
 """Of the environment: a terminal's width and colours are no part of the result."""

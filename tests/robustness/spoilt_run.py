@@ -249,7 +249,7 @@ def run_mutant(case: Case, number: int, root: Path, spoilt: Mutant | None = None
             nullcontext() if depth == "whole" else cut(soon=depth == "soon"),
             mock.patch.object(tempfile, "tempdir", str(folder / "tmp")),
             # one core is no reason for a second process
-            mock.patch.dict(os.environ, {LIMIT: "1", "TMPDIR": str(folder / "tmp")}),
+            mock.patch.dict(os.environ, {LIMIT: "1", "TMPDIR": str(folder / "tmp"), "TWIN_CALIBRATIONS": "off"}),
             _stderr_into(raw) as errors,
             warnings.catch_warnings(record=True) as told,
             _watch.within(folder, case.starts and depth == "whole") as seen,

@@ -206,7 +206,7 @@ def test_a_diffraction_limited_camera_says_so(backend) -> None:
     own = numbers["fields"][GRID.index((0.0, 0.0))]
     assert own["wfe_rms_waves"] == pytest.approx(0.015918, rel=1e-3)
     assert own["strehl"] == pytest.approx(0.99, abs=1e-3)
-    # figures and files are drawn and written by the slow tests; what needs none of them
+    # figures and files are drawn and written by the tests of the second tier; what needs none of them
     assert first_order_table(run).rows[0][1] == "0.03628 waves rms at (1.25, 0.15) deg"
     assert camera_data(run).attrs["reference_frames"]
 
