@@ -60,6 +60,7 @@ def rows(page: str) -> dict[str, str]:
     return {found[1]: found[0] for found in re.finditer(r'^\| <span id="([^"]+)"></span>.*$', page, re.M)}
 
 
+@pytest.mark.second
 def test_every_key_stands_in_the_reference(pages: dict[str, str]) -> None:
     """Each model's keys in one table, each row with all five columns filled; by the models themselves, and by the JSON
     Schemas, which pydantic makes.
@@ -82,6 +83,7 @@ def schema_keys(node: Any) -> set[str]:
     return own.union(*map(schema_keys, below))
 
 
+@pytest.mark.second
 def test_every_example_is_taken_by_its_model() -> None:
     """As it is shown: the line is read as YAML and put into the mapping that it is an example in."""
     for kind in MODELS:

@@ -169,6 +169,7 @@ def test_interpolation_and_mtf50():
 # --- noise ---
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("contrast_e", "use_model"), quick(1, [(4000, True), (4000, False), (600, True)]))
 def test_sigma_agrees_with_the_scatter(contrast_e, use_model):
     edges = repeats(contrast_e, use_model=use_model)

@@ -241,6 +241,7 @@ def test_one_wrong_number_of_each_file_is_the_one_difference() -> None:
     assert with_sigma > 25
 
 
+@pytest.mark.second
 def test_exceptions_are_of_something_and_have_a_reason() -> None:
     places = [f"{name} / {place}" for name in BY_NAME for place in kept(name)[1]]
     for one in EXCEPTIONS:

@@ -191,6 +191,7 @@ def entries(record: Path) -> list[dict]:
         return list(history.entries())
 
 
+@pytest.mark.second
 def test_a_life_is_a_record_as_any_other(made: tuple[Path, Path, Mapping]) -> None:
     record, truth, told = made
     found = entries(record)

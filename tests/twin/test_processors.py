@@ -119,6 +119,7 @@ finite = st.floats(-1e6, 1e6, allow_subnormal=False)
 sigmas = st.floats(1e-9, 1e3)
 
 
+@pytest.mark.second
 @given(finite, sigmas)
 def test_stated_readings(value, sigma) -> None:
     out = stated({"a": {"x": value, "x_sigma": sigma}, "row": value, "row_sigma": sigma, "frames": 3, "text": "ml"})

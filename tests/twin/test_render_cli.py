@@ -110,6 +110,7 @@ def test_a_drawing_that_fails_is_a_note_and_a_file_that_fails_is_left_out():
     assert "no such font &lt;x&gt;</text>" in drawn["side"]
 
 
+@pytest.mark.second
 def test_all_that_is_drawn_can_be_sent_to_the_second_process(computed):
     """What cannot is drawn by the first process alone: a run that is right and takes twice as long."""
     kept = computed[3]
