@@ -45,7 +45,7 @@ def each(do: Callable[[Job, Runner], T], jobs: list[Job], workers: int) -> Itera
 
     with ExitStack() as stack:
         for _ in range(workers):
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="golden-"))
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="golden-", dir="/tmp"))
             free.put(stack.enter_context(Runner(Path(folder))))
         yield from stack.enter_context(ThreadPoolExecutor(workers)).map(done, jobs)
 

@@ -73,6 +73,8 @@ def _below(source: str) -> str:
 def measure(root: Path, folder: Path, workers: int, files: Iterable[str] = ()) -> int:
     """Run the tests under coverage, by default all; returns pytest's exit code."""
     folder.mkdir(parents=True, exist_ok=True)
-    environment = os.environ | {"TWIN_COVERAGE_OUT": str(folder.resolve()), "PYTHONPATH": str(root)}
+    # A test that measures is a worker's own, whose number would be taken for that of a worker here.
+    outer = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
+    environment = outer | {"TWIN_COVERAGE_OUT": str(folder.resolve()), "PYTHONPATH": str(root)}
     words = ["-q", "-n", str(workers), "-m", "", "--tb=line", "-p", "tests.mutation.coverage_plugin", *files]
     return subprocess.run([sys.executable, "-m", "pytest", *words], cwd=root, env=environment).returncode

@@ -70,6 +70,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 def pytest_unconfigure() -> None:
     """Write what was seen."""
     _measured.stop()
-    _measured.save()
+    if _measured.get_data().measured_files():
+        _measured.save()
     times = {name: seconds for name, seconds in _seconds.items() if _passed[name]}
     (_OUT / f"{_WORKER}.json").write_text(json.dumps(times))
