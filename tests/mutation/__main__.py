@@ -179,6 +179,8 @@ def run(
     results = out / "results.jsonl"
     before = read_verdicts(results)
     todo = [one for one in chosen if one.key not in before or (again and before[one.key].fate != "killed")]
+    # In an order of its own, so that what an interrupted campaign has found is a sample, too.
+    todo.sort(key=lambda one: hashlib.sha256(one.key.encode()).digest())
     if todo:
         run_campaign(root, todo, read_map(folder), results, workers)
     verdicts = read_verdicts(results)

@@ -64,7 +64,7 @@ def serving(computer: StandIn, stay: bool = True, host: str = "127.0.0.1", port:
         yield port, server
     finally:
         server.stop()
-        thread.join(5)
+        thread.join(60)  # a guard against one that never ends, on a machine with other work
         assert not thread.is_alive()
 
 
