@@ -26,8 +26,10 @@ from tests.mutation.fork_server import ForkServer
 from tests.mutation.mutants import Mutant
 
 Fate = Literal["killed", "survived", "uncovered"]
-STAGES = ((6.0, 2), (30.0, 8))
-"""For each round of tests its seconds at the most (without any fault) and how many cases of one test function."""
+STAGES = ((6.0, 2, ""), (30.0, 4, "tests/golden/"), (30.0, 8, ""))
+"""For each round of tests its seconds at the most (without any fault), how many cases of one test function, and where.
+
+Golden runs compare all numbers of a command, so they have a round before the many tests that compare a few."""
 _STARTING = 40
 """Processor seconds that starting and compiling kernels may take, beside five times what the tests take.
 
@@ -124,12 +126,12 @@ def rounds(known: CoverageMap, mutant: Mutant) -> Iterator[list[str]]:
     """Tests of each round, which run together."""
     covering = known.covering(mutant.path, mutant.line)
     ran: set[str] = set()
-    for seconds, cases in STAGES:
+    for seconds, cases, folder in STAGES:
         tests: list[str] = []
         count: Counter[str] = Counter()
         for name in covering:
             function = name.split("[")[0]
-            if name in ran or count[function] >= cases:
+            if name in ran or count[function] >= cases or not name.startswith(folder):
                 continue
             # One test may be longer than the round: the only one that meets the line is not left out for its length.
             if tests and seconds < known.seconds[name]:
