@@ -98,6 +98,8 @@ class Job:
 
 SET = {"COLUMNS": "500", "NO_COLOR": "1", "TERM": "dumb", "PYTHONUTF8": "1", "PYTHONHASHSEED": "0"}
 SET |= {"OPENBLAS_CORETYPE": os.environ.get("OPENBLAS_CORETYPE", "Haswell")}
+MEASURED = "TWIN_COVERAGE_OUT"
+"""Set while the lines of each test are noted: every job then has a process without the memory of another."""
 UNSET = ("FORCE_COLOR", "TTY_COMPATIBLE")
 """Of the environment: a terminal's width and colours are no part of the result."""
 PREPARE = {
@@ -188,6 +190,7 @@ class Runner:
         """
         if self._process is None:
             environment = {key: value for key, value in os.environ.items() if key not in UNSET} | SET
+            environment |= {"TWIN_CALIBRATIONS": "off"} if MEASURED in os.environ else {}
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "tests.golden.worker"],
                 cwd=ROOT,
@@ -208,6 +211,9 @@ class Runner:
         if not answer:
             self._process = None
             raise RuntimeError(f"the process ended, with {process.wait()}, over {' '.join(words)}")
+        if MEASURED in os.environ:
+            self.__exit__()
+            self._process = None
         return dict(json.loads(answer))
 
 

@@ -26,10 +26,10 @@ from tests.mutation.fork_server import ForkServer
 from tests.mutation.mutants import Mutant
 
 Fate = Literal["killed", "survived", "uncovered"]
-STAGES = ((6.0, 2, ""), (30.0, 4, "tests/golden/"), (30.0, 8, ""))
-"""For each round of tests its seconds at the most (without any fault), how many cases of one test function, and where.
-
-Golden runs compare all numbers of a command, so they have a round before the many tests that compare a few."""
+STAGES = ((6.0, 2, False), (30.0, 4, True), (30.0, 8, False))
+"""For each round of tests its seconds at the most (without any fault), how many cases of one test function, and whether
+they are golden runs, which compare all numbers of a command and come before the many tests that compare a few."""
+GOLDEN = "tests/golden/"
 _STARTING = 40
 """Processor seconds that starting and compiling kernels may take, beside five times what the tests take.
 
@@ -123,19 +123,26 @@ def try_mutant(server: ForkServer, mutant: Mutant, known: CoverageMap) -> Verdic
 
 
 def rounds(known: CoverageMap, mutant: Mutant) -> Iterator[list[str]]:
-    """Tests of each round, which run together."""
+    """Yield the tests of each round, which run together.
+
+    Of a fixture that several tests of a file share only the first is seen to run its lines, so that in the last round
+    the others of these files follow.
+    """
     covering = known.covering(mutant.path, mutant.line)
+    files = {name.split("::")[0] for name in covering if not name.startswith(GOLDEN)}
+    beside = sorted(known.seconds.keys() - set(covering), key=lambda name: (known.seconds[name], name))
+    beside = [name for name in beside if name.split("::")[0] in files]
     ran: set[str] = set()
-    for seconds, cases, folder in STAGES:
+    for seconds, cases, golden in STAGES:
         tests: list[str] = []
         count: Counter[str] = Counter()
-        for name in covering:
+        for name in [*covering, *beside] if ran and not golden else covering:
             function = name.split("[")[0]
-            if name in ran or count[function] >= cases or not name.startswith(folder):
+            if name in ran or count[function] >= cases or name.startswith(GOLDEN) != golden:
                 continue
             # One test may be longer than the round: the only one that meets the line is not left out for its length.
             if tests and seconds < known.seconds[name]:
-                break
+                continue
             seconds -= known.seconds[name]
             count[function] += 1
             tests.append(name)
