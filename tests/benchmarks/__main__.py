@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from optics.numerics.threads import cores
-from tests.benchmarks.beside import compared, print_pairs, sources_of
+from tests.benchmarks.beside import compared, print_pairs, ratios, sources_of
 from tests.benchmarks.number import Speed, shown
 from tests.benchmarks.workbench import Workbench
 from twin.run.cli import InputErrorText, explained, print_whole
@@ -112,8 +112,8 @@ def main(
         if beside is not None:
             with sources_of(beside) as (name, old):
                 pairs, notes = compared(todo, old, rounds, quick, tell)
-            numbers = {pair.key: pair.data for pair in pairs}
-            data = {"old": name, "numbers": numbers, "notes": notes, "machine": where, "quick": quick}
+            data = {"old": name, "numbers": pairs, "ratios": {key: ratios(turns) for key, turns in pairs.items()}}
+            data |= {"notes": notes, "machine": where, "quick": quick}
         else:
             bench, speeds = Workbench(), {}
             for name in todo:

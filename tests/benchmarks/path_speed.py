@@ -23,7 +23,6 @@ from twin.path_tracing.source import DiskSource
 from twin.path_tracing.stray_light import monitor_families, pinhole, trace_stray
 from twin.path_tracing.tracer import PathTracer
 
-INSTRUMENTS = ("gf7_pair", "monitor_pair")
 PATHS, PATHS_BACK, QUICK_PATHS = 1 << 19, 1 << 18, 1 << 15
 CORES = 2
 ROUNDS = 7
@@ -79,21 +78,15 @@ def stray(bench: Workbench, chosen: Instrument, paths: int) -> Callable[[int], f
 def measure(bench: Workbench, quick: bool) -> Speed:
     """Paths per second of two cores, and processor time for a standard deviation of stray light."""
     numbers = []
-    kinds = (("imaging", imaging, PATHS), ("out_and_back", out_and_back, PATHS_BACK))
-    for name, (kind, prepare, full) in itertools.product(INSTRUMENTS[:1] if quick else INSTRUMENTS, kinds):
+    chosen = bench.instrument("gf7_pair")
+    for name, prepare, full in (("imaging", imaging, PATHS), ("out_and_back", out_and_back, PATHS_BACK)):
         paths = QUICK_PATHS if quick else full
-        run, seeds = prepare(bench, bench.instrument(name), paths), itertools.count()
+        run, seeds = prepare(bench, chosen, paths), itertools.count()
         work = Work(lambda _, run=run, seeds=seeds: run(next(seeds)))
-
         spent = in_turns({"paths": work}, 1 if quick else ROUNDS)["paths"]
-        rate = paths * CORES / spent.cpu_s
-        key = "" if name == INSTRUMENTS[0] else f"{name}_"
-        text = f"paths of {name}, {kind.replace('_', ' ')}, two cores"
-        numbers.append(Number(f"{key}{kind}_paths_per_s", rate, text, "paths/s"))
-    faint, seeds = (
-        stray(bench, bench.instrument(INSTRUMENTS[0]), QUICK_PATHS if quick else STRAY_PATHS),
-        itertools.count(),
-    )
+        text = f"paths of gf7_pair, {name.replace('_', ' ')}, two cores"
+        numbers.append(Number(f"{name}_paths_per_s", paths * CORES / spent.cpu_s, text, "paths/s"))
+    faint, seeds = stray(bench, chosen, QUICK_PATHS if quick else STRAY_PATHS), itertools.count()
     spent = in_turns({"stray": Work(lambda _: faint(next(seeds)))}, 1 if quick else ROUNDS)["stray"]
     text = f"processor time for stray light of one source to {STRAY_SIGMA:g} of a spot"
     seconds = spent.cpu_s * spent.result / STRAY_SIGMA**2

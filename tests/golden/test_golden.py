@@ -1,6 +1,5 @@
 """Golden runs: every command computes what it computed before, on any machine; and what would not be so is found."""
 
-import ast
 import json
 import math
 import tempfile
@@ -106,26 +105,20 @@ def without_figure(out: Path) -> None:
 
 CHANGES = {
     "a number": ({"alpha": 1.25 * (1 + 2e-7)}, "truth.json / d_alpha_arcsec", "1.25"),
-    "its sign": ({"alpha": -1.25}, "truth.json / d_alpha_arcsec", "-1.25"),
-    "no number": ({"alpha": None}, "truth.json / d_alpha_arcsec", "None"),
     "a text": ({"text": "gf8"}, "truth.json / name", "'gf7' -> 'gf8'"),
     "one of many numbers": ({"many": with_one(MANY, 1.1)}, "truth.json / many / mean", "->"),
-    "the rows it is in": ({"many": with_one(MANY, 1.1)}, "truth.json / rows / mean", "->"),
     "a variable of netCDF": ({"light": with_one(MANY, 1.1)}, "variables / irradiance / values / rms", "->"),
-    "its type": ({"light": MANY.astype(np.float32)}, "irradiance / values / kind", "'f8' -> 'f4'"),
     "its unit": ({"units": "mW"}, "irradiance / attrs / units", "'W' -> 'mW'"),
     "pixels": ({"image": IMAGE + 2 * (IMAGE > 40)}, "frame.tiff / pixels / mean", "->"),
     "a row of a table": ({"row": 4.5}, "table.csv / columns / value[0]", "4.0 -> 4.5"),
     "a cell of the report": ({"alpha": 2.25}, "report.html / tables[0] / numbers", "'1.25' -> '2.25'"),
     "a number in its prose": ({"error": 4.5}, "report.html / prose / Result", "'3.5' -> '4.5'"),
     "a missing section": ({"more": ""}, "report.html / ids", "'crosstalk' -> 'again'"),
-    "another section": ({"more": 2 * SECTION}, "report.html / headings", "absent"),
     "the input": ({"shift": "4 um"}, "config.yaml / job / shift", "->"),
     "a line of a drawing": ({"line": "1.6"}, "figure.svg / ink / at[1]", "1.5 -> 1.6"),
     "the exit code": ({"code": 1}, "exit[0]", "0 -> 1"),
     "what was printed": ({"stdout": "d_alpha 1.26\n"}, "stdout[0][0]", "d_alpha 1.26"),
     "a missing file": ({"break_it": lambda out: (out / "table.csv").unlink()}, "table.csv", "absent"),
-    "another file": ({"break_it": lambda out: (out / "new.json").write_text("{}")}, "new.json", "absent"),
     "a missing figure": ({"break_it": without_figure}, "report.html / figures / svg", "1 -> 0"),
 }
 
@@ -280,18 +273,6 @@ def test_every_command_has_a_golden_run() -> None:
         for command in below or [""]:
             words = f"{module} {command}".strip().removesuffix(" camera")  # that is meant where none is said
             assert any(f"{words} " in f"{one} " for one in run), words
-
-
-def test_nothing_of_the_program_is_imported() -> None:
-    """So that it says the same before and after modules move; the commands' names are all it knows."""
-    for path in FOLDER.glob("*.py"):
-        for node in ast.parse(path.read_text("utf-8")).body:
-            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            names += [one.name for one in node.names] if isinstance(node, ast.Import) else []
-            assert not {name.split(".")[0] for name in names} & {"optics", "scenes", "analysis", "twin"}, path
-
-
-# --- runs ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="session")

@@ -23,25 +23,10 @@ from twin.run.cluster import _children_deaf_to_ctrl_c
 from twin.run.console import PROGRAMS as ALL_PROGRAMS
 from twin.run.durable import ending_later
 
-DRAWS = {"matplotlib", "mitsuba", "trimesh", "xarray"}
-HEAVY = {
-    *(
-        "cv2",
-        "dask",
-        "distributed",
-        "drjit",
-        "erfa",
-        "h5netcdf",
-        "h5py",
-        "jinja2",
-        "networkx",
-        "pandas",
-        "pint",
-        "pyproj",
-    ),
-    *("scipy", "skfem", "sklearn", "sqlalchemy", "tifffile"),
-    *DRAWS,
-}
+HEAVY = set(
+    "cv2 dask distributed drjit erfa h5netcdf h5py jinja2 matplotlib mitsuba networkx pandas pint pyproj scipy skfem"
+    " sklearn sqlalchemy tifffile trimesh xarray".split()
+)
 """What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""
 PROGRAMS = tuple(module for module, _ in ALL_PROGRAMS.values())
 

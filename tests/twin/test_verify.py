@@ -60,13 +60,6 @@ def flip(place: Path, at: int) -> None:
     place.write_bytes(content)
 
 
-def test_an_untouched_folder_is_whole(folder) -> None:
-    state = folder_state(folder)
-    assert state.whole
-    assert state.sealed
-    assert obstacle(state) == ""
-
-
 @pytest.mark.parametrize("name", ["config.yaml", "numbers.json", "images/frame.tiff"])
 def test_every_changed_byte_of_a_file_is_found(folder, name) -> None:
     kept = (folder / name).read_bytes()

@@ -10,7 +10,7 @@ from analysis.orbit.planes import Station
 from optics.numerics.backend import load_backend
 from scenes.specs.orbit.angle import LINES, usual_angles
 from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass
-from tests.validation.undrawn import undrawn
+from tests.validation.mutated import undrawn
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED
 from twin.validation.paper_000 import figures, suppositions, table1
 from twin.validation.paper_000.equations_000 import derivatives, least_slopes, numerical_derivatives, sum_of_squares

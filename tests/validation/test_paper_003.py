@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optics.numerics.backend import load_backend
-from tests.validation.undrawn import undrawn
+from tests.validation.mutated import undrawn
 from twin.validation import registry
 from twin.validation.checks.check import (
     AGREED,

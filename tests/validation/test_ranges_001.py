@@ -7,7 +7,7 @@ from analysis.monitor import monitoring
 from analysis.spots.spot_positions import SpotError
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
-from tests.validation.undrawn import undrawn
+from tests.validation.mutated import undrawn
 from twin.validation.checks.check import CORRECTED, REFUTED
 from twin.validation.checks.group import Context
 from twin.validation.paper_001.ranges import ranges_group
