@@ -40,7 +40,7 @@ from twin.verify.file_difference import (
     file_difference,
 )
 from twin.verify.folder_state import folder_state
-from twin.verify.verification import obstacle, of_rounded, repeat_chunk
+from twin.verify.verification import CannotRepeat, obstacle, of_rounded, repeat_chunk
 
 
 @pytest.fixture
@@ -184,6 +184,8 @@ def test_chunks_that_were_taken_out_with_their_lines_are_missed(study, tmp_path)
     index.write_bytes(b"".join(index.read_bytes().splitlines(keepends=True)[:-1]))
     (copy / "chunks/00003.npz").unlink()
     assert folder_state(copy).changed == ("chunks/index.txt",)
+    with pytest.raises(CannotRepeat, match="its chunks are not whole; --all makes the whole study again"):
+        repeat_chunk(folder_state(copy))
     (copy / "chunks/00007.npz").write_bytes(b"another's")
     assert folder_state(copy).additional == ("chunks/00007.npz",)
 
@@ -325,6 +327,7 @@ def test_tables_pictures_and_texts(tmp_path) -> None:
     picture[0, 30, 30] = 1.0
     moved = np.roll(picture, 3, axis=1)
     assert pair(tmp_path, "png", preview_png(picture), preview_png(moved)).state == DIFFERENT
+    assert "no PNG" in pair(tmp_path, "png", preview_png(picture), b"GIF89a").why
     drawing = '<svg><path d="M 1.25 2.5 L 3 4"/><text>f</text></svg>'
     assert pair(tmp_path, "svg", drawing.encode(), drawing.replace("2.5", "2.5000000001").encode()).state == ROUNDED
     drawn = (drawing, drawing.replace("2.5", "2.500001"))

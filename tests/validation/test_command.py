@@ -426,6 +426,16 @@ def test_a_group_that_answers_wrongly_has_failed(results, why, backend):
     assert why in validation.results[-1].how
 
 
+def test_artefacts_of_one_name_in_a_group_are_refused(backend):
+    def twice(context: Context):
+        yield from ()
+        for _ in range(2):
+            context.add(Data("data", "Data", "All of it.", {}))
+
+    (result,) = run_checks(select([group("001.table3", "a", run=twice)], None), backend, 1).results
+    assert (result.verdict, "two artefacts data.json in one group" in result.how) == (FAILED, True)
+
+
 def test_progress_runs_from_nothing_to_all(backend):
     seen = []
     groups = (group("001.table3", "a", "b", seconds=6.0), group("001.table4", "", run=breaks, seconds=4.0))
