@@ -53,11 +53,11 @@ from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.procedures import Procedure
-from scenes.specs.resolved import ExperimentSetup, resolve
+from scenes.specs.resolved import resolve
 from scenes.specs.samplers import Sampler
 from scenes.yaml.errors import InputError
 from scenes.yaml.file_kind import FileKind
-from scenes.yaml.spec import Spec, validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
 from tests.twin import test_path_figure as path_figure
@@ -721,16 +721,6 @@ def test_a_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: Callab
     quiet, loud = setup.job.evaluate(setup.tree, runs, load_backend())
     assert quiet["level"]["mean_arcsec"] == found["mean_arcsec"]
     assert loud["level"]["mean_arcsec"] == pytest.approx(4.0 * found["mean_arcsec"])
-
-
-def test_everything_that_the_list_of_tests_names_is_there() -> None:
-    for name, procedure in registered(PROCEDURES)[2].items():
-        assert re.fullmatch("(lab|orbit|design|asbuilt) [a-z]+", name)
-        assert issubclass(procedure.model, ExperimentSetup)
-        for function in (procedure.resolve, procedure.run, procedure.numbers, procedure.report):
-            assert callable(function.get()), name
-        assert procedure.export is None or callable(procedure.export.get())
-        assert all(issubclass(kind.model, Spec) for kind in procedure.files)
 
 
 # --- orbits -----------------------------------------------------------------------------------------------------------

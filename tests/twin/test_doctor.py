@@ -11,7 +11,7 @@ from packaging.requirements import Requirement
 
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
-from twin.run import lock_file
+from twin.run import lock_file, probe
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -120,6 +120,9 @@ def test_every_check_says_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (doctor._libatomic().status, doctor._llvm().status) == ("failed", "failed")
     with pytest.raises(LibraryMissing, match="apt install libatomic1"):
         ensure_llvm()
+    monkeypatch.setattr(probe, "ULPS", -1.0)
+    with pytest.raises(RuntimeError, match="the kernel's results differ from numpy's by"):
+        probe.kernel()
     monkeypatch.setattr(doctor, "run_probe", fail)
     assert (doctor._probe("kernel", [], str).status, doctor._gpu().status) == ("failed", "note")
     for found, status in (({"available": False}, "note"), ({"version": "12", "compute_capability": "9.0"}, "ok")):

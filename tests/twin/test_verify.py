@@ -186,6 +186,9 @@ def test_chunks_that_were_taken_out_with_their_lines_are_missed(study, tmp_path)
     assert folder_state(copy).changed == ("chunks/index.txt",)
     with pytest.raises(CannotRepeat, match="its chunks are not whole; --all makes the whole study again"):
         repeat_chunk(folder_state(copy))
+    (copy / "config.yaml").write_text("name: levels\n")
+    with pytest.raises(CannotRepeat, match=r"config\.yaml:1: "):
+        repeat_chunk(folder_state(copy))
     (copy / "chunks/00007.npz").write_bytes(b"another's")
     assert folder_state(copy).additional == ("chunks/00007.npz",)
 
@@ -349,12 +352,16 @@ def test_what_is_no_run_folder_is_refused(tmp_path, folder) -> None:
     (tmp_path / "begun/study_state.json").write_text("{}")
     (tmp_path / "other").mkdir()
     (tmp_path / "other/manifest.json").write_text('{"name": "an extension of a browser"}')
+    told = json.loads((folder / MANIFEST).read_text())
+    told["sha256"]["n" * 300] = "0" * 64
+    (folder / MANIFEST).write_text(json.dumps(told))
     for name, said in (
         ("none", "no such folder"),
         ("run/config.yaml", "is not a folder"),
         ("empty", "it has no manifest.json of a run; allowed: the folder of a finished run"),
         ("begun", "a study that is not finished; allowed: the same twin.study command with --resume"),
         ("other", "other/manifest.json: is not the manifest of a run, or is damaged"),
+        ("run", "cannot be read: File name too long"),
     ):
         result = invoke(app, tmp_path / name)
         assert result.exit_code == 2

@@ -90,6 +90,16 @@ def turned(monkeypatch):
     return check
 
 
+@pytest.mark.second
+def test_sigmas_of_biases_and_interior_are_those_of_the_fields_alone():
+    one = campaigns()[0]
+    found = flights.flights_of([one])
+    for k, field in enumerate(one.passes):
+        sigma = alone(one, field).sigma
+        assert found.bias_sigma[0, k].tolist() == [sigma[f"{field.name} {axis}"] for axis in ("roll", "pitch", "yaw")]
+        assert found.interior_sigma[0, k].tolist() == [sigma[name] for name in flights.INNER]
+
+
 # ---- broken formulas ----
 
 
