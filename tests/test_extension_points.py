@@ -37,7 +37,6 @@ from optics.geometry.aperture import Circle
 from optics.geometry.sag_terms import SAG_TERMS, grown
 from optics.geometry.tree import Motion, State
 from optics.geometry.vector_shape import Polygon
-from optics.numerics.backend import load_backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
@@ -82,7 +81,7 @@ from twin.run.run_folder import RunFolder, write_manifest
 from twin.sensors.area_detector import EmvaDetector
 from twin.study import scripted
 from twin.study.report.study_report import write_report
-from twin.study.runs.base_job import BlockResult, Run
+from twin.study.runs.base_job import BlockResult
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.runs.study_folder import StudyFolder
@@ -658,14 +657,6 @@ def test_an_output_format_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyP
 PROCEDURES = "scenes.specs.procedures.PROCEDURES"
 TOY_TEST = "tests.twin.test_procedure"
 """The toy's own modules, which the entry names and which are imported when they are used."""
-LEVEL_STUDY = """name: levels
-base: {command: lab level, file: level.yaml}
-factors:
-  noise: {key: [test, sigma_arcsec], values: [0.5, 2.0]}
-design: {kind: grid}
-responses:
-  mean: {key: [level, mean_arcsec], sigma: [level, mean_arcsec_sigma]}
-"""
 
 
 @pytest.fixture
@@ -714,13 +705,6 @@ def test_a_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: Callab
     result = twin.perform("lab level", file, seed=4)
     assert result.numbers["readings_arcsec"] == np.random.default_rng(4).normal(0.0, 0.5, 5).tolist()
     assert twin.perform("lab level", file).numbers["mean_arcsec"] == found["mean_arcsec"]
-    (tmp_path / "study.yaml").write_text(LEVEL_STUDY, "utf-8")
-    setup = resolve_study(tmp_path / "study.yaml")
-    key = ("test", "sigma_arcsec")
-    runs = [Run(0, ((key, 0.5),), None), Run(1, ((key, 2.0),), None)]
-    quiet, loud = setup.job.evaluate(setup.tree, runs, load_backend())
-    assert quiet["level"]["mean_arcsec"] == found["mean_arcsec"]
-    assert loud["level"]["mean_arcsec"] == pytest.approx(4.0 * found["mean_arcsec"])
 
 
 # --- orbits -----------------------------------------------------------------------------------------------------------

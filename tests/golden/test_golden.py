@@ -15,16 +15,7 @@ import xarray as xr
 from typer.testing import CliRunner
 
 from tests.golden.__main__ import app
-from tests.golden.compare import (
-    BITWISE,
-    CLOSE,
-    DIFFERENT,
-    EXCEPTIONS,
-    allowed,
-    compare,
-    limits,
-    printed_close,
-)
+from tests.golden.compare import BITWISE, CLOSE, DIFFERENT, EXCEPTIONS, allowed, compare, limits, printed_close
 from tests.golden.digest import condensed, flattened, is_number
 from tests.golden.golden import FOLDER, check, golden_file
 from tests.golden.jobs import ALL, BY_NAME, Done, Printed, Runner
@@ -231,10 +222,7 @@ def test_golden_files_are_small_and_one_for_each_job() -> None:
     assert sum(path.stat().st_size for path in FOLDER.glob("*.json")) < 3e6
 
 
-NO_RESULT = {
-    "twin.doctor": "it tells what this machine has",
-    "twin.run.probe": "the doctor's own",
-}
+NO_RESULT = {"twin.doctor": "it tells what this machine has", "twin.run.probe": "the doctor's own"}
 """Programs without a golden run, and why."""
 
 

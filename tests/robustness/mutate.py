@@ -276,7 +276,7 @@ PATHS: dict[str, tuple[Change, Only]] = {
     "path": (
         _put(lambda old, root, chance: chance.choice(NASTY["paths"])),
         lambda value: isinstance(value, dict | str) and not _is_quantity(value),
-    ),
+    )
 }
 
 

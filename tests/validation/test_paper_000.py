@@ -12,7 +12,7 @@ from scenes.specs.orbit.angle import LINES, usual_angles
 from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass
 from tests.validation.mutated import undrawn
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED
-from twin.validation.paper_000 import figures, suppositions, table1
+from twin.validation.paper_000 import figures
 from twin.validation.paper_000.equations_000 import derivatives, least_slopes, numerical_derivatives, sum_of_squares
 from twin.validation.paper_000.figures import SENTENCES, Sentence
 from twin.validation.registry import GROUPS as ALL
@@ -98,17 +98,6 @@ def test_what_is_found():
         assert result.verdict == verdict, identifier
         assert "cause is not known" not in result.how, identifier
         assert result.measured is None if value is None else result.measured == pytest.approx(value, abs=accuracy)
-
-
-def test_only_what_is_needed_runs(monkeypatch):
-    def build(*_, **__):
-        raise AssertionError("not asked for")
-
-    monkeypatch.setattr(figures, "make_passes", build)
-    monkeypatch.setattr(table1, "make_data", build)
-    monkeypatch.setattr(suppositions, "traced_passes", build)
-    found = checked("000.fig3.values,000.table1.angles,000.light").results
-    assert {r.verdict for r in found} == {NOT_CHECKABLE, CORRECTED}
 
 
 def test_least_squares_of_an_exact_plane():

@@ -8,11 +8,7 @@ import pytest
 from optics.numerics.backend import load_backend
 from tests.validation.mutated import undrawn
 from twin.validation import registry
-from twin.validation.checks.check import (
-    CORRECTED,
-    NOT_CHECKABLE,
-    median_of,
-)
+from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, median_of
 from twin.validation.paper_003 import fields, flights, model, rendered
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
