@@ -1,7 +1,6 @@
 """Results that cannot be written: a full disk is one sentence and exit code 1, a reader that has gone no word."""
 
 import io
-import json
 import os
 import signal
 import subprocess
@@ -95,14 +94,6 @@ def test_a_full_disk_in_process(printed, monkeypatch) -> None:
 def test_a_reader_that_has_gone_in_process(printed, monkeypatch) -> None:
     with closed_pipe() as pipe:
         assert outcome(printed, pipe, monkeypatch) == (128 + signal.SIGPIPE, "")
-
-
-def test_what_is_printed_arrives(capfd) -> None:
-    with to_stdout(Console(stderr=True)):
-        print_json({"x": [1.5, None]})
-    out, errors = capfd.readouterr()
-    assert json.loads(out) == {"x": [1.5, None]}
-    assert errors == ""
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import pytest
 
 from analysis.orbit.angles import sensitivity
@@ -13,7 +12,6 @@ from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass
 from tests.validation.mutated import undrawn
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED
 from twin.validation.paper_000 import figures
-from twin.validation.paper_000.equations_000 import derivatives, least_slopes, numerical_derivatives, sum_of_squares
 from twin.validation.paper_000.figures import SENTENCES, Sentence
 from twin.validation.registry import GROUPS as ALL
 from twin.validation.registry import select
@@ -98,19 +96,6 @@ def test_what_is_found():
         assert result.verdict == verdict, identifier
         assert "cause is not known" not in result.how, identifier
         assert result.measured is None if value is None else result.measured == pytest.approx(value, abs=accuracy)
-
-
-def test_least_squares_of_an_exact_plane():
-    random = np.random.default_rng(5)
-    station, slopes = np.array([1.0, 2.0, 3.0]), np.array([0.4, -1.3])
-    arm = random.standard_normal((7, 2))
-    points = station + np.column_stack([arm, arm @ slopes])
-    assert sum_of_squares(slopes, points, station) == pytest.approx(0.0, abs=1e-25)
-    beside = slopes + np.array([0.1, 0.0])
-    assert sum_of_squares(beside, points, station) == pytest.approx(0.01 * np.sum(arm[:, 0] ** 2))
-    assert least_slopes(points, station) == pytest.approx(slopes, abs=1e-12)
-    away = np.array([2.0, 1.0])
-    assert numerical_derivatives(away, points, station) == pytest.approx(derivatives(away, points, station), rel=1e-8)
 
 
 def false_on(scene: Pass, lines: Sequence[str] = LINES) -> set[Sentence]:
