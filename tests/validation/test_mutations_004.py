@@ -77,6 +77,23 @@ def turned(monkeypatch):
     return check
 
 
+@pytest.mark.second
+def test_adjustments_turn_and_shift_the_line_about_the_middle_of_the_mount():
+    """To first order; the second is the square of the turns at the middle's distance."""
+    bench = alignment().bench
+    test = bench.setup.test
+    mount = focus_checks.mount_of(test)
+    up, centre = mount.normal, mount.holes.mean(axis=0)
+    x = np.cross(np.cross(up, [1.0, 0.0, 0.0]), up)
+    axes = np.array([x, np.cross(up, x), up]) / np.array([[np.linalg.norm(x)], [np.linalg.norm(x)], [1.0]])
+    turn, shift = np.array(test.misset.rotate)[:, None], np.array(test.misset.shift)[:, None]
+    moved = focus_checks.effects(bench)[:, 3:5]
+    second = float(np.max(turn)) ** 2 * np.linalg.norm(centre)
+    assert second < 0.01 * np.abs(moved[:2]).max()
+    np.testing.assert_allclose(moved[:3], (turn * np.cross(axes, -centre))[:, :2], rtol=0, atol=second)
+    np.testing.assert_allclose(moved[3:], (shift * axes)[:, :2], rtol=0, atol=1e-15)
+
+
 # ---- broken formulas ----
 
 
