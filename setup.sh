@@ -17,7 +17,8 @@ What is installed is pinned with checksums in docs/supply/lock; docs/installed.m
   --help   this text
 
 Needs Python 3.11 or newer with its venv module, and libatomic.so.1. As root on Debian or Ubuntu the last two are installed when
-they are missing; as an ordinary user you are told what to install.
+they are missing; an ordinary user reads which packages an administrator has to install.
+Exit code: 0 installed and checked, 1 something failed, 2 bad option, or Python or a package of the system is missing.
 The variable PYTHON names the interpreter to use, for instance PYTHON=python3.13.
 TEXT
 }
@@ -36,6 +37,7 @@ done
 cd "$(dirname "${BASH_SOURCE[0]}")"
 say() { echo "setup: $*"; }
 fail() { echo "setup: $*" >&2; exit 1; }
+needs() { echo "setup: $*" >&2; exit 2; } # what no ordinary user can give
 
 # --- Python -----------------------------------------------------------------------------------------------------------------
 new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; }
@@ -46,7 +48,7 @@ for candidate in ${PYTHON:-python3 python3.13 python3.12 python3.11 python3.14};
         break
     fi
 done
-[ -n "$python" ] || fail "no Python 3.11 or newer found (looked for: ${PYTHON:-python3, python3.11 .. python3.14}). Install it, or name it: PYTHON=/path/to/python3 bash setup.sh"
+[ -n "$python" ] || needs "no Python 3.11 or newer found (looked for: ${PYTHON:-python3, python3.11 .. python3.14}). Install it, or name it: PYTHON=/path/to/python3 bash setup.sh"
 say "using $("$python" --version) at $python"
 
 # --- what pip cannot install ------------------------------------------------------------------------------------------------
@@ -66,9 +68,7 @@ if [ -n "$missing" ] && [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; the
         || fail "apt could not install: $missing"
     missing="$(missing_packages | xargs)"
 fi
-[ -z "$missing" ] || fail "please install: $missing
-       (on Debian or Ubuntu, as root: apt install $missing)
-       and run this again"
+[ -z "$missing" ] || needs "$missing missing; an administrator installs it with \"apt-get install $missing\" (Debian, Ubuntu), then run setup.sh again"
 
 # --- .venv ------------------------------------------------------------------------------------------------------------------
 if [ -e .venv ] && ! { new_enough .venv/bin/python && .venv/bin/python -m pip --version >/dev/null 2>&1; }; then

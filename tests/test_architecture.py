@@ -190,26 +190,18 @@ def test_imports_go_one_way() -> None:
     assert {str(path): forbidden(path) for path in source_files() if forbidden(path)} == {}
 
 
-@pytest.mark.parametrize(
-    ("package", "line", "wrong"),
-    [
-        ("optics", "import scenes.specs.load", True),
-        ("optics", "def f():\n    from twin import render", True),
-        ("optics", "import ruamel.yaml", True),
-        ("scenes", "from analysis.spots.centroid import x", True),
-        ("analysis", "import drjit", True),
-        ("analysis", "import importlib\nimportlib.import_module('optics.raytrace.trace')", True),
-        ("twin", "import numpy\nfrom analysis import centroid\nfrom scenes.specs.load import load_job", False),
-    ],
-)
-def test_a_wrong_arrow_is_found(
-    package: str, line: str, wrong: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_arrow_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
-    path = tmp_path / package / "module.py"
-    path.parent.mkdir()
-    path.write_text(line)
-    assert bool(forbidden(path)) is wrong
+    for package, line, wrong in (
+        ("optics", "def f():\n    from twin import render", {"twin"}),
+        ("optics", "import ruamel.yaml", {"ruamel"}),
+        ("analysis", "import importlib\nimportlib.import_module('optics.raytrace.trace')", {"optics"}),
+        ("twin", "import numpy\nfrom analysis import centroid", set()),
+    ):
+        path = tmp_path / package / f"{len(line)}.py"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(line)
+        assert forbidden(path) == wrong
 
 
 def test_what_computes_neither_draws_nor_fills_templates() -> None:

@@ -1,11 +1,9 @@
 """Measured figures in README and docs are those of docs/figures/figures.yaml."""
 
-from pathlib import Path
-
 import pytest
 
 from docs.figures.pages import filled, pages, places
-from docs.figures.sources import RUNS, SUMMARY, Figure, of_validation, read_figures, write_figures
+from docs.figures.sources import RUNS, SUMMARY, Figure, of_validation, read_figures
 
 FIGURES = read_figures()
 
@@ -57,8 +55,3 @@ def test_what_stands_in_a_marked_place_is_replaced(text: str, right: str) -> Non
 def test_a_mark_that_means_nothing_is_refused(text: str, told: str) -> None:
     with pytest.raises(ValueError, match=told):
         filled(text, KNOWN)
-
-
-def test_the_file_is_read_as_it_was_written(tmp_path: Path) -> None:
-    write_figures(KNOWN, tmp_path / "figures.yaml")
-    assert read_figures(tmp_path / "figures.yaml") == KNOWN

@@ -2,13 +2,9 @@
 
 import inspect
 import re
-import typing
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from pydantic import BaseModel
 
 import twin
 from docs.site.api_page import api_page
@@ -36,25 +32,6 @@ def pages() -> dict[str, str]:
 # --- keys of files ---------------------------------------------------------------------------------------
 
 
-def models_below(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Models that a type mentions, at any depth."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for part in typing.get_args(annotation):
-        yield from models_below(part)
-
-
-def keys_below(model: type[BaseModel], seen: set[type[BaseModel]]) -> Iterator[tuple[type[BaseModel], str]]:
-    """(model, key) of everything that a file may hold, by the models themselves."""
-    if model in seen:
-        return
-    seen.add(model)
-    for name, info in model.model_fields.items():
-        yield model, name
-        for below in models_below(info.annotation):
-            yield from keys_below(below, seen)
-
-
 def rows(page: str) -> dict[str, str]:
     """Place of a key -> its row in the page's tables."""
     return {found[1]: found[0] for found in re.finditer(r'^\| <span id="([^"]+)"></span>.*$', page, re.M)}
@@ -62,25 +39,15 @@ def rows(page: str) -> dict[str, str]:
 
 @pytest.mark.second
 def test_every_key_stands_in_the_reference(pages: dict[str, str]) -> None:
-    """Each model's keys in one table, each row with all five columns filled; by the models themselves, and by the JSON
-    Schemas, which pydantic makes.
-    """
-    for kind, model in MODELS.items():
-        page = pages[f"reference/files/{kind}.md"]
-        found, wanted = rows(page), list(keys_below(model, set()))
-        assert len(found) == len(wanted), kind
-        assert sorted(place.split(".")[-1] for place in found) == sorted(slug(name) for _, name in wanted), kind
+    """In one table, each row with all five columns filled; by the JSON Schemas, which pydantic makes."""
+    for kind in MODELS:
+        schema, found = json_schema(kind), rows(pages[f"reference/files/{kind}.md"])
+        keys = [key for part in (schema, *schema.get("$defs", {}).values()) for key in part.get("properties", {})]
+        assert sorted(place.split(".")[-1] for place in found) == sorted(map(slug, keys)), kind
         for row in found.values():
             cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]]
             assert len(cells) == 5, row
             assert all(cells), row
-        assert schema_keys(json_schema(kind)) <= set(re.findall(r"`([A-Za-z0-9_]+)`", page)), kind
-
-
-def schema_keys(node: Any) -> set[str]:
-    below = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
-    own = set(node.get("properties", {})) if isinstance(node, dict) else set()
-    return own.union(*map(schema_keys, below))
 
 
 @pytest.mark.second
@@ -169,10 +136,8 @@ def write_site(folder: Path, **pages: str) -> Path:
 @pytest.mark.parametrize(
     ("page", "said"),
     [
-        ('<a href="other.html">x</a>', None),
         ('<a href="other.html#here">x</a>', None),
         ('<a href="#top">x</a><p id="top"></p><a href="other.html">o</a>', None),
-        ('<a href="https://example.org/">x</a><a href="other.html">o</a>', None),
         ('<a href="gone.html">x</a><a href="other.html">o</a>', "gone.html leads nowhere"),
         ('<a href="other.html#there">x</a>', "names no place in other.html"),
         ('<a href="other.html">x</a><img src="https://example.org/a.png">', "from the network"),

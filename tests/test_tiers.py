@@ -1,12 +1,11 @@
 """Which tests run, and in which order."""
 
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from tests.tiers import LONGEST, longest_first, quick, shuffled
+from tests.tiers import LONGEST, longest_first, quick
 
 
 def item(name: str) -> SimpleNamespace:
@@ -17,16 +16,6 @@ def test_files_that_take_longest_come_first_and_then_those_of_most_tests() -> No
     assert [name for name in LONGEST if not (Path(__file__).parent / name).is_file()] == []
     names = ["a.py::one", f"{LONGEST[1]}::b", "c.py::one", "c.py::two", f"{LONGEST[0]}::a"]
     assert longest_first(list(map(item, names))) == [item(names[k]) for k in (4, 1, 2, 3, 0)]
-
-
-def test_a_random_order_keeps_files_together_and_is_that_of_its_seed() -> None:
-    names = [f"{file}.py::{k}" for file in "abcdef" for k in range(6)]
-    orders = [[one.nodeid for one in shuffled(list(map(item, names)), seed)] for seed in (1, 1, 2)]
-    assert orders[0] == orders[1] != orders[2]
-    assert sorted(orders[2]) == sorted(f"tests/{name}" for name in names)
-    files = [name.partition("::")[0] for name in orders[0]]
-    assert sum(a != b for a, b in pairwise(files)) == 5
-    assert files != sorted(files)
 
 
 def test_cases_of_the_second_tier() -> None:

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from optics.numerics.threads import cores
-from tests.benchmarks.beside import compared, print_pairs, sources_of
+from tests.benchmarks.beside import compared, print_pairs, ratios, sources_of
 from tests.benchmarks.number import Speed, shown
 from tests.benchmarks.workbench import Workbench
 from twin.run.cli import InputErrorText, explained, print_whole
@@ -23,13 +23,11 @@ from twin.run.durable import exit_on_terminate
 from twin.run.provenance import Provenance
 
 BENCHMARKS = {
-    "study": ("the engine of trade studies, and a study of ten thousand states", 400),
+    "study": ("a study of ten thousand states", 300),
     "trace": ("sequential trace beside batoid and optiland", 52),
     "psf": ("image of a far point beside poppy", 8),
     "monitor": ("a batch of states of the monitor", 40),
     "growth": ("how processor time grows with states, pixels, bodies and frames", 500),
-    "path": ("paths of the path tracer", 18),
-    "tolerance": ("cameras drawn within their tolerances, beside optiland", 65),
     "record": ("one reading more in the record of an instrument", 340),
     "block": ("a block of a hundred scenes with a million tie points", 600),
     "live": ("the live twin: from a state that is sent to the server's answer", 30),
@@ -112,8 +110,8 @@ def main(
         if beside is not None:
             with sources_of(beside) as (name, old):
                 pairs, notes = compared(todo, old, rounds, quick, tell)
-            numbers = {pair.key: pair.data for pair in pairs}
-            data = {"old": name, "numbers": numbers, "notes": notes, "machine": where, "quick": quick}
+            data = {"old": name, "numbers": pairs, "ratios": {key: ratios(turns) for key, turns in pairs.items()}}
+            data |= {"notes": notes, "machine": where, "quick": quick}
         else:
             bench, speeds = Workbench(), {}
             for name in todo:

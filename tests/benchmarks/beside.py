@@ -14,10 +14,8 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -32,34 +30,13 @@ Numbers = dict[str, float]
 Runner = Callable[[Path, str, bool], Numbers | None]
 
 
-@dataclass(frozen=True)
-class Pair:
-    """A number of both commits.
+Turns = list[tuple[float, float]]
+"""A number of both commits, old and new, in each turn."""
 
-    Attributes:
-        key: benchmark and number, with a dot between them.
-        old, new: of each turn, in the same order.
-    """
 
-    key: str
-    old: tuple[float, ...]
-    new: tuple[float, ...]
-
-    @property
-    def ratios(self) -> list[float]:
-        """New over old of each turn, ascending; empty where an old one is 0."""
-        if 0.0 in self.old:
-            return []
-        return sorted(new / old for old, new in zip(self.old, self.new, strict=True))
-
-    @property
-    def data(self) -> dict[str, Any]:
-        """For the JSON."""
-        ratios = self.ratios
-        both: dict[str, Any] = {"old": list(self.old), "new": list(self.new)}
-        if not ratios:
-            return both
-        return both | {"ratio": {"least": ratios[0], "median": median(ratios), "most": ratios[-1]}}
+def ratios(turns: Turns) -> list[float]:
+    """Return new over old of each turn, ascending; nothing where an old one is 0."""
+    return sorted(new / old for old, new in turns) if all(old for old, _ in turns) else []
 
 
 @contextmanager
@@ -113,8 +90,8 @@ def numbers_of(sources: Path, name: str, quick: bool) -> Numbers | None:
 
 def compared(
     names: Sequence[str], old: Path, rounds: int, quick: bool, tell: Callable[[str], None], run: Runner = numbers_of
-) -> tuple[list[Pair], list[str]]:
-    """Both commits' numbers, in turns.
+) -> tuple[dict[str, Turns], list[str]]:
+    """Return both commits' numbers, in turns, and remarks on what only one has.
 
     Args:
         names: of the benchmarks.
@@ -123,44 +100,39 @@ def compared(
         quick: small sizes.
         tell: gets what is about to run.
         run: the benchmark of some sources; another one is for tests.
-
-    Returns:
-        The numbers that both have, and remarks on what only one has.
     """
-    pairs: list[Pair] = []
+    pairs: dict[str, Turns] = {}
     remarks: list[str] = []
     for name in names:
-        found: dict[Path, list[Numbers]] = {old: [], ROOT: []}
-        order = [where for turn in range(rounds) for where in ((old, ROOT) if turn % 2 == 0 else (ROOT, old))]
-        for place, where in enumerate(order):
-            tell(f"{name}, {'new' if where == ROOT else 'old'}, {place // 2 + 1} of {rounds}")
-            numbers = run(where, name, quick)
-            if numbers is None:
+        for turn in range(rounds):
+            found: dict[Path, Numbers | None] = {}
+            for where in (old, ROOT) if turn % 2 == 0 else (ROOT, old):
+                tell(f"{name}, {'new' if where == ROOT else 'old'}, {turn + 1} of {rounds}")
+                found[where] = run(where, name, quick)
+                if found[where] is None:
+                    break
+            before, after = found[old], found.get(ROOT)
+            if before is None or after is None:
+                remarks.append(f"{name}: the older commit has no such benchmark")
                 break
-            found[where].append(numbers)
-        if not found[old]:
-            remarks.append(f"{name}: the older commit has no such benchmark")
-            continue
-        keys = list(found[ROOT][0])
-        both = [key for key in keys if all(key in one for some in found.values() for one in some)]
-        for key in both:
-            before, after = (tuple(one[key] for one in found[where]) for where in (old, ROOT))
-            pairs.append(Pair(f"{name}.{key}", before, after))
-        if only := [key for key in keys if key not in both]:
-            remarks.append(f"{name}: the older commit has no {', '.join(only)}")
+            for key in after:
+                if key in before:
+                    pairs.setdefault(f"{name}.{key}", []).append((before[key], after[key]))
+                elif turn == 0:
+                    remarks.append(f"{name}: the older commit has no {key}")
     return pairs, remarks
 
 
-def print_pairs(console: Console, commit: str, pairs: Sequence[Pair], remarks: Sequence[str]) -> None:
-    """The table: middle values, and the ratio with its least and largest."""
+def print_pairs(console: Console, commit: str, pairs: dict[str, Turns], remarks: Sequence[str]) -> None:
+    """Print the table: middle values, and the ratio with its least and largest."""
     table = Table(title=f"Beside {commit[:8]}", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for head, side in (("number", "left"), ("old", "right"), ("new", "right"), ("new / old", "right")):
         table.add_column(head, justify=side, no_wrap=True)  # type: ignore[arg-type]
-    for pair in pairs:
-        ratios = pair.ratios
-        spread = f" ({ratios[0]:.2f} to {ratios[-1]:.2f})" if len(ratios) > 1 else ""
-        ratio = f"{median(ratios):.2f}{spread}" if ratios else ""
-        table.add_row(pair.key, shown(median(pair.old)), shown(median(pair.new)), ratio)
+    for key, turns in pairs.items():
+        every = ratios(turns)
+        spread = f" ({every[0]:.2f} to {every[-1]:.2f})" if len(every) > 1 else ""
+        old, new = (shown(median(side)) for side in zip(*turns, strict=True))
+        table.add_row(key, old, new, f"{median(every):.2f}{spread}" if every else "")
     print_whole(console, table)
     for line in remarks:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

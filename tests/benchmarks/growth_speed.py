@@ -6,8 +6,7 @@ Slopes are those of straight lines through the logarithms of the upper half of t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -24,23 +23,6 @@ from twin.monitor.observation import Observing, observe, one_detector
 
 SIDE = 48
 """Of the CCDs of many states, pixels."""
-
-
-@dataclass(frozen=True)
-class Growth:
-    """One size that grows.
-
-    Attributes:
-        key, text: its name.
-        sizes, quick_sizes: that are measured.
-        work: size -> what is timed, ready to be.
-    """
-
-    key: str
-    text: str
-    sizes: tuple[int, ...]
-    quick_sizes: tuple[int, ...]
-    work: Callable[[Workbench, int], Callable[[], object]]
 
 
 def with_ccd(bench: Workbench, side: int) -> MonitorExperiment:
@@ -97,12 +79,13 @@ def of_frames(bench: Workbench, count: int) -> Callable[[], object]:
     return lambda: experiment.detector.expose(photons, one, count, experiment.exposure, 1)
 
 
-GROWTHS = (
-    Growth("states", "states", (100, 1000, 10_000, 30_000), (25, 50), of_states),
-    Growth("pixels", "pixels on a side", (32, 64, 128, 256, 512, 1024), (32, 64), of_pixels),
-    Growth("bodies", "bodies", (10, 20, 40, 80, 160), (10, 40), of_bodies),
-    Growth("frames", "frames", (1, 10, 100, 1000, 10_000), (1, 10), of_frames),
-)
+GROWTHS: dict[str, tuple[str, tuple[int, ...], tuple[int, ...], Callable[[Workbench, int], Callable[[], object]]]] = {
+    "states": ("states", (100, 1000, 10_000, 30_000), (25, 50), of_states),
+    "pixels": ("pixels on a side", (32, 64, 128, 256, 512, 1024), (32, 64), of_pixels),
+    "bodies": ("bodies", (10, 20, 40, 80, 160), (10, 40), of_bodies),
+    "frames": ("frames", (1, 10, 100, 1000, 10_000), (1, 10), of_frames),
+}
+"""What grows -> its name, the sizes that are measured, those of --quick, and size -> what is timed, ready to be."""
 
 
 def slope(times: Mapping[int, float]) -> float:
@@ -113,17 +96,16 @@ def slope(times: Mapping[int, float]) -> float:
 
 def measure(bench: Workbench, quick: bool) -> Speed:
     """Seconds of processor time at each size, and slopes."""
-    return Speed(tuple(number for growth in GROWTHS for number in _numbers(bench, growth, quick)))
-
-
-def _numbers(bench: Workbench, growth: Growth, quick: bool) -> Iterator[Number]:
-    times = {}
-    for size in growth.quick_sizes if quick else growth.sizes:
-        work = growth.work(bench, size)
-        first = timed(Work(lambda _, work=work: work()))
-        # short work again, for an undisturbed turn
-        again = 0 if quick else int(min(20, 1.0 / max(first.cpu_s, 1e-3)))
-        best = min(first.cpu_s, timed(Work(lambda _, work=work: work(), repeats=again)).cpu_s if again else np.inf)
-        times[size] = best
-        yield Number(f"{growth.key}_{size}_s", best, f"  {size:,} {growth.text}", "s")
-    yield Number(f"{growth.key}_slope", slope(times), f"slope with {growth.text}")
+    numbers = []
+    for key, (text, sizes, few, work_of) in GROWTHS.items():
+        times = {}
+        for size in few if quick else sizes:
+            work = work_of(bench, size)
+            once = Work(lambda _, work=work: work())
+            first = timed(once).cpu_s
+            # short work again, for an undisturbed turn
+            again = 0 if quick else int(min(20, 1.0 / max(first, 1e-3)))
+            times[size] = min([first, *(timed(once).cpu_s for _ in range(again))])
+            numbers.append(Number(f"{key}_{size}_s", times[size], f"  {size:,} {text}", "s"))
+        numbers.append(Number(f"{key}_slope", slope(times), f"slope with {text}"))
+    return Speed(tuple(numbers))

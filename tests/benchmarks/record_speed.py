@@ -35,20 +35,16 @@ def reading(k: int) -> Entry:
     one = {f"{name}{end}": value for name in NUMBERS for end in ("", "_sigma", "_sigma_noise")}
     places = iter((47.5 + NOISE * np.random.default_rng(k).standard_normal(8)).tolist())
     sigma = {"row_sigma": NOISE, "column_sigma": NOISE}
-    numbers = {
-        "cameras": {camera: dict.fromkeys(ESTIMATORS, one) for camera in CAMERAS},
-        "spots": {
-            camera: {
-                side: {
-                    "before": {"row": 47.5, "column": 47.5, **sigma},
-                    "after": {"row": next(places), "column": next(places), **sigma},
-                }
-                for side in ("left", "right")
-            }
-            for camera in CAMERAS
-        },
-        "sigma_holds": True,
+    start = {"row": 47.5, "column": 47.5, **sigma}
+    spots = {
+        camera: {
+            side: {"before": start, "after": {"row": next(places), "column": next(places), **sigma}}
+            for side in ("left", "right")
+        }
+        for camera in CAMERAS
     }
+    cameras = {camera: dict.fromkeys(ESTIMATORS, one) for camera in CAMERAS}
+    numbers = {"cameras": cameras, "spots": spots, "sigma_holds": True}
     step = 86_400_000_000 // A_DAY
     return Entry("monitor", "monitor", START + step * k, {"numbers": numbers, "state": 0}, None, f"{k:064x}")
 

@@ -1,20 +1,17 @@
 """Sequential trace, with apertures and path lengths, beside batoid and optiland.
 
 batoid takes as many threads as OMP_NUM_THREADS says, one if it says nothing, and so do its users; optiland on NumPy
-takes one. The twin takes all cores. The limit is on batoid as it is set up; beside it stands batoid with all cores.
+takes one. The twin takes all cores.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from optics.numerics.threads import cores
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_axis import LINE_AXIS
@@ -39,19 +36,6 @@ def launch(bench: Workbench, model: CameraModel, rays: int) -> tuple[np.ndarray,
     return middle + place @ np.stack([LINE_AXIS, np.cross(direction, LINE_AXIS)]), direction
 
 
-@contextmanager
-def batoid_threads(count: int) -> Iterator[None]:
-    """Let batoid take so many threads; it looks at every call."""
-    from batoid import global_vars
-
-    before = global_vars._batoid_max_threads
-    global_vars._batoid_max_threads = count
-    try:
-        yield
-    finally:
-        global_vars._batoid_max_threads = before
-
-
 def works(bench: Workbench, model: CameraModel, rays: int) -> dict[str, Work]:
     """The same beam through the same camera in each software."""
     position, direction = launch(bench, model, rays)
@@ -66,13 +50,7 @@ def works(bench: Workbench, model: CameraModel, rays: int) -> dict[str, Work]:
     out = {"twin": Work(twin, repeats=REPEATS)}
     if installed("batoid"):
         peer = batoid_camera(model, apertures=True)
-
-        def on_all_cores(given: Any) -> Any:
-            with batoid_threads(cores()):
-                return peer.trace(given)
-
         out["batoid"] = Work(peer.trace, lambda: batoid_rays(position, direction))
-        out["batoid_all_cores"] = Work(on_all_cores, lambda: batoid_rays(position, direction))
     if installed("optiland"):
         optic = optiland_camera(model, apertures=True)
 
@@ -94,8 +72,8 @@ def check_same_work(spent: dict[str, Spent]) -> None:
     """
     _, _, path, valid = (array[0] for array in spent["twin"].result.numpy())
     assert 0.7 < valid.mean() < 0.9, valid.mean()
-    for name in spent.keys() & {"batoid", "batoid_all_cores"}:
-        theirs = spent[name].result
+    if "batoid" in spent:
+        theirs = spent["batoid"].result
         assert np.array_equal(valid, ~theirs.vignetted)
         np.testing.assert_allclose(theirs.t[valid], path[valid], rtol=0, atol=1e-12)
     if "optiland" in spent:
@@ -123,11 +101,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
             Number(f"{key}cpu_ns", each, "  processor time of a ray at a surface", "ns"),
         ]
         numbers.append(Number(f"{key}threads", twin.threads, "  threads at work"))
-        for peer in [k for k in spent if k != "twin"]:
+        for peer in spent.keys() - {"twin"}:
             ratio = spent[peer].wall_s / twin.wall_s
-            text = f"  times {peer.replace('_', ' ')}"
-            numbers.append(Number(f"{key}ratio_{peer}", ratio, text))
-            numbers.append(
-                Number(f"{key}{peer}_threads", spent[peer].threads, f"  threads of {peer.replace('_', ' ')}")
-            )
+            numbers.append(Number(f"{key}ratio_{peer}", ratio, f"  times {peer}"))
     return Speed(tuple(numbers), tuple(notes))

@@ -1,6 +1,5 @@
 """Golden runs: every command computes what it computed before, on any machine; and what would not be so is found."""
 
-import ast
 import json
 import math
 import tempfile
@@ -16,17 +15,7 @@ import xarray as xr
 from typer.testing import CliRunner
 
 from tests.golden.__main__ import app
-from tests.golden.compare import (
-    BITWISE,
-    CLOSE,
-    DIFFERENT,
-    EXCEPTIONS,
-    allowed,
-    compare,
-    compare_flat,
-    limits,
-    printed_close,
-)
+from tests.golden.compare import BITWISE, CLOSE, DIFFERENT, EXCEPTIONS, allowed, compare, limits, printed_close
 from tests.golden.digest import condensed, flattened, is_number
 from tests.golden.golden import FOLDER, check, golden_file
 from tests.golden.jobs import ALL, BY_NAME, Done, Printed, Runner
@@ -106,26 +95,20 @@ def without_figure(out: Path) -> None:
 
 CHANGES = {
     "a number": ({"alpha": 1.25 * (1 + 2e-7)}, "truth.json / d_alpha_arcsec", "1.25"),
-    "its sign": ({"alpha": -1.25}, "truth.json / d_alpha_arcsec", "-1.25"),
-    "no number": ({"alpha": None}, "truth.json / d_alpha_arcsec", "None"),
     "a text": ({"text": "gf8"}, "truth.json / name", "'gf7' -> 'gf8'"),
     "one of many numbers": ({"many": with_one(MANY, 1.1)}, "truth.json / many / mean", "->"),
-    "the rows it is in": ({"many": with_one(MANY, 1.1)}, "truth.json / rows / mean", "->"),
     "a variable of netCDF": ({"light": with_one(MANY, 1.1)}, "variables / irradiance / values / rms", "->"),
-    "its type": ({"light": MANY.astype(np.float32)}, "irradiance / values / kind", "'f8' -> 'f4'"),
     "its unit": ({"units": "mW"}, "irradiance / attrs / units", "'W' -> 'mW'"),
     "pixels": ({"image": IMAGE + 2 * (IMAGE > 40)}, "frame.tiff / pixels / mean", "->"),
     "a row of a table": ({"row": 4.5}, "table.csv / columns / value[0]", "4.0 -> 4.5"),
     "a cell of the report": ({"alpha": 2.25}, "report.html / tables[0] / numbers", "'1.25' -> '2.25'"),
     "a number in its prose": ({"error": 4.5}, "report.html / prose / Result", "'3.5' -> '4.5'"),
     "a missing section": ({"more": ""}, "report.html / ids", "'crosstalk' -> 'again'"),
-    "another section": ({"more": 2 * SECTION}, "report.html / headings", "absent"),
     "the input": ({"shift": "4 um"}, "config.yaml / job / shift", "->"),
     "a line of a drawing": ({"line": "1.6"}, "figure.svg / ink / at[1]", "1.5 -> 1.6"),
     "the exit code": ({"code": 1}, "exit[0]", "0 -> 1"),
     "what was printed": ({"stdout": "d_alpha 1.26\n"}, "stdout[0][0]", "d_alpha 1.26"),
     "a missing file": ({"break_it": lambda out: (out / "table.csv").unlink()}, "table.csv", "absent"),
-    "another file": ({"break_it": lambda out: (out / "new.json").write_text("{}")}, "new.json", "absent"),
     "a missing figure": ({"break_it": without_figure}, "report.html / figures / svg", "1 -> 0"),
 }
 
@@ -176,9 +159,7 @@ def test_limits_are_a_thousandth_of_sigma_or_1e_7_of_the_number() -> None:
         ("d 1.25 um", "d 1.26 um", True),
         ("d 1.25 um", "d 1.27 um", False),
         ("d -0.00 um", "d 0.01 um", True),
-        ("1.2e-05", "1.3e-05", True),
         ("1.2e-05", "1.2e-04", False),
-        ("3 of 10", "4 of 10", False),
         ("d 1.25 um", "d 1.25 mm", False),
         ("1.5", None, False),
     ],
@@ -224,24 +205,6 @@ MOST_NUMBERS, SMALL_TENFOLD, SMALL_PERCENT = 50_000, 0.02, 0.07
 """Real numbers of all golden files at least, and shares of those that are so small beside what they stand with."""
 
 
-def test_one_wrong_number_of_each_file_is_the_one_difference() -> None:
-    """Ten times, 1.01 times, and 3 sigma more where the record states a standard deviation."""
-    with_sigma = 0
-    for name in BY_NAME:
-        _, values, limit = kept(name)
-        large = [(place, value) for place, value, own in numbers(name) if abs(0.01 * value) > own]
-        sized = [one for one in large if limit[one[0]] > 2e-7 * abs(one[1])]
-        for place, value in [*large[len(large) // 2 :][:1], *sized[:1]]:
-            wrong = [10.0 * value, 1.01 * value]
-            if (place, value) in sized:
-                wrong.append(value + 3e3 * limit[place])
-                with_sigma += 1
-            for one in wrong:
-                found = compare_flat(values, {**values, place: one}, limit)
-                assert [far.place for far in found] == [place], (name, place, one)
-    assert with_sigma > 25
-
-
 @pytest.mark.second
 def test_exceptions_are_of_something_and_have_a_reason() -> None:
     places = [f"{name} / {place}" for name in BY_NAME for place in kept(name)[1]]
@@ -257,10 +220,7 @@ def test_golden_files_are_small_and_one_for_each_job() -> None:
     assert sum(path.stat().st_size for path in FOLDER.glob("*.json")) < 3e6
 
 
-NO_RESULT = {
-    "twin.doctor": "it tells what this machine has",
-    "twin.run.probe": "the doctor's own",
-}
+NO_RESULT = {"twin.doctor": "it tells what this machine has", "twin.run.probe": "the doctor's own"}
 """Programs without a golden run, and why."""
 
 
@@ -280,18 +240,6 @@ def test_every_command_has_a_golden_run() -> None:
         for command in below or [""]:
             words = f"{module} {command}".strip().removesuffix(" camera")  # that is meant where none is said
             assert any(f"{words} " in f"{one} " for one in run), words
-
-
-def test_nothing_of_the_program_is_imported() -> None:
-    """So that it says the same before and after modules move; the commands' names are all it knows."""
-    for path in FOLDER.glob("*.py"):
-        for node in ast.parse(path.read_text("utf-8")).body:
-            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            names += [one.name for one in node.names] if isinstance(node, ast.Import) else []
-            assert not {name.split(".")[0] for name in names} & {"optics", "scenes", "analysis", "twin"}, path
-
-
-# --- runs ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,6 @@
 """``python -m tests.hunt [CASES] [FIRST] [KIND]``: hunt for cases in which the twin misleads its user, and print them.
 
-CASES of each kind (60), beginning with number FIRST (0); KIND is one of jobs, stops, lives, spans and telescopes.
+CASES of each kind (60), beginning with number FIRST (0); KIND is one of jobs, stops, spans and telescopes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from tests.daily import report
 from tests.hunt.hunt import hunt
 from tests.hunt.legal_spans import span_hunt
 from tests.hunt.legal_telescopes import telescopes
-from tests.hunt.lives import lives
 from tests.hunt.stops import stops
 
 
@@ -25,7 +24,6 @@ def main(cases: str = "60", first: str = "0", kind: str = "") -> int:
         kinds = {
             "jobs": lambda: hunt(number, count, Path(folder), backend, 6),
             "stops": lambda: stops(number, count, backend),
-            "lives": lambda: lives(number, count),
             "spans": lambda: span_hunt(number, count),
             "telescopes": lambda: telescopes(number, count, Path(folder), backend),
         }

@@ -103,19 +103,11 @@ class Case:
     starts: bool = False
 
 
-def text_of(name: str) -> bytes:
-    """A file of scenes."""
-    return (SCENES / name).read_bytes()
-
-
-def job_of(name: str) -> bytes:
-    """A file of the golden runs' small jobs."""
-    return (JOBS / name).read_bytes()
-
-
-def edited(content: bytes, *changes: tuple[str, str]) -> bytes:
-    """A text with other words, all of which have to be there."""
-    text = content.decode()
+def file_of(name: str, *changes: tuple[str, str]) -> bytes:
+    """Return a file of scenes, whose name has a slash, or of the golden runs' small jobs; with words exchanged, all of
+    which have to be there.
+    """
+    text = ((SCENES if "/" in name else JOBS) / name).read_bytes().decode()
     for old, new in changes:
         assert old in text, old
         text = text.replace(old, new)

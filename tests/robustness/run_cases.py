@@ -6,19 +6,14 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from tests.golden.jobs import ROOT, _files
-from tests.robustness.case import JOBS, Case, edited, job_of
-from twin.camera.__main__ import app as camera
-from twin.compare.__main__ import app as compare
-from twin.export.__main__ import app as export
-from twin.live.__main__ import app as live
-from twin.orbit.__main__ import app as orbit
-from twin.render import app as render
-from twin.study.__main__ import app as study
+from tests.robustness.case import JOBS, Case, file_of
 
 BASES = {
     "render": "twin.render {jobs}/course.yaml --out {here}/run",
@@ -42,8 +37,8 @@ def made(bases: Path, name: str) -> Path:
         if name == "pass":
             _files(here)
         else:
-            few = edited(job_of("study_render.yaml"), ("runs: 30", "runs: 5"), ("perturb.yaml", f"{JOBS}/perturb.yaml"))
-            (here / "study.yaml").write_bytes(few)
+            few = (("runs: 30", "runs: 5"), ("perturb.yaml", f"{JOBS}/perturb.yaml"))
+            (here / "study.yaml").write_bytes(file_of("study_render.yaml", *few))
             words = BASES[name].format(jobs=JOBS, here=here).split()
             subprocess.run([sys.executable, "-m", *words, "--quiet"], cwd=ROOT, check=True)
         shutil.rmtree(here) if place.is_dir() else here.rename(place)
@@ -59,8 +54,10 @@ def _folder(place: Path, under: str = "run") -> dict[str, bytes]:
     }
 
 
-def run_cases(bases: Path) -> Iterator[Case]:
-    """All of them: one file of each ending for every command that opens the folder."""
+def run_cases(bases: Path, app_of: Callable[[str], typer.Typer]) -> Iterator[Case]:
+    """Yield one file of each ending for every command that opens the folder; ``app_of`` has the programs by name."""
+    names = ("camera", "compare", "export", "live", "orbit", "render", "study")
+    camera, compare, export, live, orbit, render, study = map(app_of, names)
     whole: dict[str, Any] = {"whole": 1}
     port = {"out": "", "options": ("--port", "0")}
     readers = {
@@ -81,7 +78,7 @@ def run_cases(bases: Path) -> Iterator[Case]:
             yield Case("run-render-config", "config of render", render, (), files, given, given=given)
             one = ("--camera", "forward")
             yield Case("run-camera-config", "config of render", camera, (), files, given, one, given=given)
-    yield from _resumed(_folder(made(bases, "study") / "run"))
+    yield from _resumed(_folder(made(bases, "study") / "run"), study)
     place = made(bases, "pass")
     own = {"match.yaml": (place / "match.yaml").read_bytes()}
     for folder in ("pass/images", "files/simulate"):
@@ -90,7 +87,7 @@ def run_cases(bases: Path) -> Iterator[Case]:
         yield Case(f"match-{Path(target).stem}", "points to be matched", orbit, ("match",), own, target, whole=30)
 
 
-def _resumed(files: dict[str, bytes]) -> Iterator[Case]:
+def _resumed(files: dict[str, bytes], study: typer.Typer) -> Iterator[Case]:
     """A study that goes on from what it kept."""
     state = next(name for name in files if b'"fingerprint"' in files[name])
     kept = {name: files[name] for name in files if name.startswith("run/chunks/") or name in (state, "run/config.yaml")}
@@ -99,6 +96,3 @@ def _resumed(files: dict[str, bytes]) -> Iterator[Case]:
     for target in (state, "run/chunks/index.txt", next(name for name in files if name.endswith(".npz"))):
         own = {"study.yaml": files["run/config.yaml"], **kept}
         yield Case(f"resume-{Path(target).stem}", "state of a study", study, (), own, target, **resumed)
-
-
-__all__ = ["run_cases"]

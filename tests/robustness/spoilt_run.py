@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -91,64 +92,52 @@ class Outcome:
         return f"{head}\n{self.text[-3000:]}\nagain: {again}"
 
 
-class _Watch:
-    """Notes every file that Python code changes outside of one folder, and every program or connection it starts.
-
-    Audit hooks cannot be removed, so that one is made for the process and switched on where it is wanted.
-    """
-
-    allowed: str = ""
-    starts: bool = False
-    on: bool = False
-    seen: list[str]
-
-    def __init__(self) -> None:
-        self.seen = []
-        self.hooked = False
-
-    @contextmanager
-    def within(self, folder: Path, starts: bool) -> Iterator[list[str]]:
-        if not self.hooked:
-            sys.addaudithook(self._hook)
-            self.hooked = True
-        self.allowed, self.starts, self.seen, self.on = os.path.realpath(folder), starts, [], True
-        try:
-            yield self.seen
-        finally:
-            self.on = False
-
-    def _hook(self, event: str, args: tuple[Any, ...]) -> None:
-        if not self.on:
-            return
-        if event == "open":
-            path, _, flags = args
-            writes = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-            if isinstance(path, int) or not (flags & writes):
-                return
-            self._note(event, path)
-        elif event in _CHANGES:
-            for path in args[:2] if event in ("os.rename", "os.link", "os.symlink") else args[:1]:
-                if not isinstance(path, int):
-                    self._note(event, path)
-        elif event in _STARTS and not self.starts:
-            self.seen.append(f"{event} {args[:2]}")
-
-    def _note(self, event: str, path: Any) -> None:
-        text = os.fsdecode(path)
-        full = os.path.realpath(os.path.dirname(os.path.abspath(text)))
-        if os.path.realpath(text) == self.allowed:  # made where it is, and so not at all
-            return
-        if not (full + "/").startswith(self.allowed + "/") and "__pycache__" not in text and text != os.devnull:
-            self.seen.append(f"{event} {text}")
-
-
 _CHANGES = {
     *("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.symlink", "os.link", "os.truncate", "os.chmod", "os.chown"),
     *("os.utime", "os.setxattr", "shutil.rmtree", "shutil.move", "shutil.copyfile"),
     *("tempfile.mkstemp", "tempfile.mkdtemp"),
 }
 _STARTS = {"subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.fork", "socket.connect", "socket.bind"}
-_watch = _Watch()
+_WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+_watched: list[tuple[str, bool, list[str]]] = []
+"""The folder that is watched, whether programs may start, and what was seen beyond; empty while nothing is watched."""
+
+
+@contextmanager
+def _watching(folder: Path, starts: bool) -> Iterator[list[str]]:
+    """Note every file that Python code changes outside of a folder, and every program or connection it starts."""
+    _hook()
+    _watched.append((os.path.realpath(folder), starts, []))
+    try:
+        yield _watched[-1][2]
+    finally:
+        _watched.clear()
+
+
+@cache
+def _hook() -> None:
+    """Make the audit hook, once for the process: it cannot be removed."""
+    sys.addaudithook(_note)
+
+
+def _note(event: str, args: tuple[Any, ...]) -> None:
+    if not _watched:
+        return
+    allowed, starts, seen = _watched[0]
+    paths: tuple[Any, ...] = ()
+    if event == "open":
+        paths = args[:1] if args[2] & _WRITES else ()
+    elif event in _CHANGES:
+        paths = args[:2] if event in ("os.rename", "os.link", "os.symlink") else args[:1]
+    elif event in _STARTS and not starts:
+        seen.append(f"{event} {args[:2]}")
+    for path in paths:
+        text = "" if isinstance(path, int) else os.fsdecode(path)
+        # the folder itself is made where it is, and so not at all
+        if text in ("", os.devnull) or "__pycache__" in text or os.path.realpath(text) == allowed:
+            continue
+        if not (os.path.realpath(os.path.dirname(os.path.abspath(text))) + "/").startswith(allowed + "/"):
+            seen.append(f"{event} {text}")
 
 
 def mutant(case: Case, number: int) -> Mutant:
@@ -172,7 +161,7 @@ def write_files(case: Case, folder: Path, content: bytes | None = None) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content if name == case.target and content is not None else own)
     os.mkfifo(folder / "fifo.yaml")
-    (folder / "loop.yaml").symlink_to("loop.yaml")
+    (folder / "ring.yaml").symlink_to("ring.yaml")
     (folder / "folder.yaml").mkdir()
     (folder / "binary.yaml").write_bytes(bytes(range(256)))
     for name in ("out", "tmp"):
@@ -252,7 +241,7 @@ def run_mutant(case: Case, number: int, root: Path, spoilt: Mutant | None = None
             mock.patch.dict(os.environ, {LIMIT: "1", "TMPDIR": str(folder / "tmp"), "TWIN_CALIBRATIONS": "off"}),
             _stderr_into(raw) as errors,
             warnings.catch_warnings(record=True) as told,
-            _watch.within(folder, case.starts and depth == "whole") as seen,
+            _watching(folder, case.starts and depth == "whole") as seen,
             limited(seconds, errors=errors),
         ):
             warnings.simplefilter("always")
@@ -354,15 +343,7 @@ def _left(case: Case, code: int | None, folder: Path, before: dict[str, float]) 
 
 
 def _open(folder: Path) -> list[str]:
-    found = []
-    for number in os.listdir("/proc/self/fd"):
-        try:
-            name = os.readlink(f"/proc/self/fd/{number}")
-        except OSError:
-            continue
-        if name.startswith(str(folder)):
-            found.append(name)
-    return found
+    return [one.path for one in psutil.Process().open_files() if one.path.startswith(str(folder))]
 
 
 def _children() -> dict[int, str]:

@@ -136,51 +136,43 @@ def test_small_differences_count_by_the_tolerance(runs: Path, tmp_path: Path) ->
 
 
 @pytest.mark.second
-def test_keys_that_only_one_has_are_told(runs: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(runs / "a", copy)
-    truth = json.loads((copy / "truth.json").read_text())
-    del truth["intersection_angle"]["nominal_deg"]
-    (copy / "truth.json").write_text(json.dumps(truth))
+def test_a_changed_file_of_a_run(runs: Path, tmp_path: Path) -> None:
+    """A key that only one has is told, another unit is no difference, and what is no run is named."""
+    copy = shutil.copytree(runs / "a", tmp_path / "copy")
+
+    def written(name: str, old: str, new: str) -> None:
+        text = (copy / name).read_text()
+        assert old in text
+        (copy / name).write_text(text.replace(old, new))
+
+    def refused(said: str, *folders: Path) -> None:
+        code, text = run(*folders, "--out", tmp_path / "out")
+        assert (code, said in text, (tmp_path / "out").exists()) == (2, True, False), text
+
+    written("config.yaml", "3 um", "0.003 mm")
     (found,) = compare([runs / "a", copy], 1e-9, None).found
-    assert [(one.key, one.other) for one in found.numbers] == [("intersection_angle.nominal_deg", None)]
-
-
-@pytest.mark.second
-def test_units_do_not_matter(runs: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(runs / "a", copy)
-    text = (copy / "config.yaml").read_text()
-    assert "3 um" in text
-    (copy / "config.yaml").write_text(text.replace("3 um", "0.003 mm"))
-    assert not compare([runs / "a", copy], 1e-9, None).found[0].inputs
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("other", ["missing", "empty", "kind", "one"])
-def test_bad_input_is_explained(runs: Path, tmp_path: Path, other: str) -> None:
-    folder = tmp_path / "folder"
-    if other == "empty":
-        folder.mkdir()
-    if other == "kind":
-        shutil.copytree(runs / "a", folder)
-        text = (folder / "manifest.json").read_text()
-        (folder / "manifest.json").write_text(text.replace("twin.render", "twin.orbit"))
-    words = [runs / "a"] if other == "one" else [runs / "a", folder]
-    code, text = run(*words, "--out", tmp_path / "out")
-    says = {"missing": "no such folder", "empty": "not a run folder", "kind": "runs of two kinds", "one": "two runs"}
-    assert code == 2
-    assert says[other] in text
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.second
-def test_a_damaged_file_is_named(runs: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(runs / "a", copy)
+    assert not found.inputs
+    assert found.same
+    written("truth.json", '"nominal_deg"', '"other_deg"')
+    (found,) = compare([runs / "a", copy], 1e-9, None).found
+    assert {(one.key, one.other is None) for one in found.numbers} == {
+        ("intersection_angle.nominal_deg", True),
+        ("intersection_angle.other_deg", False),
+    }
+    (copy / "irradiance.nc").write_bytes(b"CDF")
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["sha256"]["irradiance.nc"] = "0" * 64
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    refused("cannot be read as a netCDF file", runs / "a", copy)
+    written("manifest.json", "twin.render", "twin.orbit")
+    refused("runs of two kinds", runs / "a", copy)
     (copy / "truth.json").write_text("{")
     with pytest.raises(InputError, match=r"truth\.json:1: not JSON"):
         read_run(copy)
+    refused("two runs", runs / "a")
+    refused("no such folder", runs / "a", tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    refused("not a run folder", runs / "a", tmp_path / "empty")
 
 
 def test_numbers_at_the_end_of_the_range_are_compared_without_a_warning() -> None:

@@ -11,7 +11,7 @@ from packaging.requirements import Requirement
 
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
-from twin.run import lock_file
+from twin.run import lock_file, probe
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -43,35 +43,22 @@ def test_a_missing_library_is_reported_and_fails() -> None:
     assert "Traceback" not in result.stdout + result.stderr
 
 
-def test_a_crash_is_a_readable_failure() -> None:
-    with pytest.raises(RuntimeError, match="crashed with SIGABRT"):
-        doctor.run_probe(["-c", "import os; os.abort()"])
+ABORTS = "import os, sys; sys.stderr.write('LLVM ERROR: Cannot select: fmaximum\\n'); sys.stderr.flush(); os.abort()"
 
 
-def test_an_llvm_that_aborts_is_named_as_the_cause() -> None:
-    code = "import os, sys; sys.stderr.write('LLVM ERROR: Cannot select: fmaximum\\n'); sys.stderr.flush(); os.abort()"
-    with pytest.raises(RuntimeError, match=r"needs LLVM 17 or newer.*Cannot select"):
-        doctor.run_probe(["-c", code])
-
-
-def test_a_hang_ends() -> None:
-    with pytest.raises(RuntimeError, match=r"no answer after 0\.5 s"):
-        doctor.run_probe(["-c", "import time; time.sleep(60)"], timeout_s=0.5)
-
-
-def test_a_child_without_an_answer() -> None:
-    with pytest.raises(RuntimeError, match="exit code 3 and no answer"):
-        doctor.run_probe(["-c", "raise SystemExit(3)"])
-
-
-def test_an_error_in_the_child_is_passed_on() -> None:
-    with pytest.raises(RuntimeError, match="no_such_variant"):
-        doctor.run_probe(["-m", "twin.run.probe", "render", "no_such_variant"])
-
-
-@pytest.mark.second
-def test_the_variant_is_the_one_asked_for() -> None:
-    assert doctor.run_probe(["-m", "twin.run.probe", "render", "llvm_ad_rgb"])["variant"] == "llvm_ad_rgb"
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("-c", "import os; os.abort()"), "crashed with SIGABRT"),
+        (("-c", ABORTS), "needs LLVM 17 or newer.*Cannot select"),
+        (("-c", "import time; time.sleep(60)"), "no answer after 1 s"),
+        (("-c", "raise SystemExit(3)"), "exit code 3 and no answer"),
+        (("-m", "twin.run.probe", "render", "no_such_variant"), "no_such_variant"),
+    ],
+)
+def test_a_child_that_fails_is_told(words: tuple[str, ...], told: str) -> None:
+    with pytest.raises(RuntimeError, match=told):
+        doctor.run_probe(list(words), timeout_s=1.0 if "sleep" in words[1] else 60.0)
 
 
 def test_every_dependency_is_asked_for_in_a_range_that_is_here() -> None:
@@ -107,15 +94,6 @@ def test_a_users_llvm_is_respected(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
         ensure_llvm()
 
 
-def test_libatomic_missing_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_library(name: str) -> None:
-        raise OSError(f"{name}: cannot open shared object file")
-
-    monkeypatch.setattr("ctypes.CDLL", no_library)
-    with pytest.raises(LibraryMissing, match="apt install libatomic1"):
-        ensure_llvm()
-
-
 def test_drjit_imported_too_early_is_told() -> None:
     """Either drjit found a usable LLVM by itself, or importing optics after it says what to do."""
     code = "import drjit; drjit.has_backend(drjit.JitBackend.LLVM); import optics"
@@ -140,6 +118,11 @@ def test_every_check_says_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (doctor._python().status, "needs 99.1 or newer" in doctor._python().detail) == ("failed", True)
     monkeypatch.setattr("ctypes.CDLL", no_library)
     assert (doctor._libatomic().status, doctor._llvm().status) == ("failed", "failed")
+    with pytest.raises(LibraryMissing, match="apt install libatomic1"):
+        ensure_llvm()
+    monkeypatch.setattr(probe, "ULPS", -1.0)
+    with pytest.raises(RuntimeError, match="the kernel's results differ from numpy's by"):
+        probe.kernel()
     monkeypatch.setattr(doctor, "run_probe", fail)
     assert (doctor._probe("kernel", [], str).status, doctor._gpu().status) == ("failed", "note")
     for found, status in (({"available": False}, "note"), ({"version": "12", "compute_capability": "9.0"}, "ok")):
@@ -159,14 +142,7 @@ def test_packages_that_are_not_as_locked_are_told(missing, other, unknown, statu
     assert (check.name, check.status) == ("lock", status)
     assert all(text in check.detail for text in (missing, other, unknown))
     assert ("bash setup.sh" in check.detail) == (status != "ok")
-
-
-def test_lock_files_that_cannot_be_read_are_told(monkeypatch) -> None:
-    def fail(own: str) -> None:
-        raise lock_file.LockError("a.txt:3: not a hash")
-
-    monkeypatch.setattr(lock_file, "FOLDER", Path("/"))
-    monkeypatch.setattr(lock_file, "differences", fail)
-    assert [(one.status, one.detail) for one in doctor._lock()] == [("failed", "cannot be read: a.txt:3: not a hash")]
+    monkeypatch.setattr(lock_file, "differences", lambda own: lock_file.parse("numpy==1\n", "runtime", "a.txt"))
+    assert [(one.status, one.detail[:24]) for one in doctor._lock()] == [("failed", "cannot be read: a.txt:1:")]
     monkeypatch.setattr(lock_file, "FOLDER", Path("/nowhere"))
     assert doctor._lock() == []

@@ -1,57 +1,28 @@
 """What --help teaches: every command has an example, whose program, options and files are there."""
 
-import importlib
 import re
 import shlex
-
-import typer
 
 from scenes.kinds.file_kinds import kind_of
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.study_bench import ROOT
+from twin.run.console import parser
 from twin.validation.registry import GROUPS, select
 
-PROGRAMS = (
-    *(
-        "twin.render",
-        "twin.live",
-        "twin.recover",
-        "twin.lab",
-        "twin.orbit",
-        "twin.study",
-        "twin.design",
-        "twin.validate",
-    ),
-    *("twin.compare", "analysis.mtf"),
-)
-FUNCTIONS = ("twin.doctor", "scenes.schema")
-"""Programs of one function."""
+TAUGHT = (
+    "twin.render twin.live twin.recover twin.lab twin.orbit twin.study twin.design twin.validate twin.compare"
+    " twin.doctor analysis.mtf scenes.schema"
+).split()
 OPENED = ("job", "study")
 """Kinds of files that twin.live opens beside the commands that read them."""
 MADE = "runs/"
 """Beginning of files that other examples make."""
 
 
-def app_of(program: str) -> typer.Typer:
-    if program in FUNCTIONS:
-        app = typer.Typer()
-        app.command()(importlib.import_module(program).main)
-        return app
-    module = importlib.import_module(program)
-    if hasattr(module, "__path__"):  # a package
-        module = importlib.import_module(f"{program}.__main__")
-    return module.app
-
-
-def command_of(program: str):
-    """The command line interface of a program."""
-    return typer.main.get_command(app_of(program))
-
-
 def helps():
     """(program and subcommand, its command, the words of its help)."""
-    for program in (*PROGRAMS, *FUNCTIONS):
-        command = command_of(program)
+    for program in TAUGHT:
+        command = parser(program)
         yield (program,), command, command.help
         for name, below in getattr(command, "commands", {}).items():
             yield (program, name), below, below.help
@@ -67,7 +38,7 @@ def test_the_examples_of_a_help_can_be_run() -> None:
         assert any(example.startswith(" ".join(name)) for example in examples), name
         for example in examples:
             program, *rest = shlex.split(example)
-            command = command_of(program)
+            command = parser(program)
             sub = [rest.pop(0)] if getattr(command, "commands", None) else []
             target = command.commands[sub[0]] if sub else command
             known = {option for parameter in target.params for option in parameter.opts}

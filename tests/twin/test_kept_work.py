@@ -33,8 +33,9 @@ def test_a_folder_of_the_user_is_refused_and_stays(tmp_path: Path) -> None:
             kept.begin()
     assert own.read_text() == "my own data"
     (tmp_path / "x.samples").write_text("a file")
-    with KeptWork(tmp_path / "x", "x", "samples", False) as kept, pytest.raises(RunFolderError, match="is in the way"):
-        kept.begin()
+    for place, said in (("x", "is in the way"), ("x.samples/below", "cannot use .*: Not a directory")):
+        with KeptWork(tmp_path / place, "x", "samples", False) as kept, pytest.raises(RunFolderError, match=said):
+            kept.begin()
 
 
 def test_what_is_kept_goes_and_a_file_put_there_meanwhile_stays(tmp_path: Path) -> None:

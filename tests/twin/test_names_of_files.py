@@ -1,4 +1,4 @@
-"""Names that no file can have, and standard output that a full disk does not take: one line, and an exit code."""
+"""Names that no file can have: one line, and an exit code."""
 
 from __future__ import annotations
 
@@ -34,12 +34,3 @@ def test_a_name_too_long_is_bad_input(words: tuple[str, ...]) -> None:
     done = run(*words, stdout=subprocess.PIPE)
     assert done.returncode == 2
     assert "File name too long" in done.stderr
-
-
-@pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="this system has no /dev/full")
-@pytest.mark.parametrize("module", quick(2, ["twin.render", "analysis.mtf", "twin.operate", "scenes.lens"]))
-def test_help_that_a_full_disk_does_not_take(module: str) -> None:
-    with Path("/dev/full").open("w") as full:
-        done = run(module, "--help", stdout=full)
-    assert done.returncode == 1
-    assert done.stderr == "error: cannot write to the standard output: No space left on device\n"

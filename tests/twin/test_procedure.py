@@ -27,7 +27,7 @@ from scenes.yaml.yaml_file import read_yaml
 from tests.twin.commands import files, invoke
 from tests.twin.test_blurred_cameras import gf7_with
 from twin.run import cli, reference_frames
-from twin.run.artefact import SvgFigure, Table
+from twin.run.artefact import PngFigure, SvgFigure, Table
 from twin.run.cli import heartbeat
 from twin.run.command import add_test
 from twin.run.procedure import Advance, BenchError
@@ -100,15 +100,32 @@ def report(run: LevelRun) -> Report:
     )
 
 
+SHOWN = Table("readings", "Readings", "", ("number",), [])
+
+
 @pytest.mark.parametrize("verdict", ["", "No full stop", "One sentence. And another. And more.", "Is it? No. Yes."])
 def test_a_verdict_is_two_sentences_at_most(verdict: str) -> None:
-    table = Table("readings", "Readings", "", ("number",), [])
     with pytest.raises(ValueError, match="not one or two sentences"):
-        Report("Level", verdict, (), (), table, ())
+        Report("Level", verdict, (), (), SHOWN, ())
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: SvgFigure("A b", "A", "B", "<svg></svg>"), "only small letters"),
+        (lambda: SvgFigure("a", "A", "B", "<p>"), "not an <svg>"),
+        (lambda: PngFigure("a", "A", "B", b"GIF"), "not a PNG"),
+        (lambda: Table("a", "A", "B", ("x", "y"), [(1,)]), "a row of 1 cells under 2 heads"),
+        (lambda: Report("Level", "It holds.", (), (), SHOWN, (Section("A", (), (SHOWN,)),)), "is called readings"),
+    ],
+)
+def test_what_is_no_artefact_is_refused(make: Callable[[], object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        make()
 
 
 def test_numbers_have_no_verdict_but_the_reports() -> None:
-    told = Report("Level", "It holds.", (), (), Table("readings", "Readings", "", ("number",), []), ())
+    told = Report("Level", "It holds.", (), (), SHOWN, ())
     expected = {"a": 1, "verdict": "It holds.", "warnings": []}
     assert told.told({"a": 1, "verdict": "It holds."}) == told.told({"a": 1}) == expected
     with pytest.raises(ValueError, match="verdict"):

@@ -1,8 +1,5 @@
 """The report says what the results say, by itself: no other file, no network, nothing missing."""
 
-import base64
-import csv
-import io
 import math
 import re
 import xml.etree.ElementTree as ET
@@ -51,30 +48,6 @@ def test_a_page_needs_nothing_else_and_misses_nothing(page):
         ET.fromstring(drawing.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1))
     words = re.sub(r"<(style|script).*?</\1>|<[^>]+>", " ", page, flags=re.DOTALL)
     assert not re.search(r"(?<![A-Za-z])(nan|NaN|None|inf|np\.float64)(?![A-Za-z])", words)
-
-
-def tables_of(page: str) -> dict[str, list[list[str]]]:
-    """Return the tables that a page hands out, by their names."""
-    found = re.findall(r'download="([a-z_-]+)\.csv" href="data:text/csv;charset=utf-8;base64,([^"]+)"', page)
-    return {name: list(csv.reader(io.StringIO(base64.b64decode(data).decode()))) for name, data in found}
-
-
-@pytest.mark.second
-def test_tables_of_the_page_have_all_digits(run, page):
-    handed, recovered = tables_of(page), run.recovered_dict()["cameras"]
-    heads, *rows = handed["results"]
-    for row in rows[:8]:
-        at = dict(zip(heads, row, strict=True))
-        key = next(p.key for p in PARAMETERS if p.symbol == at["parameter"])
-        for ending in ("", "_sigma", "_sigma_noise"):
-            assert float(at[f"model{ending}".replace("_", " ")]) == recovered[at["camera"]]["model"][f"{key}{ending}"]
-    heads, *rows = handed["motions"]
-    table = run.crosstalk["forward"]
-    for k, row in enumerate(rows[: len(table.motions)]):
-        at = dict(zip(heads, row, strict=True))
-        assert (at["camera"], at["motion"]) == ("forward", table.motions[k].label)
-        shown = [float(at[f"{name} [µm]"]) for name in ("left y", "left x", "right y", "right x")]
-        np.testing.assert_allclose(shown, 1e6 * run.experiment.path.pitch * table.spot_shift[:, k], rtol=1e-14)
 
 
 @pytest.mark.second

@@ -455,7 +455,9 @@ def test_a_run_that_has_changed_places_with_the_old_one(tmp_path):
 
 
 def test_folders_that_cannot_change_places_in_one_step(tmp_path, monkeypatch):
-    """On a file system that does not know it: by way of a third name."""
+    """On a file system that does not know it: by way of a third name. One that is not there is an error."""
+    with pytest.raises(FileNotFoundError):
+        durable.exchange(tmp_path, tmp_path / "none")
     monkeypatch.setattr(durable, "exchange", lambda first, second: False)
     target = a_run(tmp_path / "run")
     a_run(target, "second", force=True)

@@ -185,7 +185,7 @@ def _with(perturb: dict, amount: str) -> dict:
         ("base/forward/M9 shift z", "'base/forward/M9'", "no such node"),
         ("base/forward/M2 shfit z", "'shfit'", "did you mean 'shift'"),
         ("base/forward/M2 shift w", "'base/forward/M2 shift w'", "not a motion of a node"),
-        ("base/forward/M2 shift", "'base/forward/M2 shift'", "not a motion of a node"),
+        ("base/forward/M2 shift z 2 um", "'base/forward/M2 shift z 2 um'", "not a motion of a node"),
         ("base/forward/focal_plane figure Z5", "'figure'", "cannot be differentiated"),
         ("base/forward/M2 figure Z0", "Z0", "not a Zernike term"),
         ("base/forward/M2 rotate x about middle", "'middle'", "no such pivot"),

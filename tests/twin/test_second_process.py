@@ -79,15 +79,6 @@ def _others():
     OTHERS.update(child.pid for child in psutil.Process().children())
 
 
-def test_both_processes_take_their_part() -> None:
-    with SecondProcess(nothing) as beside:
-        beside.start({str(k): partial(square, k, 0.02) for k in range(20)})
-        found = beside.results()
-    assert [found[str(k)][0] for k in range(20)] == [k**2 for k in range(20)]
-    assert list(found) == [str(k) for k in range(20)]
-    assert len({pid for _, pid in found.values()}) == 2
-
-
 def test_it_works_while_the_first_does_not_know_all_tasks_yet() -> None:
     """Tasks that come one after the other, of which it does some before the last are known."""
     own = os.getpid()

@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Iterable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,29 +20,16 @@ import pytest
 from scenes.kinds.file_kinds import FILE_KINDS
 from tests.tiers import quick
 from tests.twin.study_bench import ROOT
+from twin.run import cluster
+from twin.run.cli import InputErrorText
 from twin.run.cluster import _children_deaf_to_ctrl_c
 from twin.run.console import PROGRAMS as ALL_PROGRAMS
 from twin.run.durable import ending_later
 
-DRAWS = {"matplotlib", "mitsuba", "trimesh", "xarray"}
-HEAVY = {
-    *(
-        "cv2",
-        "dask",
-        "distributed",
-        "drjit",
-        "erfa",
-        "h5netcdf",
-        "h5py",
-        "jinja2",
-        "networkx",
-        "pandas",
-        "pint",
-        "pyproj",
-    ),
-    *("scipy", "skfem", "sklearn", "sqlalchemy", "tifffile"),
-    *DRAWS,
-}
+HEAVY = set(
+    "cv2 dask distributed drjit erfa h5netcdf h5py jinja2 matplotlib mitsuba networkx pandas pint pyproj scipy skfem"
+    " sklearn sqlalchemy tifffile trimesh xarray".split()
+)
 """What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""
 PROGRAMS = tuple(module for module, _ in ALL_PROGRAMS.values())
 
@@ -179,6 +167,37 @@ def test_workers_leave_ctrl_c_to_their_command() -> None:
     with _children_deaf_to_ctrl_c():
         assert exit_code_of_a_worker() == 0
     assert exit_code_of_a_worker() == 1
+
+
+@pytest.mark.second
+def test_a_cluster_that_cannot_be_used_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers without the twin, with another one, or none; a scheduler that is gone, or cannot be reached."""
+    import dask
+
+    versions, source = cluster._program()
+
+    def client(status: str = "running", **found: object) -> Any:
+        return SimpleNamespace(
+            run=lambda work, on_error: found or 1 / 0, status=status, scheduler_info=lambda n_workers: {"workers": {}}
+        )
+
+    assert cluster._differences(client(w=(versions, source))) == []
+    (other,) = cluster._differences(client(w=(versions | {"numpy": "0"}, source)))
+    assert other.startswith("the worker w has other versions: numpy 0 instead of")
+    monkeypatch.setattr(cluster, "WORKER_SECONDS", 0.0)
+    monkeypatch.setattr(cluster, "REACH_SECONDS", 0.5)
+    certificates = {f"distributed.comm.tls.{name}": "/none" for name in ("ca-file", "client.cert", "client.key")}
+    for act, said in (
+        (lambda: cluster._differences(client(w=ImportError("numpy"))), r"w cannot import the twin \(numpy\)"),
+        (lambda: cluster._differences(client(w=(versions, "another"))), "w has other source files of the twin"),
+        (lambda: cluster._differences(client()), "the workers do not answer: division"),
+        (lambda: cluster.Workers(client("closed"), False).next_finished(), "the scheduler is gone"),
+        (lambda: cluster._wait_for_worker(cluster.Workers(client(), False), "a", print), "a had no workers for 0 s"),
+        (lambda: cluster.remote_workers("tcp://127.0.0.1:9", print).__enter__(), "9 cannot be reached"),
+        (lambda: cluster._check_address("tls://127.0.0.1:9"), "the certificates that Dask is told of cannot be used"),
+    ):
+        with dask.config.set(certificates), pytest.raises((cluster.ClusterError, InputErrorText), match=said):
+            act()
 
 
 def test_a_signal_waits_for_the_end_of_what_cannot_be_broken_off() -> None:

@@ -40,7 +40,7 @@ from twin.verify.file_difference import (
     file_difference,
 )
 from twin.verify.folder_state import folder_state
-from twin.verify.verification import obstacle, of_rounded, repeat_chunk
+from twin.verify.verification import CannotRepeat, obstacle, of_rounded, repeat_chunk
 
 
 @pytest.fixture
@@ -58,13 +58,6 @@ def flip(place: Path, at: int) -> None:
     content = bytearray(place.read_bytes())
     content[at] ^= 1
     place.write_bytes(content)
-
-
-def test_an_untouched_folder_is_whole(folder) -> None:
-    state = folder_state(folder)
-    assert state.whole
-    assert state.sealed
-    assert obstacle(state) == ""
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "numbers.json", "images/frame.tiff"])
@@ -191,6 +184,11 @@ def test_chunks_that_were_taken_out_with_their_lines_are_missed(study, tmp_path)
     index.write_bytes(b"".join(index.read_bytes().splitlines(keepends=True)[:-1]))
     (copy / "chunks/00003.npz").unlink()
     assert folder_state(copy).changed == ("chunks/index.txt",)
+    with pytest.raises(CannotRepeat, match="its chunks are not whole; --all makes the whole study again"):
+        repeat_chunk(folder_state(copy))
+    (copy / "config.yaml").write_text("name: levels\n")
+    with pytest.raises(CannotRepeat, match=r"config\.yaml:1: "):
+        repeat_chunk(folder_state(copy))
     (copy / "chunks/00007.npz").write_bytes(b"another's")
     assert folder_state(copy).additional == ("chunks/00007.npz",)
 
@@ -332,6 +330,7 @@ def test_tables_pictures_and_texts(tmp_path) -> None:
     picture[0, 30, 30] = 1.0
     moved = np.roll(picture, 3, axis=1)
     assert pair(tmp_path, "png", preview_png(picture), preview_png(moved)).state == DIFFERENT
+    assert "no PNG" in pair(tmp_path, "png", preview_png(picture), b"GIF89a").why
     drawing = '<svg><path d="M 1.25 2.5 L 3 4"/><text>f</text></svg>'
     assert pair(tmp_path, "svg", drawing.encode(), drawing.replace("2.5", "2.5000000001").encode()).state == ROUNDED
     drawn = (drawing, drawing.replace("2.5", "2.500001"))
@@ -353,12 +352,16 @@ def test_what_is_no_run_folder_is_refused(tmp_path, folder) -> None:
     (tmp_path / "begun/study_state.json").write_text("{}")
     (tmp_path / "other").mkdir()
     (tmp_path / "other/manifest.json").write_text('{"name": "an extension of a browser"}')
+    told = json.loads((folder / MANIFEST).read_text())
+    told["sha256"]["n" * 300] = "0" * 64
+    (folder / MANIFEST).write_text(json.dumps(told))
     for name, said in (
         ("none", "no such folder"),
         ("run/config.yaml", "is not a folder"),
         ("empty", "it has no manifest.json of a run; allowed: the folder of a finished run"),
         ("begun", "a study that is not finished; allowed: the same twin.study command with --resume"),
         ("other", "other/manifest.json: is not the manifest of a run, or is damaged"),
+        ("run", "cannot be read: File name too long"),
     ):
         result = invoke(app, tmp_path / name)
         assert result.exit_code == 2

@@ -6,7 +6,6 @@ launches of its own.
 
 from __future__ import annotations
 
-import drjit as dr
 import numpy as np
 import pytest
 
@@ -59,10 +58,3 @@ def test_wide_paths_are_those_of_small_launches(wide: Backend, backend: Backend)
         if family.count > 100:
             assert found[key].energy == pytest.approx(family.energy, rel=rough)
             np.testing.assert_allclose(found[key].centroid, family.centroid, rtol=0, atol=rough)
-
-
-def test_a_kernel_takes_its_numbers_from_memory(wide: Backend) -> None:
-    """A number that is compiled in would make a kernel of each scene."""
-    value = wide.opaque(np.arange(5.0))
-    assert value.state == dr.VarState.Evaluated
-    assert all(one.state == dr.VarState.Evaluated for one in wide.opaque_each([np.ones(3), np.zeros(3)]))

@@ -15,13 +15,14 @@ That unbroken formulas turn nothing, `python -m twin.validate` shows.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from analysis.monitor import autocollimator, monitoring, recovery
 from scenes.specs.load import load_autocollimator_test
+from tests.validation.mutated import break_it, times
 from twin.laboratory.autocollimator_bench import Reader, run_autocollimator_test
 from twin.validation.checks.check import REPRODUCED, UNDECIDED
 from twin.validation.checks.group import Context
@@ -33,25 +34,6 @@ SEED = 2
 D_ALPHA, D_BETA, D_GAMMA, D_F = range(4)
 LIMITS = "001.table2.mean_error 001.table2.below_1"
 """What section 3.1.3 says of the largest of Table 2's mean differences."""
-
-
-@dataclass(frozen=True)
-class Mutation:
-    """A broken formula.
-
-    Attributes:
-        formula: id of the equation or table row that it breaks.
-        name: what is broken.
-        group: whose verdicts must turn.
-        turns: ids that must turn, and no id but these may.
-        apply: patches it in.
-    """
-
-    formula: str
-    name: str
-    group: str
-    turns: str
-    apply: Callable[[pytest.MonkeyPatch], None]
 
 
 @pytest.fixture(scope="module")
@@ -100,112 +82,86 @@ def turned(groups, backend, monkeypatch):
 def factors(estimator: str, row: int, change: Callable[[np.ndarray], np.ndarray]):
     """Break one row of an estimator's factors, (4,) [left row, left column, right row, right column]."""
 
-    def apply(patch: pytest.MonkeyPatch) -> None:
-        sound = monitoring.coefficients
-
-        def broken(name, geometry):
-            matrix = sound(name, geometry).copy()
+    def broken(right):
+        def wrong(name, geometry):
+            matrix = right(name, geometry).copy()
             if name == estimator:
                 matrix[row] = change(matrix[row])
             return matrix
 
-        patch.setattr(monitoring, "coefficients", broken)
+        return wrong
 
-    return apply
-
-
-def formula(module, name: str, broken: Callable[[Callable], Callable]):
-    """Break a function of a module: ``broken`` takes the sound one."""
-    return lambda patch: patch.setattr(module, name, broken(getattr(module, name)))
+    return monitoring, "coefficients", broken
 
 
-def negated(row):
-    return -row
+def relation(axis: str, unit: int, change: Callable[[float, float], float]):
+    """Break the relation of Table 2 for turns about an axis: ``change(angle between the mirrors, right value)``."""
+
+    def broken(right):
+        return lambda a, u, between: (
+            change(between, right(a, u, between)) if (a, u) == (axis, unit) else right(a, u, between)
+        )
+
+    return (autocollimator, table2), "relation_factor", broken
 
 
-def doubled(row):
-    return 2 * row
-
-
-def halved(row):
-    return row / 2
-
-
-def swapped(row):
-    return row[[2, 3, 0, 1]]
-
-
-def x_for_y(row):
-    return row[[1, 0, 3, 2]]
-
-
-def scaled(by: float):
-    return lambda sound: lambda *args: by * np.asarray(sound(*args))
-
-
-def relation(change: Callable[[str, int, float, float], float]):
-    """Break the relation of Table 2 wherever it is looked up."""
-
-    def apply(patch: pytest.MonkeyPatch) -> None:
-        sound = autocollimator.relation_factor
-
-        def broken(axis, unit, between):
-            return change(axis, unit, between, sound(axis, unit, between))
-
-        for module in (autocollimator, table2):
-            patch.setattr(module, "relation_factor", broken)
-
-    return apply
-
-
-MUTATIONS = (
-    Mutation("001.eq1", "twice", "formulas", "001.eq1.displacement",
-             formula(autocollimator, "mirror_rotation", scaled(2))),
-    Mutation("001.eq2", "half", "formulas", "001.eq2 001.eq2.cos2", factors("paper_single", D_BETA, halved)),
-    Mutation("001.eq3", "x for y", "formulas", "001.eq3 001.eq3.cos2", factors("paper_single", D_ALPHA, x_for_y)),
-    Mutation("001.eq5", "sign", "formulas", "001.eq5", factors("paper_single", D_GAMMA, negated)),
-    Mutation("001.eq7", "left and right swapped", "formulas", "001.eq7", factors("paper_single", D_F, swapped)),
-    Mutation("001.table1.d_beta", "half", "joint", "001.table1.d_beta", factors("paper_joint", D_BETA, halved)),
-    Mutation("001.table1.d_alpha", "sign", "joint", "001.table1.d_alpha 001.fig4.angle",
-             factors("paper_joint", D_ALPHA, negated)),
+LEFT_RIGHT, X_Y = [2, 3, 0, 1], [1, 0, 3, 2]
+MUTATIONS = {
+    "001.eq1: twice": (autocollimator, "mirror_rotation", times(2.0), "formulas", "001.eq1.displacement"),
+    "001.eq2: half": (*factors("paper_single", D_BETA, lambda row: row / 2), "formulas", "001.eq2 001.eq2.cos2"),
+    "001.eq3: x for y": (*factors("paper_single", D_ALPHA, lambda row: row[X_Y]), "formulas", "001.eq3 001.eq3.cos2"),
+    "001.eq5: sign": (*factors("paper_single", D_GAMMA, lambda row: -row), "formulas", "001.eq5"),
+    "001.eq7: left and right swapped": (
+        *factors("paper_single", D_F, lambda row: row[LEFT_RIGHT]), "formulas", "001.eq7"),
+    "001.table1.d_beta: half": (*factors("paper_joint", D_BETA, lambda row: row / 2), "joint", "001.table1.d_beta"),
+    "001.table1.d_alpha: sign": (
+        *factors("paper_joint", D_ALPHA, lambda row: -row), "joint", "001.table1.d_alpha 001.fig4.angle"),
     # a refuted row, too, which a formula that reads nothing of the change confirms
-    Mutation("001.table1.d_gamma", "x for y", "joint", "001.table1.d_gamma 001.table1.d_gamma_by_d_beta",
-             factors("paper_joint", D_GAMMA, x_for_y)),
-    Mutation("001.table1.d_f", "left and right swapped", "joint", "001.table1.d_f",
-             factors("paper_joint", D_F, swapped)),
-    Mutation("001.table5.d_f", "(7)'s factor", "budget_checks", "001.table5.d_f.by_table1",
-             factors("paper_joint", D_F, doubled)),
-    Mutation("001.eq4", "sign", "formulas", "001.eq5", formula(formulas_images, "roll_displacement", scaled(-1))),
-    Mutation("001.eq6", "half", "formulas", "001.eq7", formula(formulas_images, "scale_displacement", scaled(0.5))),
-    Mutation("001.eq8", "sign", "joint", "001.eq8.y 001.eq8.x",
-             formula(formulas_images, "superposed", lambda sound: lambda first, second: first - second)),
-    Mutation("001.eq9", "twice", "joint", "001.eq9.d_f", formula(formulas_images, "right_of_focal_length", scaled(2))),
-    Mutation("001.eq10", "left and right swapped", "joint", "001.eq10.d_f",
-             formula(formulas_images, "parts_along", lambda sound: lambda left, right: sound(right, left))),
-    Mutation("001.eq11", "sum for difference", "joint", "001.eq11.d_alpha 001.eq11.d_gamma",
-             formula(formulas_images, "parts_across", lambda sound: lambda left, right: sound(left, right)[::-1])),
-    Mutation("001.fig4", "forward and backward swapped", "joint", "001.fig4.angle",
-             formula(recovery.intersection_angle, "exact", lambda sound: lambda f, b, *given: sound(b, f, *given))),
-    Mutation("001.eq12", "frames not averaged", "budget_checks", "001.eq12.frames 001.table4.printed_lines",
-             formula(budget, "frame_mean", lambda sound: lambda error, frames=9: error)),
-    Mutation("001.table4", "a quarter", "budget_checks", "001.eq12 001.table4.printed_lines 001.table4.root_sum",
-             formula(budget, "root_sum", scaled(0.25))),
-    Mutation("001.table2", "cosine for sine about Z", "table2",
-             f"001.table2.z 001.table2.relation.z {LIMITS}",
-             relation(lambda axis, unit, b, sound: np.cos(b) if (axis, unit) == ("Z", 2) else sound)),
-    Mutation("001.table2", "twice about X", "table2", f"001.table2.x 001.table2.relation.x {LIMITS}",
-             relation(lambda axis, unit, b, sound: 2 * sound if (axis, unit) == ("X", 2) else sound)),
-)  # fmt: skip
+    "001.table1.d_gamma: x for y": (
+        *factors("paper_joint", D_GAMMA, lambda row: row[X_Y]), "joint",
+        "001.table1.d_gamma 001.table1.d_gamma_by_d_beta"),
+    "001.table1.d_f: left and right swapped": (
+        *factors("paper_joint", D_F, lambda row: row[LEFT_RIGHT]), "joint", "001.table1.d_f"),
+    "001.table5.d_f: (7)'s factor": (
+        *factors("paper_joint", D_F, lambda row: 2 * row), "budget_checks", "001.table5.d_f.by_table1"),
+    "001.eq4: sign": (formulas_images, "roll_displacement", times(-1.0), "formulas", "001.eq5"),
+    "001.eq6: half": (formulas_images, "scale_displacement", times(0.5), "formulas", "001.eq7"),
+    "001.eq8: sign": (
+        formulas_images, "superposed", lambda right: lambda first, second: first - second, "joint",
+        "001.eq8.y 001.eq8.x"),
+    "001.eq9: twice": (formulas_images, "right_of_focal_length", times(2.0), "joint", "001.eq9.d_f"),
+    "001.eq10: left and right swapped": (
+        formulas_images, "parts_along", lambda right: lambda one, other: right(other, one), "joint", "001.eq10.d_f"),
+    "001.eq11: sum for difference": (
+        formulas_images, "parts_across", lambda right: lambda one, other: right(one, other)[::-1], "joint",
+        "001.eq11.d_alpha 001.eq11.d_gamma"),
+    "001.fig4: forward and backward swapped": (
+        recovery.intersection_angle, "exact", lambda right: lambda f, b, *given: right(b, f, *given), "joint",
+        "001.fig4.angle"),
+    "001.eq12: frames not averaged": (
+        budget, "frame_mean", lambda right: lambda error, frames=9: error, "budget_checks",
+        "001.eq12.frames 001.table4.printed_lines"),
+    "001.table4: a quarter": (
+        budget, "root_sum", times(0.25), "budget_checks", "001.eq12 001.table4.printed_lines 001.table4.root_sum"),
+    "001.table2: cosine for sine about Z": (
+        *relation("Z", 2, lambda between, right: np.cos(between)), "table2",
+        f"001.table2.z 001.table2.relation.z {LIMITS}"),
+    "001.table2: twice about X": (
+        *relation("X", 2, lambda between, right: 2 * right), "table2",
+        f"001.table2.x 001.table2.relation.x {LIMITS}"),
+}  # fmt: skip
+"""What is broken -> where, what and how; the group to run; its ids that must turn, and no others may."""
 
 
 # --- the tests --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: f"{m.formula}: {m.name}")
+@pytest.mark.parametrize("mutation", MUTATIONS)
 def test_a_broken_formula_turns_a_verdict(mutation, turned, monkeypatch):
-    mutation.apply(monkeypatch)
-    assert turned(mutation.group) == set(mutation.turns.split())
+    *where, group, turns = MUTATIONS[mutation]
+    break_it(monkeypatch, *where)
+    assert turned(group) == set(turns.split())
 
 
 @pytest.mark.second

@@ -7,8 +7,9 @@ MTF (it is a modulus), and in (4) the two sums swapped, which is its sign.
 That unbroken formulas turn nothing, `python -m twin.validate` shows.
 """
 
-import dataclasses
+from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from analysis.focal_plane.plane_fit import FocalPlaneFit
 from analysis.turntable import dividing_error
 from optics.numerics.backend import load_backend
 from scenes.specs.resolved import resolve_distortion, resolve_focus
+from tests.validation.mutated import break_it, times, with_fields
 from twin.laboratory import distortion_run as laboratory
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.focus_bench import FocusBench
@@ -75,156 +77,60 @@ def turned(monkeypatch):
     return check
 
 
+@pytest.mark.second
+def test_adjustments_turn_and_shift_the_line_about_the_middle_of_the_mount():
+    """To first order; the second is the square of the turns at the middle's distance."""
+    bench = alignment().bench
+    test = bench.setup.test
+    mount = focus_checks.mount_of(test)
+    up, centre = mount.normal, mount.holes.mean(axis=0)
+    x = np.cross(np.cross(up, [1.0, 0.0, 0.0]), up)
+    axes = np.array([x, np.cross(up, x), up]) / np.array([[np.linalg.norm(x)], [np.linalg.norm(x)], [1.0]])
+    turn, shift = np.array(test.misset.rotate)[:, None], np.array(test.misset.shift)[:, None]
+    moved = focus_checks.effects(bench)[:, 3:5]
+    second = float(np.max(turn)) ** 2 * np.linalg.norm(centre)
+    assert second < 0.01 * np.abs(moved[:2]).max()
+    np.testing.assert_allclose(moved[:3], (turn * np.cross(axes, -centre))[:, :2], rtol=0, atol=second)
+    np.testing.assert_allclose(moved[3:], (shift * axes)[:, :2], rtol=0, atol=1e-15)
+
+
 # ---- broken formulas ----
 
 
-def eq1(change):
-    """(1) with its terms L, f tan W and p tan^2 W changed."""
-
-    def broken(where, turn, f, p=0.0):
-        t = np.tan(turn)
-        return np.asarray(change(np.asarray(where), f * t, p * t**2))
-
-    def patch(monkeypatch):
-        monkeypatch.setattr(equations_004, "distortion", broken)
-
-    return patch
-
-
-def eq2(change):
-    """(2) from its sums: L tan W, L tan^2 W, and tan^2 to tan^4."""
+def wrong_distance(right):
+    """(2) with the other sign in the numerator of f."""
 
     def broken(where, turn):
         t = np.tan(turn)
-        return change(np.sum(where * t), np.sum(where * t**2), *(np.sum(t**k) for k in (2, 3, 4)))
+        a, b, c, d, e = np.sum(where * t), np.sum(where * t**2), *(np.sum(t**k) for k in (2, 3, 4))
+        return (b * d + a * e) / (d * d - c * e), right(where, turn)[1]
 
-    def patch(monkeypatch):
-        monkeypatch.setattr(equations_004, "principal_distance_and_point", broken)
-
-    return patch
+    return broken
 
 
-def right2(lt, lt2, t2, t3, t4):
-    determinant = t3**2 - t2 * t4
-    return (lt2 * t3 - lt * t4) / determinant, (lt2 * t2 - lt * t3) / determinant
+def half_frequency(right):
+    """The frequency of an edge's MTF taken times a half."""
+
+    def broken(*given, **options):
+        found = right(*given, **options)
+        return SimpleNamespace(
+            at=lambda frequency: found.at(0.5 * frequency),
+            frequency_at=lambda value: tuple(v / 0.5 for v in found.frequency_at(value)),
+        )
+
+    return broken
 
 
-def eq3(change):
-    """(3) from its two sums."""
-
-    def broken(where, turn):
-        t = np.tan(turn)
-        return np.asarray(change(np.sum(where * t, axis=-1), np.sum(t**2, axis=-1)))
-
-    def patch(monkeypatch):
-        monkeypatch.setattr(equations_004, "principal_distance", broken)
-
-    return patch
-
-
-def eq4(change):
-    """(4) from f sum tan^3, sum L tan^2 and sum tan^4."""
-
-    def broken(where, turn, f):
-        t = np.tan(turn)
-        return np.asarray(change(f * np.sum(t**3), np.sum(where * t**2), np.sum(t**4)))
-
-    def patch(monkeypatch):
-        monkeypatch.setattr(equations_004, "principal_point", broken)
-
-    return patch
-
-
-def vertex(factor):
-    def patch(monkeypatch):
-        right = focus_checks.focus_vertex
-
-        def broken(*given):
-            found = right(*given)
-            return dataclasses.replace(found, position=factor * found.position)
-
-        monkeypatch.setattr(focus_checks, "focus_vertex", broken)
-
-    return patch
-
-
-def plane(change):
-    def patch(monkeypatch):
-        right = focus_checks.fit_focal_plane
-
-        def broken(*given, **options):
-            found = right(*given, **options)
-            return dataclasses.replace(found, **change(found))
-
-        monkeypatch.setattr(focus_checks, "fit_focal_plane", broken)
-
-    return patch
-
-
-def level(factor):
-    def patch(monkeypatch):
-        right = FocalPlaneFit.correction
-
-        def broken(self, level=None):
-            return right(self, level and dataclasses.replace(level, angle=factor * level.angle))
-
-        monkeypatch.setattr(FocalPlaneFit, "correction", broken)
-
-    return patch
-
-
-def shims(change):
-    def patch(monkeypatch):
-        right = focus_checks.shim_plan
-
-        def broken(*given):
-            found = right(*given)
-            return dataclasses.replace(found, change=change(found.change))
-
-        monkeypatch.setattr(focus_checks, "shim_plan", broken)
-
-    return patch
-
-
-def edge(factor):
-    """The frequency of an edge's MTF taken times a factor."""
-
-    class Broken:
-        def __init__(self, right):
-            self.right = right
-
-        def at(self, frequency):
-            return self.right.at(factor * frequency)
-
-        def frequency_at(self, value):
-            return tuple(v / factor for v in self.right.frequency_at(value))
-
-    def patch(monkeypatch):
-        right = focus_checks.measure_edge
-        monkeypatch.setattr(focus_checks, "measure_edge", lambda *given, **options: Broken(right(*given, **options)))
-
-    return patch
-
-
-def chauvenet_swapped(monkeypatch):
+def chauvenet_swapped(right):
     """What is to go stays, and the other way round."""
-    right = dividing_error.chauvenet
 
     def broken(readings, present=None):
-        keep = right(readings, present)
         # where nothing is to go everything would: two readings have to stay for a mean
-        out = ~keep
+        out = ~right(readings, present)
         out[..., :2] = True
         return out
 
-    monkeypatch.setattr(dividing_error, "chauvenet", broken)
-
-
-def reduction(change):
-    def patch(monkeypatch):
-        monkeypatch.setattr(distortion_checks, "lower", lambda raw, own: float(change(raw, own)))
-
-    return patch
+    return broken
 
 
 # without 004.eq2.distance and 004.eq2.point, which come from the fit with a constant and not from a printed equation
@@ -240,28 +146,42 @@ MOVED = {"004.alignment.plane", "004.alignment.shims"}
 COLUMNS = {"004.table2.largest"}
 """The two others are refuted, and stay so by another number."""
 
-# formula, mutation -> how, ids to run, ids that turn at least
+# formula, mutation -> where, what and how it is broken, ids to run, ids that turn at least
 MUTATIONS = {
-    ("(1)", "sign of p"): (eq1(lambda w, f, p: w - f - p), SPOTS, {"004.eq1.constant"}),
+    ("(1)", "sign of p"): (
+        equations_004, "distortion", lambda right: lambda w, t, f, p=0.0: right(w, t, f, -p), SPOTS,
+        {"004.eq1.constant"}),
     ("(2)", "sign in the numerator of f"): (
-        eq2(lambda a, b, c, d, e: ((b * d + a * e) / (d * d - c * e), right2(a, b, c, d, e)[1])), SPOTS, F2),
-    ("(3)", "twice"): (eq3(lambda lt, t2: 2 * lt / t2), SPOTS, F3),
-    ("(4)", "sign of the second sum"): (eq4(lambda f, w, t4: (f + w) / t4), SPOTS, {"004.eq4.solution",
-                                                                                     "004.eq4.uneven"}),
-    ("focus vertex", "half"): (vertex(0.5), PLAN, {"004.alignment.defocus", *MOVED}),
-    ("plane", "X' and Y' swapped"): (plane(lambda f: {"slope_x": f.slope_y, "slope_y": f.slope_x}), PLAN, MOVED),
-    ("line level", "sign"): (level(-1.0), PLAN, {"004.alignment.constraint"}),
-    ("shims", "left and right swapped"): (shims(lambda c: c[[1, 0, 3, 2]]), PLAN, {"004.alignment.shims"}),
-    ("edge MTF", "half the frequency"): (edge(0.5), TABLE1, EDGES),
+        equations_004, "principal_distance_and_point", wrong_distance, SPOTS, F2),
+    ("(3)", "twice"): (equations_004, "principal_distance", times(2.0), SPOTS, F3),
+    ("(4)", "sign of the second sum"): (
+        equations_004, "principal_point", lambda right: lambda w, t, f: right(-w, t, f), SPOTS,
+        {"004.eq4.solution", "004.eq4.uneven"}),
+    ("focus vertex", "half"): (
+        focus_checks, "focus_vertex", with_fields(position=lambda f: 0.5 * f.position), PLAN,
+        {"004.alignment.defocus", *MOVED}),
+    ("plane", "X' and Y' swapped"): (
+        focus_checks, "fit_focal_plane", with_fields(slope_x=lambda f: f.slope_y, slope_y=lambda f: f.slope_x), PLAN,
+        MOVED),
+    ("line level", "sign"): (
+        FocalPlaneFit, "correction",
+        lambda right: lambda fit, level=None: right(fit, level and replace(level, angle=-level.angle)), PLAN,
+        {"004.alignment.constraint"}),
+    ("shims", "left and right swapped"): (
+        focus_checks, "shim_plan", with_fields(change=lambda f: f.change[[1, 0, 3, 2]]), PLAN,
+        {"004.alignment.shims"}),
+    ("edge MTF", "half the frequency"): (focus_checks, "measure_edge", half_frequency, TABLE1, EDGES),
     ("Chauvenet", "kept and rejected swapped"): (
-        chauvenet_swapped, REPEATS, {"004.turntable.criterion", "004.turntable.chauvenet"}),
-    ("Table 2", "columns swapped"): (reduction(lambda raw, own: 100 * (1 - raw / own)), TABLE2, COLUMNS),
+        dividing_error, "chauvenet", chauvenet_swapped, REPEATS,
+        {"004.turntable.criterion", "004.turntable.chauvenet"}),
+    ("Table 2", "columns swapped"): (
+        distortion_checks, "lower", lambda right: lambda raw, own: float(100 * (1 - raw / own)), TABLE2, COLUMNS),
 }  # fmt: skip
 
 
 @pytest.mark.second
 @pytest.mark.parametrize(("formula", "mutation"), MUTATIONS)
 def test_a_broken_formula_turns_verdicts(formula, mutation, turned, monkeypatch):
-    patch, only, ids = MUTATIONS[formula, mutation]
-    patch(monkeypatch)
+    *where, only, ids = MUTATIONS[formula, mutation]
+    break_it(monkeypatch, *where)
     assert ids <= turned(only)

@@ -7,14 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from analysis.turntable.angle_fits import FITS
 from optics.numerics.backend import load_backend
 from tests.tiers import quick
 from twin.validation import registry
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, REFUTED, REPRODUCED
-from twin.validation.paper_004 import distortion_checks, focus_checks, turntable_checks
+from twin.validation.paper_004 import focus_checks, turntable_checks
 from twin.validation.paper_004.equations_004 import Perspective
-from twin.validation.paper_004.turntable_checks import FittedTable
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -76,18 +74,6 @@ def test_parameters_that_adjustments_tie_together(ties, largest):
     assert focus_checks.coupled(change * focus_checks.LIMITS) == largest
 
 
-@pytest.mark.second
-def test_only_what_is_needed_runs(monkeypatch):
-    def build(*_):
-        raise AssertionError("not asked for")
-
-    monkeypatch.setattr(distortion_checks.DistortionBench, "build", build)
-    monkeypatch.setattr(turntable_checks, "fit_table", build)
-    monkeypatch.setattr(focus_checks, "FocusBench", build)
-    found = run_checks(select(GROUPS, "004.table2.reduction,004.turntable.repeat"), load_backend("llvm"), 2).results
-    assert {r.id: r.verdict for r in found} == {"004.turntable.repeat": REPRODUCED, "004.table2.reduction": REFUTED}
-
-
 @pytest.mark.parametrize(
     ("identifier", "which", "part", "keys"),
     quick(
@@ -122,18 +108,6 @@ def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, 
     assert limits.high is not None
     assert judged(0.93 * limits.high) == REPRODUCED
     assert judged(1.1 * limits.high) != REPRODUCED
-
-
-@pytest.mark.parametrize(
-    ("network", "value", "verdict"), [(0.85, 0.85, CONFIRMED), (1.0, 1.0, REFUTED), (1.25, 1.25, REFUTED)]
-)
-def test_advantage_of_the_network(network, value, verdict, monkeypatch):
-    made = {**{name: 1.0 + 0.1 * k for k, name in enumerate(FITS)}, "network": network, "cubic_spline": 1.0}
-    monkeypatch.setattr(turntable_checks, "fit_table", lambda *_: FittedTable("cubic_spline", made))
-    group = turntable_checks.GROUP
-    (run,) = run_checks(select([group], "004.turntable.network"), load_backend("llvm"), 1).runs
-    (result,) = run.results
-    assert (result.measured, result.verdict) == (pytest.approx(value), verdict)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 1e-3])

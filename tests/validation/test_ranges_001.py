@@ -7,7 +7,7 @@ from analysis.monitor import monitoring
 from analysis.spots.spot_positions import SpotError
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
-from tests.validation.undrawn import undrawn
+from tests.validation.mutated import undrawn
 from twin.validation.checks.check import CORRECTED, REFUTED
 from twin.validation.checks.group import Context
 from twin.validation.paper_001.ranges import ranges_group
@@ -61,6 +61,8 @@ def test_a_limit_is_found_between_the_points():
 def test_larger_ccds_read_the_same_positions(bench, wide):
     # the same light on the same pixels; single precision of the images is 1e-7 of the peak
     assert wide.positions([{}]) == pytest.approx(bench.positions([{}]), abs=1e-4)
+    # where beams are traced from the middles of the CCDs, pixels: coma of the edge against the middle
+    assert np.abs(bench.traced([{}])).max() < 0.1
 
 
 def test_an_unknown_kind_of_return_is_refused(bench):

@@ -52,10 +52,9 @@ _BEFORE = __name__.removesuffix("twin.run.console")
 
 @cache
 def parser(program: str) -> Any:
-    """The command of a program, with its parser; of a program with subcommands the group.
+    """Return the command of a program, with its parser; of a program with subcommands the group.
 
-    Raises:
-        LookupError: neither a Typer application ``app`` nor a function ``main``.
+    A program has a Typer application ``app`` or a function ``main``.
     """
     import typer
 
@@ -64,8 +63,6 @@ def parser(program: str) -> Any:
         module = importlib.import_module(f"{_BEFORE}{program}.__main__")
     app = getattr(module, "app", None)
     if app is None:
-        if not hasattr(module, "main"):
-            raise LookupError(f"{program}: neither app nor main")
         app = typer.Typer(add_completion=False)
         app.command()(module.main)
     return typer.main.get_command(app)

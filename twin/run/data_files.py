@@ -344,10 +344,7 @@ def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndar
 
 def preview_png(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> bytes:
     """``preview`` as a PNG file."""
-    ok, encoded = cv2.imencode(".png", preview(frames, stretch))
-    if not ok:
-        raise OSError("the preview cannot be encoded as PNG")
-    return bytes(encoded.tobytes())
+    return bytes(cv2.imencode(".png", preview(frames, stretch))[1].tobytes())
 
 
 FITS_UNITS: Mapping[str, str] = FrozenMap(

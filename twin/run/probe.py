@@ -51,16 +51,14 @@ def kernel(backend: str = "llvm") -> dict[str, Any]:
 def render(variant: str = "llvm_ad_mono") -> dict[str, Any]:
     """Render a bright sky of 16 x 16 pixels in exactly this Mitsuba variant.
 
-    Mitsuba silently falls back to another variant when it is given several names, so one is asked for and checked.
+    Given several names Mitsuba would silently fall back to another variant; given one it does not.
 
     Raises:
-        RuntimeError: Mitsuba chose another variant, or the picture is not the uniform sky.
+        RuntimeError: the picture is not the uniform sky.
     """
     import mitsuba as mi
 
     mi.set_variant(variant)
-    if mi.variant() != variant:
-        raise RuntimeError(f"asked Mitsuba for {variant}, got {mi.variant()}")
     scene = mi.load_dict(
         {
             "type": "scene",

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Protocol
 
@@ -40,16 +41,13 @@ class Numbered:
     stem: str
 
     def free(self) -> Path:
-        """The first that does not exist now.
+        """Return the first that does not exist now."""
+        every = (self.folder / f"{self.stem}-{number:03d}" for number in count(1))
+        return next(path for path in every if not _taken(path) and not owned_files.successor(path).exists())
 
-        Raises:
-            RunFolderError: a million of them do.
-        """
-        for number in range(1, 1_000_000):
-            candidate = self.folder / f"{self.stem}-{number:03d}"
-            if not (candidate.exists() or candidate.is_symlink() or owned_files.successor(candidate).exists()):
-                return candidate
-        raise RunFolderError(f"no free name {self.stem}-NNN in {self.folder}; choose one with --out")
+
+def _taken(path: Path) -> bool:
+    return path.exists() or path.is_symlink()
 
 
 def chosen(out: Path | None, stem: str) -> Path | Numbered:
@@ -92,7 +90,7 @@ class RunFolder:
 
     def _check_target(self) -> None:
         target = self.target
-        if not (target.exists() or target.is_symlink()):
+        if not _taken(target):
             return
         if not target.is_dir() or target.is_symlink():
             raise RunFolderError(f"output {target} exists and is not a folder; choose another with --out")
@@ -418,7 +416,7 @@ def remove_run(old: Path, new: Path) -> None:
     others = unlisted(old)
     for name in owned_files.every_file(old) if others is None else others:
         place = new / name
-        while place.exists() or place.is_symlink():
+        while _taken(place):
             place = place.with_name(f"{place.name}.kept")
         place.parent.mkdir(parents=True, exist_ok=True)
         (old / name).rename(place)
