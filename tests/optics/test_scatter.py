@@ -53,18 +53,8 @@ def test_total_at_oblique_incidence(sine: float) -> None:
 
 
 def test_more_than_all_cannot_be_scattered() -> None:
-    with pytest.raises(ValueError, match=r"scatter 1\.\d+ of the light"):
-        ABg(0.1, 1e-2, 2.0)
-    with pytest.raises(ValueError, match="of the light"):
-        HarveyShack(400.0, 0.1, -3.0)
     with pytest.raises(ValueError, match="too strong"):
         _ = HarveyShack(0.3, 1.0, 0.0).lobe
-
-
-@pytest.mark.parametrize("numbers", [(0.0, 1.0, 2.0), (1.0, 0.0, 2.0), (1e-3, 1e-3, -1.0)])
-def test_impossible_numbers(numbers: tuple[float, float, float]) -> None:
-    with pytest.raises(ValueError, match="needs"):
-        ABg(*numbers)
 
 
 @pytest.mark.parametrize("scatter", LOBES, ids=str)
@@ -93,10 +83,3 @@ def test_library_finishes_conserve_energy(finish: Finish) -> None:
     total = finish.reflectance + finish.transmission + finish.diffuse
     assert 0.0 <= total <= (0.0 if finish.bare else 1.0)
     assert len(finish.numbers) == 8
-
-
-def test_impossible_finishes() -> None:
-    with pytest.raises(ValueError, match="at most 1"):
-        Finish(reflectance=0.6, transmission=0.5)
-    with pytest.raises(ValueError, match="Fresnel"):
-        Finish(reflectance=0.1, bare=True)

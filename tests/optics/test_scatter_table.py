@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
-from optics.materials.finish import CoatingTable, Finish
+from optics.materials.finish import CoatingTable
 from optics.materials.scatter import STEPS, ABg, ScatterTable, total_scatter
 from scenes.models.scenery import MeasuredFinishes
 from scenes.models.scenery_parts import Finishes
@@ -117,39 +117,6 @@ def test_shares_of_drawn_cells_are_those_of_the_table() -> None:
     assert np.all(drawn.sectors[:, :, -1] == 1.0)
 
 
-def test_impossible_tables_are_refused() -> None:
-    good = {"incidence": [0.0], "azimuth": [0.0], "radial": [0.0, 1.0], "values": [[[0.1, 0.1]]]}
-    ScatterTable(**good)
-    for change, text in (
-        ({"values": [[[0.9, 0.9]]]}, "no surface scatters more"),
-        ({"values": [[[-0.1, 0.1]]]}, "not negative"),
-        ({"values": [[[np.nan, 0.1]]]}, "finite"),
-        ({"radial": [0.1, 1.0]}, "from 0"),
-        ({"radial": [0.0, 4.0]}, "180"),
-        ({"radial": [0.0, 0.0]}, "ascend"),
-        ({"incidence": [1.6]}, "less than 90"),
-        ({"azimuth": [0.0, 1.0], "values": [[[0.1, 0.1]] * 2]}, "to 180 or to 360"),
-        ({"values": [[[0.1, 0.1, 0.1]]]}, "must be"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            ScatterTable(**{**good, **change})
-
-
-def test_finishes_with_tables() -> None:
-    table = lambert(0.3)
-    for wrong, text in (
-        ({"reflectance": 0.2, "table": table}, "only 0.2 are reflected"),
-        ({"reflectance": 0.5, "table": table, "scattered_only": True}, "no reflectance"),
-        ({"scattered_only": True}, "give a table"),
-        ({"reflectance": 0.5, "table": table, "scatter": ABg(1e-3, 1e-2, 2.0)}, "in place of a lobe"),
-        ({"transmission": 0.9, "table": table}, "does not go through"),
-        ({"bare": True, "table": table}, "bare glass"),
-        ({"table": table, "scattered_only": True, "diffuse": 0.8}, "more than all"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            Finish(**wrong)
-
-
 def test_coatings() -> None:
     coating = CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]), np.array([0.8, 0.5]))
     assert coating.at(np.radians(20.0), True) == pytest.approx((0.2, 0.65))
@@ -158,9 +125,3 @@ def test_coatings() -> None:
     assert bare.at(np.radians(20.0), True) == pytest.approx((0.2, 0.8))
     assert bare.at(np.radians(20.0), False) == pytest.approx((0.2, 0.0))
     np.testing.assert_allclose(bare.drawn(False)[80], [0.2, 0.0])
-    with pytest.raises(ValueError, match="also together"):
-        CoatingTable(np.zeros(1), np.array([0.6]), np.array([0.5]))
-    with pytest.raises(ValueError, match="ascend"):
-        CoatingTable(np.radians([10.0, 5.0]), np.array([0.6, 0.5]))
-    with pytest.raises(ValueError, match="one reflectance, and one transmittance"):
-        CoatingTable(np.radians([5.0, 10.0]), np.array([0.6, 0.5]), np.array([0.1]))

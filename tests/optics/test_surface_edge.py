@@ -62,10 +62,3 @@ def test_a_polygon_is_matplotlibs() -> None:
     star = tuple(map(tuple, np.stack([radii * np.cos(turns), radii * np.sin(turns)], axis=-1).tolist()))
     inside = Outline(np.array([*star, star[0]]), closed=True).contains_points(np.stack([x, y], axis=-1))
     np.testing.assert_array_equal(Edge(Polygon(star)).passes(x, y), inside)
-
-
-def test_shapes_without_size_are_refused() -> None:
-    with pytest.raises(ValueError, match="a vane needs a width"):
-        Ray(0.0)
-    with pytest.raises(ValueError, match="three corners"):
-        Polygon(((0.0, 0.0), (1.0, 0.0)))

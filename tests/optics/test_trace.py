@@ -11,18 +11,6 @@ from tests.optics.bench import PASS, REFRACT, Stage, at, beam, build, disk_point
 Z = np.array([0.0, 0.0, 1.0])
 
 
-def test_plane_mirror(backend) -> None:
-    turn = rotation_matrix([0.5, -0.3, 0.2])
-    mirror = Pose(turn, np.array([0.1, 0.2, 3.0]))
-    position, direction = beam(disk_points(50, 0.5), 0.0, unit(0.1, 0.2, 1.0))
-    hit, leaving, path, valid = run(backend, build(Stage(plane(), pose=mirror)), position, direction)
-    normal = turn[:, 2]
-    assert valid.all()
-    np.testing.assert_allclose((hit - mirror.translation) @ normal, 0.0, atol=1e-15)
-    np.testing.assert_allclose(leaving, direction - 2 * np.outer(direction @ normal, normal), atol=1e-15)
-    np.testing.assert_allclose(path, np.linalg.norm(hit - position, axis=-1), rtol=1e-15)
-
-
 def test_paraboloid_focuses_the_axis_with_equal_paths(backend) -> None:
     f = 2.0
     bench = build(Stage(Surface(-1 / (2 * f), -1.0)), Stage(plane(), PASS, at(-f)))
@@ -51,24 +39,6 @@ def test_rays_from_the_other_sheet_of_a_hyperboloid_meet_the_one_with_the_vertex
     sag = square / radius / (1.0 + np.sqrt(1.0 - (1.0 + conic) * square / radius**2))
     np.testing.assert_allclose(z, sag, rtol=0, atol=1e-15)
     np.testing.assert_allclose(start + path[:, None] * sense * heading, hit, rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize(("before", "after"), [(1.0, 1.5), (1.5, 1.0), (1.5, 1.7), (1.4, 1.4)])
-def test_snell(backend, before: float, after: float) -> None:
-    incoming = np.array(
-        [unit(np.sin(a) * np.cos(3 * a), np.sin(a) * np.sin(3 * a), np.cos(a)) for a in np.linspace(0, 0.6, 30)]
-    )
-    bench = build(
-        Stage(plane(), PASS, index_after=before),
-        Stage(plane(), REFRACT, at(1.0), index_after=after),
-        Stage(plane(), PASS, at(2.0), index_after=after),
-    )
-    hit, leaving, path, valid = run(backend, bench, np.zeros_like(incoming), incoming)
-    assert valid.all()
-    np.testing.assert_allclose(after * leaving[:, :2], before * incoming[:, :2], atol=1e-15)
-    np.testing.assert_allclose(np.linalg.norm(leaving, axis=-1), 1.0, atol=1e-15)
-    np.testing.assert_allclose(path, before / incoming[:, 2] + after / leaving[:, 2], rtol=1e-15)
-    np.testing.assert_allclose(hit[:, 2], 2.0, atol=1e-15)
 
 
 def test_total_internal_reflection_is_invalid_and_finite(backend) -> None:
