@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.raytrace.trace import BeamMissedError, require_some
 from tests.optics.bench import PASS, REFRACT, Stage, at, beam, build, disk_points, run, unit

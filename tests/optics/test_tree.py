@@ -1,7 +1,10 @@
+"""Rotations, poses, and bodies that carry each other."""
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from optics.geometry.pose import Pose, about_axis
+from optics.geometry.pose import Pose, about_axis, rotation_matrix, rotation_vector
 from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, State, compose
 
 PIVOT = (0.0, 0.2, -0.1)
@@ -129,3 +132,41 @@ def test_a_tree_stands_by_itself_as_another_does_in_a_state() -> None:
     ):
         with pytest.raises(error):
             tree.standing(state)
+
+
+def test_a_pose_turns_then_shifts() -> None:
+    pose = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([10.0, 20, 30]))
+    np.testing.assert_array_equal(pose.apply([[1.0, 0, 0], [0, 1, 0]]), [[10, 21, 30], [9, 20, 30]])
+
+
+def test_arrays_of_a_pose_are_copied() -> None:
+    translation = np.zeros(3)
+    pose = Pose(np.eye(3), translation)
+    translation[0] = 1.0
+    assert pose.translation[0] == 0.0
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_positive_by_the_right_hand_rule(axis: int) -> None:
+    first, second = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+    np.testing.assert_allclose(about_axis(axis, np.pi / 2) @ first, second, atol=1e-15)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 0.49, 0.51, 2.0, 3.1])
+def test_matches_scipy(size: float) -> None:
+    vectors = np.random.default_rng(1).normal(size=(20, 3))
+    vectors *= size / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    matrix = rotation_matrix(vectors)
+    np.testing.assert_allclose(matrix, Rotation.from_rotvec(vectors).as_matrix(), atol=5e-16, rtol=0)
+    np.testing.assert_allclose(
+        matrix @ np.swapaxes(matrix, -1, -2), np.broadcast_to(np.eye(3), matrix.shape), atol=1e-15
+    )
+    np.testing.assert_allclose(rotation_vector(matrix), vectors, atol=3e-15 / max(np.pi - size, 1e-3))
+
+
+def test_complex_step_is_the_derivative() -> None:
+    vector, direction = np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.7, -0.4])
+    exact = rotation_matrix(vector + 1e-40j * direction).imag / 1e-40
+    h = 1e-6
+    difference = (rotation_matrix(vector + h * direction) - rotation_matrix(vector - h * direction)) / (2 * h)
+    np.testing.assert_allclose(exact, difference, atol=1e-10)

@@ -86,16 +86,6 @@ def test_principal_distance(backend, camera, name: str, focal_length: float, exa
     )
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_local_focal_length_is_the_slope_of_the_image(backend, camera, name: str) -> None:
-    """FirstOrder.scale along the line against chief rays of neighbouring fields."""
-    model = camera(name)
-    h = 1e-4
-    sides = [bundle(backend, model, s * h, 0.0)[0][0, 0] for s in (1, -1)]
-    angle = 2 * np.arctan(np.tan(h) * np.cos(model.spec.field_bias))  # between the two directions
-    assert abs(sides[0] - sides[1]) / angle == pytest.approx(abs(model.first_order.scale[0, 0, 0]), rel=1e-7)
-
-
 @pytest.mark.parametrize(
     ("name", "low", "high"),
     quick(1, [("gf7", 0.0145, 0.0182), ("monitor", 0.0105, 0.0162), ("gf7_short", 0.0085, 0.0115)]),

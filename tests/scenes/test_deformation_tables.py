@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from scenes.models.nodal_bodies import deformed_face
-from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes
 from scenes.specs.job_tables import DeformationSpec
 from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
@@ -105,14 +104,6 @@ def test_a_mesh_says_what_a_table_says(tmp_path, nodes, gf7_pair, ending: str) -
         load_job(job(tmp_path, place.name))
     with pytest.raises(InputError, match="no such vectors"):
         read_nodes(place, unit="mm", field="displacement")
-
-
-def test_only_what_has_a_figure_is_deformed(tmp_path, nodes, gf7_pair) -> None:
-    place = table(tmp_path / "m1.csv", nodes)
-    what = PerturbationSpec(deformation=DeformationSpec(table=str(place)))
-    for path in ("base/forward", "base/forward/focal_plane"):
-        with pytest.raises(InputError, match="does not allow deformation"):
-            checked_nodes(JobSpec(instrument="gf7_pair", perturb={path: what.plain()}), gf7_pair.nodes)
 
 
 def test_the_job_knows_the_table_that_it_was_read_with(tmp_path, nodes) -> None:

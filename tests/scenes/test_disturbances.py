@@ -160,34 +160,6 @@ disturbances:
     assert set(plain.causes) - same == {"base_heat", "mirror_figure", "central_prism_heat"}
 
 
-def test_a_config_reads_back_to_the_same(tmp_path, backend) -> None:
-    """New causes, changed ones, correlations and laws; twice, and to the same motions."""
-    job = """instrument: gf7_pair
-disturbances:
-  causes:
-    mirror_mounts: {together: 0.3, time: {period: 95 min}}
-    mirror_figure: {figure: {Z5: 9 nm}}
-    new:
-      bodies: [base/forward/M1, base/backward/M1]
-      shift: 1 um
-      correlations:
-        - {between: [base/forward/M1 shift x, base/backward/M1 shift y], matrix: [[1, -0.2], [-0.2, 1]]}
-      reason: why not
-"""
-    (tmp_path / "job.yaml").write_text(job)
-    first = resolve(tmp_path / "job.yaml")
-    (tmp_path / "config.yaml").write_text(first.to_yaml())
-    second = resolve(tmp_path / "config.yaml")
-    assert second == first
-    assert second.to_yaml() == first.to_yaml()
-    assert hash(second) == hash(first)
-    built = build_instrument(first.instrument, first.cameras, backend)
-    one, two = (stated_motions(resolved, built) for resolved in (first, second))
-    assert one.components == two.components
-    assert one.laws == two.laws
-    np.testing.assert_array_equal(one.correlation, two.correlation)
-
-
 def test_none_states_nothing_and_a_name_stands_for_a_file(tmp_path) -> None:
     def named(text: str):
         (tmp_path / "job.yaml").write_text(f"instrument: gf7_pair\ndisturbances: {text}\n")

@@ -21,12 +21,6 @@ def written(folder: Path, text: str) -> Path:
     return file
 
 
-def test_all_but_instrument_and_disturbances_has_a_default(tmp_path: Path) -> None:
-    plan = read_operation(written(tmp_path, SHORT)).operation
-    assert (plan.events, plan.requirements) == ({}, ())
-    assert (plan.window, plan.coefficients, plan.mission, plan.horizon) == (60, 0.3, 87_600 * 3600.0, 720 * 3600.0)
-
-
 def test_the_example_says_its_limits_in_the_units_of_its_quantities() -> None:
     setup = read_operation(EXAMPLES / "operation.yaml")
     limits = {(one.group, one.key): (one.largest, one.probability) for one in setup.operation.requirements}

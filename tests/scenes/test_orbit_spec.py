@@ -54,17 +54,6 @@ def test_values_are_si() -> None:
     assert errors.star_tracker.bias[1] == pytest.approx(-math.radians(0.1), rel=1e-15)
 
 
-def test_what_is_not_written() -> None:
-    spec = read(OrbitSpec, "epoch: 2011-03-05T03:05:00Z\npassing: {longitude: 116 deg, latitude: 40 deg}")
-    assert (spec.passing.direction, spec.passing.altitude, spec.passing.inclination) == ("descending", 500e3, None)
-    assert read(AttitudeSpec, "{}") == AttitudeSpec(nadir="geodetic", steering="none")
-    # nothing is wrong unless it is written
-    zero = read(ErrorsSpec, "{}")
-    assert not any((*zero.gps.noise, *zero.gps.drift, *zero.gps.velocity))
-    assert not any((*zero.star_tracker.noise, *zero.star_tracker.bias, *zero.star_tracker.thermal.amplitude))
-    assert (EarthSpec().ut1_utc, EarthSpec().polar_motion) == (0.0, (0.0, 0.0))
-
-
 def test_it_reads_back() -> None:
     attitude = "{nadir: geocentric, steering: yaw, offset: [0.1 deg, 0 deg, -2 arcsec]}"
     earth = "{ut1_utc: -150 ms, polar_motion: [0.1 arcsec, -200 mas]}"
@@ -83,41 +72,6 @@ def test_times_that_are_read() -> None:
     for none in (20110305, None):
         with pytest.raises(Problem, match="not a date and time"):
             parse_utc(none)
-
-
-@pytest.mark.parametrize(
-    ("resolve", "name"),
-    [
-        *((resolve_angle, name) for name in ("angle", "angle_gf7", "angle_off_axis")),
-        *((resolve_loop, "loop"), (resolve_monitor, "monitor"), (resolve_simulate, "simulate")),
-    ],
-)
-def test_config_reads_back_to_the_same_values(resolve, name: str, tmp_path: Path) -> None:
-    setup = resolve(SCENES / ORBIT / f"{name}.yaml").with_seed(7)
-    again = resolve(write(tmp_path, setup.to_yaml()))
-    assert type(again) is type(setup)
-    assert again == setup
-    assert again.test.seed == 7
-    assert again.to_yaml() == setup.to_yaml()
-
-
-# --- the intersection angle
-
-
-def test_an_angle_test(tmp_path: Path) -> None:
-    setup = resolve_angle(SCENES / ORBIT / "angle.yaml")
-    assert setup.camera == load_three_line_camera("th1")
-    assert setup.test.perturb["forward"].rotate[1] == pytest.approx(4.0 * ARCSEC, rel=1e-15)
-    assert dict(setup.angles) == {"alpha": ("forward", "nadir"), "beta": ("nadir", "backward")}
-    setup = resolve_angle(SCENES / ORBIT / "angle_off_axis.yaml")
-    assert setup.angles["multispectral"] == ("multispectral", "nadir")
-    assert (setup.pixels["high_resolution"], setup.pixels["multispectral"], setup.usual_pixels) == (30000, 6000, 12000)
-    test = resolve_angle(write(tmp_path, good("angle"))).test
-    assert dict(test.perturb) == {}
-    assert (test.errors.station, test.errors.points, test.errors.datum) == (0.5, 1.5, (0.0, 0.0, 0.0))
-    effects = test.effects
-    assert (effects.light_time, effects.aberration, effects.refraction, effects.corrected) == (True,) * 4
-    assert (test.passes, test.seed, test.terrain.relief, test.orbit.passing.direction) == (200, 0, 0.0, "descending")
 
 
 def test_lines_of_a_camera_of_ones_own(tmp_path: Path) -> None:
@@ -156,9 +110,6 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=words):
             resolve_angle(write(tmp_path, dump_yaml({**data, **change})))
-
-
-# --- monitors in orbit
 
 
 def test_a_loop(tmp_path: Path) -> None:
@@ -200,21 +151,6 @@ def test_a_motion_is_a_step_a_ramp_or_a_swing() -> None:
     assert shares((9.9, 10.0, 1e4)) == [0.0, 1.0, 1.0]
     assert shares((0.0, 15.0, 40.0), duration=20.0) == [0.0, 0.25, 1.0]
     assert shares((10.0, 20.0, 40.0), period=40.0) == pytest.approx([0.0, 1.0, -1.0])
-
-
-# --- simulated images
-
-
-def test_a_simulated_pass(tmp_path: Path) -> None:
-    setup = resolve_simulate(SCENES / ORBIT / "simulate.yaml")
-    assert set(setup.detectors) == {"th1_line"}
-    assert setup.test.ground.light.elevation == pytest.approx(math.radians(38.0), rel=1e-15)
-    assert setup.camera.image_of("backward").wavefront["Z4"] == 20e-9
-    test = resolve_simulate(write(tmp_path, good("simulate"))).test
-    assert test.lines == ("forward", "nadir", "backward")
-    assert (test.ground.terrain.kind, test.ground.terrain.relief) == ("real", None)
-    assert (test.patch.line, test.patch.lines, test.seed) == ("nadir", 1000, 0)
-    assert math.degrees(test.control.light.elevation) == pytest.approx(60.0)
 
 
 def test_a_payload_of_ones_own_comes_through_config_yaml(tmp_path: Path) -> None:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from optics.geometry.pose import Pose, rotation_matrix
-from optics.geometry.solid import Coating, solid_mesh
-from optics.geometry.tree import Body, Motion, RigidTree
-from optics.raytrace.assembly import Assembly, Interaction
+from optics.geometry.solid import solid_mesh
+from optics.geometry.tree import Motion, RigidTree
+from optics.raytrace.assembly import Assembly
 from optics.raytrace.reflectors import EDGE, Mount, prism_0, prism_180, roof_offset
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
@@ -239,30 +239,3 @@ def test_bodies(hand, width) -> None:
     box = (SHIFT + width) * (width + 2.0 * EDGE) * (width + 2.0 * EDGE)
     placed = RigidTree(small.bodies).place()
     assert solid_mesh(small.solids[0], placed).mesh.volume == pytest.approx(box, rel=1e-9)
-
-
-def test_faces_do_what_they_should() -> None:
-    kinds = {face.name: face.coating for face in parts_180().solids[0].faces}
-    assert kinds["window"] is Coating.TRANSMITTING
-    assert kinds["mirror"] is Coating.MIRROR
-    assert kinds["roof_a"] is kinds["roof_b"] is Coating.TOTAL
-    assert {kinds[name] for name in ("top", "side_a", "side_b", "end_a", "end_b")} == {Coating.GROUND}
-    doing = [e.interaction for e in parts_180().elements]
-    assert doing == [
-        Interaction.REFRACT,
-        Interaction.REFLECT,
-        Interaction.TOTAL,
-        Interaction.TOTAL,
-        Interaction.REFRACT,
-    ]
-    # the coated face is coated because its 45 degrees barely exceed the critical angle, and the roofs are steeper
-    assert np.degrees(np.arcsin(1.0 / N)) < 45.0
-
-
-def test_what_cannot_be_made() -> None:
-    with pytest.raises(ValueError, match="no such face: roof"):
-        parts_180(errors={"roof": (0.0, 0.0)})
-    with pytest.raises(ValueError, match="cannot displace the beam by only 50 mm; at least 63 mm"):
-        prism_0(Mount("glass", Pose(), "p", "fused silica", 0.05, 0.06))
-    with pytest.raises(ValueError, match="glass/entry"):
-        RigidTree((Body("glass/entry"), *parts_0().bodies))

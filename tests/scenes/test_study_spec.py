@@ -32,13 +32,6 @@ def test_what_it_says() -> None:
     assert study.factors["b"].numbers().whole
     assert study.responses["r"].units == "um"
     assert study.responses["s"].units == "percent"
-    assert study.limits.runs == 20_000
-    assert study.limits.bytes == 4e9
-    assert study.noise == "own"
-
-
-def test_what_it_writes_reads_back() -> None:
-    study = read(TEXT)
     assert read(dump_yaml(study.plain())) == study
 
 

@@ -15,7 +15,6 @@ from scenes.models.thermal_model import ThermalModel
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera, load_instrument, load_job
-from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 
@@ -187,18 +186,3 @@ def test_tables_of_another_body_frame_or_unit_are_refused(silica, tmp_path) -> N
         heated_bodies(job(tmp_path, M1, "{table: heat.csv, frame: base/forwrd}"), silica)
     with pytest.raises(InputError, match="at -6"):
         warmed(silica, tmp_path, M1, points, np.full(len(points), -300.0))
-
-
-def test_the_job_knows_the_table_that_it_was_read_with(tmp_path, silica) -> None:
-    points = lattice(silica, M1, (5, 5, 3))
-    place = write(tmp_path / "heat.csv", points, quadratic(points))
-    job(tmp_path, M1, place.name)
-    resolved = resolve(tmp_path / "job.yaml")
-    given = resolved.job.perturb[M1].temperature
-    assert given.table == str(place)
-    assert resolved.job.perturb[M1].uses() == ("temperature",)
-    (tmp_path / "config.yaml").write_text(resolved.to_yaml())
-    assert resolve(tmp_path / "config.yaml") == resolved
-    place.write_text(place.read_text() + "# changed\n")
-    with pytest.raises(InputError, match="checksum is another"):
-        resolve(tmp_path / "config.yaml")

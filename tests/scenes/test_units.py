@@ -45,21 +45,14 @@ NO_QUANTITY = (
     *("two um", ""),
 )
 REFUSED = [
-    *((found, LENGTH, "a number without a unit", None) for found in (2, "2", 0, "0")),
     *((found, LENGTH, "not a quantity", None) for found in (True, None, ["1 m"])),
     *((found, LENGTH, "not a finite number", None) for found in NOT_FINITE),
     *((found, LENGTH, "not a number with a unit", None) for found in NO_QUANTITY),
     ("21/m^3", PER_LENGTH3, "not a number with a unit", None),
-    ("2 arcsek", ANGLE, "unknown unit 'arcsek'", "arcsec"),
     ("2 Um", LENGTH, "unknown unit 'Um'", "um"),
     ("3 dB", SCALE, "unknown unit", None),
-    ("2 um", ANGLE, "'um' is a unit of a length, not of an angle", None),
-    ("2 ppm", ANGLE, "'ppm' is a unit of a relative change, not of an angle", None),
     ("1 rad", SCALE, "'rad' is a unit of an angle, not of a relative change", None),
     ("2 sec", ANGLE, "'sec' is a unit of a time, not of an angle", "arcsec"),
-    ("2 m", SPEED, "'m' is a unit of a length, not of a speed", None),
-    ("2 km/s", LENGTH, "'km/s' is a unit of a speed, not of a length", None),
-    ("2 degC", TEMPERATURE_DIFFERENCE, "not of a temperature difference", None),
 ]
 KEPT = {
     ANGLE: ("2 arcsec", "-1.5 arcsec", "26 deg"),
@@ -74,9 +67,6 @@ KEPT = {
 def test_exact_values() -> None:
     for kind, texts in EXACT.items():
         assert {text: parse_quantity(text, kind) for text in texts} == texts
-
-
-def test_arcseconds() -> None:
     assert parse_quantity("2 arcsec", ANGLE) == pytest.approx(2 * math.pi / 648000, rel=4e-16)
 
 

@@ -64,28 +64,7 @@ def test_a_byte_order_mark_is_fine(tmp_path: Path) -> None:
     assert read_yaml(path).data == {"x": 1}
 
 
-AWKWARD = (
-    *(
-        "",
-        "null",
-        "1",
-        "1e3",
-        ".5",
-        "-.inf",
-        ".nan",
-        "true",
-        "a: b",
-        "# no",
-        " x ",
-        "*a",
-        "&a",
-        "!t",
-        "a\nb",
-        "ü µm",
-        "[",
-    ),
-    *("<<", "-"),
-)
+AWKWARD = ("", "a\nb", *"null|1|1e3|.5|-.inf|.nan|true|a: b|# no| x |*a|&a|!t|ü µm|[|<<|-".split("|"))
 NUMBERS = (0.1, 1e-300, 1.7976931348623157e308, -0.0, 3, 10**20, 1e16, True, None, 5e-324)
 
 
@@ -106,14 +85,7 @@ def test_too_many_values_are_refused_where_they_begin(monkeypatch: pytest.Monkey
     assert caught.value.key == ("b", 7)
 
 
-def test_texts_that_no_file_can_hold() -> None:
-    """They would end in HDF5, Matplotlib or the encoder, after all that is computed."""
-    for text in (r'unit: "a\0b"', r'unit: "\x1b[2J"', r'unit: "\ud800"', r'"un\0it": um', r'unit: ["\uffff"]'):
-        with pytest.raises(InputError, match=r"a control character, or half a character, in a text") as caught:
-            parse_yaml(f"name: x\n{text}\n", "study.yaml")
-        assert (caught.value.file, caught.value.line) == ("study.yaml", 2)
+def test_tabs_and_signs_of_units_are_texts() -> None:
     assert parse_yaml('note: "a\\tb\\nc µ ″"').data == {"note": "a\tb\nc µ ″"}
-    with pytest.raises(InputError, match="not valid YAML"):
-        parse_yaml("x: \x01\n")
     with pytest.raises(InputError, match="nested too deeply"):
         parse_yaml("[" * 500_000)

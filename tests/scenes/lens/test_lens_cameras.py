@@ -18,7 +18,6 @@ from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
 from scenes.lens.camera_writer import perturbed_prescription, prescription_of
-from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import own_glasses, read_catalogues
 from scenes.lens.prescription import SEQUENCE, Prescription, joined
 from scenes.lens.zemax_reader import read_zemax
@@ -30,7 +29,7 @@ from scenes.specs.load import EXAMPLES, load_camera, load_instrument
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
-from tests.scenes.lens.files import BATOID, CODEV, SINGLET, TMA
+from tests.scenes.lens.files import BATOID, SINGLET, TMA
 
 ROUNDING = 1e-12
 """Metres: some ten metres of path in float64, with a lever arm of mirrors."""
@@ -289,12 +288,6 @@ def test_the_command(tmp_path: Path, backend) -> None:
         assert code == 0, said
     moved = read_zemax(tmp_path / "a.zmx")
     assert moved.surfaces[1].pose.translation[2] == pytest.approx(-2.01593047747168 + 30e-6, abs=1e-14)
-
-
-def test_what_a_camera_cannot_hold_is_refused(tmp_path: Path, backend) -> None:
-    (tmp_path / "a.seq").write_text(CODEV.replace("SI 0.0 0.25\n  ADE 1.5", "SI 0.0 0.25\n  ADE 70"), "utf-8")
-    with pytest.raises(InputError, match="an image turned too far"):
-        camera_of(read_codev(tmp_path / "a.seq"), "c", backend)
 
 
 def test_what_a_zemax_file_cannot_hold_is_refused(tmp_path: Path, backend) -> None:

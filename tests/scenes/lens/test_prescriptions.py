@@ -102,30 +102,22 @@ def test_shapes_by_their_sag(tmp_path: Path) -> None:
     r2 = x * x + y * y
     base = -0.004 * r2 / (1.0 + math.sqrt(1.0 - 0.004**2 * r2))
     cases = {
-        "STANDARD": ((), 0.0),
-        "EVENASPH": (("PARM 1 1e-4", "PARM 2 2e-7", "PARM 3 3e-10"), 1e-4 * r2 + 2e-7 * r2**2 + 3e-10 * r2**3),
-        "ODDASPHE": (("PARM 2 1e-4", "PARM 4 2e-7"), 1e-4 * r2 + 2e-7 * r2**2),
+        "STANDARD": ("", 0.0),
+        "EVENASPH": ("PARM 1 1e-4; PARM 2 2e-7; PARM 3 3e-10", 1e-4 * r2 + 2e-7 * r2**2 + 3e-10 * r2**3),
+        "ODDASPHE": ("PARM 2 1e-4; PARM 4 2e-7", 1e-4 * r2 + 2e-7 * r2**2),
         "XPOLYNOM": (
-            ("XDAT 1 9 0 0 1", "XDAT 2 20 0 0 1", "XDAT 5 0.01 0 0 1", "XDAT 6 0.02 0 0 1", "XDAT 11 0.03 0 0 1"),
+            "XDAT 1 9 0 0 1; XDAT 2 20 0 0 1; XDAT 5 0.01 0 0 1; XDAT 6 0.02 0 0 1; XDAT 11 0.03 0 0 1",
             0.01 * x**2 / 20**2 + 0.02 * x * y / 20**2 + 0.03 * y**3 / 20**3,
         ),
         "SZERNSAG": (
-            (
-                "PARM 2 2e-7",
-                "PARM 9 1",
-                "PARM 10 -2",
-                "XDAT 1 5 0 0 1",
-                "XDAT 2 25 0 0 1",
-                "XDAT 6 0.01",
-                "XDAT 7 0.02",
-            ),
+            "PARM 2 2e-7; PARM 9 1; PARM 10 -2; XDAT 1 5 0 0 1; XDAT 2 25 0 0 1; XDAT 6 0.01; XDAT 7 0.02",
             2e-7 * r2**2
             + 0.01 * math.sqrt(3.0) * (2.0 * ((x - 1) ** 2 + (y + 2) ** 2) / 25**2 - 1.0)
             + 0.02 * math.sqrt(6.0) * 2.0 * (x - 1) * (y + 2) / 25**2,
         ),
     }
     for kind, (lines, more) in cases.items():
-        surface = shaped(tmp_path, kind, *lines).surfaces[1].surface
+        surface = shaped(tmp_path, kind, *filter(None, lines.split("; "))).surfaces[1].surface
         assert 1e3 * float(surface.sag(x * 1e-3, y * 1e-3)) == pytest.approx(base + more, rel=1e-12), kind
 
 

@@ -15,7 +15,7 @@ from scenes.lens.camera_reader import camera_of
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import own_glasses, read_catalogue
 from scenes.lens.zemax_reader import read_zemax
-from scenes.models.camera_model import build_camera_under_test
+from scenes.models.camera_model import build_camera_under_test, derive_camera
 from scenes.models.disturbances import motions_of_spec, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.scenery import measured_finishes
@@ -54,6 +54,7 @@ from scenes.yaml.units import ANGLE, LENGTH
 from scenes.yaml.yaml_file import read_yaml
 from tests.scenes.lens.colour_cameras import colour_camera
 from tests.scenes.test_finish_tables import bsdf_text
+from twin.monitor.monitor_experiment import MonitorExperiment
 
 Fixture = Callable[[str], Any]
 Read = Callable[[Path], object]
@@ -153,6 +154,27 @@ def stated_job(folder: Path, fixture: Fixture) -> Read:
     return read
 
 
+def experiment(folder: Path, fixture: Fixture) -> Read:
+    """A job's state, with tables of temperatures from 20 degC to others on both sides of a mirror."""
+    backend = fixture("backend")
+    places = [(x, y, z) for x in (-300, -9, 9, 300) for y in (-500, -100) for z in (-20, 20)]
+    for name, low, high in (("hot", 20, 130), ("cold", -273, 20)):
+        rows = "".join(f"{x},{y},{z},{low if x < 0 else high}\n" for x, y, z in places)
+        (folder / f"{name}.csv").write_text(f"x [mm],y [mm],z [mm],T [degC]\n{rows}", "utf-8")
+
+    def read(path: Path) -> object:
+        resolved = resolve(path)
+        return MonitorExperiment(resolved, backend).state(resolved.job)
+
+    return read
+
+
+def of_a_job(folder: Path, fixture: Fixture) -> Read:
+    """An instrument that a job names, with all its files."""
+    (folder / "job.yaml").write_text("instrument: own.yaml\n", "utf-8")
+    return lambda path: resolve(folder / "job.yaml")
+
+
 def payload(folder: Path, fixture: Fixture) -> Read:
     """A three-line camera of a simulated pass."""
     orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
@@ -213,6 +235,11 @@ def finishes(folder: Path, fixture: Fixture) -> Read:
 def agf(folder: Path, fixture: Fixture) -> Read:
     """A glass catalogue."""
     return read_catalogue
+
+
+def derived(folder: Path, fixture: Fixture) -> Read:
+    """A camera with all that follows from its surfaces."""
+    return lambda path: derive_camera(load_camera(path), fixture("backend"))
 
 
 def _lens_camera(read: Read) -> Callable[[Path, Fixture], Read]:
