@@ -1,7 +1,10 @@
+"""Apertures and edges of surfaces: what they hold, areas, turns, the same edge in a frame that is turned over."""
+
 import numpy as np
 import pytest
+from matplotlib.path import Path as Outline
 
-from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
+from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Polygon, Ray, Rectangle, turned_over
 from optics.geometry.surface import plane
 from optics.numerics.backend import Backend
 from tests.optics.bench import PASS, Stage, beam, build, run
@@ -36,3 +39,61 @@ def test_a_rectangle_is_walked_in_even_steps() -> None:
     """Each corner once: from a point to the next it is a tenth of a side."""
     steps = np.linalg.norm(np.diff(Rectangle(2.0, 1.0).outline(40), axis=0), axis=-1)
     np.testing.assert_allclose(steps, np.repeat([0.4, 0.2, 0.4, 0.2], 10), rtol=1e-12)
+
+
+L_SHAPE = ((0.0, 0.0), (1.0, 0.0), (1.0, 0.4), (0.4, 0.4), (0.4, 1.0), (0.0, 1.0))
+SHAPES = (
+    (Circle(0.8, (0.1, -0.2)), np.pi * 0.64),
+    (Circle(0.8, (0.1, -0.2), 0.3), np.pi * (0.64 - 0.09)),
+    (Rectangle(0.5, 0.2, (-0.1, 0.3)), 0.4),
+    (Ellipse(0.5, 0.2, (-0.1, 0.3)), np.pi * 0.1),
+    (Ray(0.3, (0.5, 0.1)), 0.3 * 1.5),  # as far as the field reaches, which is x = 2
+    (Polygon(L_SHAPE), 0.64),
+)
+
+
+def field(count: int = 400_000) -> tuple[np.ndarray, np.ndarray]:
+    """Points spread evenly over -2 .. 2."""
+    x, y = np.random.default_rng(5).uniform(-2.0, 2.0, (2, count))
+    return x, y
+
+
+@pytest.mark.parametrize(("shape", "area"), SHAPES, ids=lambda one: type(one).__name__)
+def test_the_area_is_the_shape_s_and_the_rest_is_the_other_way_round(shape, area) -> None:
+    x, y = field()
+    clear = Edge(shape).passes(x, y)
+    share = area / 16.0
+    # binomial: five standard deviations are passed once in two million
+    assert np.mean(clear) == pytest.approx(share, abs=5.0 * np.sqrt(share * (1.0 - share) / x.size))
+    np.testing.assert_array_equal(Edge(shape, blocks=True).passes(x, y), ~clear)
+
+
+@pytest.mark.parametrize("shape", [shape for shape, _ in SHAPES if not isinstance(shape, Polygon)], ids=repr)
+def test_a_turn_is_right_handed_about_the_shape_s_own_centre(shape) -> None:
+    x, y = field(20_000)
+    turn = 0.7
+    cx, cy = shape.centre
+    moved = (
+        cx + np.cos(turn) * (x - cx) - np.sin(turn) * (y - cy),
+        cy + np.sin(turn) * (x - cx) + np.cos(turn) * (y - cy),
+    )
+    same = Edge(shape, turn=turn).passes(*moved) == Edge(shape).passes(x, y)
+    assert np.mean(same) == 1.0
+    if not isinstance(shape, Circle):
+        assert np.mean(Edge(shape, turn=turn).passes(x, y) == Edge(shape).passes(x, y)) < 0.999
+
+
+@pytest.mark.parametrize("shape", [shape for shape, _ in SHAPES], ids=lambda one: type(one).__name__)
+def test_turned_over_it_is_the_same_edge_at_minus_y(shape) -> None:
+    x, y = field(20_000)
+    edge = Edge(shape, blocks=True, turn=0.0 if isinstance(shape, Polygon) else 0.4)
+    np.testing.assert_array_equal(turned_over(edge).passes(x, -y), edge.passes(x, y))
+    assert turned_over(turned_over(edge)) == edge
+
+
+def test_a_polygon_is_matplotlibs() -> None:
+    x, y = field(20_000)
+    radii, turns = np.tile([1.5, 0.6], 5), np.arange(10) * np.pi / 5.0
+    star = tuple(map(tuple, np.stack([radii * np.cos(turns), radii * np.sin(turns)], axis=-1).tolist()))
+    inside = Outline(np.array([*star, star[0]]), closed=True).contains_points(np.stack([x, y], axis=-1))
+    np.testing.assert_array_equal(Edge(Polygon(star)).passes(x, y), inside)

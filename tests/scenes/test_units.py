@@ -1,13 +1,20 @@
-"""Quantities: exact values, exact round trips, and refusals that say what is allowed."""
+"""Quantities: exact values, exact round trips, examples in messages, and refusals that say what is allowed."""
 
+import importlib
 import math
+import pkgutil
 import random
 import sys
+from collections.abc import Iterator
 
 import pytest
 
+import scenes.specs
 from scenes.yaml import units
 from scenes.yaml.errors import Problem
+from scenes.yaml.examples import EXAMPLES, example_of
+from scenes.yaml.quantity import Quantity, Vector
+from scenes.yaml.spec import Spec
 from scenes.yaml.units import (
     ANGLE,
     DISTANCE,
@@ -140,3 +147,36 @@ def test_a_decimal_comma_is_told() -> None:
         with pytest.raises(Problem) as caught:
             parse_quantity(text, LENGTH)
         assert "decimal comma" not in str(caught.value)
+
+
+for module in pkgutil.walk_packages(scenes.specs.__path__, "scenes.specs."):
+    importlib.import_module(module.name)
+
+
+def kinds(spec: type[Spec]) -> Iterator[type[Spec]]:
+    for one in spec.__subclasses__():
+        yield one
+        yield from kinds(one)
+
+
+QUANTITIES = {
+    (spec.__name__, name): item.of if isinstance(item, Vector) else item
+    for spec in kinds(Spec)
+    for name, field in spec.model_fields.items()
+    for item in field.metadata
+    if isinstance(item, Quantity | Vector)
+}
+
+
+def test_every_example_is_allowed() -> None:
+    assert len(QUANTITIES) > 150
+    for (_, name), quantity in QUANTITIES.items():
+        quantity.parse(example_of(quantity, (name,)))
+
+
+def test_an_example_is_of_its_key() -> None:
+    names = {name for _, name in QUANTITIES}
+    assert {key.rpartition(".")[2] for key in EXAMPLES} <= names
+    pupil = QUANTITIES["CameraSpec", "entrance_pupil"]
+    assert example_of(pupil, ("entrance_pupil",)) == "0.6 m"
+    assert example_of(QUANTITIES["Prism0Spec", "shift"], ("monitor", "prism_0", "shift")) == "100 mm"
