@@ -266,10 +266,7 @@ causes:
 
 def test_derivatives_by_radii_and_conic_constants(backend, pair) -> None:
     """Central differences of another step agree to the term of third order, some 1e-6."""
-    found = motions_of_spec(
-        spec("", "name: own\ncauses:\n  a: {bodies: base/forward/M?, radius: 100 ppm, conic: 1.0e-4, reason: r}\n"),
-        pair,
-    )
+    found = stated(pair, "  a: {bodies: base/forward/M?, radius: 100 ppm, conic: 1.0e-4, reason: r}\n")
     path = MonitorPath(pair, backend)
     known = disturbances_of(found, path, ThermalModel(pair), pair, backend)
     for k, component in enumerate(found.components):

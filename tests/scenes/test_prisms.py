@@ -276,7 +276,7 @@ def small(shift=SHIFT, width=WIDTH, errors=None):
 
 
 def made(kind: str, hand: float = 1.0, errors=None):
-    """Parts and where the middle of the wide_beam enters."""
+    """Parts and where the middle of the beam enters."""
     if kind == "periscope":
         return small(errors=errors), np.array([-0.5 * SHIFT, 0.0, -0.2])
     return hollow(hand=hand, errors=errors), np.array([-0.5 * LENGTH, hand * hollow_offset(WIDTH), -0.2])
@@ -374,7 +374,7 @@ def test_plates_and_frame_leave_room_to_the_beam_and_to_each_other(kind, width, 
         segments = np.stack([places[:-1], places[1:]], axis=1).transpose(2, 0, 1, 3)
         for path, corners in bodies.items():
             assert not rays_taken(segments, ConvexHull(corners).equations).any(), path
-        # the whole wide_beam meets every mirror within its clear aperture, which its plate surrounds
+        # the whole beam meets every mirror within its clear aperture, which its plate surrounds
         for element, at in zip(parts.elements, places[1:-1], strict=True):
             local = placed.pose(element.body).inverse().apply(at)
             assert element.aperture.grown(1.0 + 1e-9).contains(local[:, 0], local[:, 1]).all()
@@ -398,13 +398,13 @@ def model(backend, tmp_path_factory):
 
 
 def test_what_stands_in_which_beam(model, gf7_pair, backend) -> None:
-    """No glass, bodies clear of each other, and nothing in a monitor wide_beam; plates and frames of the 180-deg kind take
+    """No glass, bodies clear of each other, and nothing in a monitor beam; plates and frames of the 180-deg kind take
     less of the pupil than the glass that they stand for.
     """
     assert not model.assembly.media
     assert find_overlaps(model) == ()
     found = find_obstructions(model, backend)
-    assert {o.wide_beam for o in found} == {"forward/imaging", "backward/imaging"}
+    assert {o.beam for o in found} == {"forward/imaging", "backward/imaging"}
     assert all("/prism_180" in o.body for o in found)
     glass = {o.body: o.share for o in find_obstructions(gf7_pair, backend)}
     for path, share in glass.items():

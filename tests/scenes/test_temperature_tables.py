@@ -286,10 +286,10 @@ def test_a_mesh_says_what_a_table_says(tmp_path, nodes, gf7_pair, ending: str) -
 def test_the_job_knows_the_table_that_it_was_read_with(tmp_path, nodes) -> None:
     place = table(tmp_path / "m1.csv", nodes)
     resolved = resolve(deformed(tmp_path, place.name))
-    given = resolved.deformed.perturb[BODY].deformation
+    given = resolved.job.perturb[BODY].deformation
     assert given is not None
     assert given.table == str(place)
-    assert resolved.deformed.perturb[BODY].uses() == ("deformation",)
+    assert resolved.job.perturb[BODY].uses() == ("deformation",)
     config = tmp_path / "config.yaml"
     config.write_text(resolved.to_yaml())
     assert resolve(config) == resolved
