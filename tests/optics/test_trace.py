@@ -16,7 +16,7 @@ from optics.geometry.tree import Body, RigidTree
 from optics.raytrace.assembly import Assembly, Element
 from optics.raytrace.trace import BeamMissedError, require_some
 from tests.optics.bench import PASS, REFLECT, REFRACT, Stage, at, beam, build, disk_points, run, unit
-from tests.optics.test_motion_properties import motions, poses, vectors
+from tests.optics.test_tree import motions, poses, vectors
 
 Z = np.array([0.0, 0.0, 1.0])
 

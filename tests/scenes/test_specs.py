@@ -1,4 +1,4 @@
-"""Files of tests in orbit: units and defaults, the way to cameras and instruments, and configurations read back."""
+"""Files of tests in orbit, of plans of operation and of studies: values, defaults, ways to other files, read back."""
 
 import math
 from pathlib import Path
@@ -6,7 +6,11 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter
 
-from scenes.specs.load import LIBRARY, ORBIT, SCENES, load_camera, load_instrument
+from optics.numerics.backend import load_backend
+from scenes.models.disturbances import stated_motions
+from scenes.models.instrument_builder import build_instrument
+from scenes.specs.load import EXAMPLES, LIBRARY, ORBIT, SCENES, load_camera, load_instrument
+from scenes.specs.operation import ENDINGS, OperationSpec, read_operation, resolve_operation
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, UtcTime, parse_utc
 from scenes.specs.orbit.monitor import MotionSpec
 from scenes.specs.orbit.setup import (
@@ -16,10 +20,13 @@ from scenes.specs.orbit.setup import (
     resolve_monitor,
     resolve_simulate,
 )
+from scenes.specs.study import StudySpec, unit_of
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.spec import Spec, validate
-from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from scenes.yaml.units import parse_quantity
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml, read_yaml
 from tests.scenes.refusals.tables import good
+from tests.tiers import quick
 
 ARCSEC = math.pi / 648000.0
 PASSING, ELEMENTS, STATE = (good(f"orbit by {name}") for name in ("a passing", "elements", "a state"))
@@ -166,3 +173,107 @@ def test_a_payload_of_ones_own_comes_through_config_yaml(tmp_path: Path) -> None
     assert image.obstruction[0][0] == (-0.6, 0.6)
     again = resolve_simulate(write(tmp_path, setup.to_yaml())).camera.image_of("nadir")
     assert again.obstruction == image.obstruction
+
+
+SHORT = "instrument: gf7_pair\ndisturbances: in_service\n"
+
+
+def written(folder: Path, text: str) -> Path:
+    file = folder / "plan.yaml"
+    file.write_text(text, "utf-8")
+    return file
+
+
+def test_the_example_says_its_limits_in_the_units_of_its_quantities() -> None:
+    setup = read_operation(EXAMPLES / "operation.yaml")
+    limits = {(one.group, one.key): (one.largest, one.probability) for one in setup.operation.requirements}
+    assert limits == {
+        ("intersection_angle", "change_arcsec"): (pytest.approx(2.0), 0.99),
+        ("forward", "d_f_um"): (pytest.approx(60.0), 0.95),
+        ("ground", "height_m"): (10.0, 0.95),
+    }
+    assert {cause for causes in setup.operation.events.values() for cause in causes} <= set(setup.disturbances.causes)
+    again = OperationSpec.model_validate(setup.operation.plain())
+    assert again == setup.operation
+    assert resolve_operation(again).model.plain() == setup.model.plain()
+
+
+@pytest.mark.parametrize("instrument", quick(1, ["gf7_pair", "gf7_pair_two"]))
+def test_in_service_finds_its_bodies_in_both_instruments(instrument: str, tmp_path: Path) -> None:
+    """Every cause has bodies, and the causes share a few laws of time, each of which an estimate carries along."""
+    setup = read_operation(written(tmp_path, SHORT.replace("gf7_pair", instrument)))
+    built = build_instrument(setup.model.instrument, setup.model.cameras, load_backend())
+    stated = stated_motions(setup.model, built)
+    assert stated is not None
+    assert {one.cause for one in stated.components} == set(setup.disturbances.causes)
+    assert len({law.text for law in stated.laws}) == 6
+
+
+def test_own_files_are_found_from_the_plans_folder(tmp_path: Path) -> None:
+    cause = "{bodies: base/<camera>, rotate: 1 arcsec, time: {drift: 4800 h}, reason: a test}"
+    (tmp_path / "own.yaml").write_text(f"name: own\ncauses:\n  mount: {cause}\n")
+    setup = read_operation(written(tmp_path, SHORT.replace("in_service", "own.yaml")))
+    assert setup.operation.disturbances == str(tmp_path / "own.yaml")
+    assert list(setup.disturbances.causes) == ["mount"]
+
+
+def test_every_ending_measures_one_of_its_unit() -> None:
+    for kind, unit in ENDINGS.values():
+        assert parse_quantity(f"1 {unit}", kind) > 0.0
+
+
+TEXT = """name: study
+base: {command: render, file: perturb}
+factors:
+  a: {key: [job, x], range: [0 um, 0.003 mm], count: 3}
+  b: {keys: [[y, 1], [z]], values: [9, 16]}
+responses:
+  r: {key: [truth, d_f_um], sigma: [truth, d_f_um_sigma]}
+  s: {key: [truth, share], unit: percent}
+report: {scatter: [[a, r]], thresholds: {good: {response: r, at_most: 2}}}
+"""
+
+
+def read_study(text: str) -> StudySpec:
+    return validate(StudySpec, parse_yaml(text, "study.yaml"))
+
+
+def test_what_it_says() -> None:
+    study = read_study(TEXT)
+    assert study.factors["a"].unit == "um"
+    assert study.factors["a"].numbers().values == (0.0, 3.0)
+    assert study.factors["a"].places == (("job", "x"),)
+    assert study.factors["b"].places == (("y", 1), ("z",))
+    assert study.factors["b"].numbers().whole
+    assert study.responses["r"].units == "um"
+    assert study.responses["s"].units == "percent"
+    assert read_study(dump_yaml(study.plain())) == study
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("study_*.yaml")), ids=lambda file: file.stem)
+def test_the_examples_are_valid(file) -> None:
+    study = validate(StudySpec, read_yaml(file))
+    assert study.name == file.stem
+    assert study.description
+    # what is called noise is the noise's own sigma, not the total one, in which it is a thousandth
+    said = [one.noise for one in study.responses.values() if one.noise is not None]
+    said += [one.key for name, one in study.responses.items() if name.endswith("_noise")]
+    assert all(str(key[-1]).endswith("_sigma_noise") for key in said)
+    assert all(one.noise is not None for one in study.responses.values() if one.sigma is not None)
+
+
+UNITS = {
+    "focus.fields.0.error_um": "um", "recovered.change_arcsec_sigma": "arcsec", "focus.shims_um.2": "um",
+    "recovered.change_arcsec_sigma_noise": "arcsec", "monitor.gradient_K_per_m": "K/m",
+    "temperature.linear_gradient_k_per_m": "K/m", "monitor.height_m_per_arcsec": "m/arcsec",
+    "angle.height_m_per_arcsec.alpha": "m/arcsec", "quality.cameras.forward.defocus_um.centre": "um",
+    "quality.cameras.forward.wfe_rms_waves_focus_removed.1": "waves",
+    "block.cameras.scene.d_alpha_arcsec_sigma_before": "arcsec", "block.cameras.scene.d_f_um_true": "um",
+    "simulate.lines.drift_px_per_line": "", "optics.nyquist_per_mm": "1/mm", "turntable.rejected": "", "x.m": "",
+    "optics.plate_scale_arcsec_per_mm_sigma": "arcsec/mm", "orbit.velocity_m_per_s": "m/s",
+}  # fmt: skip
+
+
+def test_units_of_results() -> None:
+    for key, unit in UNITS.items():
+        assert unit_of(tuple(int(part) if part.isdigit() else part for part in key.split("."))) == unit, key
