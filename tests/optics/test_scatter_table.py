@@ -13,19 +13,7 @@ import pytest
 from scipy.integrate import dblquad, quad
 from scipy.stats import chi2
 
-from optics.materials.finish import (
-    ABSORBER,
-    BARE,
-    BLACK,
-    COATED,
-    GROUND,
-    MIRROR,
-    SILICON,
-    CoatingTable,
-    Finish,
-    cosine_after,
-    reflectance,
-)
+from optics.materials import finish as finishes
 from optics.materials.scatter import STEPS, ABg, HarveyShack, ScatterTable, acceptance, sample_distance, total_scatter
 from scenes.models.scenery import MeasuredFinishes
 from scenes.models.scenery_parts import Finishes
@@ -135,10 +123,10 @@ def test_shares_of_drawn_cells_are_those_of_the_table() -> None:
 
 
 def test_coatings() -> None:
-    coating = CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]), np.array([0.8, 0.5]))
+    coating = finishes.CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]), np.array([0.8, 0.5]))
     assert coating.at(np.radians(20.0), True) == pytest.approx((0.2, 0.65))
     assert coating.at(np.radians(80.0), True) == pytest.approx((0.3, 0.5))
-    bare = CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]))
+    bare = finishes.CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]))
     assert bare.at(np.radians(20.0), True) == pytest.approx((0.2, 0.8))
     assert bare.at(np.radians(20.0), False) == pytest.approx((0.2, 0.0))
     np.testing.assert_allclose(bare.drawn(False)[80], [0.2, 0.0])
@@ -209,8 +197,20 @@ def test_draws_follow_the_bsdf(scatter: ABg | HarveyShack) -> None:
     assert statistic < chi2.ppf(1.0 - FALSE_ALARM, len(rest) - 1)
 
 
-@pytest.mark.parametrize("finish", [MIRROR, COATED, BARE, GROUND, BLACK, SILICON, ABSORBER], ids=repr)
-def test_library_finishes_conserve_energy(finish: Finish) -> None:
+@pytest.mark.parametrize(
+    "finish",
+    [
+        finishes.MIRROR,
+        finishes.COATED,
+        finishes.BARE,
+        finishes.GROUND,
+        finishes.BLACK,
+        finishes.SILICON,
+        finishes.ABSORBER,
+    ],
+    ids=repr,
+)
+def test_library_finishes_conserve_energy(finish: finishes.Finish) -> None:
     total = finish.reflectance + finish.transmission + finish.diffuse
     assert 0.0 <= total <= (0.0 if finish.bare else 1.0)
     assert len(finish.numbers) == 8
@@ -225,32 +225,34 @@ def test_against_the_sine_and_tangent_form(before: float, after: float) -> None:
     a = np.linspace(0.01, 0.999 * min(critical, 0.5 * np.pi), 200)
     b = np.arcsin(before / after * np.sin(a))
     s, p = np.sin(a - b) / np.sin(a + b), np.tan(a - b) / np.tan(a + b)
-    np.testing.assert_allclose(reflectance(np.cos(a), before, after), 0.5 * (s**2 + p**2), rtol=1e-9)
-    np.testing.assert_allclose(cosine_after(np.cos(a), before, after), np.cos(b), rtol=1e-12)
+    np.testing.assert_allclose(finishes.reflectance(np.cos(a), before, after), 0.5 * (s**2 + p**2), rtol=1e-9)
+    np.testing.assert_allclose(finishes.cosine_after(np.cos(a), before, after), np.cos(b), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("before", "after"), INDICES)
 def test_normal_and_grazing_incidence(before: float, after: float) -> None:
-    assert reflectance(1.0, before, after) == pytest.approx(((before - after) / (before + after)) ** 2, rel=1e-14)
-    assert reflectance(0.0, before, after) == pytest.approx(1.0, abs=1e-10)
+    assert finishes.reflectance(1.0, before, after) == pytest.approx(
+        ((before - after) / (before + after)) ** 2, rel=1e-14
+    )
+    assert finishes.reflectance(0.0, before, after) == pytest.approx(1.0, abs=1e-10)
 
 
 def test_brewster_leaves_only_one_polarisation() -> None:
     n = 1.5
     angle = np.arctan(n)
     s = np.sin(angle - (0.5 * np.pi - angle))
-    assert reflectance(np.cos(angle), 1.0, n) == pytest.approx(0.5 * s**2, rel=1e-12)
+    assert finishes.reflectance(np.cos(angle), 1.0, n) == pytest.approx(0.5 * s**2, rel=1e-12)
 
 
 def test_beyond_the_critical_angle_all_is_reflected() -> None:
     cosine = np.cos(np.arcsin(1.0 / 1.5) + np.linspace(1e-9, 0.5, 50))
-    assert np.all(reflectance(cosine, 1.5, 1.0) == 1.0)
-    assert np.all(cosine_after(cosine, 1.5, 1.0) == 0.0)
-    assert reflectance(np.cos(np.arcsin(1.0 / 1.5) - 1e-6), 1.5, 1.0) < 1.0
+    assert np.all(finishes.reflectance(cosine, 1.5, 1.0) == 1.0)
+    assert np.all(finishes.cosine_after(cosine, 1.5, 1.0) == 0.0)
+    assert finishes.reflectance(np.cos(np.arcsin(1.0 / 1.5) - 1e-6), 1.5, 1.0) < 1.0
 
 
 def test_the_same_on_drjit(backend) -> None:
     cosine = np.linspace(0.0, 1.0, 101)
     for before, after in INDICES:
-        got = reflectance(backend.opaque(cosine), before, after).numpy()
-        np.testing.assert_allclose(got, reflectance(cosine, before, after), rtol=0, atol=1e-15)
+        got = finishes.reflectance(backend.opaque(cosine), before, after).numpy()
+        np.testing.assert_allclose(got, finishes.reflectance(cosine, before, after), rtol=0, atol=1e-15)

@@ -7,21 +7,8 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
+from optics.geometry import solid as solids
 from optics.geometry.pose import Pose, rotation_matrix
-from optics.geometry.solid import (
-    MERGED,
-    REACH,
-    Coating,
-    EmptyBodyError,
-    Face,
-    OpenBodyError,
-    Polyhedron,
-    Solid,
-    SolidError,
-    enclosed,
-    face_plane,
-    solid_mesh,
-)
 from optics.geometry.tree import Body, Motion, RigidTree
 from tests.tiers import quick
 
@@ -36,13 +23,13 @@ def axes(normal) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
-def solid_of(*planes, path: str = "glass") -> Solid:
+def solid_of(*planes, path: str = "glass") -> solids.Solid:
     """Faces (normal, point) on the solid's own body."""
     faces = (
-        Face(f"face{k}", path, Coating.TRANSMITTING, Pose(axes(n), np.array(p, float)))
+        solids.Face(f"face{k}", path, solids.Coating.TRANSMITTING, Pose(axes(n), np.array(p, float)))
         for k, (n, p) in enumerate(planes)
     )
-    return Solid(path, "N-BK7", tuple(faces))
+    return solids.Solid(path, "N-BK7", tuple(faces))
 
 
 def alone(pose: Pose | None = None):
@@ -72,7 +59,7 @@ CORNER = [((-1, 0, 0), (0, 0, 0)), ((0, -1, 0), (0, 0, 0)), ((0, 0, -1), (0, 0, 
 def test_volume_and_outline(planes, volume, corners, edges) -> None:
     pose = Pose(rotation_matrix(np.array([0.4, -1.1, 2.0])), np.array([1.0, -2.0, 3.0]))
     solid = solid_of(*planes)
-    made = solid_mesh(solid, alone(pose))
+    made = solids.solid_mesh(solid, alone(pose))
     assert made.mesh.is_watertight
     assert made.mesh.volume == pytest.approx(volume, rel=ROUNDING * 1e3)  # offsets of a body 4 m away lose three digits
     assert len(made.mesh.vertices) == corners
@@ -93,15 +80,15 @@ def test_a_turned_face_makes_a_wedge() -> None:
     """
     angle = 0.01
     base = solid_of(*BOX)
-    faces = (*base.faces[:4], Face("top", "glass/top", Coating.TOTAL), base.faces[5])
-    solid = Solid("glass", "N-BK7", faces)
+    faces = (*base.faces[:4], solids.Face("top", "glass/top", solids.Coating.TOTAL), base.faces[5])
+    solid = solids.Solid("glass", "N-BK7", faces)
     tree = RigidTree((Body("glass"), Body("glass/top", Pose(np.eye(3), np.array([0.05, 0.0, 0.04])))))
     placed = tree.place([{"glass/top": Motion(rotate=(0.0, angle, 0.0))}])
-    made = solid_mesh(solid, placed)
+    made = solids.solid_mesh(solid, placed)
     top = made.polygons[4]
     assert top[:, 2] == pytest.approx(0.04 - np.tan(angle) * (top[:, 0] - 0.05), abs=ROUNDING)
     assert made.mesh.volume == pytest.approx(0.3 * 0.1 * 0.04, rel=1e-9)  # it turns about the middle of the face
-    point, normal = face_plane(faces[4], placed)
+    point, normal = solids.face_plane(faces[4], placed)
     assert point == pytest.approx([0.05, 0.0, 0.04], abs=ROUNDING)
     assert normal == pytest.approx([np.sin(angle), 0.0, np.cos(angle)], abs=ROUNDING)
 
@@ -109,7 +96,7 @@ def test_a_turned_face_makes_a_wedge() -> None:
 def test_a_grown_body_grows_its_own_faces() -> None:
     tree = RigidTree((Body("glass", Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))),))
     states = [{"glass": motion} for motion in (Motion(), Motion(scale=0.01), Motion(stretch=0.01))]
-    volumes = np.array([solid_mesh(solid_of(*BOX), tree.place([state])).mesh.volume for state in states])
+    volumes = np.array([solids.solid_mesh(solid_of(*BOX), tree.place([state])).mesh.volume for state in states])
     np.testing.assert_allclose(volumes[1:] / volumes[0], 1.01**3, rtol=1e-9)
 
 
@@ -126,8 +113,8 @@ def test_a_grown_body_grows_its_own_faces() -> None:
     ids=["no bottom", "two parallel faces", "a corner only", "inside out", "thinner than a nanometre", "face beyond"],
 )
 def test_what_is_no_body(planes, words) -> None:
-    with pytest.raises(SolidError, match=words) as caught:
-        solid_mesh(solid_of(*planes), alone())
+    with pytest.raises(solids.SolidError, match=words) as caught:
+        solids.solid_mesh(solid_of(*planes), alone())
     assert str(caught.value).startswith("glass: ")
 
 
@@ -142,14 +129,14 @@ def unit(vectors) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def mesh_of(body: Polyhedron) -> trimesh.Trimesh:
+def mesh_of(body: solids.Polyhedron) -> trimesh.Trimesh:
     fans = [(ring[0], ring[i], ring[i + 1]) for ring in body.rings for i in range(1, len(ring) - 1)]
     return trimesh.Trimesh(body.vertices, fans, process=False)
 
 
-def checked(normals: np.ndarray, offsets: np.ndarray) -> tuple[Polyhedron, float]:
+def checked(normals: np.ndarray, offsets: np.ndarray) -> tuple[solids.Polyhedron, float]:
     """The body after a check of all that holds for every body, and its volume."""
-    body = enclosed(normals, offsets)
+    body = solids.enclosed(normals, offsets)
     mesh = mesh_of(body)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
@@ -159,7 +146,7 @@ def checked(normals: np.ndarray, offsets: np.ndarray) -> tuple[Polyhedron, float
     for k, ring in enumerate(body.rings):
         assert len(set(ring)) == len(ring) != 1
         # where an edge went, one end has moved by its length; hardly ever several in a row
-        assert np.all(heights[list(ring), k] > -3.0 * MERGED)
+        assert np.all(heights[list(ring), k] > -3.0 * solids.MERGED)
     return body, float(mesh.volume)
 
 
@@ -207,13 +194,13 @@ def random_bodies(count: int, seed: int) -> int:
         normals, offsets = random_planes(rng)
         try:
             body, volume = checked(normals, offsets)
-        except EmptyBodyError:
-            with pytest.raises(EmptyBodyError):
-                enclosed(normals[::-1], offsets[::-1])
+        except solids.EmptyBodyError:
+            with pytest.raises(solids.EmptyBodyError):
+                solids.enclosed(normals[::-1], offsets[::-1])
             continue
         bodies += 1
         # edges of that length were taken out, on a body of that much surface
-        slack = MERGED * mesh_of(body).area
+        slack = solids.MERGED * mesh_of(body).area
         assert volume == pytest.approx(volume_by_triples(normals, offsets), abs=slack)
         order = rng.permutation(len(offsets))
         assert checked(normals[order], offsets[order])[1] == pytest.approx(volume, abs=slack)
@@ -237,9 +224,9 @@ def test_planes_that_nearly_meet_in_a_point(size) -> None:
         offsets = np.array([*size * rng.uniform(-1.0, 1.0, 4), height])
         body, volume = checked(normals, offsets)
         area = (2 * half) ** 2 + 4 * half * np.hypot(half, height)
-        assert volume == pytest.approx((2 * half) ** 2 * height / 3.0, abs=(3.0 * size + MERGED) * area)
+        assert volume == pytest.approx((2 * half) ** 2 * height / 3.0, abs=(3.0 * size + solids.MERGED) * area)
         assert all(body.rings)
-        if size < 0.1 * MERGED:
+        if size < 0.1 * solids.MERGED:
             assert len(body.vertices) == 5  # one apex
 
 
@@ -248,9 +235,9 @@ def test_a_chamfer_that_shrinks_to_nothing(width) -> None:
     """V = 1 - t^2 / 2 for edges cut by t; narrower than what counts, the face is none and the cube is whole."""
     normals = np.concatenate([CUBE[0], unit([[1, 1, 0]])])
     body, volume = checked(normals, np.append(CUBE[1], (1.0 - width) / np.sqrt(2.0)))
-    assert volume == pytest.approx(1.0 - 0.5 * width**2, abs=2.0 * MERGED if width < MERGED else 1e-14)
-    assert len(body.rings[6]) == (0 if width * np.sqrt(2.0) < MERGED else 4)
-    assert len(body.vertices) == (8 if width * np.sqrt(2.0) < MERGED else 10)
+    assert volume == pytest.approx(1.0 - 0.5 * width**2, abs=2.0 * solids.MERGED if width < solids.MERGED else 1e-14)
+    assert len(body.rings[6]) == (0 if width * np.sqrt(2.0) < solids.MERGED else 4)
+    assert len(body.vertices) == (8 if width * np.sqrt(2.0) < solids.MERGED else 10)
 
 
 def test_planes_that_cut_nothing_leave_no_face() -> None:
@@ -264,22 +251,22 @@ def test_planes_that_cut_nothing_leave_no_face() -> None:
 def test_corners_are_exact() -> None:
     """Not the rounding of a solver: 1/3 is the double nearest to it."""
     normals = np.array([[1.0, 0, 0], [-3, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
-    body = enclosed(normals, np.array([1.0, 1.0, 1, 0, 1, 0]))
+    body = solids.enclosed(normals, np.array([1.0, 1.0, 1, 0, 1, 0]))
     assert body.vertices[:, 0].min() == -1.0 / 3.0
 
 
 @pytest.mark.parametrize(
     ("normals", "offsets", "error"),
     [
-        (CUBE[0][:5], CUBE[1][:5], OpenBodyError),
-        (CUBE[0], np.full(6, 2.0 * REACH), OpenBodyError),
-        (unit([[-1, 0, 0], [1e-3, 1, 0], [1e-3, -1, 0], [0, 0, 1], [0, 0, -1]]), np.full(5, 0.5), OpenBodyError),
-        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5]), EmptyBodyError),
-        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5 + 0.9 * MERGED]), EmptyBodyError),
-        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.6]), EmptyBodyError),
+        (CUBE[0][:5], CUBE[1][:5], solids.OpenBodyError),
+        (CUBE[0], np.full(6, 2.0 * solids.REACH), solids.OpenBodyError),
+        (unit([[-1, 0, 0], [1e-3, 1, 0], [1e-3, -1, 0], [0, 0, 1], [0, 0, -1]]), np.full(5, 0.5), solids.OpenBodyError),
+        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5]), solids.EmptyBodyError),
+        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5 + 0.9 * solids.MERGED]), solids.EmptyBodyError),
+        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.6]), solids.EmptyBodyError),
     ],
     ids=["five", "too large", "a wedge far too long", "flat", "thin", "inside out"],
 )
 def test_half_spaces_that_hold_no_body(normals, offsets, error) -> None:
     with pytest.raises(error):
-        enclosed(normals, offsets)
+        solids.enclosed(normals, offsets)

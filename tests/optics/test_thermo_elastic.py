@@ -10,18 +10,9 @@ from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import Surface, ZernikeFigure, plane
 from optics.geometry.zernike import zernike
 from optics.materials.material import material
+from optics.thermal import thermo_elastic
 from optics.thermal.deformation import rigid_modes
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
-from optics.thermal.thermo_elastic import (
-    Bonded,
-    Displacement,
-    ElasticBody,
-    Kinematic,
-    face_change,
-    free_linear_field,
-    solve,
-    solve_many,
-)
 from tests.tiers import quick
 
 SILICA = material("fused silica")
@@ -57,8 +48,8 @@ def without_rigid(points: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 
 @cache
-def bar() -> tuple[ElasticBody, Kinematic]:
-    return ElasticBody(polyhedron_mesh(BAR, 0.06), SILICA), Kinematic(
+def bar() -> tuple[thermo_elastic.ElasticBody, thermo_elastic.Kinematic]:
+    return thermo_elastic.ElasticBody(polyhedron_mesh(BAR, 0.06), SILICA), thermo_elastic.Kinematic(
         np.array([[0.1, -0.03, -0.03], [1.0, 0.01, -0.03], [0.5, 0.04, 0.03]])
     )
 
@@ -126,8 +117,8 @@ def test_a_disks_volume_converges_with_the_fourth_power_of_the_cells() -> None:
 
 
 def test_uniform_expansion_is_exact() -> None:
-    body = ElasticBody(mirror_mesh(Surface(1 / 3, -1.0), Circle(0.3, (0.0, -0.4)), 0.06, 1, 12), SILICA)
-    support = Kinematic(np.array([[0.2, -0.4, 0.1], [-0.1, -0.2, 0.1], [-0.1, -0.6, 0.1]]))
+    body = thermo_elastic.ElasticBody(mirror_mesh(Surface(1 / 3, -1.0), Circle(0.3, (0.0, -0.4)), 0.06, 1, 12), SILICA)
+    support = thermo_elastic.Kinematic(np.array([[0.2, -0.4, 0.1], [-0.1, -0.2, 0.1], [-0.1, -0.6, 0.1]]))
     (found,) = body.solve_many([one_kelvin], support)
     left = without_rigid(body.nodes, found.values - A * body.nodes)
     assert np.max(np.abs(left)) < 1e-12 * A * np.max(np.abs(body.nodes))
@@ -140,15 +131,17 @@ def test_any_gradient_reproduces_the_exact_field(name: str) -> None:
     about = corners.mean(axis=0)
     spread = 0.3 * (corners[[0, 3, 5]] - about) + about
     cases = [(1.0, (0, 0, 0)), (0.0, (0, 0, 3.0)), (0.0, (0, 2.0, 0)), (0.0, (5.0, 0, 0)), (0.3, (1.0, 2.0, -3.0))]
-    found = solve_many(mesh, SILICA, [linear(c, g, about) for c, g in cases], Kinematic(spread))
+    found = thermo_elastic.solve_many(
+        mesh, SILICA, [linear(c, g, about) for c, g in cases], thermo_elastic.Kinematic(spread)
+    )
     for (change, gradient), u in zip(cases, found, strict=True):
-        exact = free_linear_field(A, change, gradient, about)(u.nodes)
+        exact = thermo_elastic.free_linear_field(A, change, gradient, about)(u.nodes)
         # quadratic elements hold it; what is left is rounding, in a bar 20 times as long as thick 5e-11
         assert np.max(np.abs(without_rigid(u.nodes, u.values - exact))) < 1e-9 * np.max(np.abs(exact))
 
 
 def test_the_exact_field_turns_by_a_g_cross_r() -> None:
-    field = free_linear_field(A, 0.0, (0.0, 0.0, 4.0), (0.1, 0.2, 0.3))
+    field = thermo_elastic.free_linear_field(A, 0.0, (0.0, 0.0, 4.0), (0.1, 0.2, 0.3))
     at, h = np.array([0.4, 0.1, 0.2]), 1e-3
     slope = np.stack([(field(at + h * e) - field(at - h * e)) / (2 * h) for e in np.eye(3)], axis=1)  # d_j u_i
     spin = 0.5 * np.array([slope[2, 1] - slope[1, 2], slope[0, 2] - slope[2, 0], slope[1, 0] - slope[0, 1]])
@@ -175,14 +168,16 @@ def test_the_kinematic_support_holds_its_six_components() -> None:
 @pytest.mark.parametrize("aperture", [Circle(0.3, (0.0, -0.4)), Rectangle(0.3, 0.1)])
 def test_every_point_of_a_curved_face_is_found_in_its_own_cell(aperture, cells: int) -> None:
     surface = Surface(1 / 3, -1.0)
-    body = ElasticBody(mirror_mesh(surface, aperture, 0.06, 1, cells), SILICA)
+    body = thermo_elastic.ElasticBody(mirror_mesh(surface, aperture, 0.06, 1, cells), SILICA)
     x0, x1, y0, y1 = aperture.bounds
     u = np.random.default_rng(5).uniform(-1, 1, (1500, 2))
     x, y = 0.5 * (x0 + x1 + (x1 - x0) * u[:, 0]), 0.5 * (y0 + y1 + (y1 - y0) * u[:, 1])
     inside = aperture.contains(x, y)
     points = np.stack([x, y, surface.sag(x, y)], axis=-1)[inside]
     # the field u = r, which curved cells hold as well
-    np.testing.assert_allclose(Displacement(body.nodes, body.nodes, body._finder).at(points), points, atol=1e-9)
+    np.testing.assert_allclose(
+        thermo_elastic.Displacement(body.nodes, body.nodes, body._finder).at(points), points, atol=1e-9
+    )
 
 
 def test_load_cases_add_up_and_differ_not_from_single_ones() -> None:
@@ -190,7 +185,7 @@ def test_load_cases_add_up_and_differ_not_from_single_ones() -> None:
     fields = [lambda p: p[:, 0] ** 2, lambda p: np.sin(30 * p[:, 1])]
     both = lambda p: fields[0](p) + fields[1](p)  # noqa: E731
     first, second, total = body.solve_many([*fields, both], support)
-    alone = solve(polyhedron_mesh(BAR, 0.06), SILICA, fields[1], support)
+    alone = thermo_elastic.solve(polyhedron_mesh(BAR, 0.06), SILICA, fields[1], support)
     size = np.max(np.abs(total.values))
     np.testing.assert_allclose(first.values + second.values, total.values, atol=1e-10 * size)
     np.testing.assert_allclose(alone.values, second.values, atol=1e-10 * size)
@@ -199,8 +194,8 @@ def test_load_cases_add_up_and_differ_not_from_single_ones() -> None:
 def layer(half: float, cells: int) -> float:
     """Displacement (m/K) of a layer's free face, in its middle; the layer of 2 cm is glued at its back."""
     thick = 0.02
-    body = ElasticBody(mirror_mesh(plane(), Rectangle(half, half), thick, 1, cells), SILICA)
-    (u,) = body.solve_many([one_kelvin], Bonded(lambda nodes: nodes[:, 2] > thick - 1e-9))
+    body = thermo_elastic.ElasticBody(mirror_mesh(plane(), Rectangle(half, half), thick, 1, cells), SILICA)
+    (u,) = body.solve_many([one_kelvin], thermo_elastic.Bonded(lambda nodes: nodes[:, 2] > thick - 1e-9))
     return float(-u.at([[0.0, 0.0, 0.0]])[0, 2])
 
 
@@ -223,8 +218,8 @@ def test_two_layers_of_one_modulus_bend_as_timoshenko_says() -> None:
     # One material of which the upper half is hotter is such a pair; in a plate both directions bend alike.
     h = 0.02
     mesh = mirror_mesh(plane(), Rectangle(0.2, 0.2), h, 1, 20)
-    support = Kinematic(np.array([[0.1, 0.0, 0.01], [-0.1, 0.1, 0.01], [-0.1, -0.1, 0.01]]))
-    u = solve(mesh, SILICA, lambda p: 1.0 * (p[:, 2] > h / 2), support)
+    support = thermo_elastic.Kinematic(np.array([[0.1, 0.0, 0.01], [-0.1, 0.1, 0.01], [-0.1, -0.1, 0.01]]))
+    u = thermo_elastic.solve(mesh, SILICA, lambda p: 1.0 * (p[:, 2] > h / 2), support)
     r = 0.1  # well inside: at the rim the layers are relaxed
     line = u.at([[-r, 0, h / 2], [0, 0, h / 2], [r, 0, h / 2]])[:, 2]
     bend = (line[0] - 2 * line[1] + line[2]) / r**2
@@ -232,12 +227,12 @@ def test_two_layers_of_one_modulus_bend_as_timoshenko_says() -> None:
 
 
 def test_a_foundation_that_expands_alike_leaves_no_stress() -> None:
-    body = ElasticBody(polyhedron_mesh(BLOCK, 0.04), SILICA)
-    glued = Bonded(lambda nodes: nodes[:, 2] < 1e-9, A, 2.0, (0.1, 0.2, 0.3))
-    still = Bonded(glued.where)
+    body = thermo_elastic.ElasticBody(polyhedron_mesh(BLOCK, 0.04), SILICA)
+    glued = thermo_elastic.Bonded(lambda nodes: nodes[:, 2] < 1e-9, A, 2.0, (0.1, 0.2, 0.3))
+    still = thermo_elastic.Bonded(glued.where)
     together, alone, none = body.solve_many(
         [lambda p: np.full(len(p), 2.0), lambda p: np.full(len(p), 2.0), lambda p: np.zeros(len(p))],
-        [glued, still, Bonded(glued.where, A, 2.0, (0.1, 0.2, 0.3))],
+        [glued, still, thermo_elastic.Bonded(glued.where, A, 2.0, (0.1, 0.2, 0.3))],
     )
     exact = 2.0 * A * (body.nodes - [0.1, 0.2, 0.3])
     np.testing.assert_allclose(together.values, exact, atol=1e-13 * np.max(np.abs(exact)))
@@ -250,9 +245,9 @@ def test_a_gradient_through_a_plate_is_a_defocus_of_radius_one_over_a_g() -> Non
     g = 100.0
     aperture, radius = Rectangle(0.2, 0.15), 0.25
     mesh = mirror_mesh(plane(), aperture, 0.03, 1, 10)
-    support = Kinematic(np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.0, 0.1, 0]]))
-    u = solve(mesh, SILICA, linear(0.0, (0.0, 0.0, g)), support)
-    found = face_change(u, plane(), aperture, Pose())
+    support = thermo_elastic.Kinematic(np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.0, 0.1, 0]]))
+    u = thermo_elastic.solve(mesh, SILICA, linear(0.0, (0.0, 0.0, g)), support)
+    found = thermo_elastic.face_change(u, plane(), aperture, Pose())
     # the hot side is at +z, where the plate gets longer: z = -a g r^2 / 2
     assert found.figure[4] == pytest.approx(-A * g * radius**2 / (4 * np.sqrt(3)), rel=1e-9)
     others = [found.figure[j] for j in range(5, 16)]
@@ -271,8 +266,8 @@ def test_a_turned_and_shifted_face_with_a_figure_is_read_back() -> None:
     u, v = (inside[:, 0] - 0.002) / 0.02, (inside[:, 1] - 0.003) / 0.02
     local = shift + np.cross(rotate, inside)
     local[:, 2] += 5e-9 * zernike(4, u, v) - 2e-9 * zernike(5, u, v) + 3e-9 * zernike(6, u, v)
-    field = Displacement(body.nodes, local @ pose.rotation.T, body._finder)
-    found = face_change(field, plane(), aperture, pose)
+    field = thermo_elastic.Displacement(body.nodes, local @ pose.rotation.T, body._finder)
+    found = thermo_elastic.face_change(field, plane(), aperture, pose)
     # quadratics in-plane give no rigid part; piston and tilts are orthogonal to Z4..Z6 on the disk
     np.testing.assert_allclose(found.rotate, rotate, rtol=1e-8)
     np.testing.assert_allclose(found.shift, shift, rtol=1e-8)
@@ -286,28 +281,31 @@ def test_the_disk_is_that_of_the_figure_when_there_is_one() -> None:
     body, support = bar()
     (u,) = body.solve_many([linear(0.0, (0.0, 0.0, 2.0))], support)
     pose, aperture = Pose(np.eye(3), np.array([0.5, 0.0, 0.03])), Circle(0.04)
-    small = face_change(u, plane(), aperture, pose, terms=6)
-    large = face_change(u, plane().with_figure(ZernikeFigure(0.08)), aperture, pose, terms=6)
+    small = thermo_elastic.face_change(u, plane(), aperture, pose, terms=6)
+    large = thermo_elastic.face_change(u, plane().with_figure(ZernikeFigure(0.08)), aperture, pose, terms=6)
     assert large.figure[4] == pytest.approx(4.0 * small.figure[4], rel=1e-6)
-    assert set(face_change(u, plane(), aperture, pose, terms=3).figure) == set()
+    assert set(thermo_elastic.face_change(u, plane(), aperture, pose, terms=3).figure) == set()
 
 
 def test_supports_bonds_temperatures_and_points_that_cannot_be_are_refused() -> None:
     body, support = bar()
     (u,) = body.solve_many([one_kelvin], support)
-    outside = Kinematic(np.array([[0.1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.02]]))
-    edge = Bonded(lambda nodes: (np.abs(nodes[:, 1]) < 1e-9) & (nodes[:, 0] > 1.2 - 1e-9))
+    outside = thermo_elastic.Kinematic(np.array([[0.1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.02]]))
+    edge = thermo_elastic.Bonded(lambda nodes: (np.abs(nodes[:, 1]) < 1e-9) & (nodes[:, 0] > 1.2 - 1e-9))
     pose = Pose(np.eye(3), np.array([0.5, 0.0, 0.03]))
     for call, words in (
         (lambda: body.solve_many([one_kelvin], outside), r"\[0.5, 0.5, 0.0\] m lies outside"),
-        (lambda: body.solve_many([one_kelvin], Bonded(lambda nodes: nodes[:, 2] > 1.0)), "three nodes that are not on"),
+        (
+            lambda: body.solve_many([one_kelvin], thermo_elastic.Bonded(lambda nodes: nodes[:, 2] > 1.0)),
+            "three nodes that are not on",
+        ),
         (lambda: body.solve_many([one_kelvin], edge), "three nodes that are not on a line"),
         (lambda: body.solve_many([lambda p: np.where(p[:, 0] > 0.5, np.nan, 0.0)], support), "not finite at"),
         (lambda: body.solve_many([lambda p: p], support), "one value for each"),
         (lambda: u.at([[0.5, 0.0, 0.031]]), "lies outside of the body"),
         (lambda: u.at([0.5, 0.0, 0.0]), "shape"),
-        (lambda: face_change(u, plane(), Circle(0.2), pose), "lies outside of the body"),
-        (lambda: face_change(u, plane(), Circle(0.02), Pose(), terms=2), "between Z3 and"),
+        (lambda: thermo_elastic.face_change(u, plane(), Circle(0.2), pose), "lies outside of the body"),
+        (lambda: thermo_elastic.face_change(u, plane(), Circle(0.02), Pose(), terms=2), "between Z3 and"),
     ):
         with pytest.raises(ValueError, match=words):
             call()

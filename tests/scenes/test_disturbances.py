@@ -9,17 +9,8 @@ from scenes.models.disturbances import Component, StatedMotions, motions_of_spec
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.joint_disturbances import joint_disturbances, joint_files
 from scenes.models.thermal_model import ThermalModel
+from scenes.specs import load
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.load import (
-    CAMERAS,
-    DISTURBANCES,
-    INSTRUMENTS,
-    LIBRARY,
-    library_names,
-    load_cameras,
-    load_disturbances,
-    load_instrument,
-)
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
@@ -34,7 +25,7 @@ HEAD = "name: own\ncauses:\n"
 
 @pytest.fixture(scope="module")
 def pair(backend):
-    resolved = resolve(LIBRARY.parent / "examples/aligned.yaml")
+    resolved = resolve(load.LIBRARY.parent / "examples/aligned.yaml")
     return build_instrument(resolved.instrument, resolved.cameras, backend)
 
 
@@ -50,8 +41,8 @@ def stated(pair, causes: str) -> StatedMotions:
 # --- what is stated ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", quick(1, library_names(DISTURBANCES)))
-@pytest.mark.parametrize("stem", quick(2, library_names(INSTRUMENTS)))
+@pytest.mark.parametrize("name", quick(1, load.library_names(load.DISTURBANCES)))
+@pytest.mark.parametrize("stem", quick(2, load.library_names(load.INSTRUMENTS)))
 def test_every_file_is_of_every_instrument_of_the_library(instrument, name, stem, tmp_path) -> None:
     (tmp_path / "job.yaml").write_text(f"instrument: {stem}\ndisturbances: {name}\n")
     resolved = resolve(tmp_path / "job.yaml")
@@ -159,7 +150,7 @@ disturbances:
     settling: {bodies: base/forward/focal_plane, shift: 1 um, reason: a test of vibration}
 """
     (tmp_path / "job.yaml").write_text(job)
-    plain, found = load_disturbances("orbit"), resolve(tmp_path / "job.yaml").disturbances
+    plain, found = load.load_disturbances("orbit"), resolve(tmp_path / "job.yaml").disturbances
     assert list(found.causes) == [name for name in plain.causes if name != "base_heat"] + ["settling"]
     changed = found.causes["mirror_figure"]
     figure = {t: round(v * 1e9, 9) for t, v in changed.figure.items()}
@@ -179,8 +170,8 @@ def test_none_states_nothing_and_a_name_stands_for_a_file(tmp_path) -> None:
         return resolve(tmp_path / "job.yaml").disturbances
 
     assert named("none") is None
-    assert named("launch") == named("{file: launch}") == load_disturbances("launch")
-    assert named("{}") == load_disturbances("orbit")
+    assert named("launch") == named("{file: launch}") == load.load_disturbances("launch")
+    assert named("{}") == load.load_disturbances("orbit")
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -196,7 +187,7 @@ def stated_of_job(folder, instrument: str, disturbances: str, backend) -> Stated
 
 def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(backend, tmp_path) -> None:
     """Cameras of other names: the file is of another instrument, while those of the library are of any camera."""
-    instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8").replace("backward", "nadir")
+    instrument = (load.LIBRARY / load.INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8").replace("backward", "nadir")
     named = "{bodies: base/backward, rotate: 1 arcsec, reason: r}"
     (tmp_path / "own.yaml").write_text(f"{HEAD}  camera_heat: {named}\n  camera_mounts: {named}\n")
     with pytest.raises(
@@ -280,9 +271,11 @@ def test_derivatives_by_radii_and_conic_constants(backend, pair) -> None:
 
 @pytest.mark.parametrize("name", ["gf7", "korsch", "cassegrain"])
 def test_assembled_is_of_cameras_alone(backend, name) -> None:
-    assert name in library_names(CAMERAS)
-    alone = load_instrument(name)
-    found = motions_of_spec(load_disturbances("assembled"), build_instrument(alone, load_cameras(alone), backend))
+    assert name in load.library_names(load.CAMERAS)
+    alone = load.load_instrument(name)
+    found = motions_of_spec(
+        load.load_disturbances("assembled"), build_instrument(alone, load.load_cameras(alone), backend)
+    )
     sigma = {c.name: c.sigma / c.unit_size for c in found.components}
     assert sigma[f"base/{name}/M2 shift z"] < sigma[f"base/{name}/M2 shift x"] == pytest.approx(100.0)
     assert sigma[f"base/{name}/focal_plane rotate z"] == pytest.approx(60.0)
@@ -303,7 +296,7 @@ def covariance_of(sigma: np.ndarray, rng: np.random.Generator, rank: int) -> np.
 @pytest.mark.parametrize(("count", "rank"), [(6, 6), (6, 2), (60, 60), (60, 5)])
 def test_a_covariance_is_written_and_read_back(pair, tmp_path, count, rank) -> None:
     """In one file, and with many components in two; also one that leaves combinations without any spread."""
-    every = motions_of_spec(load_disturbances("assembled"), pair).components
+    every = motions_of_spec(load.load_disturbances("assembled"), pair).components
     rng = np.random.default_rng(count + rank)
     chosen = [every[k] for k in rng.permutation(len(every))[:count]]
     sigma = np.array([c.sigma for c in chosen]) * 10.0 ** rng.uniform(-6.0, 0.0, count)
@@ -313,7 +306,7 @@ def test_a_covariance_is_written_and_read_back(pair, tmp_path, count, rank) -> N
     assert set(files) == {"posterior.yaml", *(["posterior.csv"] if count > 12 else [])}
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    found = motions_of_spec(load_disturbances(tmp_path / "posterior.yaml"), pair)
+    found = motions_of_spec(load.load_disturbances(tmp_path / "posterior.yaml"), pair)
     assert [(c.name, c.pivot) for c in found.components] == [(c.name, c.pivot) for c in chosen]
     # correlations have twelve digits
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-12, atol=1e-12 * np.max(np.outer(sigma, sigma)))
@@ -365,7 +358,7 @@ TABLE = [
 def table_of(folder, rows) -> DisturbancesSpec:
     (folder / "own.yaml").write_text(JOINT + THREE + "  correlation_file: corr.csv\n")
     (folder / "corr.csv").write_text("\n".join(rows) + "\n")
-    return load_disturbances(folder / "own.yaml")
+    return load.load_disturbances(folder / "own.yaml")
 
 
 def test_a_table_may_have_its_columns_in_any_order(pair, tmp_path) -> None:

@@ -10,22 +10,8 @@ import pytest
 from optics.numerics.frozen_map import FrozenMap
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
+from scenes.specs import load
 from scenes.specs.camera import CameraSpec
-from scenes.specs.load import (
-    CAMERAS,
-    DETECTORS,
-    EXAMPLES,
-    INSTRUMENTS,
-    LAB,
-    LIBRARY,
-    ORBIT,
-    SCENES,
-    library_names,
-    load_camera,
-    load_detector,
-    load_instrument,
-    load_job,
-)
 from scenes.specs.orbit.setup import resolve_angle, resolve_loop, resolve_monitor, resolve_simulate
 from scenes.specs.resolved import resolve, resolve_focus
 from scenes.yaml.errors import InputError
@@ -35,19 +21,21 @@ from twin.monitor.truth import LineSight
 
 
 def test_a_full_well_is_just_below_saturation() -> None:
-    detector = load_detector("monitor_ccd")
+    detector = load.load_detector("monitor_ccd")
     full = detector.full_well_e * detector.system_gain_dn_per_e + detector.offset_dn
     assert 0.95 * 2**detector.bit_depth < full < 2**detector.bit_depth - 1
 
 
 def test_own_files_are_found_from_the_file_that_names_them(tmp_path: Path) -> None:
-    text = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
-    (tmp_path / "own_camera.yaml").write_text((LIBRARY / CAMERAS / "gf7_conic.yaml").read_text("utf-8"), "utf-8")
+    text = (load.LIBRARY / load.INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
+    (tmp_path / "own_camera.yaml").write_text(
+        (load.LIBRARY / load.CAMERAS / "gf7_conic.yaml").read_text("utf-8"), "utf-8"
+    )
     (tmp_path / "own.yaml").write_text(text.replace("camera: gf7", "camera: own_camera.yaml", 1), "utf-8")
     (tmp_path / "job.yaml").write_text("instrument: own.yaml\n", "utf-8")
     job = resolve(tmp_path / "job.yaml")
     assert {name: camera.name for name, camera in job.cameras.items()} == {"own_camera.yaml": "gf7_conic", "gf7": "gf7"}
-    assert load_instrument(tmp_path / "own.yaml") == job.instrument
+    assert load.load_instrument(tmp_path / "own.yaml") == job.instrument
 
 
 CAUSES = """instrument: gf7_pair
@@ -67,15 +55,15 @@ disturbances:
 @pytest.mark.parametrize(
     ("read", "file"),
     [
-        *((resolve_angle, f"{ORBIT}/{name}.yaml") for name in ("angle", "angle_gf7", "angle_off_axis")),
-        *((resolve_loop, f"{ORBIT}/loop.yaml"), (resolve_monitor, f"{ORBIT}/monitor.yaml")),
-        *((resolve_simulate, f"{ORBIT}/simulate.yaml"), (resolve_focus, f"{LAB}/focus.yaml")),
+        *((resolve_angle, f"{load.ORBIT}/{name}.yaml") for name in ("angle", "angle_gf7", "angle_off_axis")),
+        *((resolve_loop, f"{load.ORBIT}/loop.yaml"), (resolve_monitor, f"{load.ORBIT}/monitor.yaml")),
+        *((resolve_simulate, f"{load.ORBIT}/simulate.yaml"), (resolve_focus, f"{load.LAB}/focus.yaml")),
         *((resolve, "examples/perturb.yaml"), (resolve, CAUSES)),
     ],
 )
 def test_a_config_reads_back_to_the_same_values(read, file: str, tmp_path: Path) -> None:
     (tmp_path / "own.yaml").write_text(file, "utf-8")
-    first = read(tmp_path / "own.yaml" if file == CAUSES else SCENES / file)
+    first = read(tmp_path / "own.yaml" if file == CAUSES else load.SCENES / file)
     (tmp_path / "config.yaml").write_text(first.to_yaml(), "utf-8")
     again = read(tmp_path / "config.yaml")
     assert type(again) is type(first)
@@ -90,15 +78,15 @@ def test_changes_of_temperature(tmp_path: Path) -> None:
     path = tmp_path / "perturb.yaml"
     for text, kelvin in changes.items():
         path.write_text(f"instrument: gf7_pair\nperturb:\n  base: {{temperature: '{text}'}}\n", "utf-8")
-        job = load_job(path)
+        job = load.load_job(path)
         assert job.perturb["base"].temperature.change == kelvin
         # what is written is read again
         path.write_text(dump_yaml(job.plain()), "utf-8")
-        assert load_job(path).perturb["base"].temperature.change == kelvin
+        assert load.load_job(path).perturb["base"].temperature.change == kelvin
 
 
 def test_a_resolved_job_needs_its_cameras(tmp_path: Path) -> None:
-    text = resolve(EXAMPLES / "perturb.yaml").to_yaml().replace("\n  gf7:\n", "\n  other:\n")
+    text = resolve(load.EXAMPLES / "perturb.yaml").to_yaml().replace("\n  gf7:\n", "\n  other:\n")
     config = tmp_path / "config.yaml"
     config.write_text(text, "utf-8")
     with pytest.raises(InputError, match="camera 'gf7' of the instrument is missing"):
@@ -106,10 +94,10 @@ def test_a_resolved_job_needs_its_cameras(tmp_path: Path) -> None:
 
 
 def specimens() -> list[Spec]:
-    found: list[Spec] = [load_job(EXAMPLES / "perturb.yaml"), resolve(EXAMPLES / "perturb.yaml")]
-    found += [load_camera(name) for name in library_names(CAMERAS)]
-    found += [load_instrument(name) for name in library_names(INSTRUMENTS)]
-    found += [load_detector(name) for name in library_names(DETECTORS)]
+    found: list[Spec] = [load.load_job(load.EXAMPLES / "perturb.yaml"), resolve(load.EXAMPLES / "perturb.yaml")]
+    found += [load.load_camera(name) for name in load.library_names(load.CAMERAS)]
+    found += [load.load_instrument(name) for name in load.library_names(load.INSTRUMENTS)]
+    found += [load.load_detector(name) for name in load.library_names(load.DETECTORS)]
     return found
 
 
@@ -130,12 +118,14 @@ def test_every_specification_is_a_value(spec: Spec) -> None:
 
 def test_an_equal_instrument_is_built_once_and_that_of_another_file_anew(backend, tmp_path) -> None:
     """Errors name the file that an instrument was read from, and results the order in which it names its parts."""
-    first, again = (load_instrument("monitor_pair") for _ in range(2))
-    cameras = {site.camera: load_camera(site.camera) for site in first.cameras.values()}
+    first, again = (load.load_instrument("monitor_pair") for _ in range(2))
+    cameras = {site.camera: load.load_camera(site.camera) for site in first.cameras.values()}
     built = build_instrument(first, cameras, backend)
     assert build_instrument(again, dict(cameras), backend) is built
-    (tmp_path / "own.yaml").write_text(f"# mine\n{(LIBRARY / INSTRUMENTS / 'monitor_pair.yaml').read_text('utf-8')}")
-    own = load_instrument(tmp_path / "own.yaml")
+    (tmp_path / "own.yaml").write_text(
+        f"# mine\n{(load.LIBRARY / load.INSTRUMENTS / 'monitor_pair.yaml').read_text('utf-8')}"
+    )
+    own = load.load_instrument(tmp_path / "own.yaml")
     assert own == first
     other = build_instrument(own, cameras, backend)
     assert other is not built
@@ -147,10 +137,10 @@ def test_an_equal_instrument_is_built_once_and_that_of_another_file_anew(backend
 
 def test_a_camera_by_itself_has_no_monitor() -> None:
     with pytest.raises(InputError, match="has no monitor, so that no spot tells"):
-        _ = load_instrument("ritchey_chretien").autocollimator
+        _ = load.load_instrument("ritchey_chretien").autocollimator
 
 
-GF7 = load_camera("gf7")
+GF7 = load.load_camera("gf7")
 
 
 def with_terms(terms: dict[str, float]) -> CameraSpec:
@@ -161,7 +151,7 @@ def with_terms(terms: dict[str, float]) -> CameraSpec:
 
 def built(backend, other: CameraSpec) -> Instrument:
     """gf7_pair with another camera for the one that looks backward."""
-    spec = load_instrument("gf7_pair")
+    spec = load.load_instrument("gf7_pair")
     backward = spec.cameras["backward"].model_copy(update={"camera": "other"})
     spec = spec.model_copy(update={"cameras": FrozenMap({**spec.cameras, "backward": backward})})
     return build_instrument(spec, {"gf7": GF7, "other": other}, backend)

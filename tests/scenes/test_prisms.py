@@ -18,18 +18,8 @@ from optics.geometry.solid import Coating, solid_mesh
 from optics.geometry.tree import Motion, RigidTree
 from optics.geometry.zernike import basis
 from optics.materials.material import material
+from optics.raytrace import reflectors
 from optics.raytrace.assembly import Assembly
-from optics.raytrace.reflectors import (
-    EDGE,
-    REFLECTORS,
-    Mount,
-    hollow_offset,
-    hollow_transfer,
-    periscope,
-    prism_0,
-    prism_180,
-    roof_offset,
-)
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.thermal.heat import Temperature
@@ -50,11 +40,13 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def parts_180(hand: float = 1.0, errors=None):
-    return prism_180(Mount("glass", Pose(), "p", "fused silica", LENGTH, WIDTH, hand, errors or {}))
+    return reflectors.prism_180(
+        reflectors.Mount("glass", Pose(), "p", "fused silica", LENGTH, WIDTH, hand, errors or {})
+    )
 
 
 def parts_0(errors=None):
-    return prism_0(Mount("glass", Pose(), "p", "fused silica", SHIFT, WIDTH, errors=errors or {}))
+    return reflectors.prism_0(reflectors.Mount("glass", Pose(), "p", "fused silica", SHIFT, WIDTH, errors=errors or {}))
 
 
 def assembled(parts) -> Assembly:
@@ -77,7 +69,7 @@ def beam(middle, count: int = 12, radius: float = 0.5 * WIDTH) -> np.ndarray:
 
 
 def entry(hand: float = 1.0) -> tuple[float, float]:
-    return -0.5 * LENGTH, hand * roof_offset(WIDTH)
+    return -0.5 * LENGTH, hand * reflectors.roof_offset(WIDTH)
 
 
 def turned(vector, pivot: str = "apex") -> dict[str, Motion]:
@@ -191,7 +183,7 @@ def test_rhomboid(backend, turn, slant) -> None:
     w, x = own @ UP, own @ np.array([1.0, 0.0, 0.0])
     across = into - (into @ w) * w
     cos_j = np.sqrt(1.0 - across @ across / N**2)
-    thick = WIDTH + 2.0 * EDGE + SHIFT
+    thick = WIDTH + 2.0 * reflectors.EDGE + SHIFT
     lean = across / (N * cos_j)
     aside = thick * (w + lean) + SHIFT * (x - w)
     straight = aside - (aside @ into) * into
@@ -242,8 +234,8 @@ def test_bodies(hand, width) -> None:
     """Closed solids with glass around their clear apertures: EDGE of it, and EDGE / sqrt(3) toward the roof's slanted
     edges. The rhomboid's volume is that of its box.
     """
-    long = prism_180(Mount("glass", Pose(), "p", "fused silica", LENGTH, width, hand))
-    small = prism_0(Mount("glass", Pose(), "p", "fused silica", SHIFT + width, width))
+    long = reflectors.prism_180(reflectors.Mount("glass", Pose(), "p", "fused silica", LENGTH, width, hand))
+    small = reflectors.prism_0(reflectors.Mount("glass", Pose(), "p", "fused silica", SHIFT + width, width))
     for parts in (long, small):
         placed = RigidTree(parts.bodies).place()
         made = solid_mesh(parts.solids[0], placed)
@@ -257,8 +249,8 @@ def test_bodies(hand, width) -> None:
             edge = np.roll(corners[:, :2], -1, axis=0) - corners[:, :2]
             inward = np.stack([-edge[:, 1], edge[:, 0]], axis=-1) / np.linalg.norm(edge, axis=-1, keepdims=True)
             room = np.einsum("rek,ek->re", rim[:, None] - corners[:, :2], inward)
-            assert room.min() > EDGE / np.sqrt(3.0) - 1e-9
-    box = (SHIFT + width) * (width + 2.0 * EDGE) * (width + 2.0 * EDGE)
+            assert room.min() > reflectors.EDGE / np.sqrt(3.0) - 1e-9
+    box = (SHIFT + width) * (width + 2.0 * reflectors.EDGE) * (width + 2.0 * reflectors.EDGE)
     placed = RigidTree(small.bodies).place()
     assert solid_mesh(small.solids[0], placed).mesh.volume == pytest.approx(box, rel=1e-9)
 
@@ -268,18 +260,18 @@ ERRORS = ((20e-6, -30e-6), (-10e-6, 5e-6), (15e-6, 25e-6))
 
 
 def hollow(length=LENGTH, width=WIDTH, hand=1.0, errors=None):
-    return hollow_transfer(Mount("frame", Pose(), "p", "SiC", length, width, hand, errors or {}))
+    return reflectors.hollow_transfer(reflectors.Mount("frame", Pose(), "p", "SiC", length, width, hand, errors or {}))
 
 
 def small(shift=SHIFT, width=WIDTH, errors=None):
-    return periscope(Mount("frame", Pose(), "p", "SiC", shift, width, errors=errors or {}))
+    return reflectors.periscope(reflectors.Mount("frame", Pose(), "p", "SiC", shift, width, errors=errors or {}))
 
 
 def made(kind: str, hand: float = 1.0, errors=None):
     """Parts and where the middle of the beam enters."""
     if kind == "periscope":
         return small(errors=errors), np.array([-0.5 * SHIFT, 0.0, -0.2])
-    return hollow(hand=hand, errors=errors), np.array([-0.5 * LENGTH, hand * hollow_offset(WIDTH), -0.2])
+    return hollow(hand=hand, errors=errors), np.array([-0.5 * LENGTH, hand * reflectors.hollow_offset(WIDTH), -0.2])
 
 
 def wide_beam(middle, radius: float = 0.5 * WIDTH, rings: int = 1) -> np.ndarray:
@@ -324,7 +316,7 @@ def test_light_goes_as_plain_mirrors_send_it(backend, kind, turn, slant) -> None
         np.testing.assert_allclose(way, direction, rtol=0, atol=2e-15)
         np.testing.assert_allclose(place, places[-1], rtol=0, atol=2e-15)
         np.testing.assert_allclose(path, length, rtol=0, atol=2e-15)
-        sign = -1.0 if REFLECTORS[kind].returns else 1.0
+        sign = -1.0 if reflectors.REFLECTORS[kind].returns else 1.0
         assert np.abs(way - sign * into).max() < 1e-15
         if kind == "hollow_transfer":
             # the line that leaves is the one that enters, reflected at the point where the three mirrors meet
@@ -335,7 +327,7 @@ def test_light_goes_as_plain_mirrors_send_it(backend, kind, turn, slant) -> None
 
 @pytest.mark.parametrize("kind", ["hollow_transfer", "periscope"])
 def test_angle_errors_are_tilts_of_the_mirrors(kind) -> None:
-    errors = dict(zip(REFLECTORS[kind].faces, ERRORS, strict=False))
+    errors = dict(zip(reflectors.REFLECTORS[kind].faces, ERRORS, strict=False))
     parts, middle = made(kind, errors=errors)
     perfect, _ = made(kind)
     for name, error in errors.items():
@@ -344,7 +336,7 @@ def test_angle_errors_are_tilts_of_the_mirrors(kind) -> None:
         np.testing.assert_allclose(own.rotation, turn, rtol=0, atol=4e-16)
     start = wide_beam(middle)
     _, way, _ = by_hand(parts, {}, start, np.broadcast_to(UP, start.shape))
-    sign = -1.0 if REFLECTORS[kind].returns else 1.0
+    sign = -1.0 if reflectors.REFLECTORS[kind].returns else 1.0
     assert 1e-5 < np.abs(way[0] - sign * UP).max() < 2e-4
     with pytest.raises(ValueError, match="no such face: window"):
         made(kind, errors={"window": (0.0, 0.0)})
@@ -367,7 +359,7 @@ def test_plates_and_frame_leave_room_to_the_beam_and_to_each_other(kind, width, 
         assert set(bodies) == {b.path for b in parts.bodies}
         for a, b in combinations(bodies, 2):
             assert separation(bodies[a], bodies[b]) > LEAST_GAP, (a, b)
-        y = hand * hollow_offset(width) if kind == "hollow_transfer" else 0.0
+        y = hand * reflectors.hollow_offset(width) if kind == "hollow_transfer" else 0.0
         start = wide_beam(np.array([-0.5 * length, y, -1.0]), 0.5 * width, 4)
         places, way, _ = by_hand(parts, {}, start, np.broadcast_to(UP, start.shape))
         places = np.concatenate([places, places[-1:] + way])

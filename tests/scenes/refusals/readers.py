@@ -20,27 +20,13 @@ from scenes.models.disturbances import motions_of_spec, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.scenery import measured_finishes
 from scenes.schema import MODELS
+from scenes.specs import load
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import checked_nodes
-from scenes.specs.load import (
-    load_autocollimator_test,
-    load_camera,
-    load_cameras,
-    load_disturbances,
-    load_instrument,
-    load_job,
-)
 from scenes.specs.measured.adjust_setup import resolve_adjust
 from scenes.specs.operation import read_operation
+from scenes.specs.orbit import setup as orbit_setup
 from scenes.specs.orbit.flight import ErrorsSpec, OrbitSpec
-from scenes.specs.orbit.setup import (
-    resolve_angle,
-    resolve_calibration,
-    resolve_jitter,
-    resolve_loop,
-    resolve_monitor,
-    resolve_simulate,
-)
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import resolve, resolve_focus
 from scenes.specs.spectrum import SpectrumSpec
@@ -90,20 +76,23 @@ yaml_file, json_file = _plain(read_yaml), _plain(read_json)
 table = _plain(lambda path: read_table(path, COLUMNS))
 nodes, temperatures = _plain(read_nodes), _plain(read_temperatures)
 bsdf, coating = _plain(read_bsdf), _plain(read_coating)
-camera, job = _plain(load_camera), _plain(load_job)
-autocollimators = _plain(load_autocollimator_test)
+camera, job = _plain(load.load_camera), _plain(load.load_job)
+autocollimators = _plain(load.load_autocollimator_test)
 operation = _plain(read_operation)
 orbit, errors, study, spectrum = map(_spec, (OrbitSpec, ErrorsSpec, StudySpec, SpectrumHolder))
 camera_text = _spec(CameraSpec)
-angle, loop, monitor, simulate = map(_plain, (resolve_angle, resolve_loop, resolve_monitor, resolve_simulate))
-calibration, jitter, adjust = map(_plain, (resolve_calibration, resolve_jitter, resolve_adjust))
+angle, loop, monitor, simulate = map(
+    _plain,
+    (orbit_setup.resolve_angle, orbit_setup.resolve_loop, orbit_setup.resolve_monitor, orbit_setup.resolve_simulate),
+)
+calibration, jitter, adjust = map(_plain, (orbit_setup.resolve_calibration, orbit_setup.resolve_jitter, resolve_adjust))
 zemax, codev = _plain(read_zemax), _plain(read_codev)
 batoid = _plain(lambda path: read_batoid(path, 650e-9))
 
 
 def job_nodes(folder: Path, fixture: Fixture) -> Read:
     """A job on an instrument of three nodes."""
-    return lambda path: checked_nodes(load_job(path), NODES)
+    return lambda path: checked_nodes(load.load_job(path), NODES)
 
 
 def instrument(folder: Path, fixture: Fixture) -> Read:
@@ -111,8 +100,8 @@ def instrument(folder: Path, fixture: Fixture) -> Read:
     backend = fixture("backend")
 
     def read(path: Path) -> object:
-        spec = load_instrument(path)
-        return build_instrument(spec, load_cameras(spec), backend)
+        spec = load.load_instrument(path)
+        return build_instrument(spec, load.load_cameras(spec), backend)
 
     return read
 
@@ -131,7 +120,7 @@ def focus(folder: Path, fixture: Fixture) -> Read:
 def disturbances(folder: Path, fixture: Fixture) -> Read:
     """Disturbances of the pair gf7; a table of correlations beside them."""
     pair = fixture("gf7_pair")
-    return lambda path: motions_of_spec(load_disturbances(path), pair)
+    return lambda path: motions_of_spec(load.load_disturbances(path), pair)
 
 
 def correlations(folder: Path, fixture: Fixture) -> Read:
@@ -141,7 +130,7 @@ def correlations(folder: Path, fixture: Fixture) -> Read:
     )
     text = f"name: own\njoint: {{reason: r, components: {{{components}}}, correlation_file: corr.csv}}\n"
     (folder / "own.yaml").write_text(text, "utf-8")
-    return lambda path: load_disturbances(folder / "own.yaml")
+    return lambda path: load.load_disturbances(folder / "own.yaml")
 
 
 def stated_job(folder: Path, fixture: Fixture) -> Read:
@@ -181,7 +170,7 @@ def payload(folder: Path, fixture: Fixture) -> Read:
     (folder / "test.yaml").write_text(
         f"name: small\ncamera: own.yaml\norbit: {orbit}\npatch: {{pixel: 6000}}\n", "utf-8"
     )
-    return lambda path: resolve_simulate(folder / "test.yaml")
+    return lambda path: orbit_setup.resolve_simulate(folder / "test.yaml")
 
 
 def payload_angle(folder: Path, fixture: Fixture) -> Read:
@@ -189,14 +178,14 @@ def payload_angle(folder: Path, fixture: Fixture) -> Read:
     orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
     strips = "{points: 3, first: 0, last: 11999}"
     (folder / "test.yaml").write_text(f"name: small\ncamera: own.yaml\norbit: {orbit}\nstrips: {strips}\n", "utf-8")
-    return lambda path: resolve_angle(folder / "test.yaml")
+    return lambda path: orbit_setup.resolve_angle(folder / "test.yaml")
 
 
 def filter_table(folder: Path, fixture: Fixture) -> Read:
     """A table of a filter that a camera of lenses names."""
     text = colour_camera("achromat", "{table: filter.csv}").file_text("")
     (folder / "c.yaml").write_text(text, "utf-8")
-    return lambda path: load_camera(folder / "c.yaml")
+    return lambda path: load.load_camera(folder / "c.yaml")
 
 
 def heated(folder: Path, fixture: Fixture) -> Read:
@@ -218,7 +207,7 @@ def heated(folder: Path, fixture: Fixture) -> Read:
     (folder / "text.vtu").write_text("no mesh\n", "utf-8")
     for name in ("heat.inp", "m1.bdf", "m1.xlsx"):
         (folder / name).write_text("*NODE\n", "utf-8")
-    return load_job
+    return load.load_job
 
 
 def finishes(folder: Path, fixture: Fixture) -> Read:
@@ -239,7 +228,7 @@ def agf(folder: Path, fixture: Fixture) -> Read:
 
 def derived(folder: Path, fixture: Fixture) -> Read:
     """A camera with all that follows from its surfaces."""
-    return lambda path: derive_camera(load_camera(path), fixture("backend"))
+    return lambda path: derive_camera(load.load_camera(path), fixture("backend"))
 
 
 def _lens_camera(read: Read) -> Callable[[Path, Fixture], Read]:
