@@ -47,16 +47,16 @@ BOX = [
 CORNER = [((-1, 0, 0), (0, 0, 0)), ((0, -1, 0), (0, 0, 0)), ((0, 0, -1), (0, 0, 0)), ((1, 2, 3), (0.6, 0, 0))]
 
 
-@pytest.mark.parametrize(
-    ("planes", "volume", "corners", "edges"),
-    [
-        (BOX, 0.3 * 0.1 * 0.04, 8, [4] * 6),
-        (CORNER, 0.6 * 0.3 * 0.2 / 6.0, 4, [3] * 4),
-        ([*BOX, ((1, 1, 0), (0.2, 0.01, 0))], (0.3 * 0.1 - 0.04**2 / 2.0) * 0.04, 10, [4, 4, 4, 4, 5, 5, 4]),
-    ],
-    ids=["box", "corner", "chamfered box"],
-)
-def test_volume_and_outline(planes, volume, corners, edges) -> None:
+BODIES = {
+    "box": (BOX, 0.3 * 0.1 * 0.04, 8, [4] * 6),
+    "corner": (CORNER, 0.6 * 0.3 * 0.2 / 6.0, 4, [3] * 4),
+    "chamfered": ([*BOX, ((1, 1, 0), (0.2, 0.01, 0))], (0.03 - 0.04**2 / 2.0) * 0.04, 10, [4, 4, 4, 4, 5, 5, 4]),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_volume_and_outline(name: str) -> None:
+    planes, volume, corners, edges = BODIES[name]
     pose = Pose(rotation_matrix(np.array([0.4, -1.1, 2.0])), np.array([1.0, -2.0, 3.0]))
     solid = solid_of(*planes)
     made = solids.solid_mesh(solid, alone(pose))

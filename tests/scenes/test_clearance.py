@@ -25,23 +25,13 @@ def cube(size: float = 1.0) -> np.ndarray:
     return 0.5 * size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
 
-@pytest.mark.parametrize(
-    ("move", "want"),
-    [
-        ((1.5, 0, 0), 0.5),
-        ((1.5, 2.0, 0), np.hypot(0.5, 1.0)),
-        ((2.0, 3.0, 1.5), np.sqrt(1 + 4 + 0.25)),
-        ((0.75, 0.1, 0.2), -0.25),
-        ((0.0, 0.0, 0.0), -1.0),
-        ((1.0 + 1e-5, 0, 0), 1e-5),
-    ],
-    ids=["face to face", "edge to edge", "corner to corner", "overlap", "concentric", "nearly"],
-)
-def test_separation_of_cubes(move, want) -> None:
-    """In any attitude; Qhull merges faces within some 1e-14 of the size."""
+def test_separation_of_cubes() -> None:
+    """Corner to corner, overlapping, concentric, nearly touching, in any attitude; Qhull merges faces within 1e-14."""
     turn = rotation_matrix(np.array([0.3, -1.2, 0.7]))
-    assert separation(cube() @ turn.T, (cube() + move) @ turn.T) == pytest.approx(want, abs=1e-12)
-    assert separation((cube() + move) @ turn.T, cube() @ turn.T) == pytest.approx(want, abs=1e-12)
+    near = ((0.75, 0.1, 0.2), -0.25), ((0.0, 0.0, 0.0), -1.0), ((1.0 + 1e-5, 0, 0), 1e-5)
+    for move, want in (((2.0, 3.0, 1.5), np.sqrt(1 + 4 + 0.25)), *near):
+        for one, other in ((cube(), cube() + move), (cube() + move, cube())):
+            assert separation(one @ turn.T, other @ turn.T) == pytest.approx(want, abs=1e-12), move
 
 
 def test_separations_are_those_of_trimesh() -> None:
