@@ -95,13 +95,7 @@ def test_numbers_are_those_of_the_material() -> None:
 
 
 def test_names_and_refusals() -> None:
-    others = {
-        "BK7": "N-BK7",
-        "titanium": "Ti-6Al-4V",
-        "Al2O3": "alumina",
-        "aluminium nitride": "AlN",
-        "aluminum": "aluminium",
-    }
+    others = {"BK7": "N-BK7", "titanium": "Ti-6Al-4V", "Al2O3": "alumina", "aluminum": "aluminium"}
     assert {name: material(name).name for name in others} == others
     for wrong, words in (("inver", "did you mean 'Invar'"), ("xyz", "known: AlN, CFRP, Invar")):
         with pytest.raises(KeyError, match=words):

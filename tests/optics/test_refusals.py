@@ -63,10 +63,7 @@ def test_what_cannot_be_is_refused() -> None:
     glass = CatalogueGlass("F0", 2, (-5.0, 0.01, 0.0, 0.0, 0.0, 0.0), 400e-9, 700e-9)
     for make, words in (
         (lambda: glass(500e-9), "F0: no index comes out of its dispersion formula at 500 nm"),
-        (
-            lambda: ScatterTable([0.0], azimuth, radial, np.zeros((1, 181, 1001))),
-            "1000 x 180 cells are more",
-        ),
+        (lambda: ScatterTable([0.0], azimuth, radial, np.zeros((1, 181, 1001))), "1000 x 180 cells are more"),
         (lambda: NodalTemperature(NODE, np.zeros(39)), r"nodes must be \(N, 3\) and temperatures \(N,\)"),
         (lambda: NodalTemperature(NODE, np.full(40, np.nan)), "nodes and temperatures must be finite"),
         (lambda: NodalTemperature(NODE[:2], np.zeros(2)), "2 different nodes"),

@@ -134,13 +134,8 @@ def test_coatings() -> None:
 
 FALSE_ALARM = 1e-3
 LOBES = [
-    ABg(1e-3, 1e-4, 1.5),
-    ABg(2e-3, 1e-5, 2.0),
-    ABg(1e-3, 1e-5, 2.5),
-    ABg(1e-3, 1e-3, 3.5),
-    HarveyShack(3.0, 0.01, -1.7),
-    HarveyShack(0.5, 0.1, -2.0),
-    HarveyShack(2.0, 0.05, -3.0),
+    *(ABg(*numbers) for numbers in ((1e-3, 1e-4, 1.5), (2e-3, 1e-5, 2.0), (1e-3, 1e-5, 2.5), (1e-3, 1e-3, 3.5))),
+    *(HarveyShack(*numbers) for numbers in ((3.0, 0.01, -1.7), (0.5, 0.1, -2.0), (2.0, 0.05, -3.0))),
 ]
 
 

@@ -51,11 +51,8 @@ def line_geometry(backend, model: CameraModel, states: list[State]) -> LineChang
     half = model.spec.focal_length * np.tan(model.spec.field.x)
     position = np.linspace(-half, half, 41)
     placed = bare.place(states)
-    line = model.focal_plane.apply(np.stack([0 * position, position, 0 * position], axis=-1)) - [
-        0,
-        0,
-        model.spec.image.z,
-    ]
+    line = model.focal_plane.apply(np.stack([0 * position, position, 0 * position], axis=-1))
+    line[:, 2] -= model.spec.image.z
     backward = model.mirrors[::-1]
     _, sight = chief_rays(
         backend,

@@ -57,21 +57,12 @@ def motion(error: tuple[str, str, str]) -> str:
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory) -> ToleranceSetup:
-    lines = [
-        f"  {name}: {{motion: {motion(e)}, limit: {told}, law: {law}}}" for name, (e, told, _, law) in BUDGET.items()
-    ]
+    told = (f"  {name}: {{motion: {motion(e)}, limit: {at}, law: {law}}}\n" for name, (e, at, _, law) in BUDGET.items())
     path = tmp_path_factory.mktemp("tolerance") / "budget.yaml"
+    focus = "{motion: focal_plane shift z, range: 5 mm}"
     path.write_text(
-        "\n".join(
-            [
-                "instrument: gf7",
-                "tolerances:",
-                *lines,
-                "compensators: {focus: {motion: focal_plane shift z, range: 5 mm}}",
-                "merits: {wavefront: {kind: wavefront, at_most: 0.0714}}",
-                "",
-            ]
-        ),
+        f"instrument: gf7\ntolerances:\n{''.join(told)}compensators: {{focus: {focus}}}\n"
+        "merits: {wavefront: {kind: wavefront, at_most: 0.0714}}\n",
         "utf-8",
     )
     return resolve_tolerance(path)

@@ -224,14 +224,6 @@ def test_components_stand_one_by_one(pair) -> None:
     assert {law.text for law in found.laws} == {"constant"}
 
 
-def test_joint_components_stand_beside_causes(pair) -> None:
-    causes = "causes:\n  a: {bodies: base/forward/M3, shift: [1 um, 0 um, 0 um], reason: r}\n"
-    found = motions_of_spec(spec("", f"{JOINT}{THREE}{MATRIX}  time: {{drift: 6 h}}\n{causes}"), pair)
-    assert [c.cause for c in found.components] == ["a", "joint", "joint", "joint"]
-    np.testing.assert_array_equal(found.correlation[0], [1.0, 0.0, 0.0, 0.0])
-    assert [law.text for law in found.laws] == ["white", *["drift 6 h"] * 3]
-
-
 def test_what_does_not_move_is_left_out_with_its_correlations(pair) -> None:
     found = motions_of_spec(spec("", f"{JOINT}{THREE}{MATRIX}".replace("4 arcsec", "0 arcsec")), pair)
     assert [c.what for c in found.components] == ["shift z", "conic"]
