@@ -12,8 +12,6 @@ from hypothesis import strategies as st
 
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import Surface, plane
-from optics.geometry.tree import Body, RigidTree
-from optics.raytrace.assembly import Assembly, Element
 from optics.raytrace.trace import BeamMissedError, require_some
 from tests.optics.bench import PASS, REFLECT, REFRACT, Stage, at, beam, build, disk_points, run, unit
 from tests.optics.test_tree import motions, poses, vectors
@@ -139,20 +137,6 @@ def lenses(draw) -> Lens:
     return Lens(draw(surfaces()), draw(surfaces()), draw(surfaces()), draw(st.floats(1.3, 1.9)), tilts)
 
 
-def on_a_base(stages: list[Stage], base: Pose) -> Assembly:
-    """The stages on one body that carries all of them."""
-    names = [f"base/e{i}" for i in range(len(stages))]
-    elements = {
-        n: Element(n, n, s.surface, s.interaction, s.aperture, s.index_after)
-        for n, s in zip(names, stages, strict=True)
-    }
-    bodies = (
-        Body("base", base, {"corner": (0.4, -0.2, 0.3)}),
-        *(Body(n, s.pose, {"corner": (0.0, 0.1, 0.0)}) for n, s in zip(names, stages, strict=True)),
-    )
-    return Assembly(RigidTree(bodies), elements, {"all": tuple(names)})
-
-
 @given(lens=lenses())
 def test_hits_and_the_laws_of_reflection_and_refraction(backend, lens) -> None:
     """n d before and n' d' after a surface differ along its normal only; the normal is from differences of the sag over
@@ -184,7 +168,7 @@ def test_hits_and_the_laws_of_reflection_and_refraction(backend, lens) -> None:
 @given(lens=lenses(), motion=motions(), base=poses())
 def test_moving_everything_is_moving_the_rays(backend, lens, motion, base) -> None:
     """Rigidly: paths stay. Grown by a factor: paths grow by it."""
-    assembly = on_a_base(lens.stages(), base)
+    assembly = build(*lens.stages(), base=base)
     position, direction = base.apply(START), HEADING @ base.rotation.T
     hit, leaving, path, valid = run(backend, assembly, position, direction)
     assert valid.all()

@@ -20,14 +20,13 @@ from optics.geometry.zernike import basis
 from optics.materials.material import material
 from optics.raytrace import reflectors
 from optics.raytrace.assembly import Assembly
-from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
 from optics.thermal.heat import Temperature
 from optics.thermal.thermo_elastic import free_linear_field
 from scenes.models.clearance import LEAST_GAP, find_overlaps, separation
 from scenes.models.obstruction import find_obstructions, rays_taken
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.load import load_instrument
+from tests.optics.bench import run
 from tests.scenes import monitor_layouts
 from tests.scenes.prism_errors import reflection, seen_outside, turn_by_mirrors
 
@@ -49,16 +48,12 @@ def parts_0(errors=None):
     return reflectors.prism_0(reflectors.Mount("glass", Pose(), "p", "fused silica", SHIFT, WIDTH, errors=errors or {}))
 
 
-def assembled(parts) -> Assembly:
-    elements = {e.name: replace(e, aperture=None) for e in parts.elements}
-    return Assembly(RigidTree(parts.bodies), elements, {"all": tuple(elements)}, {"glass": N})
-
-
 def send(backend, parts, position, direction, state=None):
     """World position, direction (N, 3), path, validity (N,) of rays after the last face."""
-    systems = assemble(assembled(parts), ["all"], [state or {}])
-    traced = trace(backend, systems, make_rays(backend, np.array(position), np.array(direction)), world=True)
-    return tuple(a[0] for a in traced.numpy(traced.world))
+    elements = {e.name: replace(e, aperture=None) for e in parts.elements}
+    media = {e.solid: N for e in parts.elements if e.solid}
+    assembly = Assembly(RigidTree(parts.bodies), elements, {"all": tuple(elements)}, media)
+    return run(backend, assembly, np.array(position), np.array(direction), state)
 
 
 def beam(middle, count: int = 12, radius: float = 0.5 * WIDTH) -> np.ndarray:
@@ -306,10 +301,7 @@ def test_light_goes_as_plain_mirrors_send_it(backend, kind, turn, slant) -> None
         start = start - ((start - start[0]) @ into)[:, None] * into
         ways = np.broadcast_to(into, start.shape)
         state = {"frame": Motion(rotate=tuple(ARCSEC * np.array(turn)), pivot="apex")}
-        elements = {e.name: replace(e, aperture=None) for e in parts.elements}
-        systems = assemble(Assembly(RigidTree(parts.bodies), elements, {"all": tuple(elements)}, {}), ["all"], [state])
-        traced = trace(backend, systems, make_rays(backend, start, ways), world=True)
-        place, way, path, valid = (a[0] for a in traced.numpy(traced.world))
+        place, way, path, valid = send(backend, parts, start, ways, state)
         places, direction, length = by_hand(parts, state, start, ways)
         assert valid.all()
         # lengths near 1 m, three reflections in doubles
