@@ -20,6 +20,7 @@ from scenes.lens.camera_reader import Width, camera_of, camera_text
 from scenes.lens.camera_writer import perturbed_prescription, prescription_of
 from scenes.lens.glass_catalogue import own_glasses, read_catalogues
 from scenes.lens.prescription import SEQUENCE, Prescription, joined
+from scenes.lens.statements import Glasses
 from scenes.lens.zemax_reader import read_zemax
 from scenes.lens.zemax_writer import zemax_text
 from scenes.models.camera_model import collimated, derive_camera, field_direction
@@ -60,13 +61,23 @@ def at_image(backend, assembly, sequence, launch, direction, state=None) -> np.n
     return np.concatenate([position, leaving, path[:, None]], axis=-1)
 
 
+def singlet(folder: Path, text: str = SINGLET, glasses: Glasses | None = None) -> Prescription:
+    """Return a lens of a file."""
+    (folder / "singlet.zmx").write_text(text, "utf-8")
+    return read_zemax(folder / "singlet.zmx", own_glasses() if glasses is None else glasses)
+
+
+def read_back(lens: Prescription, path: Path) -> Prescription:
+    """Write a prescription and return what is read of it."""
+    path.write_text(zemax_text(lens) if path.suffix == ".zmx" else batoid_text(lens)[0], "utf-8")
+    return read_zemax(path) if path.suffix == ".zmx" else read_batoid(path, 650e-9)
+
+
 @pytest.mark.parametrize("kind", [".zmx", ".yaml"])
 @pytest.mark.parametrize("name", ["gf7", "gf7_conic", "monitor"])
 def test_out_and_in_again(tmp_path: Path, backend, camera, name: str, kind: str) -> None:
     model = camera(name)
-    lens, path = prescription_of(model), tmp_path / f"{name}{kind}"
-    path.write_text(zemax_text(lens) if kind == ".zmx" else batoid_text(lens)[0], "utf-8")
-    back = read_zemax(path) if kind == ".zmx" else read_batoid(path, 650e-9)
+    back = read_back(prescription_of(model), tmp_path / f"{name}{kind}")
     launch, direction = rays_of(model, backend)
     first = at_image(backend, model.bare_assembly(apertures=False), "imaging", launch, direction)
     # what a file says of the edges of mirrors stops the same rays: none of these
@@ -103,17 +114,14 @@ def test_the_camera_file_is_read_and_traces_the_same(tmp_path: Path, backend) ->
 
 def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
     """Focal length by the lensmaker's formula; backward rays come out along those that went in."""
-    path = tmp_path / "singlet.zmx"
     n, c, t = N_BK7.index(587.5618e-9), 1.0 / 0.05, 0.004
     power = (n - 1.0) * (2.0 * c - (n - 1.0) * t * c * c / n)
     focus = (1.0 - (n - 1.0) * t * c / n) / power
     f_number = SINGLET.replace("ENPD 10", "FNUM 20 0")
-    path.write_text(f_number, "utf-8")
     # the pupil of an F-number is that of the focal length, wherever the image stands
-    made = camera_of(read_zemax(path, own_glasses()), "singlet", backend)
+    made = camera_of(singlet(tmp_path, f_number), "singlet", backend)
     assert made.camera.entrance_pupil == pytest.approx(1.0 / power / 20.0, rel=1e-8)
-    path.write_text(f_number.replace("DISZ 47.5", f"DISZ {1e3 * focus!r}"), "utf-8")
-    made = camera_of(read_zemax(path, own_glasses()), "singlet", backend)
+    made = camera_of(singlet(tmp_path, f_number.replace("DISZ 47.5", f"DISZ {1e3 * focus!r}")), "singlet", backend)
     model = derive_camera(made.camera, backend)
     assert float(model.first_order.principal_distance[0]) == pytest.approx(1.0 / power, rel=1e-9)
     bare = model.bare_assembly(False)
@@ -128,18 +136,16 @@ def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
 
 def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> None:
     """By name or by the catalogue's formula; a glass whose dispersion nobody knows keeps its index."""
-    path, agf = tmp_path / "singlet.zmx", tmp_path / "own.agf"
-    path.write_text(SINGLET, "utf-8")
-    front = camera_of(read_zemax(path, own_glasses()), "singlet", backend, Width(pupil=1e-4)).camera
+    agf = tmp_path / "own.agf"
+    front = camera_of(singlet(tmp_path), "singlet", backend, Width(pupil=1e-4)).camera
     assert front.medium == "air"
     assert front.plain()["mirrors"]["L1"]["glass"] == "N-BK7"
     assert front.index_behind("L1", 500e-9) == N_BK7.index(500e-9)
-    assert "N-BK7" in SINGLET
-    path.write_text(SINGLET.replace("N-BK7", "F2"), "utf-8")
     numbers = "1.34533359 0.00997743871 0.209073176 0.0470450767 0.937357162 111.886764"
     heat = "ED 8.2 9.2 3.6 0 0\nTD 1.51e-6 1.56e-8 -2.78e-11 9.34e-7 1.04e-9 0.25 20"
     agf.write_text(f"NM F2 2 0 1.62 36.37\nCD {numbers} 0 0 0 0\n{heat}\nLD 0.32 2.5\n", "utf-8")
-    made = camera_of(read_zemax(path, read_catalogues([agf])), "singlet", backend, Width(pupil=1e-4)).camera
+    lens = singlet(tmp_path, SINGLET.replace("N-BK7", "F2"), read_catalogues([agf]))
+    made = camera_of(lens, "singlet", backend, Width(pupil=1e-4)).camera
     again = validate(CameraSpec, parse_yaml(made.file_text("")))
     assert again == made
     assert again.mirrors["L1"].glass.expansion == pytest.approx(8.2e-6, rel=1e-15)
@@ -152,9 +158,7 @@ def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> No
 
 
 def test_an_instrument_takes_no_lenses(tmp_path: Path, backend) -> None:
-    path = tmp_path / "singlet.zmx"
-    path.write_text(SINGLET, "utf-8")
-    made = camera_of(read_zemax(path, own_glasses()), "singlet", backend, Width(pupil=1e-4))
+    made = camera_of(singlet(tmp_path), "singlet", backend, Width(pupil=1e-4))
     with pytest.raises(InputError, match="a camera with a monitor is made of mirrors alone"):
         build_instrument(load_instrument("gf7_pair"), {"gf7": made.camera}, backend)
 
@@ -187,9 +191,7 @@ def test_a_freeform_of_zernike_terms_goes_in_and_out(tmp_path: Path, backend) ->
         error = ZernikeFigure(0.1, (0.01, -0.05), {5: 1e-7, 7: 2e-7})
         shape = joined(replace(model.surfaces["M1"], figure=error))
         bent = replace(again, surfaces=(replace(mirror, surface=shape), *again.surfaces[1:]))
-        out = tmp_path / f"bent{kind}"
-        out.write_text(zemax_text(bent) if kind == ".zmx" else batoid_text(bent)[0], "utf-8")
-        back = read_zemax(out) if kind == ".zmx" else read_batoid(out, 650e-9)
+        back = read_back(bent, tmp_path / f"bent{kind}")
         x, y = np.array([0.01, -0.02]), np.array([-0.03, -0.06])
         wanted = model.surfaces["M1"].sag(x, y) + error.sag(x, y)
         np.testing.assert_allclose(back.surfaces[0].surface.sag(x, y), wanted, rtol=0, atol=1e-16)
@@ -209,9 +211,7 @@ def test_a_perturbed_camera_traces_as_the_instrument_does(tmp_path: Path, backen
     """Rays of the scene through the instrument in that state, and through the file that was written of it."""
     model, pair = instrument("gf7_pair").cameras["forward"], instrument("gf7_pair")
     lens = perturbed_prescription(pair, "forward", STATE)
-    path = tmp_path / f"perturbed{kind}"
-    path.write_text(zemax_text(lens) if kind == ".zmx" else batoid_text(lens)[0], "utf-8")
-    back = read_zemax(path) if kind == ".zmx" else read_batoid(path, 650e-9)
+    back = read_back(lens, tmp_path / f"perturbed{kind}")
     launch, direction = rays_of(model, backend)
     design = pair.assembly.nominal_pose("base/forward") @ model.camera_frame.inverse()
     first = at_image(
@@ -291,22 +291,17 @@ def test_the_command(tmp_path: Path, backend) -> None:
 
 
 def test_what_a_zemax_file_cannot_hold_is_refused(tmp_path: Path, backend) -> None:
-    (tmp_path / "singlet.zmx").write_text(SINGLET, "utf-8")
-    made = camera_of(read_zemax(tmp_path / "singlet.zmx", own_glasses()), "singlet", backend, Width(pupil=1e-4))
+    made = camera_of(singlet(tmp_path), "singlet", backend, Width(pupil=1e-4))
     lens: Prescription = prescription_of(derive_camera(made.camera, backend))
     with pytest.raises(InputError, match="a face of a lens"):
         zemax_text(lens)
-    text, _ = batoid_text(lens)
-    (tmp_path / "singlet.yaml").write_text(text, "utf-8")
-    back = read_batoid(tmp_path / "singlet.yaml", 650e-9)
+    back = read_back(lens, tmp_path / "singlet.yaml")
     assert [s.index for s in back.surfaces] == [s.index for s in lens.surfaces]
 
 
 def test_fields_are_those_of_the_file(tmp_path: Path, backend) -> None:
     """0 and 2 deg on one axis are the middle and the end of the camera's field; what it adds is told."""
-    path = tmp_path / "singlet.zmx"
-    path.write_text(SINGLET, "utf-8")
-    lens = read_zemax(path, own_glasses())
+    lens = singlet(tmp_path)
     made = camera_of(lens, "singlet", backend)
     assert (made.camera.field_bias, made.camera.field.x, made.camera.field.y) == (0.0, math.radians(2), math.radians(2))
     notes = [str(note) for note in made.notes if note.statement == "field"]

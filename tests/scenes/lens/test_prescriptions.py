@@ -266,9 +266,7 @@ def newton(turn: str, extra: str = "") -> str:
 
 @pytest.mark.parametrize("turn", ["3", "4"])
 def test_a_newtonian_is_a_paraboloid_with_its_image_at_the_focus(tmp_path: Path, backend, turn: str) -> None:
-    path = tmp_path / "newton.zmx"
-    path.write_text(newton(turn), "utf-8")
-    folded = read_zemax(path)
+    folded = read_zemax(file(tmp_path, "newton.zmx", newton(turn)))
     made = camera_of(folded, "newton", backend)
     assert list(made.camera.mirrors) == ["M1"]
     assert made.camera.image.z == pytest.approx(-1.0, abs=1e-15)
@@ -286,9 +284,7 @@ def test_a_newtonian_is_a_paraboloid_with_its_image_at_the_focus(tmp_path: Path,
 
 def test_what_a_fold_leaves(tmp_path: Path, backend) -> None:
     """The edge of a flat that cuts light stays where it cuts it."""
-    path = tmp_path / "newton.zmx"
-    path.write_text(newton("3", "CLAP 0 15 0"), "utf-8")
-    made = camera_of(read_zemax(path), "newton", backend)
+    made = camera_of(read_zemax(file(tmp_path, "newton.zmx", newton("3", "CLAP 0 15 0"))), "newton", backend)
     (name,) = (name for name, one in made.camera.mirrors.items() if one.light == "passes")
     assert made.camera.mirrors[name].edges is not None
     assert made.camera.mirrors[name].z == pytest.approx(-0.8)
@@ -307,18 +303,15 @@ def paraboloid(field: str, distance: str = "INFINITY", image: str = "CURV 0") ->
 @pytest.mark.parametrize("kind", [2, 3])
 def test_fields_as_heights_on_the_image(tmp_path: Path, backend, kind: int) -> None:
     """Of a paraboloid that is its own stop the chief ray of tan w meets the focal plane at f tan w, to all orders."""
-    path = tmp_path / "heights.zmx"
-    path.write_text(paraboloid(f"FTYP {kind} 0 3 1 0 0 0\nXFLN 0 10 -10\nYFLN 0 20 -20\n"), "utf-8")
-    camera = camera_of(read_zemax(path), "heights", backend).camera
+    text = paraboloid(f"FTYP {kind} 0 3 1 0 0 0\nXFLN 0 10 -10\nYFLN 0 20 -20\n")
+    camera = camera_of(read_zemax(file(tmp_path, "heights.zmx", text)), "heights", backend).camera
     assert (camera.field.x, camera.field.y) == pytest.approx((np.arctan(0.01), np.arctan(0.02)), rel=1e-12)
 
 
 def test_a_height_with_distortion(tmp_path: Path, backend) -> None:
     """The chief ray of the camera's largest direction meets the height that the file has for it."""
     text = SINGLET.replace("FTYP 0", "FTYP 3").replace("YFLN 0 2", "YFLN 0 3")
-    path = tmp_path / "singlet.zmx"
-    path.write_text(text, "utf-8")
-    spec = camera_of(read_zemax(path, own_glasses()), "singlet", backend).camera
+    spec = camera_of(read_zemax(file(tmp_path, "singlet.zmx", text), own_glasses()), "singlet", backend).camera
     model = derive_camera(spec, backend)
     bare = model.bare_assembly(apertures=False)
     # the stop is the first surface, whose vertex is the frame's origin
@@ -334,16 +327,13 @@ def test_heights_of_codev(tmp_path: Path, backend) -> None:
         "LEN NEW\nRDM Y; DIM M\nEPD 200\nWL 550\nYIM 0 20\nSO 0.0 1e13\nS -2000.0 -1000.0 REFL\n  STO; K -1.0\n"
         "SI 0.0 0.0\nGO\n"
     )
-    path = tmp_path / "heights.seq"
-    path.write_text(text, "utf-8")
-    camera = camera_of(read_codev(path), "heights", backend).camera
+    camera = camera_of(read_codev(file(tmp_path, "heights.seq", text)), "heights", backend).camera
     assert camera.field.y == pytest.approx(np.arctan(0.02), rel=1e-6)
 
 
 def test_an_object_far_away_is_at_infinity(tmp_path: Path, backend) -> None:
     """With f = 1 m its image stands 1 / 2e6 m behind the focus; heights of 2000 m there are 1 mrad."""
-    path = tmp_path / "far.zmx"
-    path.write_text(paraboloid("FTYP 1 0 3 1 0 0 0\nXFLN 0 2e6 0\nYFLN 0 0 2e6\n", "2e9"), "utf-8")
+    path = file(tmp_path, "far.zmx", paraboloid("FTYP 1 0 3 1 0 0 0\nXFLN 0 2e6 0\nYFLN 0 0 2e6\n", "2e9"))
     made = camera_of(read_zemax(path), "far", backend)
     assert (made.camera.field.x, made.camera.field.y) == pytest.approx((1e-3, 0.5e-3), rel=1e-3)
     assert "2e+06 m away is taken for infinity, whose image is 0.5 um nearer" in " ".join(map(str, made.notes))
@@ -389,8 +379,7 @@ def test_common_glasses_have_the_numbers_of_their_sheets() -> None:
 
 def test_a_common_glass_by_its_name(tmp_path: Path, backend) -> None:
     """In a prescription without a catalogue, with its source; in a camera's file; not that of another maker."""
-    path = tmp_path / "flint.zmx"
-    path.write_text(SINGLET.replace("N-BK7", "F2"), "utf-8")
+    path = file(tmp_path, "flint.zmx", SINGLET.replace("N-BK7", "F2"))
     made = camera_of(read_zemax(path, own_glasses()), "flint", backend)
     assert "F2: the glass of Schott's Zemax catalogue of 2017-01-20" in " ".join(map(str, made.notes))
     path.write_text("GCAT CDGM\n" + SINGLET.replace("N-BK7", "F2"), "utf-8")
