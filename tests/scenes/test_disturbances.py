@@ -364,11 +364,3 @@ def test_a_table_may_have_its_columns_in_any_order(pair, tmp_path) -> None:
     (tmp_path / "corr.csv").unlink()
     again = motions_of_spec(resolve(tmp_path / "config.yaml").disturbances, pair)
     np.testing.assert_array_equal(again.covariance, found.covariance)
-
-
-def test_a_job_cannot_change_what_goes_together(tmp_path) -> None:
-    (tmp_path / "own.yaml").write_text(JOINT + THREE)
-    job = "instrument: gf7_pair\ndisturbances:\n  file: ./own.yaml\n  causes: {joint: {shift: 1 um}}\n"
-    (tmp_path / "job.yaml").write_text(job)
-    with pytest.raises(InputError, match=r"job.yaml:4: disturbances.causes.joint: .* stand one by one"):
-        resolve(tmp_path / "job.yaml")

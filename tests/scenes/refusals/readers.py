@@ -134,8 +134,9 @@ def correlations(folder: Path, fixture: Fixture) -> Read:
 
 
 def stated_job(folder: Path, fixture: Fixture) -> Read:
-    """A job on the pair gf7 and what it states to move."""
+    """A job on the pair gf7 and what it states to move; a file of components that go together beside it."""
     pair = fixture("gf7_pair")
+    (folder / "own.yaml").write_text("name: own\njoint: {reason: r, components: {forward/M2 shift z: 3 um}}\n", "utf-8")
 
     def read(path: Path) -> object:
         return stated_motions(resolve(path), pair)
