@@ -98,6 +98,14 @@ def by_sides(edges: list[Edge]):
     return lambda count: edge_shadow.outlines_on_stop(places, edges, NODES, count)
 
 
+@pytest.mark.parametrize("turn", np.arange(0.0, 6.0, 0.9))
+def test_a_polygon_falls_into_the_same_parts_wherever_it_is_turned_to(turn: float) -> None:
+    c, s = 8.0 * np.cos(turn), 8.0 * np.sin(turn)
+    star = Edge(Polygon(tuple(map(tuple, STAR.corners @ np.array([[c, s], [-s, c]])))), True)
+    dark = covered(by_sides([star])(8).shadows(1), POINTS)[0]
+    assert np.mean(dark == star.passes(*POINTS.T)) < 1e-3
+
+
 def test_circles_that_nearly_coincide_get_more_sides() -> None:
     """Between two circles that all but coincide lies less than between a circle and its polygon."""
     one, error = edge_shadow.settled_shadows(by_sides([Edge(Circle(0.5), True)]), 1)
