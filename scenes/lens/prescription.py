@@ -171,7 +171,7 @@ def turned_over(surface: LensSurface) -> LensSurface:
     terms = []
     for term in shape.terms:
         if not isinstance(term, XYPolynomial):
-            raise TypeError(f"no rule for turning {type(term).__name__} over")
+            raise TypeError(f"{type(term).__name__} is no polynomial")
         terms.append(XYPolynomial(**{n: -getattr(term, n) * (-1) ** b for (_, b), n in _POLYNOMIAL.items()}))
     figure = shape.figure
     if isinstance(figure, ZernikeFigure):
@@ -180,7 +180,7 @@ def turned_over(surface: LensSurface) -> LensSurface:
         signs = {j: 1.0 if noll_to_nm(j)[1] < 0 else -1.0 for j in given}
         figure = ZernikeFigure(figure.radius, (cx, -cy), {j: signs[j] * a for j, a in given.items()})
     elif figure is not None:
-        raise TypeError("no rule for turning a grid over")
+        raise TypeError("a figure on a grid")
     even = tuple(-a for a in shape.even)
     edge = surface.aperture
     if edge is not None:

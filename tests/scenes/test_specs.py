@@ -3,12 +3,17 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from optics.geometry.aperture import Circle
+from optics.geometry.surface import Surface
 from optics.numerics.backend import load_backend
 from scenes.models.disturbances import stated_motions
 from scenes.models.instrument_builder import build_instrument
+from scenes.models.meshes import sheet_mesh
+from scenes.specs import samplers
 from scenes.specs.load import EXAMPLES, LIBRARY, ORBIT, SCENES, load_camera, load_instrument
 from scenes.specs.operation import ENDINGS, OperationSpec, read_operation, resolve_operation
 from scenes.specs.orbit import setup as orbit_setup
@@ -30,6 +35,22 @@ TH1 = (LIBRARY / "payloads/th1.yaml").read_text("utf-8")
 
 def read(model: type[Spec], text: str) -> Spec:
     return validate(model, parse_yaml(text))
+
+
+@pytest.mark.parametrize(
+    ("call", "problem"),
+    [
+        (lambda spec: spec.index_behind("M1"), "M1 is no face of a lens"),
+        (lambda spec: spec.warm_glass("M1"), "says nothing of heat; name its glass"),
+        (lambda spec: sheet_mesh(Surface(2.0), Circle(1.0)), "ends before its clear aperture does"),
+        (lambda spec: samplers.unit_cube("few", 4, 2, 0), r"must give points \(4, 2\)"),
+    ],
+)
+def test_calls_for_what_is_not_there_are_refused(call, problem: str, monkeypatch) -> None:
+    few = samplers.Sampler("few", lambda runs, factors, generator: np.zeros((1, factors)))
+    monkeypatch.setitem(samplers.SAMPLERS, "few", few)
+    with pytest.raises(ValueError, match=problem):
+        call(load_camera("gf7"))
 
 
 def write(folder: Path, text: str) -> Path:

@@ -1,6 +1,7 @@
 """Cameras made of foreign prescriptions and prescriptions made of cameras: both trace the same."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optics.geometry.surface import ZernikeFigure
+from optics.geometry.aperture import Circle, Edge
+from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
+from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
 from optics.geometry.tree import Motion
 from optics.materials.glass import N_BK7
 from optics.raytrace.system import assemble
@@ -157,6 +160,54 @@ def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> No
         assert again.index_behind("L1", wavelength) == pytest.approx(index, abs=1e-5)
 
 
+GRID = GridFigure(np.zeros((5, 5)), (-1.0, 1.0, -1.0, 1.0))
+ERROR = ZernikeFigure(0.1, (0.0, 0.0), {5: 1e-7})
+SAG = ZernikeSag(radius=0.1, Z5=1e-7)
+CURVE = XYPolynomial(x2=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("shape", "zemax", "batoid", "camera_file"),
+    [
+        (
+            Surface(-0.1, figure=GRID),
+            "a figure on a grid",
+            "cannot carry this: a figure on a grid",
+            "which a camera's file",
+        ),
+        (Surface(-0.1, terms=(CURVE,), figure=ERROR), "with other terms of its sag", "", ""),
+        (Surface(-0.1, even=(0.0,) * 7 + (1e-9,)), "even powers beyond r^16", "", ""),
+        (Surface(-0.1, terms=(SAG,)), "terms of a sag that the format does not have", "is no polynomial", ""),
+        (Surface(-0.1, even=(0.0,) * 9 + (1e-9,), terms=(CURVE,)), "a polynomial beyond order 20", "", ""),
+        (Surface(even=(0.0,) * 9 + (1e-9,)), "even powers beyond", "a polynomial of so high an order", ""),
+    ],
+)
+def test_shapes_that_a_format_has_no_place_for(backend, camera, shape, zemax, batoid, camera_file) -> None:
+    lens = prescription_of(camera("gf7"))
+    bent = replace(lens, surfaces=(replace(lens.surfaces[0], surface=shape), *lens.surfaces[1:]))
+    for write, problem in (
+        (zemax_text, zemax),
+        (batoid_text, batoid),
+        (lambda one: camera_of(one, "bent", backend), camera_file),
+    ):
+        if problem:
+            with pytest.raises(InputError, match=re.escape(problem)):
+                write(bent)
+
+
+def test_a_hole_in_an_obscuration_is_no_edge_of_a_zemax_file(camera) -> None:
+    lens = prescription_of(camera("gf7"))
+    bent = replace(lens.surfaces[0], aperture=None, edges=(Edge(Circle(0.1, inner=0.05), True),))
+    with pytest.raises(InputError, match="an obscuration with a hole"):
+        zemax_text(replace(lens, surfaces=(bent, *lens.surfaces[1:])))
+
+
+def test_zernike_terms_that_cannot_be_joined() -> None:
+    for figure, problem in ((GRID, "beside a figure on a grid"), (replace(ERROR, terms={70: 1e-9}), "beyond order")):
+        with pytest.raises(ValueError, match=problem):
+            joined(Surface(-0.1, terms=(SAG,), figure=figure))
+
+
 def test_an_instrument_takes_no_lenses(tmp_path: Path, backend) -> None:
     made = camera_of(singlet(tmp_path), "singlet", backend, Width(pupil=1e-4))
     with pytest.raises(InputError, match="a camera with a monitor is made of mirrors alone"):
@@ -241,6 +292,9 @@ def test_the_example_of_a_zemax_file_is_what_is_read_of_it(tmp_path: Path, backe
     assert load_camera(out).plain() == load_camera(EXAMPLES / "cassegrain_zmx.yaml").plain()
 
 
+JOB = "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: 0 0 30 um, figure: {Z5: 20 nm}}}\n"
+
+
 @pytest.mark.second
 def test_the_command(tmp_path: Path, backend) -> None:
     (tmp_path / "tma.zmx").write_text(TMA, "utf-16")
@@ -257,10 +311,7 @@ def test_the_command(tmp_path: Path, backend) -> None:
                      "0.1 deg", "--pupil", "2 m", "--pitch", "15 um")  # fmt: skip
     assert code == 0, said
     assert load_camera(camera).line.pitch == pytest.approx(15e-6)
-    job = tmp_path / "job.yaml"
-    job.write_text(
-        "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: 0 0 30 um, figure: {Z5: 20 nm}}}\n", "utf-8"
-    )
+    (tmp_path / "job.yaml").write_text(JOB, "utf-8")
     (tmp_path / "what.doc").touch()
     for words, problem in (
         ("read two.yaml --out a.yaml", "names no wavelength"),
@@ -283,6 +334,12 @@ def test_the_command(tmp_path: Path, backend) -> None:
         assert (code, problem in " ".join(said.split())) == (2, True), (words, said)
         assert not (tmp_path / "a.yaml").exists()
         assert not (tmp_path / "a.zmx").exists()
+
+
+@pytest.mark.second
+def test_the_command_writes_a_perturbed_camera(tmp_path: Path) -> None:
+    job = tmp_path / "job.yaml"
+    job.write_text(JOB, "utf-8")
     for name in ("a.zmx", "a.yaml"):
         code, said = run("write", "gf7", "--perturbed", job, "--camera", "forward", "--out", tmp_path / name)
         assert code == 0, said

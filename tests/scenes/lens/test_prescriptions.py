@@ -290,6 +290,14 @@ def test_what_a_fold_leaves(tmp_path: Path, backend) -> None:
     assert made.camera.mirrors[name].z == pytest.approx(-0.8)
 
 
+def test_a_fold_before_a_freeform_cannot_be_unfolded(tmp_path: Path, backend) -> None:
+    freeform = "TYPE XPOLYNOM\n  XDAT 1 9 0 0 1\n  XDAT 2 20 0 0 1\n  XDAT 5 0.01 0 0 1"
+    fold = surface(5, freeform, "CURV 0", "DISZ -10", MIRROR) + surface(6, "CURV 0", "DISZ 0")
+    text = newton("3").partition("SURF 5")[0] + fold
+    with pytest.raises(InputError, match="a fold before a surface that is not of revolution"):
+        unfolded(read_zemax(file(tmp_path, "a.zmx", text)))
+
+
 def paraboloid(field: str, distance: str = "INFINITY", image: str = "CURV 0") -> str:
     return HEAD + field + "".join(
         [
@@ -353,6 +361,29 @@ def test_a_curved_image_has_a_plane_that_touches_it(tmp_path: Path, backend) -> 
     # the sag h^2 / 2 R at 1 m for R = 0.5 m
     assert "1e+03 mm x (h / 1 m)^2" in taken.stdout
     assert with_flat_image(read_zemax(path)).image.surface.is_plane
+
+
+DEEP = "opticalSystem:\n" + "".join(
+    f"{'  ' * (2 * k + 1)}type: CompoundOptic\n{'  ' * (2 * k + 1)}items:\n{'  ' * (2 * k + 2)}-\n" for k in range(22)
+)
+ENDLESS = {
+    "too many surfaces": ("a.seq", CODEV.replace("S 0.0 100.0\n", "S 0.0 100.0\n" * 2001)),
+    "a line too long": ("b.seq", CODEV.replace("TITLE 'folded'", "TITLE '" + "x" * 100_000 + "'")),
+    "not UTF-16 text": ("c.zmx", TMA.encode("utf-16")[:-1]),
+    "too many surfaces; allowed": (
+        "d.yaml",
+        BATOID.replace("  items:\n", "  items:\n" + "    - {type: Mirror, surface: {type: Plane}}\n" * 2001, 1),
+    ),
+    "optics within optics without end": ("e.yaml", DEEP + " " * 90 + "{type: Detector}\n"),
+}
+
+
+@pytest.mark.parametrize("problem", ENDLESS)
+def test_files_without_end_or_with_half_a_character_are_refused(tmp_path: Path, problem: str) -> None:
+    name, text = ENDLESS[problem]
+    path = file(tmp_path, name, text)
+    with pytest.raises(InputError, match=problem):
+        {".seq": read_codev, ".zmx": read_zemax, ".yaml": lambda one: read_batoid(one, 650e-9)}[path.suffix](path)
 
 
 MAKERS = {

@@ -24,6 +24,8 @@ from scenes.specs import load
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import checked_nodes
 from scenes.specs.measured.adjust_setup import resolve_adjust
+from scenes.specs.measured.monitor_frames import read_frame_table, resolve_measurement
+from scenes.specs.measured.orbit_data_setup import resolve_match
 from scenes.specs.operation import read_operation
 from scenes.specs.orbit import setup as orbit_setup
 from scenes.specs.orbit.flight import ErrorsSpec, OrbitSpec
@@ -86,6 +88,7 @@ angle, loop, monitor, simulate = map(
     (orbit_setup.resolve_angle, orbit_setup.resolve_loop, orbit_setup.resolve_monitor, orbit_setup.resolve_simulate),
 )
 calibration, jitter, adjust = map(_plain, (orbit_setup.resolve_calibration, orbit_setup.resolve_jitter, resolve_adjust))
+match = _plain(resolve_match)
 zemax, codev = _plain(read_zemax), _plain(read_codev)
 batoid = _plain(lambda path: read_batoid(path, 650e-9))
 
@@ -225,6 +228,23 @@ def finishes(folder: Path, fixture: Fixture) -> Read:
 def agf(folder: Path, fixture: Fixture) -> Read:
     """A glass catalogue."""
     return read_catalogue
+
+
+def frames(folder: Path, fixture: Fixture) -> Read:
+    """A table of frames of one channel."""
+    for name in ("a.fits", "b.fits"):
+        (folder / name).touch()
+    return lambda path: read_frame_table(path, ("one/left",))
+
+
+def measurement(folder: Path, fixture: Fixture) -> Read:
+    """Measured frames of all channels of an instrument that a table lists."""
+    pair = load.load_instrument("gf7_pair")
+    channels = [f"{camera}/{channel}" for camera in pair.cameras for channel in pair.channels_of(camera)]
+    rows = "".join(f"{name},before,a.fits\n{name},after,a.fits\n" for name in channels)
+    (folder / "frames.csv").write_text(f"channel,when,file\n{rows}", "utf-8")
+    (folder / "a.fits").touch()
+    return resolve_measurement
 
 
 def derived(folder: Path, fixture: Fixture) -> Read:
