@@ -97,7 +97,7 @@ def joined(surface: Surface) -> Surface:
     """The surface with the Zernike terms of its own sag in its figure: one set of them, as other programs have it.
 
     Raises:
-        ValueError: the figure is one on a grid, or terms about two places are of too high an order to be joined.
+        ValueError: the figure is one on a grid, or has a term beyond those of Noll's that are known.
     """
     own = next((term for term in surface.terms if isinstance(term, ZernikeSag)), None)
     if own is None:
@@ -116,8 +116,6 @@ def joined(surface: Surface) -> Surface:
     for one in (shape.figure, figure):
         for pair, value in about_vertex(one).items():
             total[pair] = total.get(pair, 0.0) + value
-    if max(a + b for a, b in total) > LARGEST_ORDER:
-        raise ValueError(f"Zernike terms beyond order {LARGEST_ORDER}")
     radius = max(one.radius + float(np.hypot(*one.centre)) for one in (shape.figure, figure))
     terms = zernike_of({(a, b): c * radius ** (a + b) for (a, b), c in total.items()})
     return replace(shape, figure=ZernikeFigure(radius, (0.0, 0.0), terms))
