@@ -12,7 +12,7 @@ import numpy as np
 
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
 from optics.geometry.pose import Pose
-from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
+from optics.geometry.surface import Surface, ZernikeFigure
 from optics.raytrace.assembly import Interaction
 from scenes.lens import prescription
 from scenes.lens.camera_writer import rounded
@@ -29,7 +29,11 @@ def batoid_text(lens: prescription.Prescription) -> tuple[str, tuple[prescriptio
     items: list[dict[str, Any]] = []
     index = 1.0
     for k, surface in enumerate(lens.surfaces):
-        over = prescription.turned_over(surface)
+        try:
+            over = prescription.turned_over(surface)
+        except TypeError as error:
+            problem = f"batoid's file cannot carry this: {error}"
+            raise lens.error(problem, surface.line, surface.name, "polynomials and Zernike terms") from None
         pose = rounded(prescription.OVER @ over.pose)
         last = k == len(lens.surfaces) - 1
         kind = {Interaction.REFLECT: "Mirror", Interaction.REFRACT: "RefractiveInterface"}.get(surface.interaction)
@@ -78,14 +82,7 @@ def _place(pose: Pose) -> dict[str, float]:
 
 def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -> dict[str, Any]:
     shape = given.surface
-    if isinstance(shape.figure, GridFigure):
-        raise lens.error("batoid's file cannot carry a figure on a grid", given.line, given.name, "Zernike terms")
-    freeform: dict[tuple[int, int], float] = {}
-    if shape.terms:
-        try:
-            freeform = prescription.polynomial_of(Surface(terms=shape.terms))
-        except TypeError as error:
-            raise lens.error(f"batoid's file cannot carry this: {error}", given.line, given.name) from None
+    freeform = prescription.polynomial_of(Surface(terms=shape.terms)) if shape.terms else {}
     radius = 0.0
     figure = shape.figure
     if isinstance(figure, ZernikeFigure) and any(figure.terms.values()):

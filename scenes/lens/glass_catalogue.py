@@ -79,6 +79,8 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
                 if not coefficients:
                     raise source.error(f"{name} has no coefficients (CD)", begun)
                 first, last = (source.finite(s, k, "the range") * 1e-6 for k in (0, 1))
+                if first > last:
+                    raise source.error("a range of wavelengths that is reversed", number, s.text, "the shortest first")
                 glasses.append(CatalogueGlass(name, formula, coefficients, first, last, expansion, thermal))
                 name = ""
             case _:

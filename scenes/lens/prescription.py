@@ -97,7 +97,7 @@ def joined(surface: Surface) -> Surface:
     """The surface with the Zernike terms of its own sag in its figure: one set of them, as other programs have it.
 
     Raises:
-        ValueError: the figure is one on a grid, or terms about two places are of too high an order to be joined.
+        ValueError: the figure is one on a grid, or has a term beyond those of Noll's that are known.
     """
     own = next((term for term in surface.terms if isinstance(term, ZernikeSag)), None)
     if own is None:
@@ -116,8 +116,6 @@ def joined(surface: Surface) -> Surface:
     for one in (shape.figure, figure):
         for pair, value in about_vertex(one).items():
             total[pair] = total.get(pair, 0.0) + value
-    if max(a + b for a, b in total) > LARGEST_ORDER:
-        raise ValueError(f"Zernike terms beyond order {LARGEST_ORDER}")
     radius = max(one.radius + float(np.hypot(*one.centre)) for one in (shape.figure, figure))
     terms = zernike_of({(a, b): c * radius ** (a + b) for (a, b), c in total.items()})
     return replace(shape, figure=ZernikeFigure(radius, (0.0, 0.0), terms))
@@ -171,7 +169,7 @@ def turned_over(surface: LensSurface) -> LensSurface:
     terms = []
     for term in shape.terms:
         if not isinstance(term, XYPolynomial):
-            raise TypeError(f"no rule for turning {type(term).__name__} over")
+            raise TypeError(f"{type(term).__name__} is no polynomial")
         terms.append(XYPolynomial(**{n: -getattr(term, n) * (-1) ** b for (_, b), n in _POLYNOMIAL.items()}))
     figure = shape.figure
     if isinstance(figure, ZernikeFigure):
@@ -180,7 +178,7 @@ def turned_over(surface: LensSurface) -> LensSurface:
         signs = {j: 1.0 if noll_to_nm(j)[1] < 0 else -1.0 for j in given}
         figure = ZernikeFigure(figure.radius, (cx, -cy), {j: signs[j] * a for j, a in given.items()})
     elif figure is not None:
-        raise TypeError("no rule for turning a grid over")
+        raise TypeError("a figure on a grid")
     even = tuple(-a for a in shape.even)
     edge = surface.aperture
     if edge is not None:

@@ -10,7 +10,7 @@ import math
 import re
 import unicodedata
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation, localcontext
+from decimal import Decimal, localcontext
 from functools import cache
 from typing import Any
 
@@ -316,11 +316,7 @@ def _refuse_untyped(value: object, kind: Kind) -> None:
 def _to_si(number: str, unit: str, kind: Kind) -> float:
     factor = _look_up_checked(unit, kind)[0]
     with localcontext(prec=50):
-        try:
-            value = Decimal(number)
-        except InvalidOperation:  # pragma: no cover (the pattern admits only decimals)
-            raise Problem("not a number", shown(number), kind.allowed) from None
-        return _in_si(value, unit, factor)
+        return _in_si(Decimal(number), unit, factor)
 
 
 def _in_si(number: Decimal, unit: str, factor: Decimal) -> float:

@@ -33,14 +33,15 @@ def at(z: float) -> Pose:
     return Pose(np.eye(3), np.array([0.0, 0.0, z]))
 
 
-def build(*stages: Stage) -> Assembly:
-    """Elements e0, e1, ... in one sequence ``all``."""
-    names = [f"e{i}" for i in range(len(stages))]
+def build(*stages: Stage, base: Pose | None = None) -> Assembly:
+    """Elements e0, e1, ... in one sequence ``all``, where a base is given on one body that carries all of them."""
+    names = [f"{'' if base is None else 'base/'}e{i}" for i in range(len(stages))]
     elements = {
         n: Element(n, n, s.surface, s.interaction, s.aperture, s.index_after)
         for n, s in zip(names, stages, strict=True)
     }
-    tree = RigidTree(tuple(Body(n, s.pose) for n, s in zip(names, stages, strict=True)))
+    carrier = () if base is None else (Body("base", base, {"corner": (0.4, -0.2, 0.3)}),)
+    tree = RigidTree((*carrier, *(Body(n, s.pose) for n, s in zip(names, stages, strict=True))))
     return Assembly(tree, elements, {"all": tuple(names)})
 
 

@@ -6,32 +6,20 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from optics.geometry.polygon import (
-    area,
-    area_in_disk,
-    clip,
-    compact,
-    covered,
-    difference,
-    hull,
-    intersect,
-    quadrature,
-    sides,
-    widened,
-)
+from optics.geometry import polygon as polygons
 from optics.waves.pupil_edge import PupilEdge
 from optics.waves.pupil_shadow import FEW_SIDES, PupilShadow, quadrature_within, separate
 from scenes.models.shadow import Shadows
 from tests.tiers import quick
 
 RNG = np.random.default_rng(7)
-SOME, OTHERS = (hull(RNG.normal(size=(60, count, 2))) for count in (7, 6))
+SOME, OTHERS = (polygons.hull(RNG.normal(size=(60, count, 2))) for count in (7, 6))
 
 
 def test_hulls_have_the_area_of_qhull() -> None:
     points = RNG.normal(size=(40, 9, 2))
     points[:, 8] = points[:, 0]  # a corner that is there twice
-    np.testing.assert_allclose(area(hull(points)), [ConvexHull(p).volume for p in points], rtol=1e-12)
+    np.testing.assert_allclose(polygons.area(polygons.hull(points)), [ConvexHull(p).volume for p in points], rtol=1e-12)
 
 
 def test_areas_within_the_unit_disk() -> None:
@@ -39,55 +27,68 @@ def test_areas_within_the_unit_disk() -> None:
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     beyond = 0.4  # of x: the segment on the far side
     segment = np.arccos(beyond) - beyond * np.sqrt(1.0 - beyond**2)
-    found = area_in_disk(np.stack([5.0 * square, 0.3 * square, 5.0 * square + [5.4, 0.0], 2.0 * square + [0.0, 2.0]]))
+    found = polygons.area_in_disk(
+        np.stack([5.0 * square, 0.3 * square, 5.0 * square + [5.4, 0.0], 2.0 * square + [0.0, 2.0]])
+    )
     np.testing.assert_allclose(found, [np.pi, 0.36, segment, 0.5 * np.pi], atol=1e-14)
-    assert area_in_disk(0.5 * square[None, ::-1]) == pytest.approx(-1.0)
-    assert area_in_disk(0.2 * square[None] + 3.0) == pytest.approx(0.0, abs=1e-14)
-    inside, outside = intersect(SOME, *sides(OTHERS)), difference(SOME, OTHERS)
-    parts = area_in_disk(inside) + sum(area_in_disk(part) for part in outside)
-    np.testing.assert_allclose(parts, area_in_disk(SOME), atol=1e-13)
-    assert np.count_nonzero((area_in_disk(SOME) > 0.1) & (area_in_disk(SOME) < area(SOME) - 0.1)) > 20
+    assert polygons.area_in_disk(0.5 * square[None, ::-1]) == pytest.approx(-1.0)
+    assert polygons.area_in_disk(0.2 * square[None] + 3.0) == pytest.approx(0.0, abs=1e-14)
+    inside, outside = polygons.intersect(SOME, *polygons.sides(OTHERS)), polygons.difference(SOME, OTHERS)
+    parts = polygons.area_in_disk(inside) + sum(polygons.area_in_disk(part) for part in outside)
+    np.testing.assert_allclose(parts, polygons.area_in_disk(SOME), atol=1e-13)
+    assert (
+        np.count_nonzero(
+            (polygons.area_in_disk(SOME) > 0.1) & (polygons.area_in_disk(SOME) < polygons.area(SOME) - 0.1)
+        )
+        > 20
+    )
 
 
 def test_what_is_cut_off_and_what_stays_make_the_whole() -> None:
-    inside, outside = intersect(SOME, *sides(OTHERS)), difference(SOME, OTHERS)
-    np.testing.assert_allclose(area(inside) + sum(area(part) for part in outside), area(SOME), atol=1e-13)
-    np.testing.assert_allclose(area(inside), area(intersect(OTHERS, *sides(SOME))), atol=1e-13)
+    inside, outside = polygons.intersect(SOME, *polygons.sides(OTHERS)), polygons.difference(SOME, OTHERS)
+    np.testing.assert_allclose(
+        polygons.area(inside) + sum(polygons.area(part) for part in outside), polygons.area(SOME), atol=1e-13
+    )
+    np.testing.assert_allclose(
+        polygons.area(inside), polygons.area(polygons.intersect(OTHERS, *polygons.sides(SOME))), atol=1e-13
+    )
 
 
 def test_half_planes_and_empty_polygons() -> None:
     square = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
     normal = np.array([[1.0, 0.0]])
     for limit, left in ((2.0, 1.0), (0.25, 0.25), (-1.0, 0.0)):
-        assert area(clip(square, normal, np.array([limit])))[0] == left
+        assert polygons.area(polygons.clip(square, normal, np.array([limit])))[0] == left
     twice = np.repeat(square, 2, axis=1)
-    assert compact(twice).shape == square.shape
-    assert area(compact(twice))[0] == 1.0
+    assert polygons.compact(twice).shape == square.shape
+    assert polygons.area(polygons.compact(twice))[0] == 1.0
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_quadrature_is_exact_for_its_polynomials(count: int) -> None:
     """Integrals over a triangle: a! b! / (a + b + 2)!; a polygon's are those of its triangles."""
     triangle = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])
-    points, weights = quadrature(triangle, count)
+    points, weights = polygons.quadrature(triangle, count)
     for a in range(count):
         for b in range(count):
             want = factorial(a) * factorial(b) / factorial(a + b + 2)
             assert np.sum(weights * points.real**a * points.imag**b) == pytest.approx(want, rel=1e-12)
-    points, weights = quadrature(SOME[:, ::-1], count)  # of the other sense
-    np.testing.assert_allclose(weights.sum(axis=-1), area(SOME), rtol=1e-12)
+    points, weights = polygons.quadrature(SOME[:, ::-1], count)  # of the other sense
+    np.testing.assert_allclose(weights.sum(axis=-1), polygons.area(SOME), rtol=1e-12)
 
 
 def test_shadows_that_overlap_count_once() -> None:
     pieces, owners = separate([SOME, OTHERS])
-    union = area(SOME) + area(OTHERS) - area(intersect(SOME, *sides(OTHERS)))
-    np.testing.assert_allclose(area(pieces).sum(axis=-1), union, atol=1e-12)
+    union = (
+        polygons.area(SOME) + polygons.area(OTHERS) - polygons.area(polygons.intersect(SOME, *polygons.sides(OTHERS)))
+    )
+    np.testing.assert_allclose(polygons.area(pieces).sum(axis=-1), union, atol=1e-12)
     assert owners[0] == 0
     assert set(owners[1:]) == {1}
     # where one is nothing in a pupil, the other stays whole there
     nothing = np.where(np.arange(60)[:, None, None] % 2 == 0, SOME[:, :1], SOME)
     pieces, _ = separate([nothing, OTHERS])
-    np.testing.assert_allclose(area(pieces).sum(axis=-1)[::2], area(OTHERS)[::2], atol=1e-12)
+    np.testing.assert_allclose(polygons.area(pieces).sum(axis=-1)[::2], polygons.area(OTHERS)[::2], atol=1e-12)
 
 
 def test_rounding_in_corners_cuts_nothing_off() -> None:
@@ -95,7 +96,7 @@ def test_rounding_in_corners_cuts_nothing_off() -> None:
     square = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
     rough = np.repeat(square, 2, axis=1)
     rough[0, 1::2] += 1e-17 * np.array([[3.0, 1.0], [-1.0, 2.0], [1.0, -5.0], [0.0, 4.0]])
-    assert area(intersect(square, *sides(rough)))[0] == 1.0
+    assert polygons.area(polygons.intersect(square, *polygons.sides(rough)))[0] == 1.0
 
 
 def test_an_edge_that_is_no_circle() -> None:
@@ -107,17 +108,17 @@ def test_an_edge_that_is_no_circle() -> None:
     fine = np.stack([edge.real, edge.imag], axis=-1)[None]
     box = np.array([[[[0.5, 0.3], [0.9, 0.3], [0.9, 1.2], [0.5, 1.2]]]])
     shadow = PupilShadow.within(box, harmonics, FEW_SIDES)
-    want = area(intersect(fine, *sides(box[0])))[0]
+    want = polygons.area(polygons.intersect(fine, *polygons.sides(box[0])))[0]
     # chords of 64 sides lie (pi/64)^2 / 3 = 0.8e-3 inside of a circle, for which their area is made up; this edge's
     # curvature is another by a sixth along an arc of 0.55: 7e-5
     assert shadow.area[0] == pytest.approx(want, abs=7e-5)
     shift = np.array([0.4 + 0.2j])
     _, weights = shadow.overlap(shift[None], 3)
     move = np.array([0.4, 0.2])
-    own = intersect(fine, *sides(box[0]))
-    far = [intersect(own, *sides(fine + sign * move)) for sign in (1.0, -1.0)]
-    both = intersect(own, *sides(own + move))
-    want = -sum(area(part)[0] for part in far) + area(both)[0]
+    own = polygons.intersect(fine, *polygons.sides(box[0]))
+    far = [polygons.intersect(own, *polygons.sides(fine + sign * move)) for sign in (1.0, -1.0)]
+    both = polygons.intersect(own, *polygons.sides(own + move))
+    want = -sum(polygons.area(part)[0] for part in far) + polygons.area(both)[0]
     assert weights.sum() == pytest.approx(want, abs=2 * 7e-5)
 
 
@@ -162,7 +163,7 @@ def test_random_shadows_in_a_pupil_take_what_a_dense_raster_of_it_says(count) ->
             outlines[-1] = outlines[0] + (outlines[0][:, 1] - outlines[0][:, 0])[:, None]
         shadows = Shadows.of([(str(k), outline) for k, outline in enumerate(outlines)], 1)
         shares = shadows.shares()
-        taken = covered(np.stack([widened(o, 9) for o in outlines], axis=1), raster)[0]
+        taken = polygons.covered(np.stack([polygons.widened(o, 9) for o in outlines], axis=1), raster)[0]
         # a raster is right to the square root of the length of edges that it counts, some 1e-3 here
         assert sum(float(share[0]) for share in shares.values()) == pytest.approx(np.mean(taken), abs=4e-3)
         assert all(-1e-6 < float(share[0]) < 1.0 + 1e-6 for share in shares.values())

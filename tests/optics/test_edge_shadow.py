@@ -8,15 +8,6 @@ from optics.geometry.polygon import area, covered
 from optics.numerics import quadrature
 from optics.numerics.physical_error import UnphysicalError
 from optics.waves import edge_shadow
-from optics.waves.edge_shadow import (
-    FINE_SHARE,
-    ROUND_SIDES,
-    StopOutlines,
-    nodes_in_shadows,
-    outlines_on_stop,
-    settled_shadows,
-    shares_of_stop,
-)
 from optics.waves.lit_stop import LitStop, holes
 from optics.waves.pupil_shadow import separate
 from optics.waves.pupil_terms import products, smooth_terms
@@ -43,46 +34,31 @@ def lit(edges: list[Edge], number: int) -> np.ndarray:
 
 def shadows(edges: list[Edge], count: int = 3) -> np.ndarray:
     places = np.stack([seen(np.stack([NODES.x, NODES.y], axis=-1), k) for k in range(count)])
-    return outlines_on_stop(places, edges, NODES).shadows(count)
+    return edge_shadow.outlines_on_stop(places, edges, NODES).shadows(count)
 
 
 VANES = [Edge(Ray(0.006), True, turn) for turn in np.radians([30.0, 150.0, 270.0])]
 STAR = Polygon(((0.05, 0.0), (0.015, 0.015), (0.0, 0.06), (-0.015, 0.015), (-0.05, 0.0), (0.0, -0.03)))
 
 
-@pytest.mark.parametrize(
-    "edges",
-    quick(
-        1,
-        [
-            [Edge(Circle(0.05), True), *VANES],
-            [Edge(Circle(0.16, inner=0.04))],
-            [Edge(Rectangle(0.1, 0.13), turn=0.3), Edge(Ellipse(0.03, 0.06), True, 0.7)],
-            [Edge(STAR)],
-            [Edge(Circle(0.05), True)],
-            [Edge(Circle(0.14, (0.02, 0.0)))],
-            [Edge(Circle(0.5, inner=0.12), True)],
-            [Edge(Circle(0.152, inner=0.12), True)],
-            [Edge(Circle(0.09, (0.03, 0.02), inner=0.05), True)],
-            [Edge(STAR, True)],
-            [Edge(Circle(0.16)), *(Edge(c, True) for c in (Circle(0.05), Circle(0.049), Circle(0.05, (1e-12, 0.0))))],
-        ],
-    ),
-    ids=[
-        "spider",
-        "annulus",
-        "mixed",
-        "star-hole",
-        "obscured",
-        "vignetted",
-        "hole",
-        "hole of one",
-        "ring",
-        "star",
-        "nested",
-    ],
-)
-def test_shadows_are_what_edges_block(edges) -> None:
+EDGES = {
+    "spider": [Edge(Circle(0.05), True), *VANES],
+    "annulus": [Edge(Circle(0.16, inner=0.04))],
+    "mixed": [Edge(Rectangle(0.1, 0.13), turn=0.3), Edge(Ellipse(0.03, 0.06), True, 0.7)],
+    "star-hole": [Edge(STAR)],
+    "obscured": [Edge(Circle(0.05), True)],
+    "vignetted": [Edge(Circle(0.14, (0.02, 0.0)))],
+    "hole": [Edge(Circle(0.5, inner=0.12), True)],
+    "hole of one": [Edge(Circle(0.152, inner=0.12), True)],
+    "ring": [Edge(Circle(0.09, (0.03, 0.02), inner=0.05), True)],
+    "star": [Edge(STAR, True)],
+    "nested": [Edge(Circle(0.16)), *(Edge(Circle(*c), True) for c in ((0.05,), (0.049,), (0.05, (1e-12, 0.0))))],
+}
+
+
+@pytest.mark.parametrize("name", quick(1, EDGES))
+def test_shadows_are_what_edges_block(name: str) -> None:
+    edges = EDGES[name]
     pieces = shadows(edges)
     for number in range(len(pieces)):
         expected, found = lit(edges, number), ~covered(pieces, POINTS)[number]
@@ -103,41 +79,52 @@ def test_a_polygon_that_is_empty_but_for_rounding_leaves_a_part_once() -> None:
 
 def test_too_many_pieces_and_rays_that_no_polynomials_follow_are_refused(monkeypatch) -> None:
     with pytest.raises(UnphysicalError, match="polynomials of degree"):
-        outlines_on_stop(np.stack([NODES.x, np.sign(NODES.y)], axis=-1)[None], [Edge(Circle(0.3), True)], NODES)
+        edge_shadow.outlines_on_stop(
+            np.stack([NODES.x, np.sign(NODES.y)], axis=-1)[None], [Edge(Circle(0.3), True)], NODES
+        )
     monkeypatch.setattr(edge_shadow, "MOST_PIECES", 3)
     with pytest.raises(UnphysicalError, match="pieces of shadow"):
-        settled_shadows(by_sides([Edge(Circle(0.3), True), *VANES]), 1)
+        edge_shadow.settled_shadows(by_sides([Edge(Circle(0.3), True), *VANES]), 1)
 
 
 def test_edges_that_stop_nothing_leave_no_shadow() -> None:
     assert shadows([Edge(Circle(1.0)), Edge(Circle(0.02, (3.0, 0.0)), True)]).shape[1] == 0
-    assert StopOutlines().shadows(2).shape == (2, 0, 3, 2)
+    assert edge_shadow.StopOutlines().shadows(2).shape == (2, 0, 3, 2)
 
 
 def by_sides(edges: list[Edge]):
     """Outlines on a stop that rays meet as they meet the surface, one image, by the sides of a round edge."""
     places = np.stack([NODES.x, NODES.y], axis=-1)[None]
-    return lambda count: outlines_on_stop(places, edges, NODES, count)
+    return lambda count: edge_shadow.outlines_on_stop(places, edges, NODES, count)
+
+
+@pytest.mark.parametrize("turn", np.arange(0.0, 6.0, 0.9))
+def test_a_polygon_falls_into_the_same_parts_wherever_it_is_turned_to(turn: float) -> None:
+    c, s = np.cos(turn), np.sin(turn)
+    arrow = np.array([[0.4, 0.0], [-0.4, 0.4], [-0.08, 0.0], [-0.4, -0.4]]) @ np.array([[c, s], [-s, c]])
+    edge = Edge(Polygon(tuple(map(tuple, arrow))), True)
+    dark = covered(by_sides([edge])(8).shadows(1), POINTS)[0]
+    assert np.mean(dark == edge.passes(*POINTS.T)) < 1e-3
 
 
 def test_circles_that_nearly_coincide_get_more_sides() -> None:
     """Between two circles that all but coincide lies less than between a circle and its polygon."""
-    one, error = settled_shadows(by_sides([Edge(Circle(0.5), True)]), 1)
+    one, error = edge_shadow.settled_shadows(by_sides([Edge(Circle(0.5), True)]), 1)
     assert error < 1e-6
-    assert shares_of_stop(one)[0] == pytest.approx(0.25, abs=1e-6)
+    assert edge_shadow.shares_of_stop(one)[0] == pytest.approx(0.25, abs=1e-6)
     # one circle twice, by polygons whose corners are not the same: what both let through is smaller than either
-    twice = [Edge(Circle(0.8)), Edge(Circle(0.8), turn=np.pi / ROUND_SIDES[0])]
-    few = shares_of_stop(by_sides(twice)(ROUND_SIDES[0]).shadows(1))[0]
-    many, error = settled_shadows(by_sides(twice), 1)
-    assert few - 0.36 > FINE_SHARE > error > 0.0
-    assert shares_of_stop(many)[0] == pytest.approx(0.36, abs=error)
+    twice = [Edge(Circle(0.8)), Edge(Circle(0.8), turn=np.pi / edge_shadow.ROUND_SIDES[0])]
+    few = edge_shadow.shares_of_stop(by_sides(twice)(edge_shadow.ROUND_SIDES[0]).shadows(1))[0]
+    many, error = edge_shadow.settled_shadows(by_sides(twice), 1)
+    assert few - 0.36 > edge_shadow.FINE_SHARE > error > 0.0
+    assert edge_shadow.shares_of_stop(many)[0] == pytest.approx(0.36, abs=error)
 
 
 def test_edges_that_no_sides_are_enough_for_are_refused(monkeypatch) -> None:
     monkeypatch.setattr(edge_shadow, "FINE_SHARE", 1e-12)
     monkeypatch.setattr(edge_shadow, "COARSE_SHARE", 1e-12)
     with pytest.raises(UnphysicalError, match="edges all but coincide"):
-        settled_shadows(by_sides([Edge(Circle(0.5, (0.8, 0.0)), True)]), 1)
+        edge_shadow.settled_shadows(by_sides([Edge(Circle(0.5, (0.8, 0.0)), True)]), 1)
 
 
 def test_clear_edges_beyond_the_light_are_followed_nowhere() -> None:
@@ -146,13 +133,13 @@ def test_clear_edges_beyond_the_light_are_followed_nowhere() -> None:
     wild = np.stack([NODES.x, NODES.y], axis=-1) * np.where(lit, 1.0, 5.0 * np.cos(40.0 * NODES.x))[:, None]
     edges = [Edge(Circle(0.9))]
     with pytest.raises(UnphysicalError, match="polynomials of degree"):
-        outlines_on_stop(wild[None], edges, NODES)
-    assert not outlines_on_stop(wild[None], edges, NODES, lit=lit[None]).clear
+        edge_shadow.outlines_on_stop(wild[None], edges, NODES)
+    assert not edge_shadow.outlines_on_stop(wild[None], edges, NODES, lit=lit[None]).clear
 
 
 def test_a_stop_without_its_shadows() -> None:
     """Area and moments of a ring, and whether it is one: a vane or a shift makes it none."""
-    ring = settled_shadows(by_sides([Edge(Circle(0.6), True)]), 1)[0]
+    ring = edge_shadow.settled_shadows(by_sides([Edge(Circle(0.6), True)]), 1)[0]
     stop = LitStop.of(ring, 6, 6)
     assert stop.light[0] == pytest.approx(1.0 - 0.36, abs=1e-6)
     fourth = float(stop.weight[0] @ (stop.x[0] ** 2 + stop.y[0] ** 2) ** 2)
@@ -164,8 +151,8 @@ def test_a_stop_without_its_shadows() -> None:
         [Edge(Circle(0.6, (0.02, 0.0)), True)],
         [Edge(Circle(0.95))],
     ):
-        assert np.isnan(holes(settled_shadows(by_sides(edges), 1)[0])[0])
-    assert nodes_in_shadows(np.zeros((2, 0, 3, 2)), 4)[0].shape == (2, 0)
+        assert np.isnan(holes(edge_shadow.settled_shadows(by_sides(edges), 1)[0])[0])
+    assert edge_shadow.nodes_in_shadows(np.zeros((2, 0, 3, 2)), 4)[0].shape == (2, 0)
 
 
 def test_polynomials_follow_the_light_and_stay_near_it_in_the_dark() -> None:

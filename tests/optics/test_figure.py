@@ -98,28 +98,12 @@ def test_a_state_adds_its_figure_on_the_aperture(backend) -> None:
 
 
 def test_bad_figures_are_refused(backend) -> None:
-    with pytest.raises(ValueError, match="radius"):
-        ZernikeFigure(0.0)
-    with pytest.raises(ValueError, match="4 x 4"):
-        GridFigure(np.zeros((3, 9)), (0, 1, 0, 1))
-    with pytest.raises(ValueError, match="finite"):
-        GridFigure(np.full((5, 5), np.nan), (0, 1, 0, 1))
-    with pytest.raises(ValueError, match="x_min < x_max"):
-        GridFigure(np.zeros((5, 5)), (1, 0, 0, 1))
     with pytest.raises(ValueError, match="has no disk for a figure"):
         plane().figure_disk(None)
     with pytest.raises(ValueError, match="needs an aperture"):
         run(backend, build(Stage(plane())), np.zeros((1, 3)), Z[None], {"e0": Motion(figure={4: 1e-9})})
-
-
-def test_a_figure_that_the_trace_does_not_know_is_refused(backend) -> None:
-    """It would be left out without a word."""
-
-    class Bump:
-        pass
-
-    with pytest.raises(ValueError, match="no figure of type Bump"):
-        run(backend, build(Stage(plane().with_figure(Bump()))), np.zeros((1, 3)), Z[None])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="no figure of type str"):  # it would be left out without a word
+        run(backend, build(Stage(plane().with_figure("bump"))), np.zeros((1, 3)), Z[None])  # type: ignore[arg-type]
 
 
 def test_a_grid_on_the_samples_of_another() -> None:

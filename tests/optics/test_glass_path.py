@@ -8,8 +8,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.element_numbers import Medium, media_along
-from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
+from tests.optics.bench import run
 
 N = 1.52
 REFRACT, TOTAL, PASS, REFLECT = Interaction.REFRACT, Interaction.TOTAL, Interaction.PASS, Interaction.REFLECT
@@ -29,13 +28,6 @@ def glass(*faces: tuple[str, Pose, Interaction], screen: Pose | None = None, ind
 def at(z: float, angle: float = 0.0) -> Pose:
     """A face whose outward normal is turned from +z about y."""
     return Pose(about_axis(1, angle), np.array([0.0, 0.0, z]))
-
-
-def send(backend, assembly, position, direction, state=None):
-    """World position, direction (N, 3), path and validity (N,)."""
-    systems = assemble(assembly, ["all"], [state or {}])
-    traced = trace(backend, systems, make_rays(backend, np.array(position), np.array(direction)), world=True)
-    return tuple(a[0] for a in traced.numpy(traced.world))
 
 
 def slanted(angles) -> np.ndarray:
@@ -60,7 +52,7 @@ def test_plane_parallel_plate(backend, degrees) -> None:
     """Displaced by t sin(i) (1 - cos i / sqrt(n^2 - sin^2 i)), with the direction and the path of the textbook."""
     thick, far, i = 0.05, 0.2, np.radians(degrees)
     plate = glass(("front", at(0.0, np.pi), REFRACT), ("back", at(thick), REFRACT), screen=at(far))
-    position, direction, path, valid = send(backend, plate, np.zeros((1, 3)), slanted([i]))
+    position, direction, path, valid = run(backend, plate, np.zeros((1, 3)), slanted([i]))
     assert valid.all()
     assert np.abs(direction - slanted([i])).max() < 3e-15
     root = np.sqrt(N**2 - np.sin(i) ** 2)
@@ -90,7 +82,7 @@ def test_prism(backend, apex_deg) -> None:
     incidence = 0.5 * (apex + least) + np.radians([-8.0, -3.0, -1e-3, 0.0, 1e-3, 3.0, 8.0])
     # the entering face's inward normal is turned by -A/2 from +z about y; incidence counts away from the apex
     into = slanted(incidence - 0.5 * apex)
-    _, direction, _, valid = send(backend, wedge(apex), np.zeros(into.shape), into)
+    _, direction, _, valid = run(backend, wedge(apex), np.zeros(into.shape), into)
     assert valid.all()
     got = np.abs(deviation(direction, into))
     emergent = np.arcsin(np.sin(apex) * np.sqrt(N**2 - np.sin(incidence) ** 2) - np.cos(apex) * np.sin(incidence))
@@ -110,18 +102,18 @@ def test_critical_angle(backend) -> None:
     beyond = np.array([True, True, False, False])
     start = np.zeros(into.shape) - 0.01 * into
     faces = ("in", at(0.0, np.pi), REFRACT)
-    reflected = send(backend, glass(faces, ("slanted", at(0.05, np.pi / 4.0), TOTAL)), start, into)
+    reflected = run(backend, glass(faces, ("slanted", at(0.05, np.pi / 4.0), TOTAL)), start, into)
     assert np.array_equal(reflected[3], beyond)
     # reflected by a plane at 45 degrees: x and z change places with the opposite sign
     want = -slanted(inside)[:, ::-1]
     assert np.abs(reflected[1] - want).max() < 1e-15
-    refracted = send(backend, glass(faces, ("slanted", at(0.05, np.pi / 4.0), REFRACT)), start, into)
+    refracted = run(backend, glass(faces, ("slanted", at(0.05, np.pi / 4.0), REFRACT)), start, into)
     assert np.array_equal(refracted[3], ~beyond)
 
 
 def test_no_total_reflection_from_outside(backend) -> None:
     outside = glass(("slanted", at(0.05, np.pi - 1.5), TOTAL))
-    assert not send(backend, outside, np.zeros((1, 3)), slanted([0.0]))[3].any()
+    assert not run(backend, outside, np.zeros((1, 3)), slanted([0.0]))[3].any()
 
 
 def test_index_and_growth_change_the_path(backend) -> None:
@@ -129,7 +121,7 @@ def test_index_and_growth_change_the_path(backend) -> None:
     thick = 0.05
     plate = glass(("front", at(0.0, np.pi), REFRACT), ("back", at(thick), REFRACT), screen=at(0.2))
     start, along = np.zeros((1, 3)), slanted([0.0])
-    nominal = send(backend, plate, start, along)[2][0]
+    nominal = run(backend, plate, start, along)[2][0]
     assert nominal == pytest.approx(0.15 + N * thick, rel=1e-15)
     for motion, change in (
         (Motion(index=1e-3), 1e-3 * thick),
@@ -138,7 +130,7 @@ def test_index_and_growth_change_the_path(backend) -> None:
         (Motion(stretch=1e-3, index=-1e-3), (N - 1.0) * thick * 1e-3 - 1e-3 * thick * 1.001),
         (Motion(index=1e-3, index_gradient=(0.0, 0.0, 2e-3)), 1e-3 * thick + 1e-3 * thick**2),
     ):
-        assert send(backend, plate, start, along, {"glass": motion})[2][0] - nominal == pytest.approx(change, abs=1e-15)
+        assert run(backend, plate, start, along, {"glass": motion})[2][0] - nominal == pytest.approx(change, abs=1e-15)
     placed = plate.place([{"glass": Motion(stretch=0.5)}, {"glass": Motion(scale=0.5)}])
     back = placed.index["glass/back"]
     assert placed.translation[:, back, 2] == pytest.approx(1.5 * thick)

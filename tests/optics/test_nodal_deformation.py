@@ -55,26 +55,17 @@ def whole(face: NodalDeformation, surface: Surface, aperture: Aperture, points: 
 
 @pytest.mark.parametrize("aperture", quick(1, APERTURES), ids=["disk", "ring", "rectangle", "ellipse"])
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
-def test_a_rigid_motion_alone_is_exact(aperture: Aperture, uneven: bool) -> None:
+@pytest.mark.parametrize(("times", "growth"), [(1.0, 0.0), (100.0, 3e-4)], ids=["small", "large and grown"])
+def test_a_rigid_motion_and_a_growth_are_exact(aperture: Aperture, uneven: bool, times: float, growth: float) -> None:
     points = mesh(aperture, 50, uneven=uneven)
-    face = nodal_deformation(points, moved(points), BOWL, aperture)
+    face = nodal_deformation(points, moved(points, times * TURN, times * SHIFT, 1.0 + growth), BOWL, aperture)
     # rounding of coordinates of 1 m is 1e-16; the least lever arm is a tenth of that
-    np.testing.assert_allclose(face.rotate, TURN, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(face.shift, SHIFT, rtol=0, atol=1e-12)
-    assert abs(face.growth) < 1e-12
+    np.testing.assert_allclose(face.rotate, times * TURN, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(face.shift, times * SHIFT, rtol=0, atol=1e-12)
+    assert face.growth == pytest.approx(growth, abs=1e-12)
     assert face.rms(face.change) < 1e-14
     assert face.grid is None
     assert not face.printed_through
-
-
-def test_a_large_turn_and_a_growth_are_exact_too() -> None:
-    points = mesh(DISK, 40)
-    turn = np.array([0.3, -0.2, 0.5])
-    face = nodal_deformation(points, moved(points, turn, 100.0 * SHIFT, 1.0 + 3e-4), BOWL, DISK)
-    np.testing.assert_allclose(face.rotate, turn, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(face.shift, 100.0 * SHIFT, rtol=0, atol=1e-12)
-    assert face.growth == pytest.approx(3e-4, abs=1e-12)
-    assert face.rms(face.change) < 1e-14
 
 
 def test_figure_and_ripple_come_back_with_their_sizes() -> None:

@@ -1,15 +1,20 @@
-"""Tables of scattering: totals against closed forms, reciprocity, shares of cells, what is refused."""
+"""Scattering: tables and lobes against closed forms and integrals over the hemisphere, draws against the BSDF; Fresnel.
+
+Chi-square tests use fixed seeds and a false-alarm rate of 1e-3 each.
+"""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.integrate import dblquad
+from scipy.integrate import dblquad, quad
+from scipy.stats import chi2
 
-from optics.materials.finish import CoatingTable, Finish
-from optics.materials.scatter import STEPS, ABg, ScatterTable, total_scatter
+from optics.materials import finish as finishes
+from optics.materials.scatter import STEPS, ABg, HarveyShack, ScatterTable, acceptance, sample_distance, total_scatter
 from scenes.models.scenery import MeasuredFinishes
 from scenes.models.scenery_parts import Finishes
 
@@ -117,50 +122,132 @@ def test_shares_of_drawn_cells_are_those_of_the_table() -> None:
     assert np.all(drawn.sectors[:, :, -1] == 1.0)
 
 
-def test_impossible_tables_are_refused() -> None:
-    good = {"incidence": [0.0], "azimuth": [0.0], "radial": [0.0, 1.0], "values": [[[0.1, 0.1]]]}
-    ScatterTable(**good)
-    for change, text in (
-        ({"values": [[[0.9, 0.9]]]}, "no surface scatters more"),
-        ({"values": [[[-0.1, 0.1]]]}, "not negative"),
-        ({"values": [[[np.nan, 0.1]]]}, "finite"),
-        ({"radial": [0.1, 1.0]}, "from 0"),
-        ({"radial": [0.0, 4.0]}, "180"),
-        ({"radial": [0.0, 0.0]}, "ascend"),
-        ({"incidence": [1.6]}, "less than 90"),
-        ({"azimuth": [0.0, 1.0], "values": [[[0.1, 0.1]] * 2]}, "to 180 or to 360"),
-        ({"values": [[[0.1, 0.1, 0.1]]]}, "must be"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            ScatterTable(**{**good, **change})
-
-
-def test_finishes_with_tables() -> None:
-    table = lambert(0.3)
-    for wrong, text in (
-        ({"reflectance": 0.2, "table": table}, "only 0.2 are reflected"),
-        ({"reflectance": 0.5, "table": table, "scattered_only": True}, "no reflectance"),
-        ({"scattered_only": True}, "give a table"),
-        ({"reflectance": 0.5, "table": table, "scatter": ABg(1e-3, 1e-2, 2.0)}, "in place of a lobe"),
-        ({"transmission": 0.9, "table": table}, "does not go through"),
-        ({"bare": True, "table": table}, "bare glass"),
-        ({"table": table, "scattered_only": True, "diffuse": 0.8}, "more than all"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            Finish(**wrong)
-
-
 def test_coatings() -> None:
-    coating = CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]), np.array([0.8, 0.5]))
+    coating = finishes.CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]), np.array([0.8, 0.5]))
     assert coating.at(np.radians(20.0), True) == pytest.approx((0.2, 0.65))
     assert coating.at(np.radians(80.0), True) == pytest.approx((0.3, 0.5))
-    bare = CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]))
+    bare = finishes.CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]))
     assert bare.at(np.radians(20.0), True) == pytest.approx((0.2, 0.8))
     assert bare.at(np.radians(20.0), False) == pytest.approx((0.2, 0.0))
     np.testing.assert_allclose(bare.drawn(False)[80], [0.2, 0.0])
-    with pytest.raises(ValueError, match="also together"):
-        CoatingTable(np.zeros(1), np.array([0.6]), np.array([0.5]))
-    with pytest.raises(ValueError, match="ascend"):
-        CoatingTable(np.radians([10.0, 5.0]), np.array([0.6, 0.5]))
-    with pytest.raises(ValueError, match="one reflectance, and one transmittance"):
-        CoatingTable(np.radians([5.0, 10.0]), np.array([0.6, 0.5]), np.array([0.1]))
+
+
+FALSE_ALARM = 1e-3
+LOBES = [
+    *(ABg(*numbers) for numbers in ((1e-3, 1e-4, 1.5), (2e-3, 1e-5, 2.0), (1e-3, 1e-5, 2.5), (1e-3, 1e-3, 3.5))),
+    *(HarveyShack(*numbers) for numbers in ((3.0, 0.01, -1.7), (0.5, 0.1, -2.0), (2.0, 0.05, -3.0))),
+]
+
+
+@pytest.mark.parametrize(("a", "b"), [(2e-6, 1e-6), (1e-3, 1e-2), (1e-9, 1e-14)])
+def test_total_of_abg_with_g_2(a: float, b: float) -> None:
+    assert total_scatter(ABg(a, b, 2.0)) == pytest.approx(np.pi * a * np.log1p(1.0 / b), rel=1e-9)
+
+
+@pytest.mark.parametrize("s", [-1.0, -1.7, -2.5, -4.0])
+def test_total_of_harvey_shack(s: float) -> None:
+    b0, scale = 1.5, 0.02
+    exact = 2.0 * np.pi * b0 * scale**2 / (s + 2.0) * ((1.0 + scale**-2) ** (0.5 * (s + 2.0)) - 1.0)
+    assert total_scatter(HarveyShack(b0, scale, s)) == pytest.approx(exact, rel=1e-9)
+
+
+def test_total_of_a_flat_lobe_is_lamberts() -> None:
+    assert total_scatter(HarveyShack(0.3, 1.0, 0.0)) == pytest.approx(0.3 * np.pi, rel=1e-9)
+
+
+@pytest.mark.parametrize("sine", [0.3, 0.7, 0.95])
+def test_total_at_oblique_incidence(sine: float) -> None:
+    lobe = ABg(5e-3, 0.05, 2.0)
+    theta, dt = np.linspace(0.0, 0.5 * np.pi, 2001, retstep=True)
+    phi = (np.arange(2000) + 0.5) * np.pi / 2000
+    beta = np.sin(theta)[:, None]
+    distance = np.sqrt(np.maximum(beta**2 + sine**2 - 2.0 * beta * sine * np.cos(phi), 0.0))
+    ring = np.mean(lobe.bsdf(distance), axis=1) * 2.0 * np.pi * np.cos(theta) * np.sin(theta)
+    assert total_scatter(lobe, sine) == pytest.approx(np.sum(0.5 * (ring[1:] + ring[:-1])) * dt, rel=1e-5)
+
+
+def test_more_than_all_cannot_be_scattered() -> None:
+    with pytest.raises(ValueError, match="too strong"):
+        _ = HarveyShack(0.3, 1.0, 0.0).lobe
+
+
+@pytest.mark.parametrize("scatter", LOBES, ids=str)
+def test_draws_follow_the_bsdf(scatter: ABg | HarveyShack) -> None:
+    lobe, rng, n = scatter.lobe, np.random.default_rng(5), 400_000
+    distance = sample_distance(rng.uniform(size=n), lobe.scale, lobe.exponent)
+    kept = rng.uniform(size=n) < acceptance(distance, lobe.scale, lobe.exponent, float(lobe.abg))
+    edges = np.concatenate([[0.0], np.geomspace(0.02 * lobe.scale, 2.0, 40)])
+    counts = np.histogram(distance[kept], edges)[0]
+    # share into each ring, from the BSDF itself: the lobe's share is what is drawn
+    ring = [quad(lambda d: 2.0 * np.pi * d * float(scatter.bsdf(d)), a, b)[0] for a, b in pairwise(edges)]
+    expected = n * np.array(ring) / lobe.share
+    assert distance.max() <= 2.0
+    use = expected > 20.0
+    assert use.sum() > 15
+    rest = np.append(expected[use], n - expected[use].sum())
+    found = np.append(counts[use], n - counts[use].sum())
+    if rest[-1] < 20.0:  # all is kept
+        rest, found = rest[:-1], found[:-1]
+    statistic = np.sum((found - rest) ** 2 / rest)
+    assert statistic < chi2.ppf(1.0 - FALSE_ALARM, len(rest) - 1)
+
+
+@pytest.mark.parametrize(
+    "finish",
+    [
+        finishes.MIRROR,
+        finishes.COATED,
+        finishes.BARE,
+        finishes.GROUND,
+        finishes.BLACK,
+        finishes.SILICON,
+        finishes.ABSORBER,
+    ],
+    ids=repr,
+)
+def test_library_finishes_conserve_energy(finish: finishes.Finish) -> None:
+    total = finish.reflectance + finish.transmission + finish.diffuse
+    assert 0.0 <= total <= (0.0 if finish.bare else 1.0)
+    assert len(finish.numbers) == 8
+
+
+INDICES = [(1.0, 1.5), (1.5, 1.0), (1.0, 4.0), (1.33, 1.52)]
+
+
+@pytest.mark.parametrize(("before", "after"), INDICES)
+def test_against_the_sine_and_tangent_form(before: float, after: float) -> None:
+    critical = np.arcsin(min(1.0, after / before))
+    a = np.linspace(0.01, 0.999 * min(critical, 0.5 * np.pi), 200)
+    b = np.arcsin(before / after * np.sin(a))
+    s, p = np.sin(a - b) / np.sin(a + b), np.tan(a - b) / np.tan(a + b)
+    np.testing.assert_allclose(finishes.reflectance(np.cos(a), before, after), 0.5 * (s**2 + p**2), rtol=1e-9)
+    np.testing.assert_allclose(finishes.cosine_after(np.cos(a), before, after), np.cos(b), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("before", "after"), INDICES)
+def test_normal_and_grazing_incidence(before: float, after: float) -> None:
+    assert finishes.reflectance(1.0, before, after) == pytest.approx(
+        ((before - after) / (before + after)) ** 2, rel=1e-14
+    )
+    assert finishes.reflectance(0.0, before, after) == pytest.approx(1.0, abs=1e-10)
+
+
+def test_brewster_leaves_only_one_polarisation() -> None:
+    n = 1.5
+    angle = np.arctan(n)
+    s = np.sin(angle - (0.5 * np.pi - angle))
+    assert finishes.reflectance(np.cos(angle), 1.0, n) == pytest.approx(0.5 * s**2, rel=1e-12)
+
+
+def test_beyond_the_critical_angle_all_is_reflected() -> None:
+    cosine = np.cos(np.arcsin(1.0 / 1.5) + np.linspace(1e-9, 0.5, 50))
+    assert np.all(finishes.reflectance(cosine, 1.5, 1.0) == 1.0)
+    assert np.all(finishes.cosine_after(cosine, 1.5, 1.0) == 0.0)
+    assert finishes.reflectance(np.cos(np.arcsin(1.0 / 1.5) - 1e-6), 1.5, 1.0) < 1.0
+
+
+def test_the_same_on_drjit(backend) -> None:
+    cosine = np.linspace(0.0, 1.0, 101)
+    for before, after in INDICES:
+        got = finishes.reflectance(backend.opaque(cosine), before, after).numpy()
+        np.testing.assert_allclose(got, finishes.reflectance(cosine, before, after), rtol=0, atol=1e-15)

@@ -158,13 +158,6 @@ def test_half_plane_takes_the_tangent(mirrored: bool) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Polygon(SQUARE[:2]), "3 or more"),
-        (lambda: Polygon(SQUARE[[0, 2, 0]]), "one line"),
-        (lambda: Polygon(SQUARE * np.nan), "finite"),
-        (lambda: Disk((0.0, 0.0), 0.0), "positive radius"),
-        (lambda: Disk((0.0, np.nan), 1.0), "two finite numbers"),
-        (lambda: Disk((0.0, 0.0), 1.0, np.ones((2, 2))), "inverse"),
-        (lambda: HalfPlane((0.0, 0.0), (0.0, 0.0)), "not 0"),
         (lambda: Polygon(SQUARE).mapped(lambda p: p * np.nan), "leave the field"),
         (lambda: Polygon(SQUARE).mapped(lambda p: p[:, :1]), r"\(N, 2\)"),
         (lambda: Polygon(SQUARE).mapped(lambda p: p + RNG.normal(0.0, 1e-6, p.shape)), "bends an edge too much"),

@@ -290,16 +290,6 @@ def live(seed: int, missions: int, years: float, jumps: int | None = None) -> Sc
 
 
 @pytest.mark.second
-def test_two_short_missions() -> None:
-    score = live(36012, 2, 3.0)
-    assert score.found == score.found_online == score.large > 0
-    assert score.false == (0, 0)
-    for part in PARTS:
-        sums = np.sum(score.zones["smoothed", part], axis=0)
-        assert sums[2] / sums[0] > (0.85 if part == "away" else 0.7), part
-
-
-@pytest.mark.second
 def test_missions_of_three_years() -> None:
     """All limits of the module's text."""
     score = live(36004, 12, 3.0)

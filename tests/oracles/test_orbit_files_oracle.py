@@ -56,6 +56,11 @@ def orekit(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def point(found: Any) -> tuple[float, float, float]:
+    """Longitude, latitude and altitude of a ground point, a tuple or an object."""
+    return found if isinstance(found, tuple) else (found.longitude, found.latitude, found.altitude)
+
+
 def date(epoch: str, seconds: float) -> Any:
     from org.orekit.time import AbsoluteDate, TimeScalesFactory
 
@@ -238,16 +243,7 @@ def test_rugged_sees_the_same_ground_points(orekit: Path, tmp_path: Path) -> Non
             )
             for t in (-17.3, 0.0, 11.9):
                 found = located.direct_location_of_sensor_line(t, name)
-                theirs = np.array([Earth().ecef(p.longitude, p.latitude, p.altitude) for p in map(point, found)])
+                theirs = np.array([Earth().ecef(*point(one)) for one in found])
                 here = mine.ground(np.full(7, t + 20.0), pixels, height)
                 worst = max(worst, float(np.max(np.linalg.norm(here - theirs, axis=1))))
     assert 0.0 < worst < 5e-3
-
-
-class point:
-    """Longitude, latitude and altitude of a ground point, a tuple or an object."""
-
-    def __init__(self, found: Any) -> None:
-        self.longitude, self.latitude, self.altitude = (
-            found if isinstance(found, tuple) else (found.longitude, found.latitude, found.altitude)
-        )

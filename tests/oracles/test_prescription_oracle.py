@@ -21,16 +21,7 @@ from scenes.lens.prescription import SEQUENCE
 from scenes.lens.zemax_reader import read_zemax
 from scenes.lens.zemax_writer import zemax_text
 from scenes.yaml.errors import InputError
-from tests.oracles.prescription_peers import (
-    AnyGlass,
-    Optiland,
-    Rayoptics,
-    batoid_beam,
-    beams,
-    differences,
-    ours,
-    read_alike,
-)
+from tests.oracles import prescription_peers as peers
 from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
 
@@ -81,29 +72,31 @@ def package(name: str) -> Path:
     return Path(found.origin).parent
 
 
-def held(backend, path: Path, kind: type[Rayoptics] | type[Optiland]) -> None:
+def held(backend, path: Path, kind: type[peers.Rayoptics] | type[peers.Optiland]) -> None:
     read = read_zemax if path.suffix.lower() == ".zmx" else read_codev
     peer = kind(path)
-    lens = read_alike(read, path, peer)
+    lens = peers.read_alike(read, path, peer)
     if path.name != "achroMangin_ok.seq":  # names no reference; ray-optics takes the first wavelength, here the middle
-        assert peer.wave == pytest.approx(lens.wavelength * (1e9 if kind is Rayoptics else 1e6), rel=1e-12)
-    fields = beams(backend, lens, 0.5)
+        assert peer.wave == pytest.approx(lens.wavelength * (1e9 if kind is peers.Rayoptics else 1e6), rel=1e-12)
+    fields = peers.beams(backend, lens, 0.5)
     assert fields
     for launch, direction in fields:
-        found = differences(ours(backend, lens, launch, direction), peer.trace(launch, direction, lens.image.pose))
+        found = peers.differences(
+            peers.ours(backend, lens, launch, direction), peer.trace(launch, direction, lens.image.pose)
+        )
         for what, value in found.items():
             assert value < TOLERANCE[what], (what, value)
 
 
 @pytest.mark.parametrize("name", quick(4, RAYOPTICS))
 def test_as_ray_optics_traces_its_samples(backend, name: str) -> None:
-    held(backend, package("rayoptics") / name, Rayoptics)
+    held(backend, package("rayoptics") / name, peers.Rayoptics)
 
 
 @pytest.mark.parametrize("name", quick(3, [*SHIPPED, *OPTILAND]))
 def test_as_optiland_traces_samples(backend, name: str) -> None:
     package("optiland")
-    held(backend, HERE / f"{name}.zmx" if name in SHIPPED else package("rayoptics") / name, Optiland)
+    held(backend, HERE / f"{name}.zmx" if name in SHIPPED else package("rayoptics") / name, peers.Optiland)
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -111,7 +104,7 @@ def test_files_that_would_be_taken_wrongly(name: str) -> None:
     path = package("rayoptics") / name
     line, problem = REFUSED[name]
     with pytest.raises(InputError, match=problem) as caught:
-        (read_zemax if path.suffix.lower() == ".zmx" else read_codev)(path, AnyGlass())
+        (read_zemax if path.suffix.lower() == ".zmx" else read_codev)(path, peers.AnyGlass())
     assert caught.value.line == line
 
 
@@ -132,14 +125,14 @@ def test_as_batoid_traces_its_telescopes(backend, name: str) -> None:
     peer = batoid.Optic.fromYaml(str(path))
     system = assemble(lens.assembly(apertures=False), [SEQUENCE])
     for x, y in ((0.0, 0.0), (0.008, 0.0), (-0.004, 0.007)):
-        launch, direction, theirs, failed = batoid_beam(peer, wavelength, x, y)
+        launch, direction, theirs, failed = peers.batoid_beam(peer, wavelength, x, y)
         position, leaving, way, valid = (
             a[0] for a in trace(backend, system, make_rays(backend, launch, direction)).numpy()
         )
         np.testing.assert_array_equal(valid, ~failed)
         index = float(peer.inMedium.getN(wavelength))
         mine = (position[valid], leaving[valid], index * way[valid])
-        found = differences(mine, tuple(part[valid] for part in theirs))
+        found = peers.differences(mine, tuple(part[valid] for part in theirs))
         for what, value in found.items():
             assert value < TOLERANCE[what], (what, value)
 
@@ -218,10 +211,12 @@ def test_our_cameras_as_other_programs_read_them(tmp_path: Path, backend, camera
     package(kind)
     lens, path = prescription_of(camera(name)), tmp_path / f"{name}.zmx"
     path.write_text(zemax_text(lens), "utf-16")
-    peer = {"rayoptics": Rayoptics, "optiland": Optiland}[kind](path)
-    fields = beams(backend, lens, 1.0)
+    peer = {"rayoptics": peers.Rayoptics, "optiland": peers.Optiland}[kind](path)
+    fields = peers.beams(backend, lens, 1.0)
     assert len(fields) == 9
     for launch, direction in fields:
-        found = differences(ours(backend, lens, launch, direction), peer.trace(launch, direction, lens.image.pose))
+        found = peers.differences(
+            peers.ours(backend, lens, launch, direction), peer.trace(launch, direction, lens.image.pose)
+        )
         for what, value in found.items():
             assert value < TOLERANCE[what], (what, value)

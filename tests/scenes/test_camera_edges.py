@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
 
 from optics.geometry.aperture import Circle, Edge
 from optics.geometry.pose import Pose
@@ -28,7 +27,6 @@ from scenes.specs.load import load_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
-from tests.tiers import quick
 from tests.twin.study_bench import ROOT
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.cut_wavefront import RAYS_ACCURACY
@@ -191,46 +189,6 @@ def test_a_chief_ray_that_is_stopped_is_still_the_beams_middle(bare, cut) -> Non
     np.testing.assert_allclose(cut.path.places({}, light), bare.path.places({}, light), rtol=0, atol=1e-14)
     # the light of 0.1 deg at f tan W; the chief ray starts where the hyperboloid of M2 has its other sheet
     np.testing.assert_allclose(cut.path.places({}, light)[0], [np.tan(np.radians(0.1)) / 0.3, 0.0], rtol=0, atol=1e-7)
-
-
-def dense_mtf(optics: CameraOptics, field: tuple[float, float], frequency: np.ndarray, cells: int = 900) -> np.ndarray:
-    """MTF by the autocorrelation of a raster of the pupil, every cell a traced ray that edges stop or pass: along
-    the line and along the track, (2, M). Shares the traced rays with the product, and nothing else.
-    """
-    axis = (np.arange(cells) + 0.5) / cells * 2.0 - 1.0
-    x, y = np.meshgrid(axis, axis)
-    inside = np.hypot(x, y) <= 1.0
-    rays = optics.rays([field], np.stack([x[inside], y[inside]], axis=-1))
-    place, way = rays.position[0], rays.direction[0]
-    chief = optics.path.places({}, optics.directions([field]))[0]
-    origin = np.array([chief[1], chief[0], 0.0])
-    eikonal = rays.path[0] - np.einsum("ni,ni->n", way, place - origin)
-    wavelength = optics.model.spec.wavelength
-    pupil = np.zeros((cells, cells), complex)
-    pupil[inside] = rays.valid[0] * np.exp(2j * np.pi * (eikonal - np.mean(eikonal)) / wavelength)
-    power = np.abs(np.fft.fft2(pupil, (2 * cells, 2 * cells))) ** 2
-    correlation = np.fft.fftshift(np.abs(np.fft.ifft2(power)))
-    correlation /= correlation[cells, cells]
-    # this camera maps its stop onto direction cosines linearly, to 4e-4
-    design = np.stack([np.ones(len(way)), x[inside], y[inside]], axis=-1)
-    slope = np.linalg.lstsq(design, way[:, 1::-1], rcond=None)[0][1:].T
-    out = []
-    for unit in np.eye(2):
-        shift = np.linalg.solve(slope, wavelength * frequency * unit[:, None]) * cells / 2.0 + cells
-        out.append(map_coordinates(correlation, shift[::-1], order=1))
-    return np.array(out)
-
-
-@pytest.mark.parametrize("field", quick(0, [pytest.param((0.5, -1.0)), pytest.param((0.0, 0.0))]))
-def test_mtf_of_a_cut_pupil_is_that_of_its_raster(cut, bare, field) -> None:
-    cutoff = min(float(np.min(pupil.cutoff(np.eye(2), 650e-9))) for pupil in cut.pupils([field]))
-    frequency = np.linspace(0.0, 1.0, 21) * cutoff
-    found = cut.mtf(field, frequency)
-    np.testing.assert_allclose(found.values, dense_mtf(cut, field, frequency), atol=1e-3)
-    # the obscuration takes from the middle frequencies and gives to the high ones
-    free = bare.mtf(field, frequency)
-    assert np.all(found.values[:, 5] < free.values[:, 5] - 0.02)
-    assert found.values[0, 15] > free.values[0, 15]
 
 
 @pytest.mark.second

@@ -1,7 +1,6 @@
 """Bodies that stand in each other, prisms in the way of light, and beams that miss a prism: found, and told."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,54 +8,30 @@ import trimesh
 from scipy.spatial import ConvexHull, Delaunay
 
 from optics.geometry.pose import rotation_matrix
-from scenes.models import obstruction
+from scenes.models import instrument_builder, obstruction
 from scenes.models.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, remedy, separation
-from scenes.models.instrument_builder import build_instrument
 from scenes.models.obstruction import RAYS, find_obstructions
-from scenes.specs.load import INSTRUMENTS, LIBRARY, load_camera, load_instrument
+from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
 from scenes.yaml.errors import InputError
+from tests.scenes import monitor_layouts
+from tests.twin.commands import replaced
 
 PAIR = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
 PAIR = re.sub(r", tilt: \[[^]]*\]", "", PAIR)  # prisms square to the beam, for round numbers
 PAIR = re.sub(r" +#.*", "", PAIR)
 
 
-def changed(folder: Path, *changes: tuple[str, str]) -> Path:
-    text = PAIR
-    for old, new in changes:
-        assert text.count(old) == 1, old
-        text = text.replace(old, new)
-    path = folder / "own.yaml"
-    path.write_text(text, "utf-8")
-    return path
-
-
-def built(path: Path, backend):
-    spec = load_instrument(path)
-    return build_instrument(spec, {s.camera: load_camera(s.camera) for s in spec.cameras.values()}, backend)
-
-
 def cube(size: float = 1.0) -> np.ndarray:
     return 0.5 * size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
 
-@pytest.mark.parametrize(
-    ("move", "want"),
-    [
-        ((1.5, 0, 0), 0.5),
-        ((1.5, 2.0, 0), np.hypot(0.5, 1.0)),
-        ((2.0, 3.0, 1.5), np.sqrt(1 + 4 + 0.25)),
-        ((0.75, 0.1, 0.2), -0.25),
-        ((0.0, 0.0, 0.0), -1.0),
-        ((1.0 + 1e-5, 0, 0), 1e-5),
-    ],
-    ids=["face to face", "edge to edge", "corner to corner", "overlap", "concentric", "nearly"],
-)
-def test_separation_of_cubes(move, want) -> None:
-    """In any attitude; Qhull merges faces within some 1e-14 of the size."""
+def test_separation_of_cubes() -> None:
+    """Corner to corner, overlapping, concentric, nearly touching, in any attitude; Qhull merges faces within 1e-14."""
     turn = rotation_matrix(np.array([0.3, -1.2, 0.7]))
-    assert separation(cube() @ turn.T, (cube() + move) @ turn.T) == pytest.approx(want, abs=1e-12)
-    assert separation((cube() + move) @ turn.T, cube() @ turn.T) == pytest.approx(want, abs=1e-12)
+    near = ((0.75, 0.1, 0.2), -0.25), ((0.0, 0.0, 0.0), -1.0), ((1.0 + 1e-5, 0, 0), 1e-5)
+    for move, want in (((2.0, 3.0, 1.5), np.sqrt(1 + 4 + 0.25)), *near):
+        for one, other in ((cube(), cube() + move), (cube() + move, cube())):
+            assert separation(one @ turn.T, other @ turn.T) == pytest.approx(want, abs=1e-12), move
 
 
 def test_separations_are_those_of_trimesh() -> None:
@@ -103,98 +78,68 @@ def test_reference_instruments_have_room(name, instrument) -> None:
 
 
 @pytest.fixture
-def bare(backend, monkeypatch):
+def bare(backend, monkeypatch, tmp_path):
     """Function: changes of gf7_pair -> instrument, without the checks that would refuse it."""
-    import scenes.models.instrument_builder
+    monkeypatch.setattr(instrument_builder, "check_clearance", lambda instrument: None)
+    monkeypatch.setattr(instrument_builder, "check_beams", lambda instrument, backend: None)
 
-    monkeypatch.setattr(scenes.models.instrument_builder, "check_clearance", lambda instrument: None)
-    monkeypatch.setattr(scenes.models.instrument_builder, "check_beams", lambda instrument, backend: None)
-    return lambda folder, *changes: built(changed(folder, *changes), backend)
+    def built(*changes: tuple[str, str]):
+        (tmp_path / "own.yaml").write_text(replaced(PAIR, *changes), "utf-8")
+        spec = load_instrument(tmp_path / "own.yaml")
+        return instrument_builder.build_instrument(spec, load_cameras(spec), backend)
 
-
-OVERLAPS = [
-    (
-        ("position: [0.15 m, 0 m, 0.5 m]", "position: [-0.5 m, 0 m, -0.1 m]"),
-        {("base/backward/M3", "base/central_prism")},
-        (6, "central_prism.position", "a position"),
-    ),
-    (
-        ("distance: 0.5 m", "distance: 30 mm"),
-        {
-            (f"base/{c}/monitor/{s}/prism_0", "base/central_prism")
-            for c in ("forward", "backward")
-            for s in ("left", "right")
-        },
-        (13, "monitor.prism_0.distance", "a distance"),
-    ),
-    (
-        ("field: 1.22 deg", "field: 0.3 deg"),
-        {tuple(f"base/{c}/monitor/{s}/prism_180" for s in ("left", "right")) for c in ("forward", "backward")},
-        (12, "monitor.prism_180.distance", "field"),
-    ),
-    (
-        ("position: [-1.4 m, 0 m, 0 m]", "position: [1.4 m, 0.6 m, 0 m]"),
-        None,
-        (5, "cameras.backward.position", "a position"),
-    ),
-]
+    return built
 
 
-@pytest.mark.parametrize(("change", "pairs", "told"), OVERLAPS, ids=["central", "rhomboid", "field", "camera"])
-def test_bodies_in_each_other(change, pairs, told, bare, tmp_path) -> None:
-    model = bare(tmp_path, change)
-    found = find_overlaps(model)
-    if pairs is not None:
-        assert {tuple(sorted((o.first, o.second))) for o in found} == {tuple(sorted(p)) for p in pairs}
-    assert [o.depth for o in found] == sorted((o.depth for o in found), reverse=True)
-    with pytest.raises(InputError) as caught:
-        check_clearance(model)
-    line, key, remedy = told
-    issues = {(i.line, ".".join(map(str, i.key))): i for i in caught.value.issues}
-    assert (line, key) in issues
-    assert remedy in issues[line, key].allowed
-    for overlap, issue in zip(found, caught.value.issues, strict=True):
-        assert overlap.first in issue.problem
-        assert overlap.second in issue.problem
-        assert f"{1e3 * overlap.depth:.3g} mm" in issue.problem
-        assert issue.file.endswith("own.yaml")
-
-
+POSITION = "position: [0.15 m, 0 m, 0.5 m]"
+OVERLAPS = {
+    "central": (POSITION, "position: [-0.5 m, 0 m, -0.1 m]", 1, (6, "central_prism.position")),
+    "rhomboid": ("distance: 0.5 m", "distance: 30 mm", 4, (13, "monitor.prism_0.distance")),
+    "field": ("field: 1.22 deg", "field: 0.3 deg", 2, (12, "monitor.prism_180.distance")),
+    "camera": ("[-1.4 m, 0 m, 0 m]", "[1.4 m, 0.6 m, 0 m]", None, (5, "cameras.backward.position")),
+}
+"""Change of the pair, number of overlaps, line and key of one."""
 MOVE = re.compile(r"move it by ([+-])([xyz]) ([0-9.e+]+) mm of the base")
 
 
-@pytest.mark.second
-def test_what_is_told_takes_bodies_apart(bare, tmp_path) -> None:
-    """A message says how far and along which axis the body that its key moves goes; moved so, it is free."""
-    for change, _, _ in OVERLAPS:
-        model = bare(tmp_path, change)
-        bodies = convex_bodies(model)
-        with pytest.raises(InputError) as caught:
-            check_clearance(model)
-        for overlap, issue in zip(find_overlaps(model), caught.value.issues, strict=True):
-            told = MOVE.search(issue.allowed)
-            assert told is not None, issue.allowed
-            way = np.zeros(3)
-            way["xyz".index(told[2])] = float(f"{told[1]}{told[3]}e-3")
-            # the issue's body is the one whose key is told
-            keys = {path: remedy(model, path)[0] for path in (overlap.first, overlap.second)}
-            moved = overlap.second if keys[overlap.second] == issue.key else overlap.first
-            other = overlap.first if moved == overlap.second else overlap.second
-            gap = separation(bodies[moved] + way, bodies[other])
-            assert gap >= LEAST_GAP * (1.0 - 1e-6)
-            # 2 % less and they still touch: it is no further than it has to be
-            assert separation(bodies[moved] + 0.98 * way, bodies[other]) < LEAST_GAP
+@pytest.mark.parametrize("name", OVERLAPS)
+def test_bodies_in_each_other(name, bare) -> None:
+    """A message names both bodies and how deep they reach into each other, and says how far and along which axis the
+    body that its key moves goes; moved so, it is free.
+    """
+    old, new, count, place = OVERLAPS[name]
+    model = bare((old, new))
+    found, bodies = find_overlaps(model), convex_bodies(model)
+    assert count in (None, len(found))
+    assert [o.depth for o in found] == sorted((o.depth for o in found), reverse=True)
+    with pytest.raises(InputError) as caught:
+        check_clearance(model)
+    assert place in {(i.line, ".".join(map(str, i.key))) for i in caught.value.issues}
+    for overlap, issue in zip(found, caught.value.issues, strict=True):
+        for said in (overlap.first, overlap.second, f"{1e3 * overlap.depth:.3g} mm"):
+            assert said in issue.problem
+        assert issue.file.endswith("own.yaml")
+        told = MOVE.search(issue.allowed)
+        assert told is not None, issue.allowed
+        way = float(f"{told[1]}{told[3]}e-3") * np.eye(3)["xyz".index(told[2])]
+        # the issue's body is the one whose key is told
+        other, moved = overlap.first, overlap.second
+        if remedy(model, moved)[0] != issue.key:
+            other, moved = moved, other
+        assert separation(bodies[moved] + way, bodies[other]) >= LEAST_GAP * (1.0 - 1e-6)
+        # 2 % less and they still touch: it is no further than it has to be
+        assert separation(bodies[moved] + 0.98 * way, bodies[other]) < LEAST_GAP
 
 
-def test_a_gap_below_the_least(bare, tmp_path) -> None:
+def test_a_gap_below_the_least(bare) -> None:
     """10 um between rhomboid and facet are too little, 100 um are enough."""
-    touching = bare(tmp_path, ("distance: 0.5 m", "distance: 33.01 mm"))
+    touching = bare(("distance: 0.5 m", "distance: 33.01 mm"))
     found = find_overlaps(touching)
     assert len(found) == 4
     assert all(-LEAST_GAP < o.depth <= 0.0 for o in found)
     with pytest.raises(InputError, match=r"is only .* um from base/central_prism"):
         check_clearance(touching)
-    check_clearance(bare(tmp_path, ("distance: 0.5 m", "distance: 33.1 mm")))
+    check_clearance(bare(("distance: 0.5 m", "distance: 33.1 mm")))
 
 
 @pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
@@ -238,9 +183,9 @@ def test_segments_through_a_body() -> None:
     assert obstruction.rays_taken(along - [0.0, 0.0, 1e-5], cube_planes).tolist() == [True, False]
 
 
-def test_prisms_in_the_way(bare, backend, tmp_path) -> None:
+def test_prisms_in_the_way(bare, backend) -> None:
     """The central prism before the forward camera, and rhomboids that stand in their own beam to the 180-deg prism."""
-    model = bare(tmp_path, ("position: [0.15 m, 0 m, 0.5 m]", "position: [1.7 m, 0 m, 0.4 m]"))
+    model = bare((POSITION, "position: [1.7 m, 0 m, 0.4 m]"))
     found = {(o.beam, o.body): o for o in find_obstructions(model, backend)}
     block = found["forward/imaging", "base/central_prism"]
     assert block.used == 0.0
@@ -250,3 +195,24 @@ def test_prisms_in_the_way(bare, backend, tmp_path) -> None:
     assert 0.7 * face / pupil < block.share < 2.5 * face / pupil
     assert found["forward/left", "base/forward/monitor/left/prism_0"].share > 0.1
     assert ("backward/imaging", "base/central_prism") not in found
+
+
+@pytest.mark.second
+def test_two_beams_stand_clear(backend, tmp_path) -> None:
+    model = monitor_layouts.built(monitor_layouts.two_beams(), tmp_path, backend)
+    names = ("left", "right", "left_2", "right_2")
+    assert [c.key for c in model.channels] == [f"{c}/{name}" for c in ("forward", "backward") for name in names]
+    obstruction.check_beams(model, backend)
+    found = find_obstructions(model, backend)
+    assert {o.beam for o in found} == {"forward/imaging", "backward/imaging"}
+    # what is not in the monitor's own part of the pupil is only just touched
+    prisms = {c.prism_body("prism_180") for c in model.channels}
+    assert prisms <= {o.body for o in found}
+    assert all(o.body in prisms or o.share < 0.01 for o in found)
+    # each 180-deg prism stands where its own channel says
+    for channel in model.channels:
+        given = model.spec.channels_of(channel.camera)[channel.name]
+        window = model.assembly.nominal_pose(f"{channel.prism_body('prism_180')}/window/entry").translation
+        home = model.assembly.nominal_pose(f"base/{channel.camera}")
+        assert home.inverse().apply(window)[2] == pytest.approx(given.prism_180.distance, abs=0.01)
+        assert model.assembly.elements[f"{channel.key}/return_face"].aperture.radius == 0.5 * channel.aperture

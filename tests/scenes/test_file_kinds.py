@@ -17,50 +17,8 @@ from twin.orbit.__main__ import app as orbit
 from twin.render import app as render
 from twin.study.__main__ import app as study
 
-# the beginning of a shipped file's place -> its kind
-FOLDERS = dict(
-    line.split()
-    for line in """
-examples/study study
-examples/measured measurement
-examples/design_monitor monitor_design
-examples/design camera_design
-examples/tolerance tolerance
-examples/asbuilt asbuilt
-examples/telemetry telemetry
-examples/operation operation
-examples/as_built as_built_instrument
-examples/cassegrain camera
-examples/ job
-lab/focus focus_test
-lab/distortion distortion_test
-lab/turntable turntable_test
-lab/principle principle_experiment
-lab/measured/focus measured_focus
-lab/measured/distortion measured_distortion
-lab/measured/turntable measured_turntable
-library/budgets error_budget
-library/cameras camera
-library/detectors detector
-library/disturbances disturbances
-library/instruments instrument
-library/payloads three_line_camera
-orbit/measured/adjust measured_adjust
-orbit/measured/angle measured_angle
-orbit/measured/calibrate measured_calibration
-orbit/measured/data orbit_data
-orbit/measured/check orbit_check
-orbit/measured/match orbit_match
-orbit/measured/jitter measured_jitter
-orbit/adjust orbit_adjust
-orbit/angle orbit_angle
-orbit/calibrate orbit_calibration
-orbit/jitter orbit_jitter
-orbit/loop orbit_loop
-orbit/monitor orbit_monitor
-orbit/simulate orbit_simulate
-""".strip().splitlines()
-)
+FOLDERS = dict(line.split() for line in Path(__file__).with_name("file_kinds.txt").read_text("utf-8").splitlines())
+"""Beginning of a shipped file's place -> its kind."""
 FILES = sorted(path.relative_to(SCENES).as_posix() for path in SCENES.rglob("*.yaml"))
 
 
@@ -120,13 +78,7 @@ WRONG = [
     (study, "--gradient", "lab/focus.yaml", "a focus test, which twin.study", "twin.lab focus {} does"),
     (lab, "focus", "lab/distortion.yaml", "which twin.lab focus", "twin.lab distortion {} does"),
     (orbit, "angle", "library/cameras/gf7.yaml", "a camera's prescription, which twin.orbit angle", "twin.camera {} d"),
-    (
-        design,
-        "",
-        "orbit/simulate.yaml",
-        "images of the ground, which twin.design camera",
-        "twin.orbit simulate {} does",
-    ),
+    (design, "", "orbit/simulate.yaml", "images of the ground, which twin.design", "twin.orbit simulate {} does"),
 ]
 
 

@@ -10,7 +10,6 @@ import pytest
 from optics.geometry.tree import State
 from optics.materials.glass import glass
 from optics.thermal.heat import Temperature
-from scenes.lens.glass_catalogue import read_catalogue
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
@@ -21,7 +20,6 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
 from tests.scenes.lens.colour_cameras import ACHROMAT, F2, colour_camera
-from tests.scenes.lens.files import AGF
 from twin.monitor.image_quality import image_quality
 from twin.monitor.truth import trace_truth
 
@@ -190,11 +188,3 @@ def test_a_lens_beyond_what_is_known_is_refused(singlet) -> None:
     with pytest.raises(TemperatureError, match=r"L1 would be at 373\.15 K") as caught:
         heat.check({"base/achromat": Temperature(80.0)})
     assert caught.value.origin == "base/achromat"
-
-
-def test_catalogues_say_what_heat_does(tmp_path) -> None:
-    (tmp_path / "two.agf").write_text(AGF, "utf-8")
-    first, second = read_catalogue(tmp_path / "two.agf")
-    assert first.expansion == pytest.approx(7.1e-6, rel=1e-15)
-    assert first.thermal == (1.86e-6, 1.31e-8, -1.37e-11, 4.34e-7, 6.27e-10, 0.17)
-    assert (second.expansion, second.thermal) == (None, None)

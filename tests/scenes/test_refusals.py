@@ -9,8 +9,8 @@ monitors) and ``--``. Every row below is
 OLD stands once in the good file; an empty OLD is the whole file, ``^OLD`` the first of several, ``~`` the OLD of the
 row above, ``@a.b.0`` a key of its YAML tree whose value is replaced (or lost, if NEW is empty). Two changes are joined
 by `` && ``, a line break is written ``\\n``. The name of another file that is blamed precedes LINE, which is ``?`` for
-none; ``+1`` behind KEY counts further messages. In place of LINE and KEY ``ok`` says that the changed file is read as
-well: the value is just within its limits.
+none; ``+1`` behind KEY counts further messages; of ``!word`` the message has nothing. In place of LINE and KEY ``ok``
+says that the changed file is read as well: the value is just within its limits.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def judged(read: Callable[[Path], object], path: Path, text: str, row: str) -> s
         found += f" +{len(more)}" if more else ""
         if found != where:
             return f"told at {found!r}: {told}"
-        missing = [word for word in words.split(" ; ") if word.replace("\\n", "\n") not in told]
-        return f"{missing} not in: {told}" if missing else ""
+        wrong = [w for w in words.split(" ; ") if (w.removeprefix("!").replace("\\n", "\n") in told) == (w[:1] == "!")]
+        return f"{wrong} of: {told}" if wrong else ""
     return "" if where == "ok" else "not refused"
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion
 from optics.materials.glass import GLASSES, glass
 from optics.materials.material import MATERIALS, material
@@ -19,10 +19,8 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TERMS, TemperatureError, ThermalModel
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import checked_nodes
-from scenes.specs.load import LIBRARY, load_camera, load_instrument, load_job
+from scenes.specs.load import load_camera, load_instrument, load_job
 from scenes.specs.resolved import resolve, resolve_job
-from scenes.yaml.errors import InputError
-from twin.monitor.monitor_experiment import MonitorExperiment
 
 SILICA = material("fused silica")
 WAVELENGTH = 650e-9
@@ -68,14 +66,6 @@ def test_temperature_is_inherited_until_a_body_has_its_own(model) -> None:
             assert inherited.at(np.array(point)) == pytest.approx(source.at(there), abs=1e-13)
 
 
-def test_a_gradient_turns_into_the_frame_of_a_turned_child() -> None:
-    child = Pose(rotation_matrix(np.array([0.0, np.pi / 2, 0.0])), np.array([1.0, 2.0, 3.0]))
-    seen = Temperature(10.0, (1.0, 0.0, 0.5)).seen_from(child)
-    assert seen.change == pytest.approx(10.0 + 1.0 + 1.5)
-    # the child's z lies along the parent's x, its x along -z
-    np.testing.assert_allclose(seen.gradient, (-0.5, 0.0, 1.0), atol=1e-15)
-
-
 # --- expansion --------------------------------------------------------------------------------------------------------
 
 
@@ -102,29 +92,6 @@ def test_a_structure_carries_its_children_and_a_mirror_grows_about_its_centre(ba
             atol=2e-15,
         )
     np.testing.assert_array_equal(placed.rotation[0], placed.rotation[1])
-
-
-def test_one_material_at_one_temperature_only_grows(one_material) -> None:
-    change = 10.0
-    grown = 1.0 + SILICA.expansion * change
-    instrument = one_material.instrument
-    state = one_material.state({"base": Temperature(change)})
-    placed = instrument.assembly.place([{}, state])
-    np.testing.assert_allclose(placed.translation[1], grown * placed.translation[0], rtol=0, atol=3e-15)
-    np.testing.assert_array_equal(placed.rotation[0], placed.rotation[1])
-    # every body, faces of prisms and their footprints, too; what that does to the light: tests/twin/test_similarity.py
-    np.testing.assert_allclose(placed.scale[1], grown, rtol=1e-15)
-
-
-def test_carried_motion_is_the_free_field_and_its_rotation() -> None:
-    g, q, a, step = np.array([3.0, -2.0, 5.0]), np.array([0.4, 0.7, -1.1]), 2e-6, 1e-3
-    turn, move = carried_motion(a, g, q)
-    field = free_linear_field(a, 0.0, g)
-    np.testing.assert_allclose(move, field(q[None])[0], rtol=1e-14)
-    # the field is quadratic, so central differences are exact; slope[i, j] = d u_j / d q_i
-    slope = np.array([field((q + e)[None])[0] - field((q - e)[None])[0] for e in step * np.eye(3)]) / (2.0 * step)
-    curl = np.array([slope[1, 2] - slope[2, 1], slope[2, 0] - slope[0, 2], slope[0, 1] - slope[1, 0]])
-    np.testing.assert_allclose(turn, 0.5 * curl, rtol=1e-10)
 
 
 def test_nested_structures_move_as_one_free_body(backend) -> None:
@@ -228,22 +195,6 @@ def test_the_index_is_that_at_the_temperature_of_the_glass(gf7_pair, reference: 
         if abs(here - 293.15) > 30.0:
             at_20 = glass(SILICA.name).dn_dt(WAVELENGTH)
             assert abs(slope / at_20 - 1.0) > 0.05  # so far apart that the one cannot pass for the other
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_an_index_gradient_deflects_as_its_integral_over_the_legs(model, gf7_pair, backend, axis: int) -> None:
-    gradient = np.eye(3)[axis] * 0.05
-    slope = glass(SILICA.name).dn_dt(WAVELENGTH) * gradient
-    for camera, prism in PRISMS.items():
-        fields = [Temperature(0.0, tuple(k * gradient)) for k in (1.0, 2.0, -1.0)]
-        states = [only_glass(model.state({prism: field}), prism) for field in fields]
-        direction, _, places = through(gf7_pair, camera, [{}, *states], backend)
-        turned = (direction[1:] - direction[0])[:, :2]
-        expected = bulk_turn(gf7_pair, camera, places, slope)[:2]
-        scale = np.linalg.norm(slope) * gf7_pair.glass_path[f"{camera}/left"]["prism_180"]
-        np.testing.assert_allclose(turned[0], expected, atol=1e-5 * scale)
-        np.testing.assert_allclose(turned[1], 2.0 * turned[0], atol=1e-5 * scale)
-        np.testing.assert_allclose(turned[2], -turned[0], atol=1e-5 * scale)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -400,71 +351,11 @@ def test_no_change_is_a_temperature_of_its_own(own: str, one_material, tmp_path)
     assert resolve(tmp_path / "config.yaml").job.fields() == fields
 
 
-@pytest.mark.parametrize("face", ["mirror", "window", "window/entry"])
-def test_a_face_of_a_prism_has_no_temperature_of_its_own(face: str, gf7_pair, tmp_path) -> None:
-    job = load_job(written(tmp_path, HEAD + f"  {PRISM}/{face}: {{temperature: 1 K}}"))
-    with pytest.raises(InputError, match="does not allow temperature") as caught:
-        checked_nodes(job, gf7_pair.nodes)
-    assert caught.value.line == 3
-
-
 def test_a_figure_belongs_to_the_footprint_that_the_beam_meets(gf7_pair) -> None:
     allowing = {path for path, info in gf7_pair.nodes.items() if "figure" in info.allows}
     assert {f"{PRISM}/window/entry", f"{PRISM}/window/exit", f"{PRISM}/mirror", "base/forward/M1"} <= allowing
+    assert not any("temperature" in gf7_pair.nodes[f"{PRISM}/{face}"].allows for face in ("mirror", "window/entry"))
     assert f"{PRISM}/window" not in allowing  # two footprints far apart: nothing stands on the window as a whole
-
-
-@pytest.mark.parametrize(
-    ("node", "heat", "told"),
-    [
-        ("base/forward/M1", "-293 K", "would be at 0.15 K, where the expansion of Zerodur is not known"),
-        ("base/forward/M1", "{change: 60 K, gradient: [0 K/m, -80 K/m, 0 K/m]}", "of Zerodur"),
-        ("base/forward/focal_plane", "-25 K", "focal_plane would be at 268.15 K, where the expansion of SiC"),
-        ("base", "85 K", "where the expansion of"),
-        (PRISM, "+125 K", "fused silica is not known"),
-    ],
-)
-def test_heat_beyond_what_is_known_of_materials_is_told_with_the_line(backend, tmp_path, node, heat, told) -> None:
-    """0.15 K was accepted."""
-    job = load_job(written(tmp_path, HEAD + f"  {node}: {{temperature: {heat}}}"))
-    experiment = MonitorExperiment(resolve_job(job), backend)
-    with pytest.raises(InputError) as caught:
-        experiment.state(job)
-    assert (caught.value.line, caught.value.key) == (3, ("perturb", node, "temperature"))
-    text = " ".join(str(caught.value).split())
-    assert told in text
-    assert "or another material for it in the instrument" in text
-    assert "degC) on all of base" in text
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "told"), [(20.0, 130.0, "293.15 K to 403.15 K"), (-273.0, 20.0, "0.15 K to 293.15 K")]
-)
-def test_a_table_of_heat_beyond_what_is_known_is_told_with_the_line(backend, tmp_path, low, high, told) -> None:
-    rows = [
-        f"{x},{y},{z},{low if x < 0 else high}" for x in (-300, -9, 9, 300) for y in (-500, -100) for z in (-20, 20)
-    ]
-    (tmp_path / "nodes.csv").write_text("\n".join(["x [mm],y [mm],z [mm],T [degC]", *rows]) + "\n")
-    path = tmp_path / "job.yaml"
-    path.write_text(HEAD + "  base/forward/M1: {temperature: {table: nodes.csv}}\n")
-    resolved = resolve(path)
-    with pytest.raises(InputError, match="does not describe the temperature of base/forward/M1") as caught:
-        MonitorExperiment(resolved, backend).state(resolved.job)
-    assert (caught.value.line, caught.value.key) == (3, ("perturb", "base/forward/M1", "temperature", "table"))
-    assert f"its nodes are at {told}, where Zerodur is not known" in str(caught.value)
-
-
-def test_an_instrument_at_home_where_materials_are_not_known_is_refused(backend, tmp_path) -> None:
-    text = (LIBRARY / "instruments/gf7_pair.yaml").read_text() + "temperature: 0.15 K\n"
-    (tmp_path / "cold.yaml").write_text(text)
-    path = tmp_path / "job.yaml"
-    path.write_text("instrument: cold.yaml\n")
-    with pytest.raises(InputError, match=r"the expansion of \S+ \(materials\.\S+\) is known from") as caught:
-        MonitorExperiment(resolve_job(load_job(path)), backend)
-    assert caught.value.key == ("temperature",)
-    assert caught.value.line == len(text.splitlines())
-    text = " ".join(str(caught.value).split())
-    assert "found '0.15 K', allowed: 273.15 K to 323.15 K (0 to 50 degC) for all of its materials" in text
 
 
 def test_every_material_is_known_about_room_temperature_and_nowhere_near_zero() -> None:

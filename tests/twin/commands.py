@@ -38,12 +38,16 @@ def refused(run: Callable, command: str, path: Path, key: str, words: Sequence[s
     return int(found[1])
 
 
-def edited_copy(source: Path, folder: Path, *changes: tuple[str, str]) -> Path:
-    """Write the text of a file into a folder with texts replaced, each of which stands in it exactly once."""
-    text = source.read_text("utf-8")
+def replaced(text: str, *changes: tuple[str, str]) -> str:
+    """Return a text with texts replaced, each of which stands in it exactly once."""
     for old, new in changes:
         assert text.count(old) == 1, old
         text = text.replace(old, new)
+    return text
+
+
+def edited_copy(source: Path, folder: Path, *changes: tuple[str, str]) -> Path:
+    """Write the text of a file into a folder, with changes."""
     path = folder / "small.yaml"
-    path.write_text(text, "utf-8")
+    path.write_text(replaced(source.read_text("utf-8"), *changes), "utf-8")
     return path

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from scenes.specs.load import INSTRUMENTS, LIBRARY
+from tests.twin.commands import replaced
 
 ROOT = Path(__file__).resolve().parents[2]
 STUDY = """name: study
@@ -24,17 +25,12 @@ responses:
 def write_study(folder: Path, *changes: tuple[str, str], text: str = STUDY) -> Path:
     """The study and its base in a folder, with changes of its text."""
     instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
-    for old, new in (("name: gf7_pair", "name: small"), ("rows: 96, columns: 96", "rows: 48, columns: 48")):
-        assert instrument.count(old) == 1, old
-        instrument = instrument.replace(old, new)
+    small = replaced(instrument, ("name: gf7_pair", "name: small"), ("rows: 96, columns: 96", "rows: 48, columns: 48"))
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "small.yaml").write_text(instrument, "utf-8")
+    (folder / "small.yaml").write_text(small, "utf-8")
     (folder / "job.yaml").write_text("instrument: small.yaml\nrender: {frames: 1, seed: 1}\n", "utf-8")
-    for old, new in changes:
-        assert text.count(old) == 1, old
-        text = text.replace(old, new)
     path = folder / "study.yaml"
-    path.write_text(text, "utf-8")
+    path.write_text(replaced(text, *changes), "utf-8")
     return path
 
 

@@ -17,7 +17,7 @@ from scenes.specs.load import EXAMPLES, LIBRARY, load_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
-from tests.scenes.test_stated_focal_length import CASSEGRAIN
+from tests.scenes.refusals.tables import good
 from twin.design.__main__ import app
 from twin.design.design_run import HELD_BY, _held_text
 
@@ -96,7 +96,7 @@ def test_constraints_that_contradict_the_camera(tmp_path, envelope: str, clearan
 @pytest.mark.second
 def test_a_telescope_about_its_axis_is_told_its_clearance(tmp_path) -> None:
     """Its beam passes through its secondary, and the message names the clearance with which it can be designed."""
-    (tmp_path / "axis.yaml").write_text(CASSEGRAIN, "utf-8")
+    (tmp_path / "axis.yaml").write_text(good("cassegrain out of focus"), "utf-8")
     file, text = tmp_path / "on_axis.yaml", SHORT.format(envelope="101 percent", vary="M2: [conic]")
     file.write_text(text.replace("camera: gf7", "camera: axis.yaml"), "utf-8")
     refused = CliRunner().invoke(app, [str(file), "--out", str(tmp_path / "out"), "--quiet"])

@@ -1,6 +1,7 @@
 """Cameras made of foreign prescriptions and prescriptions made of cameras: both trace the same."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optics.geometry.surface import ZernikeFigure
+from optics.geometry.aperture import Circle, Edge
+from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
+from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
 from optics.geometry.tree import Motion
 from optics.materials.glass import N_BK7
 from optics.raytrace.system import assemble
@@ -18,9 +21,9 @@ from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
 from scenes.lens.camera_writer import perturbed_prescription, prescription_of
-from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import own_glasses, read_catalogues
 from scenes.lens.prescription import SEQUENCE, Prescription, joined
+from scenes.lens.statements import Glasses
 from scenes.lens.zemax_reader import read_zemax
 from scenes.lens.zemax_writer import zemax_text
 from scenes.models.camera_model import collimated, derive_camera, field_direction
@@ -30,7 +33,7 @@ from scenes.specs.load import EXAMPLES, load_camera, load_instrument
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
-from tests.scenes.lens.files import BATOID, CODEV, SINGLET, TMA
+from tests.scenes.lens.files import BATOID, SINGLET, TMA
 
 ROUNDING = 1e-12
 """Metres: some ten metres of path in float64, with a lever arm of mirrors."""
@@ -61,13 +64,23 @@ def at_image(backend, assembly, sequence, launch, direction, state=None) -> np.n
     return np.concatenate([position, leaving, path[:, None]], axis=-1)
 
 
+def singlet(folder: Path, text: str = SINGLET, glasses: Glasses | None = None) -> Prescription:
+    """Return a lens of a file."""
+    (folder / "singlet.zmx").write_text(text, "utf-8")
+    return read_zemax(folder / "singlet.zmx", own_glasses() if glasses is None else glasses)
+
+
+def read_back(lens: Prescription, path: Path) -> Prescription:
+    """Write a prescription and return what is read of it."""
+    path.write_text(zemax_text(lens) if path.suffix == ".zmx" else batoid_text(lens)[0], "utf-8")
+    return read_zemax(path) if path.suffix == ".zmx" else read_batoid(path, 650e-9)
+
+
 @pytest.mark.parametrize("kind", [".zmx", ".yaml"])
 @pytest.mark.parametrize("name", ["gf7", "gf7_conic", "monitor"])
 def test_out_and_in_again(tmp_path: Path, backend, camera, name: str, kind: str) -> None:
     model = camera(name)
-    lens, path = prescription_of(model), tmp_path / f"{name}{kind}"
-    path.write_text(zemax_text(lens) if kind == ".zmx" else batoid_text(lens)[0], "utf-8")
-    back = read_zemax(path) if kind == ".zmx" else read_batoid(path, 650e-9)
+    back = read_back(prescription_of(model), tmp_path / f"{name}{kind}")
     launch, direction = rays_of(model, backend)
     first = at_image(backend, model.bare_assembly(apertures=False), "imaging", launch, direction)
     # what a file says of the edges of mirrors stops the same rays: none of these
@@ -104,17 +117,14 @@ def test_the_camera_file_is_read_and_traces_the_same(tmp_path: Path, backend) ->
 
 def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
     """Focal length by the lensmaker's formula; backward rays come out along those that went in."""
-    path = tmp_path / "singlet.zmx"
     n, c, t = N_BK7.index(587.5618e-9), 1.0 / 0.05, 0.004
     power = (n - 1.0) * (2.0 * c - (n - 1.0) * t * c * c / n)
     focus = (1.0 - (n - 1.0) * t * c / n) / power
     f_number = SINGLET.replace("ENPD 10", "FNUM 20 0")
-    path.write_text(f_number, "utf-8")
     # the pupil of an F-number is that of the focal length, wherever the image stands
-    made = camera_of(read_zemax(path, own_glasses()), "singlet", backend)
+    made = camera_of(singlet(tmp_path, f_number), "singlet", backend)
     assert made.camera.entrance_pupil == pytest.approx(1.0 / power / 20.0, rel=1e-8)
-    path.write_text(f_number.replace("DISZ 47.5", f"DISZ {1e3 * focus!r}"), "utf-8")
-    made = camera_of(read_zemax(path, own_glasses()), "singlet", backend)
+    made = camera_of(singlet(tmp_path, f_number.replace("DISZ 47.5", f"DISZ {1e3 * focus!r}")), "singlet", backend)
     model = derive_camera(made.camera, backend)
     assert float(model.first_order.principal_distance[0]) == pytest.approx(1.0 / power, rel=1e-9)
     bare = model.bare_assembly(False)
@@ -129,18 +139,16 @@ def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
 
 def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> None:
     """By name or by the catalogue's formula; a glass whose dispersion nobody knows keeps its index."""
-    path, agf = tmp_path / "singlet.zmx", tmp_path / "own.agf"
-    path.write_text(SINGLET, "utf-8")
-    front = camera_of(read_zemax(path, own_glasses()), "singlet", backend, Width(pupil=1e-4)).camera
+    agf = tmp_path / "own.agf"
+    front = camera_of(singlet(tmp_path), "singlet", backend, Width(pupil=1e-4)).camera
     assert front.medium == "air"
     assert front.plain()["mirrors"]["L1"]["glass"] == "N-BK7"
     assert front.index_behind("L1", 500e-9) == N_BK7.index(500e-9)
-    assert "N-BK7" in SINGLET
-    path.write_text(SINGLET.replace("N-BK7", "F2"), "utf-8")
     numbers = "1.34533359 0.00997743871 0.209073176 0.0470450767 0.937357162 111.886764"
     heat = "ED 8.2 9.2 3.6 0 0\nTD 1.51e-6 1.56e-8 -2.78e-11 9.34e-7 1.04e-9 0.25 20"
     agf.write_text(f"NM F2 2 0 1.62 36.37\nCD {numbers} 0 0 0 0\n{heat}\nLD 0.32 2.5\n", "utf-8")
-    made = camera_of(read_zemax(path, read_catalogues([agf])), "singlet", backend, Width(pupil=1e-4)).camera
+    lens = singlet(tmp_path, SINGLET.replace("N-BK7", "F2"), read_catalogues([agf]))
+    made = camera_of(lens, "singlet", backend, Width(pupil=1e-4)).camera
     again = validate(CameraSpec, parse_yaml(made.file_text("")))
     assert again == made
     assert again.mirrors["L1"].glass.expansion == pytest.approx(8.2e-6, rel=1e-15)
@@ -152,10 +160,56 @@ def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> No
         assert again.index_behind("L1", wavelength) == pytest.approx(index, abs=1e-5)
 
 
+GRID = GridFigure(np.zeros((5, 5)), (-1.0, 1.0, -1.0, 1.0))
+ERROR = ZernikeFigure(0.1, (0.0, 0.0), {5: 1e-7})
+SAG = ZernikeSag(radius=0.1, Z5=1e-7)
+CURVE = XYPolynomial(x2=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("shape", "zemax", "batoid", "camera_file"),
+    [
+        (
+            Surface(-0.1, figure=GRID),
+            "a figure on a grid",
+            "cannot carry this: a figure on a grid",
+            "which a camera's file",
+        ),
+        (Surface(-0.1, terms=(CURVE,), figure=ERROR), "with other terms of its sag", "", ""),
+        (Surface(-0.1, even=(0.0,) * 7 + (1e-9,)), "even powers beyond r^16", "", ""),
+        (Surface(-0.1, terms=(SAG,)), "terms of a sag that the format does not have", "is no polynomial", ""),
+        (Surface(-0.1, even=(0.0,) * 9 + (1e-9,), terms=(CURVE,)), "a polynomial beyond order 20", "", ""),
+        (Surface(even=(0.0,) * 9 + (1e-9,)), "even powers beyond", "a polynomial of so high an order", ""),
+    ],
+)
+def test_shapes_that_a_format_has_no_place_for(backend, camera, shape, zemax, batoid, camera_file) -> None:
+    lens = prescription_of(camera("gf7"))
+    bent = replace(lens, surfaces=(replace(lens.surfaces[0], surface=shape), *lens.surfaces[1:]))
+    for write, problem in (
+        (zemax_text, zemax),
+        (batoid_text, batoid),
+        (lambda one: camera_of(one, "bent", backend), camera_file),
+    ):
+        if problem:
+            with pytest.raises(InputError, match=re.escape(problem)):
+                write(bent)
+
+
+def test_a_hole_in_an_obscuration_is_no_edge_of_a_zemax_file(camera) -> None:
+    lens = prescription_of(camera("gf7"))
+    bent = replace(lens.surfaces[0], aperture=None, edges=(Edge(Circle(0.1, inner=0.05), True),))
+    with pytest.raises(InputError, match="an obscuration with a hole"):
+        zemax_text(replace(lens, surfaces=(bent, *lens.surfaces[1:])))
+
+
+def test_zernike_terms_that_cannot_be_joined() -> None:
+    for figure, problem in ((GRID, "beside a figure on a grid"), (replace(ERROR, terms={70: 1e-9}), "outside 1..66")):
+        with pytest.raises(ValueError, match=problem):
+            joined(Surface(-0.1, terms=(SAG,), figure=figure))
+
+
 def test_an_instrument_takes_no_lenses(tmp_path: Path, backend) -> None:
-    path = tmp_path / "singlet.zmx"
-    path.write_text(SINGLET, "utf-8")
-    made = camera_of(read_zemax(path, own_glasses()), "singlet", backend, Width(pupil=1e-4))
+    made = camera_of(singlet(tmp_path), "singlet", backend, Width(pupil=1e-4))
     with pytest.raises(InputError, match="a camera with a monitor is made of mirrors alone"):
         build_instrument(load_instrument("gf7_pair"), {"gf7": made.camera}, backend)
 
@@ -188,9 +242,7 @@ def test_a_freeform_of_zernike_terms_goes_in_and_out(tmp_path: Path, backend) ->
         error = ZernikeFigure(0.1, (0.01, -0.05), {5: 1e-7, 7: 2e-7})
         shape = joined(replace(model.surfaces["M1"], figure=error))
         bent = replace(again, surfaces=(replace(mirror, surface=shape), *again.surfaces[1:]))
-        out = tmp_path / f"bent{kind}"
-        out.write_text(zemax_text(bent) if kind == ".zmx" else batoid_text(bent)[0], "utf-8")
-        back = read_zemax(out) if kind == ".zmx" else read_batoid(out, 650e-9)
+        back = read_back(bent, tmp_path / f"bent{kind}")
         x, y = np.array([0.01, -0.02]), np.array([-0.03, -0.06])
         wanted = model.surfaces["M1"].sag(x, y) + error.sag(x, y)
         np.testing.assert_allclose(back.surfaces[0].surface.sag(x, y), wanted, rtol=0, atol=1e-16)
@@ -210,9 +262,7 @@ def test_a_perturbed_camera_traces_as_the_instrument_does(tmp_path: Path, backen
     """Rays of the scene through the instrument in that state, and through the file that was written of it."""
     model, pair = instrument("gf7_pair").cameras["forward"], instrument("gf7_pair")
     lens = perturbed_prescription(pair, "forward", STATE)
-    path = tmp_path / f"perturbed{kind}"
-    path.write_text(zemax_text(lens) if kind == ".zmx" else batoid_text(lens)[0], "utf-8")
-    back = read_zemax(path) if kind == ".zmx" else read_batoid(path, 650e-9)
+    back = read_back(lens, tmp_path / f"perturbed{kind}")
     launch, direction = rays_of(model, backend)
     design = pair.assembly.nominal_pose("base/forward") @ model.camera_frame.inverse()
     first = at_image(
@@ -242,6 +292,9 @@ def test_the_example_of_a_zemax_file_is_what_is_read_of_it(tmp_path: Path, backe
     assert load_camera(out).plain() == load_camera(EXAMPLES / "cassegrain_zmx.yaml").plain()
 
 
+JOB = "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: 0 0 30 um, figure: {Z5: 20 nm}}}\n"
+
+
 @pytest.mark.second
 def test_the_command(tmp_path: Path, backend) -> None:
     (tmp_path / "tma.zmx").write_text(TMA, "utf-16")
@@ -258,10 +311,7 @@ def test_the_command(tmp_path: Path, backend) -> None:
                      "0.1 deg", "--pupil", "2 m", "--pitch", "15 um")  # fmt: skip
     assert code == 0, said
     assert load_camera(camera).line.pitch == pytest.approx(15e-6)
-    job = tmp_path / "job.yaml"
-    job.write_text(
-        "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: 0 0 30 um, figure: {Z5: 20 nm}}}\n", "utf-8"
-    )
+    (tmp_path / "job.yaml").write_text(JOB, "utf-8")
     (tmp_path / "what.doc").touch()
     for words, problem in (
         ("read two.yaml --out a.yaml", "names no wavelength"),
@@ -284,6 +334,12 @@ def test_the_command(tmp_path: Path, backend) -> None:
         assert (code, problem in " ".join(said.split())) == (2, True), (words, said)
         assert not (tmp_path / "a.yaml").exists()
         assert not (tmp_path / "a.zmx").exists()
+
+
+@pytest.mark.second
+def test_the_command_writes_a_perturbed_camera(tmp_path: Path) -> None:
+    job = tmp_path / "job.yaml"
+    job.write_text(JOB, "utf-8")
     for name in ("a.zmx", "a.yaml"):
         code, said = run("write", "gf7", "--perturbed", job, "--camera", "forward", "--out", tmp_path / name)
         assert code == 0, said
@@ -291,29 +347,18 @@ def test_the_command(tmp_path: Path, backend) -> None:
     assert moved.surfaces[1].pose.translation[2] == pytest.approx(-2.01593047747168 + 30e-6, abs=1e-14)
 
 
-def test_what_a_camera_cannot_hold_is_refused(tmp_path: Path, backend) -> None:
-    (tmp_path / "a.seq").write_text(CODEV.replace("SI 0.0 0.25\n  ADE 1.5", "SI 0.0 0.25\n  ADE 70"), "utf-8")
-    with pytest.raises(InputError, match="an image turned too far"):
-        camera_of(read_codev(tmp_path / "a.seq"), "c", backend)
-
-
 def test_what_a_zemax_file_cannot_hold_is_refused(tmp_path: Path, backend) -> None:
-    (tmp_path / "singlet.zmx").write_text(SINGLET, "utf-8")
-    made = camera_of(read_zemax(tmp_path / "singlet.zmx", own_glasses()), "singlet", backend, Width(pupil=1e-4))
+    made = camera_of(singlet(tmp_path), "singlet", backend, Width(pupil=1e-4))
     lens: Prescription = prescription_of(derive_camera(made.camera, backend))
     with pytest.raises(InputError, match="a face of a lens"):
         zemax_text(lens)
-    text, _ = batoid_text(lens)
-    (tmp_path / "singlet.yaml").write_text(text, "utf-8")
-    back = read_batoid(tmp_path / "singlet.yaml", 650e-9)
+    back = read_back(lens, tmp_path / "singlet.yaml")
     assert [s.index for s in back.surfaces] == [s.index for s in lens.surfaces]
 
 
 def test_fields_are_those_of_the_file(tmp_path: Path, backend) -> None:
     """0 and 2 deg on one axis are the middle and the end of the camera's field; what it adds is told."""
-    path = tmp_path / "singlet.zmx"
-    path.write_text(SINGLET, "utf-8")
-    lens = read_zemax(path, own_glasses())
+    lens = singlet(tmp_path)
     made = camera_of(lens, "singlet", backend)
     assert (made.camera.field_bias, made.camera.field.x, made.camera.field.y) == (0.0, math.radians(2), math.radians(2))
     notes = [str(note) for note in made.notes if note.statement == "field"]

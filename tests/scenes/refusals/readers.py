@@ -15,32 +15,20 @@ from scenes.lens.camera_reader import camera_of
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import own_glasses, read_catalogue
 from scenes.lens.zemax_reader import read_zemax
-from scenes.models.camera_model import build_camera_under_test
+from scenes.models.camera_model import build_camera_under_test, derive_camera
 from scenes.models.disturbances import motions_of_spec, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.scenery import measured_finishes
 from scenes.schema import MODELS
+from scenes.specs import load
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import checked_nodes
-from scenes.specs.load import (
-    load_autocollimator_test,
-    load_camera,
-    load_cameras,
-    load_disturbances,
-    load_instrument,
-    load_job,
-)
 from scenes.specs.measured.adjust_setup import resolve_adjust
+from scenes.specs.measured.monitor_frames import read_frame_table, resolve_measurement
+from scenes.specs.measured.orbit_data_setup import resolve_match
 from scenes.specs.operation import read_operation
+from scenes.specs.orbit import setup as orbit_setup
 from scenes.specs.orbit.flight import ErrorsSpec, OrbitSpec
-from scenes.specs.orbit.setup import (
-    resolve_angle,
-    resolve_calibration,
-    resolve_jitter,
-    resolve_loop,
-    resolve_monitor,
-    resolve_simulate,
-)
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import resolve, resolve_focus
 from scenes.specs.spectrum import SpectrumSpec
@@ -54,6 +42,7 @@ from scenes.yaml.units import ANGLE, LENGTH
 from scenes.yaml.yaml_file import read_yaml
 from tests.scenes.lens.colour_cameras import colour_camera
 from tests.scenes.test_finish_tables import bsdf_text
+from twin.monitor.monitor_experiment import MonitorExperiment
 
 Fixture = Callable[[str], Any]
 Read = Callable[[Path], object]
@@ -89,20 +78,24 @@ yaml_file, json_file = _plain(read_yaml), _plain(read_json)
 table = _plain(lambda path: read_table(path, COLUMNS))
 nodes, temperatures = _plain(read_nodes), _plain(read_temperatures)
 bsdf, coating = _plain(read_bsdf), _plain(read_coating)
-camera, job = _plain(load_camera), _plain(load_job)
-autocollimators = _plain(load_autocollimator_test)
+camera, job = _plain(load.load_camera), _plain(load.load_job)
+autocollimators = _plain(load.load_autocollimator_test)
 operation = _plain(read_operation)
 orbit, errors, study, spectrum = map(_spec, (OrbitSpec, ErrorsSpec, StudySpec, SpectrumHolder))
 camera_text = _spec(CameraSpec)
-angle, loop, monitor, simulate = map(_plain, (resolve_angle, resolve_loop, resolve_monitor, resolve_simulate))
-calibration, jitter, adjust = map(_plain, (resolve_calibration, resolve_jitter, resolve_adjust))
+angle, loop, monitor, simulate = map(
+    _plain,
+    (orbit_setup.resolve_angle, orbit_setup.resolve_loop, orbit_setup.resolve_monitor, orbit_setup.resolve_simulate),
+)
+calibration, jitter, adjust = map(_plain, (orbit_setup.resolve_calibration, orbit_setup.resolve_jitter, resolve_adjust))
+match = _plain(resolve_match)
 zemax, codev = _plain(read_zemax), _plain(read_codev)
 batoid = _plain(lambda path: read_batoid(path, 650e-9))
 
 
 def job_nodes(folder: Path, fixture: Fixture) -> Read:
     """A job on an instrument of three nodes."""
-    return lambda path: checked_nodes(load_job(path), NODES)
+    return lambda path: checked_nodes(load.load_job(path), NODES)
 
 
 def instrument(folder: Path, fixture: Fixture) -> Read:
@@ -110,8 +103,8 @@ def instrument(folder: Path, fixture: Fixture) -> Read:
     backend = fixture("backend")
 
     def read(path: Path) -> object:
-        spec = load_instrument(path)
-        return build_instrument(spec, load_cameras(spec), backend)
+        spec = load.load_instrument(path)
+        return build_instrument(spec, load.load_cameras(spec), backend)
 
     return read
 
@@ -130,7 +123,7 @@ def focus(folder: Path, fixture: Fixture) -> Read:
 def disturbances(folder: Path, fixture: Fixture) -> Read:
     """Disturbances of the pair gf7; a table of correlations beside them."""
     pair = fixture("gf7_pair")
-    return lambda path: motions_of_spec(load_disturbances(path), pair)
+    return lambda path: motions_of_spec(load.load_disturbances(path), pair)
 
 
 def correlations(folder: Path, fixture: Fixture) -> Read:
@@ -140,17 +133,39 @@ def correlations(folder: Path, fixture: Fixture) -> Read:
     )
     text = f"name: own\njoint: {{reason: r, components: {{{components}}}, correlation_file: corr.csv}}\n"
     (folder / "own.yaml").write_text(text, "utf-8")
-    return lambda path: load_disturbances(folder / "own.yaml")
+    return lambda path: load.load_disturbances(folder / "own.yaml")
 
 
 def stated_job(folder: Path, fixture: Fixture) -> Read:
-    """A job on the pair gf7 and what it states to move."""
+    """A job on the pair gf7 and what it states to move; a file of components that go together beside it."""
     pair = fixture("gf7_pair")
+    (folder / "own.yaml").write_text("name: own\njoint: {reason: r, components: {forward/M2 shift z: 3 um}}\n", "utf-8")
 
     def read(path: Path) -> object:
         return stated_motions(resolve(path), pair)
 
     return read
+
+
+def experiment(folder: Path, fixture: Fixture) -> Read:
+    """A job's state, with tables of temperatures from 20 degC to others on both sides of a mirror."""
+    backend = fixture("backend")
+    places = [(x, y, z) for x in (-300, -9, 9, 300) for y in (-500, -100) for z in (-20, 20)]
+    for name, low, high in (("hot", 20, 130), ("cold", -273, 20)):
+        rows = "".join(f"{x},{y},{z},{low if x < 0 else high}\n" for x, y, z in places)
+        (folder / f"{name}.csv").write_text(f"x [mm],y [mm],z [mm],T [degC]\n{rows}", "utf-8")
+
+    def read(path: Path) -> object:
+        resolved = resolve(path)
+        return MonitorExperiment(resolved, backend).state(resolved.job)
+
+    return read
+
+
+def of_a_job(folder: Path, fixture: Fixture) -> Read:
+    """An instrument that a job names, with all its files."""
+    (folder / "job.yaml").write_text("instrument: own.yaml\n", "utf-8")
+    return lambda path: resolve(folder / "job.yaml")
 
 
 def payload(folder: Path, fixture: Fixture) -> Read:
@@ -159,7 +174,7 @@ def payload(folder: Path, fixture: Fixture) -> Read:
     (folder / "test.yaml").write_text(
         f"name: small\ncamera: own.yaml\norbit: {orbit}\npatch: {{pixel: 6000}}\n", "utf-8"
     )
-    return lambda path: resolve_simulate(folder / "test.yaml")
+    return lambda path: orbit_setup.resolve_simulate(folder / "test.yaml")
 
 
 def payload_angle(folder: Path, fixture: Fixture) -> Read:
@@ -167,14 +182,14 @@ def payload_angle(folder: Path, fixture: Fixture) -> Read:
     orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
     strips = "{points: 3, first: 0, last: 11999}"
     (folder / "test.yaml").write_text(f"name: small\ncamera: own.yaml\norbit: {orbit}\nstrips: {strips}\n", "utf-8")
-    return lambda path: resolve_angle(folder / "test.yaml")
+    return lambda path: orbit_setup.resolve_angle(folder / "test.yaml")
 
 
 def filter_table(folder: Path, fixture: Fixture) -> Read:
     """A table of a filter that a camera of lenses names."""
     text = colour_camera("achromat", "{table: filter.csv}").file_text("")
     (folder / "c.yaml").write_text(text, "utf-8")
-    return lambda path: load_camera(folder / "c.yaml")
+    return lambda path: load.load_camera(folder / "c.yaml")
 
 
 def heated(folder: Path, fixture: Fixture) -> Read:
@@ -196,7 +211,7 @@ def heated(folder: Path, fixture: Fixture) -> Read:
     (folder / "text.vtu").write_text("no mesh\n", "utf-8")
     for name in ("heat.inp", "m1.bdf", "m1.xlsx"):
         (folder / name).write_text("*NODE\n", "utf-8")
-    return load_job
+    return load.load_job
 
 
 def finishes(folder: Path, fixture: Fixture) -> Read:
@@ -213,6 +228,28 @@ def finishes(folder: Path, fixture: Fixture) -> Read:
 def agf(folder: Path, fixture: Fixture) -> Read:
     """A glass catalogue."""
     return read_catalogue
+
+
+def frames(folder: Path, fixture: Fixture) -> Read:
+    """A table of frames of one channel."""
+    for name in ("a.fits", "b.fits"):
+        (folder / name).touch()
+    return lambda path: read_frame_table(path, ("one/left",))
+
+
+def measurement(folder: Path, fixture: Fixture) -> Read:
+    """Measured frames of all channels of an instrument that a table lists."""
+    pair = load.load_instrument("gf7_pair")
+    channels = [f"{camera}/{channel}" for camera in pair.cameras for channel in pair.channels_of(camera)]
+    rows = "".join(f"{name},before,a.fits\n{name},after,a.fits\n" for name in channels)
+    (folder / "frames.csv").write_text(f"channel,when,file\n{rows}", "utf-8")
+    (folder / "a.fits").touch()
+    return resolve_measurement
+
+
+def derived(folder: Path, fixture: Fixture) -> Read:
+    """A camera with all that follows from its surfaces."""
+    return lambda path: derive_camera(load.load_camera(path), fixture("backend"))
 
 
 def _lens_camera(read: Read) -> Callable[[Path, Fixture], Read]:
