@@ -1,27 +1,21 @@
 """Passes of an in-orbit calibration adjusted on tie points before check points are intersected."""
 
-from functools import partial
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.linalg import eigh
 from scipy.stats import chi2
 
-import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
-from tests.twin.commands import edited_copy, invoke, refused
 from tests.twin.strip_prediction import predicted
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.schemes import tested as at_checks
 from twin.orbit.calibration.strip import adjusted_strip
 from twin.orbit.calibration.strip import tested_in_strip as in_strip
 
-run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "calibrate_strip.yaml"
 WHOLE = resolve_calibration(EXAMPLE)
 ARCSEC = np.pi / 648000
@@ -90,17 +84,3 @@ def test_slow_errors_are_taken_out_as_the_covariances_say() -> None:
         assert least < value < most
     # of the RMS; it changes with places of points by some thousandths
     assert np.sqrt(np.trace(heights[1]) / np.trace(heights[0])) == pytest.approx(0.52, abs=0.01)
-
-
-BAD = {
-    "few ties": ("ties: 300", "ties: 5", "strip.ties", ["too few tie points", "20 or more"]),
-    "long strip": ("length: 360 km", "length: 990 km", "strip.length", ["tie points", "shorter strip"]),
-    "exact": ("image: 0.3", "image: 0.3\n  switched_on: false", "strip", ["nothing to adjust"]),
-    "interval": ("interval: 20 s", "interval: 0 s", "errors.star_tracker.slow.interval", ["greater than zero"]),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input(case: str, tmp_path: Path) -> None:
-    old, new, key, words = BAD[case]
-    refused(run, "calibrate", edited_copy(EXAMPLE, tmp_path, (old, new)), key, words)

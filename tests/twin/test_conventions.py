@@ -180,22 +180,6 @@ def test_parity_of_the_image_space(truth, scales):
     assert truth["rear_node about Z"][GAMMA] == pytest.approx(+f_y / f_x, rel=1e-3)
 
 
-def test_principal_distance_is_eq_3_of_paper_004(gf7_pair, backend):
-    """F = sum(L tan W) / sum(tan^2 W), here from collimated beams traced forward, not from backward chief rays."""
-    model = gf7_pair.cameras[CAMERA]
-    half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
-    bare = model.bare_assembly()
-    angle = np.linspace(-1, 1, 41) * np.arctan(half / model.line_principal_distance)
-    travel = np.array([field_direction(model.spec, w, 0.0) for w in angle])
-    launch = collimated(backend, assemble(bare, [("M1", "M2")]), travel, np.zeros((1, 2)))[:, 0]
-    hits = trace(backend, assemble(bare, ["imaging"]), make_rays(backend, launch, travel)).numpy()[0][0]
-    sight = -travel @ model.camera_frame.rotation
-    tangent = -sight[:, 1] / sight[:, 2]
-    position = hits[:, 0]
-    eq_3 = np.sum(position * tangent) / np.sum(tangent**2)
-    assert trace_truth(gf7_pair, backend, [{}]).principal_distance[CAMERA] == pytest.approx(eq_3, rel=2e-4)
-
-
 @pytest.mark.second
 @pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
 def test_the_truth_and_the_pixels_in_orbit_see_the_whole_line(name: str, instrument, backend):

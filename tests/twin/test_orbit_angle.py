@@ -1,26 +1,21 @@
 """Intersection angles from ground points, end to end: against hand calculations, statistics, and as a user runs it."""
 
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-import twin.orbit.__main__ as command
 from analysis.units import ARCSEC
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
-from tests.twin.commands import edited_copy, invoke, refused
 from twin.orbit.angle.angle_flight import AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, frame_rows, run_angle, tls_angles
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import look_angle
 
-run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "angle.yaml"
 SETUP = resolve_angle(EXAMPLE)
 LOOK = np.radians(25.0)
@@ -197,34 +192,3 @@ def test_a_datum_shift_is_the_stations_shift_reversed() -> None:
 
 
 # The command
-
-
-# what is wrong, key, what to do about it
-BAD = {
-    "few points": ("points: 60,", "points: 2,", "strips.points", ["too few points", "3 or more"]),
-    "late": ("time: 0 s", "time: 61 s", "time", ["outside the orbit data", "longer orbit"]),
-    "outside the line": ("last: 11899", "last: 12000", "strips.last", ["outside the line", "11999.5"]),
-    "camera": (
-        "camera: th1",
-        "camera: th2",
-        "camera",
-        ["no such name in payloads or instruments", "did you mean 'th1'"],
-    ),
-    "one place": ("last: 11899", "last: 101", "strips", ["all points lie at one place", "a longer strip"]),
-    "orbit": ("altitude: 500 km", "altitude: 500 km, inclination: 30 deg", "orbit", ["never passes latitude 40"]),
-    "looks away": (
-        "[20 arcsec, -35 arcsec,",
-        "[20 arcsec, 45 deg,",
-        "attitude",
-        ["misses the Earth", "see the ground"],
-    ),
-    "at the end": ("time: 0 s", "time: 59.9999 s", "time", ["time outside the orbit", "a longer orbit"]),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input(case: str, tmp_path: Path) -> None:
-    old, new, key, words = BAD[case]
-    path = edited_copy(EXAMPLE, tmp_path, (old, new))
-    line = refused(run, "angle", path, key, words)
-    assert key.split(".")[-1] in path.read_text("utf-8").splitlines()[line - 1]

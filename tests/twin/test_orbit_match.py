@@ -1,7 +1,6 @@
 """Points measured in a user's images: the simulation's images and maps, through files alone."""
 
 import shutil
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +9,15 @@ import pytest
 import rasterio
 import tifffile
 
-import twin.orbit.__main__ as command
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import MatchSetup
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.orbit.setup import load_three_line_camera, resolve_simulate
 from scenes.yaml.errors import InputError
-from tests.tiers import quick
 from tests.twin import orbit_file_bench as bench
-from tests.twin.commands import invoke
 from twin.orbit.images.simulate_run import Simulation, run_simulation
 from twin.orbit.matching.match_run import Match, run_match
-
-run = partial(invoke, command.app)
 
 
 @pytest.fixture(scope="module")
@@ -121,33 +115,6 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
         a, b = np.array(pairs).T
         np.testing.assert_allclose(there.pixel[b], row.pixel[a], rtol=0, atol=0.02)
         np.testing.assert_allclose(there.line[b] - 10.0, row.line[a], rtol=0, atol=0.02)
-
-
-WIDE = {"row": 0, "column": 0, "rows": 9999, "columns": 40}
-WRONG = [
-    ({"images": {"nadir": {"file": "photo.tiff", "first_pixel_sees": "up"}}}, None),
-    ({"orthophoto": {"file": "nadir.tiff"}}, "without a place"),
-    ({"dem": {"file": "photo.tiff"}}, "counted from is not said"),
-    ({"images": {"front": {"file": "nadir.tiff", "first_pixel_sees": "right"}}}, "no such line"),
-    ({"images": {"nadir": {"file": "none.tiff", "first_pixel_sees": "right"}}}, "no such file"),
-    ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel": 11_900, "first_pixel_sees": "right"}}}, "wider than"),
-    ({"images": {"nadir": {"file": "nadir.tiff", "first_line": 50, "first_pixel_sees": "right"}}}, "longer than its"),
-    ({"images": {"nadir": {"file": "nan.tiff", "first_pixel_sees": "right"}}}, "grey values that are not finite"),
-    ({"images": {"nadir": {"file": "complex.tiff", "first_pixel_sees": "right"}}}, "values that are no grey values"),
-    ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel_sees": "right", "window": WIDE}}}, "a window outside of"),
-    ({"images": {"nadir": {"file": "nadir.tiff", "band": 2, "first_pixel_sees": "right"}}}, "no such band"),
-]
-
-
-@pytest.mark.parametrize(("change", "told"), quick(0, WRONG))
-def test_what_does_not_fit_is_refused(files, change: dict[str, Any], told: str | None) -> None:
-    folder, data = files
-    if told is None:
-        with pytest.raises(Exception, match="first_pixel_sees"):
-            OrbitMatchSpec.model_validate({**data, **change})
-        return
-    with pytest.raises(InputError, match=told):
-        matched(folder, {**data, **change})
 
 
 @pytest.mark.second

@@ -218,17 +218,6 @@ def test_an_area_ccd_that_alone_is_warm_has_larger_pixels(with_camera, backend) 
     np.testing.assert_array_equal(found[1:, 1], found[1:, 0])
 
 
-def test_a_scaled_camera_keeps_its_detectors(with_camera, backend) -> None:
-    """`scale` is not heat: mirrors and spacings grow and CCDs do not, so that the principal distance grows."""
-    instrument = with_camera("gf7")
-    state = {"base/forward": Motion(scale=20e-6)}
-    placed = instrument.assembly.place([state])
-    for body in (line_body("base/forward"), instrument.channels[0].ccd_body):
-        assert placed.size(body)[0] == 1.0
-    change = trace_truth(instrument, backend, [state])
-    assert change.cameras["forward"].d_f[0] == pytest.approx(20e-6 * change.principal_distance["forward"], rel=2e-3)
-
-
 # --- glass ------------------------------------------------------------------------------------------------------------
 
 
