@@ -115,6 +115,22 @@ COMMENT states""".splitlines()
     return path
 
 
+def oem_xml(path: Path) -> None:
+    s = sampled("GCRS", 10.0)
+    states = "\n".join(
+        f"<stateVector><EPOCH>{calendar(t)}</EPOCH>"
+        + "".join(f"<{n}>{float(v)!r}</{n}>" for n, v in zip("XYZ", r / 1e3, strict=True))
+        + "".join(f"<{n}_DOT>{float(v)!r}</{n}_DOT>" for n, v in zip("XYZ", w / 1e3, strict=True))
+        + "</stateVector>"
+        for t, r, w in zip(s.seconds, s.position, s.velocity, strict=True)
+    )
+    meta = "<OBJECT_ID>A</OBJECT_ID><CENTER_NAME>EARTH</CENTER_NAME><REF_FRAME>GCRF</REF_FRAME>"
+    path.write_text(
+        f'<?xml version="1.0"?><oem id="CCSDS_OEM_VERS" version="2.0"><body><segment><metadata>{meta}'
+        f"<TIME_SYSTEM>UTC</TIME_SYSTEM></metadata><data>{states}</data></segment></body></oem>"
+    )
+
+
 def aem(path: Path, scale: str = "UTC", direction: str = "A2B", first: bool = False, step: float = 0.25) -> Path:
     t = np.arange(-60.0, 60.0 + 1e-9, step)
     inverse = direction == "B2A"

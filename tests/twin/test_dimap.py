@@ -203,20 +203,21 @@ def test_a_billion_laughs_and_files_that_are_too_deep_or_long(tmp_path: Path, mo
             read_dimap(tmp_path / "DIM.XML")
 
 
-def test_line_times_of_a_scene(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("scale", "cameras", "words"),
+    [("UTC", ("pan",), ""), ("UTC", ("pan", "ms"), "the times of one line"), ("GPS", ("pan",), "in UTC")],
+)
+def test_line_times_of_a_scene(tmp_path: Path, scale: str, cameras: tuple[str, ...], words: str) -> None:
     path = write(tmp_path, SPOT)  # over midnight
-    said = {"file": path.name, "time_scale": "UTC", "moment": "middle"}
-    found = read_line_clocks(LineTimesFileSpec.model_validate(said), ("pan",), tmp_path)["pan"]
-    scene = read_scene(path)
+    spec = LineTimesFileSpec.model_validate({"file": path.name, "time_scale": scale, "moment": "middle"})
+    if words:
+        with pytest.raises(InputError, match=words):
+            read_line_clocks(spec, cameras, tmp_path)
+        return
+    found, scene = read_line_clocks(spec, cameras, tmp_path)["pan"], read_scene(path)
     moments = found.clock.instants("UTC").since(scene.epoch)
     # the table's seconds of the day have 1e-11 s
     np.testing.assert_allclose(moments, scene.sensor.time(found.line), rtol=0, atol=1e-9)
-    for change, cameras, message in (
-        ({}, ("pan", "ms"), "the times of one line"),
-        ({"time_scale": "GPS"}, ("pan",), "in UTC"),
-    ):
-        with pytest.raises(InputError, match=message):
-            read_line_clocks(LineTimesFileSpec.model_validate(said | change), cameras, tmp_path)
 
 
 def against_the_stars(text: str) -> str:

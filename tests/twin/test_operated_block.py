@@ -26,8 +26,7 @@ from tests.twin.operation_records import (
     record_of,
 )
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.operated_block import cameras_of, run_operated_block
-from twin.operate.posterior import Posterior
+from twin.operate.operated_block import run_operated_block
 from twin.orbit.block.drawn_block import draw_block
 
 pytestmark = pytest.mark.second
@@ -98,22 +97,6 @@ def by_hand(stated, shifts):
     left = own.reshape(count, count) - gain @ with_spots.reshape(count, size).T
     shape = (len(PASSES), len(LINES), 4)
     return CamerasKnowledge(LINES, mean, left.reshape(*shape, *shape).transpose(1, 0, 2, 4, 3, 5).reshape(count, count))
-
-
-def test_every_number_and_covariance_goes_to_its_camera_pass_and_unit():
-    random = np.random.default_rng(2)
-    mean, covariance = random.standard_normal((2, 8)), random.standard_normal((2, 8, 2, 8))
-    found = cameras_of(Posterior(np.arange(2), (), mean, covariance), LINES, [1, 0, 1])
-    unit = np.tile([np.pi / 648000] * 3 + [1e-6], 2)
-    for camera, other in np.ndindex(2, 2):
-        for one, time in enumerate((1, 0, 1)):
-            own = 4 * camera + np.arange(4)
-            assert found.mean[camera, one] == pytest.approx(mean[time, own] * unit[own])
-            for two, later in enumerate((1, 0, 1)):
-                there = 4 * other + np.arange(4)
-                block = found.covariance[12 * camera + 4 * one :, 12 * other + 4 * two :][:4, :4]
-                said = covariance[time, own][:, later, there] * unit[own][:, None] * unit[there]
-                assert block == pytest.approx(said)
 
 
 @one_blas_thread()

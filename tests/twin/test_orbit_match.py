@@ -1,12 +1,10 @@
 """Points measured in a user's images: the simulation's images and maps, through files alone."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 import tifffile
 
 from scenes.specs.load import ORBIT, SCENES
@@ -14,7 +12,6 @@ from scenes.specs.measured.orbit_data import OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import MatchSetup
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.orbit.setup import load_three_line_camera, resolve_simulate
-from scenes.yaml.errors import InputError
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.images.simulate_run import Simulation, run_simulation
 from twin.orbit.matching.match_run import Match, run_match
@@ -115,19 +112,3 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
         a, b = np.array(pairs).T
         np.testing.assert_allclose(there.pixel[b], row.pixel[a], rtol=0, atol=0.02)
         np.testing.assert_allclose(there.line[b] - 10.0, row.line[a], rtol=0, atol=0.02)
-
-
-@pytest.mark.second
-def test_heights_that_no_ground_has_are_refused(files, tmp_path: Path) -> None:
-    """One of them, as a flipped bit makes it, would put the ground beyond the Earth."""
-    folder, data = files
-    dem = tmp_path / "dem.tiff"
-    shutil.copy(folder / "dem.tiff", dem)
-    with rasterio.open(dem, "r+") as file:
-        values = file.read(1)
-        values[3, 4] = 1e30
-        file.write(values, 1)
-    with pytest.raises(
-        InputError, match=r"dem.tiff: no heights of ground; found .* to 1e\+30 m, allowed: up to 20000 m"
-    ):
-        matched(folder, {**data, "dem": {"file": str(dem)}})

@@ -16,6 +16,7 @@ import tifffile
 from rasterio.transform import from_origin
 
 import twin.orbit.__main__ as command
+from analysis.orbit.forward_intersection import CalibratedLine
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resolve_measured_angle
@@ -27,12 +28,15 @@ from tests.tiers import quick
 from tests.twin import dimap_bench, orbit_files
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import edited_copy, invoke, refused
+from tests.twin.pushbroom_bench import lost, shaken
 from twin.laboratory.distortion_run import _check_angles
 from twin.orbit.angle.angle_flight import angle_camera
 from twin.orbit.angle.angle_run import SimulatedAngleRun
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
 from twin.orbit.conventions.check_run import run_check
+from twin.orbit.export.estimated_change import ground_rows
 from twin.orbit.export.export_run import read_exportable, run_export
+from twin.orbit.export.line_scanner import line_scanner
 from twin.orbit.export.polynomial_export import read_polynomial_source
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.export.rpc_files import read_rpc
@@ -82,6 +86,7 @@ def campaign_files(folder: Path) -> None:
 def platform_files(folder: Path) -> None:
     bench.orbit_csv(folder / "orbit.csv")
     bench.attitude_csv(folder / "attitude.csv")
+    bench.oem_xml(folder / "a.xml")
     for kind in (bench.oem, bench.aem, bench.sp3):
         kind(folder / f"a.{kind.__name__}")
 
@@ -98,11 +103,14 @@ def map_files(folder: Path) -> None:
         ("empty.tif", "float32", near, np.nan),
         ("far.tif", "float32", (299_000.0, 4_429_000.0), 1.0),
         ("nosystem.tif", "float32", near, 1.0),
-        ("geoid.tif", "float32", (0.0, 1.0), 1.0),
+        ("geoid.tif", "float32", None, 1.0),
+        ("hollow.tif", "float32", None, -99.0),
+        ("wild.tif", "float32", None, 151.0),
     ):
-        place = from_origin(*corner, *((0.01, 0.01) if name == "geoid.tif" else (20.0, 20.0)))
-        more = how | {"crs": {"nosystem.tif": None, "geoid.tif": "EPSG:4326"}.get(name, "EPSG:32650")}
-        with rasterio.open(folder / name, "w", dtype=dtype, transform=place, **more) as file:
+        place = from_origin(*corner, 20.0, 20.0) if corner else from_origin(0.0, 1.0, 0.01, 0.01)
+        crs = None if name == "nosystem.tif" else "EPSG:32650" if corner else "EPSG:4326"
+        more = {"dtype": dtype, "crs": crs, "transform": place, "nodata": None if corner else -99.0}
+        with rasterio.open(folder / name, "w", **how, **more) as file:
             file.write(np.full((120, 150), value, dtype), 1)
     with rasterio.open(folder / "image.png", "w", driver="PNG", width=4, height=4, count=1, dtype="uint8") as file:
         file.write(np.zeros((4, 4), "u1"), 1)
@@ -162,7 +170,7 @@ READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, dict[str, Any]],
         ),
     ),
     "earth": (lambda _: None, lambda folder, _: read_earth_orientation(folder / "eop.txt")),
-    "ground": (lambda _: None, lambda folder, spec: read_ground_points(GroundFileSpec.model_validate(spec), folder)),
+    "ground": (map_files, lambda folder, spec: read_ground_points(GroundFileSpec.model_validate(spec), folder)),
     "map": (map_files, map_used),
     "scene": (scene_files, lambda folder, spec: read_scene(folder / spec.get("file", "DIM_SCENE.XML"))),
     "rpc": (rpc_files, lambda folder, spec: read_rpc(folder / spec["file"])),
@@ -264,6 +272,12 @@ def test_a_file_is_refused_by_words(part: dict[str, Any], row: list[Any], good, 
 
 # --- functions ----------------------------------------------------------------------------------------------
 
+
+def calibrated() -> CalibratedLine:
+    camera = lost().camera
+    return CalibratedLine(camera.pixels, camera.directions, camera.origins, np.eye(3), 0.65)
+
+
 FILE = Path("scene.ntf")
 TRACED = SimulatedAngleRun.__new__(SimulatedAngleRun)
 object.__setattr__(TRACED, "setup", resolve_angle(SCENES / ORBIT / "angle_gf7.yaml"))
@@ -285,6 +299,8 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: command._ground("1 s", "2 m"), InputErrorText, "--lowest, --highest: .*'0 m' and '2000 m'"),
     (lambda: command._ground("5 m", "1 m"), InputErrorText, "--lowest must be below --highest"),
     (lambda: run_export(UNMADE, UNMADE, None, changes={}), ValueError, "only the cameras of an instrument"),
+    (lambda: line_scanner(shaken(), "a", bench.EPOCH, 1e-5, (0.0, 1.0, 2.0)), ValueError, "nodes of the orbit"),
+    (lambda: ground_rows(lost(), calibrated(), np.zeros(4), 0.0), ValueError, "a look misses the Earth"),
     (lambda: angle_camera(UNMADE, None), ValueError, "an instrument's lines need a backend"),
     (lambda: RationalPolynomial.through(PLACES, PLACES), ValueError, "the 180th meridian or a pole"),
     (lambda: sights_of(UNMADE, {}, ("blue",), None, None), SightsError, "no image points of blue"),

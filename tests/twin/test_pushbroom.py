@@ -11,7 +11,7 @@ from analysis.mtf.slanted_edge import measure_edge
 from scenes.specs.load import load_detector
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, TerrainSpec
 from scenes.specs.orbit.setup import load_three_line_camera
-from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, optics
+from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, lost, optics, shaken
 from twin.orbit.flight.line_camera import LineCamera
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.terrain import Terrain
@@ -208,6 +208,22 @@ def test_steep_terrain_is_refused() -> None:
             looked()
 
 
+def test_looks_that_cannot_be_followed_are_refused() -> None:
+    """A window at the image's end, looks past the Earth, an attitude and a terrain that no node follows."""
+    flat, inside = Terrain.flat(600.0), Window(40, 6000, 10, 10)
+    for sensor, window, words in (
+        (lines()["nadir"].sensor, Window(0, 0, 40, 40), "does not lie"),
+        (lost(), Window(64_000, 6000, 40, 40), "a look misses the Earth"),
+        (shaken(), inside, "an attitude so rough"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            look_map(sensor, FRAME, flat, window)
+    grey = Ground(lambda e, n: np.full(np.shape(e), 0.3))
+    posts = 600.0 + 0.3 * np.random.default_rng(1).standard_normal((501, 501))
+    with pytest.raises(ValueError, match="terrain so rough"):
+        photograph("forward", Terrain.through(posts, (1.0, 1.0), (-250.0, -250.0)), grey, 8)
+
+
 HILLS = TerrainSpec.model_validate({"kind": "fractal", "relief": "60 m", "height": "600 m", "exponent": 2.3})
 GROUND = GroundSpec(terrain=HILLS)
 
@@ -218,6 +234,7 @@ def test_what_cannot_be_imaged() -> None:
         ((PLACE[0] + 0.02, PLACE[1]), (60, 60), "place"),
         ((PLACE[0], PLACE[1] + 0.12), (60, 60), "span"),
         (PLACE, (60, 11990), "size"),
+        (PLACE, (12_000, 60), "size"),
     ]
     for place, size, part in cases:
         with pytest.raises(PatchError) as caught:
