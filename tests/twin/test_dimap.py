@@ -12,11 +12,8 @@ import pytest
 from scenes.specs.measured.orbit_data import LineTimesFileSpec
 from scenes.specs.measured.pass_files import PlatformFilesSpec
 from scenes.yaml.errors import InputError
-from tests.tiers import quick
-from tests.twin.dimap_bench import Oracle, Scene, clock, rpc, write
+from tests.twin.dimap_bench import Oracle, Scene, clock, write
 from twin.orbit.conventions.pass_readings import read_line_clocks
-from twin.orbit.export.rational_polynomial import RationalPolynomial
-from twin.orbit.export.rpc_files import read_rpc
 from twin.orbit.flight.earth import east_north_up
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.measured import xml_file
@@ -102,27 +99,6 @@ def test_midnight_within_a_scene_changes_nothing(tmp_path: Path) -> None:
         late, noon = (read_scene(write(tmp_path, replace(scene, start=s))).sensor for s in (scene.start, 43_000.0))
         # texts of times have nanoseconds, in which the satellite moves by 7 um
         assert np.abs(late.ground(row, column, height) - noon.ground(row, column, height)).max() < 3e-5
-
-
-@pytest.mark.parametrize("name", quick(1, SCENES))
-def test_the_rpc_of_the_same_file_agrees(tmp_path: Path, name: str) -> None:
-    """The polynomials go into the product's file by the project's fitter, and come back as the user reads them."""
-    scene = SCENES[name]
-    sensor = read_scene(write(tmp_path, scene)).sensor
-    model = RationalPolynomial.fit(sensor, 0, scene.pixels, (0.0, 3000.0))
-    (tmp_path / "RPC_SCENE.XML").write_text(rpc(model, scene.version))
-    found = read_rpc(tmp_path / "RPC_SCENE.XML")
-    row, column, height = places(scene, 300)
-    height = height.clip(0.0, 3000.0)
-    ground = sensor.ground(row, column, height)
-    longitude, latitude, _ = sensor.earth.geodetic(ground)
-    line, sample = found.image(np.degrees(latitude), np.degrees(longitude), height)
-    # random places do not reach the corners, where the fit is worst; rounding of the offsets is 1e-11
-    assert np.abs(line - row).max() < max(model.error_px[0], 1e-7) * 1.01
-    assert np.abs(sample - column).max() < max(model.error_px[1], 1e-7) * 1.01
-    assert max(model.error_px) < 2e-3
-    back = found.ground(row, column, height)
-    np.testing.assert_allclose(back, np.degrees((latitude, longitude)), rtol=0, atol=2e-3 * 1e-5)  # 2e-3 px of 0.7 m
 
 
 def test_an_orbit_that_begins_with_the_image_is_carried_on(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.jitter import sights
 from twin.orbit.jitter.jitter_numbers import JITTER, blind_multiples
 from twin.orbit.jitter.jitter_report import _warnings as jitter_warnings
-from twin.orbit.jitter.jitter_report import jitter_report
 from twin.orbit.jitter.jitter_run import JitterRun, fly_strip, run_jitter
 from twin.orbit.jitter.sights import SightsError, sights_of
 from twin.orbit.jitter.steady_platform import SteadyPlatform
@@ -154,19 +153,6 @@ def test_the_noise_of_measured_lines_gives_rows_no_oscillation() -> None:
     ask = {"lowest": "25 Hz", "highest": "45 Hz", "height": "300 m"}
     one = setup(attitude={"steering": "yaw"}, points={**points, "height": "300 m"}, search=ask)
     assert not [seed for seed in range(3) if len(searched(one, seed).lines.frequency)]
-
-
-@pytest.mark.second
-def test_an_alias_is_reported_in_words_and_numbers() -> None:
-    """21 Hz on even rows of 10 a second is 1 Hz to them: what cannot be told apart is in result and warnings."""
-    points = {"count": 160, "duration": "10 s", "rows": "100 ms", "height": "300 m"}
-    line = {"frequency": "21 Hz", "amplitude": "0.8 0 0 arcsec", "phase": "0 deg"}
-    ask = {"highest": "4 Hz", "height": "300 m"}
-    found = run_jitter(setup(attitude=attitude(line), points=points, search=ask), None, 2)
-    first = JITTER(found)["passes"]["jitter"]["oscillations"][0]
-    assert min(abs(f - 21.0) for f in (first["frequency_hz"], *first["aliases_hz"])) < 0.02
-    assert first["in_search"] == (first["frequency_hz"] < 4.0)
-    assert any("beyond the search" in text or "may as well be" in text for text in jitter_report(found).warnings)
 
 
 def test_steady_readings_are_those_of_a_pass_without_noise() -> None:
