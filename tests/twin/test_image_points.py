@@ -1,10 +1,13 @@
 """Points measured in rendered images, against the exact sensor; the commands that use them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from analysis.orbit.three_line_model import BIAS
+from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec
@@ -95,6 +98,25 @@ def test_tie_points_are_five_times_better(flown: Simulation, control: MatchedPoi
     # without control the heights are read 100 m off, so that the prediction is worse, and still within reach
     alone = tie_points(flown.patch, spec)
     assert alone.in_all.sum() >= 10
+
+
+@pytest.mark.second
+def test_ground_without_points_is_refused(flown: Simulation) -> None:
+    """A map of other ground, a map and an image of one grey value."""
+    patch, maps = flown.patch, flown.patch.control
+    photo, nadir = maps.orthophoto, flown.patch.images["nadir"]
+    grey = FrozenMap({**patch.images, "nadir": replace(nadir, frame=np.zeros_like(nadir.frame))})
+    for points, wrong, words in (
+        (map_points, replace(patch, control=replace(maps, orthophoto=replace(photo, west=1e5))), "no place of the"),
+        (
+            map_points,
+            replace(patch, control=replace(maps, orthophoto=replace(photo, values=np.zeros_like(photo.values)))),
+            "the orthophoto has no distinct places",
+        ),
+        (tie_points, replace(patch, images=grey), "nadir: no distinct point is seen"),
+    ):
+        with pytest.raises(image_points.PointsError, match=words):
+            points(wrong, asked())
 
 
 def two_patches() -> OrbitCalibrationSpec:

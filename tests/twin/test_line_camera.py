@@ -17,6 +17,7 @@ from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from twin.monitor.truth import LineSight
 from twin.orbit.flight.line_camera import (
     LinePiece,
     along_track_angle,
@@ -131,7 +132,10 @@ def test_traced_lines_between_the_traced_points(gf7_pair, backend, state) -> Non
     assembly = gf7_pair.assembly
     placed = assembly.place([state])
     rng = np.random.default_rng(4)
-    for name, camera in cameras.items():
+    sight = LineSight(gf7_pair, backend).trace([state])[:, 0]
+    for ends, (name, camera) in zip(sight, cameras.items(), strict=True):
+        # what tells the truth of a camera sees the whole line, too
+        np.testing.assert_allclose(ends[[0, -1]], camera.look(np.array([-0.5, camera.pixels - 0.5])), rtol=0, atol=1e-12)
         pixel = np.concatenate([[-0.5, 0.0, camera.pixels - 0.5], rng.uniform(-0.5, camera.pixels - 0.5, 120)])
         y = (pixel - 0.5 * (camera.pixels - 1)) * gf7_pair.cameras[name].spec.line.pitch
         line = np.stack([0 * y, y, 0 * y], axis=-1)

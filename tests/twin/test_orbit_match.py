@@ -90,18 +90,10 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
             "first_pixel_sees": "left",
             "window": {"row": 10, "column": 5, "rows": window.lines, "columns": window.pixels},
         }
-    lines = (folder / "lines.csv").read_text().splitlines()
-    shifted = [lines[0]]
-    for line in lines[1:]:
-        name, number, time = line.split(",")
-        shifted.append(f"{name},{int(number) + 10},{time}")
     # the table of times begins 10 lines before the window, so that its first line is the image's
-    step = 0.7e-3
-    first = {line.split(",")[0]: float(line.split(",")[2]) for line in reversed(lines[1:])}
-    rows = []
-    for name, time in first.items():
-        rows += [f"{name},0,{time - 10 * step!r}", *(r for r in shifted[1:] if r.startswith(f"{name},"))]
-    (tmp_path / "lines.csv").write_text("\n".join([lines[0], *rows]) + "\n")
+    table = [row.split(",") for row in (folder / "lines.csv").read_text().splitlines()[1:]]
+    table = [(name, int(k) and int(k) + 10, float(s) - (0.0 if int(k) else 7e-3)) for name, k, s in table]
+    bench.csv(tmp_path / "lines.csv", ("camera", "line", "time [s]"), *zip(*table, strict=True))
     other = {**data, "images": images, "lines": {**data["lines"], "file": str(tmp_path / "lines.csv")}}
     again = matched(folder, other)
     for name, row in found.measurements.images.items():

@@ -17,6 +17,7 @@ from rasterio.transform import from_origin
 
 import twin.orbit.__main__ as command
 from analysis.orbit.forward_intersection import CalibratedLine
+from optics.numerics.physical_error import UnphysicalError
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resolve_measured_angle
@@ -33,6 +34,7 @@ from twin.laboratory.distortion_run import _check_angles
 from twin.orbit.angle.angle_flight import angle_camera
 from twin.orbit.angle.angle_run import SimulatedAngleRun
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
+from twin.orbit.block.point_workers import PointWorkers
 from twin.orbit.conventions.check_run import run_check
 from twin.orbit.export.estimated_change import ground_rows
 from twin.orbit.export.export_run import read_exportable, run_export
@@ -53,6 +55,7 @@ from twin.orbit.measured.map_part import UserMap
 from twin.orbit.measured.platform_files import platform_table, read_platform
 from twin.orbit.monitoring.monitor_series import MonitorSeries
 from twin.run.cli import InputErrorText
+from twin.run.cluster import ClusterError
 from twin.run.data_files import FrameFacts, tiff
 from twin.run.procedure import BenchError
 
@@ -263,7 +266,7 @@ def test_a_file_is_refused_by_words(part: dict[str, Any], row: list[Any], good, 
             after = edited(before or "", item)
             assert after != before
             file.write_bytes(after.replace("␀", "\0").encode("latin-1"))
-    with pytest.raises((InputError, BenchError)) as caught:
+    with pytest.raises((InputError, BenchError, UnphysicalError)) as caught:
         READERS[part["reader"]][1](tmp_path, spec)
     for word in [words] if isinstance(words, str) else words:
         assert word in str(caught.value)
@@ -277,6 +280,7 @@ def calibrated() -> CalibratedLine:
     return CalibratedLine(camera.pixels, camera.directions, camera.origins, np.eye(3), 0.65)
 
 
+GONE: Any = Ns(submit=lambda *_: Ns(status="lost"), next_finished=lambda look: look())
 FILE = Path("scene.ntf")
 TRACED = SimulatedAngleRun.__new__(SimulatedAngleRun)
 object.__setattr__(TRACED, "setup", resolve_angle(SCENES / ORBIT / "angle_gf7.yaml"))
@@ -298,6 +302,7 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: command._ground("1 s", "2 m"), InputErrorText, "--lowest, --highest: .*'0 m' and '2000 m'"),
     (lambda: command._ground("5 m", "1 m"), InputErrorText, "--lowest must be below --highest"),
     (lambda: run_export(UNMADE, UNMADE, None, changes={}), ValueError, "only the cameras of an instrument"),
+    (lambda: PointWorkers(GONE, 1).results(abs, [(1,)]), ClusterError, "a worker was lost"),
     (lambda: ground_rows(lost(), calibrated(), np.zeros(4), 0.0), ValueError, "a look misses the Earth"),
     (lambda: angle_camera(UNMADE, None), ValueError, "an instrument's lines need a backend"),
     (lambda: RationalPolynomial.through(PLACES, PLACES), ValueError, "the 180th meridian or a pole"),
