@@ -179,8 +179,6 @@ def test_parity_of_the_image_space(truth, scales):
     assert truth["rear_node about Z"][GAMMA] == pytest.approx(+f_y / f_x, rel=1e-3)
 
 
-
-
 def test_the_intersection_angle_grows_with_d_alpha_of_the_forward_camera(gf7_pair, backend):
     turn = 1e-5
     states = [{f"base/{name}": Motion(rotate=(0.0, turn, 0.0))} for name in ("forward", "backward")]

@@ -135,7 +135,8 @@ def test_traced_lines_between_the_traced_points(gf7_pair, backend, state) -> Non
     sight = LineSight(gf7_pair, backend).trace([state])[:, 0]
     for ends, (name, camera) in zip(sight, cameras.items(), strict=True):
         # what tells the truth of a camera sees the whole line, too
-        np.testing.assert_allclose(ends[[0, -1]], camera.look(np.array([-0.5, camera.pixels - 0.5])), rtol=0, atol=1e-12)
+        edges = camera.look(np.array([-0.5, camera.pixels - 0.5]))
+        np.testing.assert_allclose(ends[[0, -1]], edges, rtol=0, atol=1e-12)
         pixel = np.concatenate([[-0.5, 0.0, camera.pixels - 0.5], rng.uniform(-0.5, camera.pixels - 0.5, 120)])
         y = (pixel - 0.5 * (camera.pixels - 1)) * gf7_pair.cameras[name].spec.line.pitch
         line = np.stack([0 * y, y, 0 * y], axis=-1)

@@ -63,8 +63,6 @@ def test_what_is_written_comes_back(tmp_path: Path, model: RationalPolynomial, b
         np.testing.assert_allclose(parts(read_rpc(tmp_path / "RPC.XML")), parts(model), rtol=0, atol=1e-11)
 
 
-
-
 def test_slopes_are_those_of_the_rigorous_sensor(sensor, model: RationalPolynomial) -> None:
     _, itrs = ground_points(sensor, 12, 1)
     longitude, latitude, height = Earth().geodetic(itrs)

@@ -94,8 +94,6 @@ def test_a_correlated_field_has_its_covariance() -> None:
     assert white.std() == pytest.approx(1.0, abs=0.03)
 
 
-
-
 def test_nothing_beyond_the_ground() -> None:
     ground = reflectance(EXTENT, TEXTURE, SEED)
     corners = np.array([EXTENT.west, EXTENT.east]), np.array([EXTENT.south, EXTENT.north])
