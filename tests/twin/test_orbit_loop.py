@@ -31,7 +31,7 @@ def loop_of(*specs: dict) -> LoopModel:
     for k, given in enumerate(specs):
         spec = CorrectionSpec(camera="one", quantity="d_alpha", mechanism="body rotate y", **given)
         effect = np.zeros(count)
-        effect[k], effect[(k + 1) % count] = 2.0 * k + 1.0, 0.1 * (count > 1)
+        effect[(k + 1) % count] = 0.1
         effect[k] = 2.0 * k + 1.0
         correctors.append(Corrector(f"c{k}", spec, None, k, effect, np.zeros(2)))
     nothing = Disturbances(

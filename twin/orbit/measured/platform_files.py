@@ -327,15 +327,17 @@ def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFil
     if ("time" in table) == ("date_time" in table):
         found, allowed = ", ".join(table.columns), "time [s] with `epoch:`, or date_time"
         raise InputError(Issue("times are not said once", table.file, None, (), found, allowed))
-    if "time" in table:
+    try:
+        if "date_time" in table:
+            return Readings.of_texts(table["date_time"].tolist())
         if spec.epoch is None:
             raise spec.error("times in seconds without their epoch", ("epoch",), allowed="reading of the clock at 0 s")
         return Readings.after(spec.epoch, table["time"])
-    try:
-        return Readings.of_texts(table["date_time"].tolist())
     except Problem as problem:
-        row = int(problem.within[0])
-        raise table.error(row, "date_time", problem.problem, problem.found, problem.allowed) from None
+        if problem.within:
+            row = int(problem.within[0])
+            raise table.error(row, "date_time", problem.problem, problem.found, problem.allowed) from None
+        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
 
 
 def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readings, str | None]:
