@@ -20,7 +20,7 @@ from twin.orbit.calibration.campaign import interior_names
 from twin.orbit.calibration.campaign_adjustment import GAUGE, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import surprises
-from twin.orbit.calibration.latitude import fitted
+from twin.orbit.calibration.latitude import fitted, rate_priors
 from twin.orbit.calibration.observations import PassData, image_sigma
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints
@@ -98,6 +98,10 @@ def test_numbers_say_what_their_sigmas_hold(full) -> None:
     # descending at 0.06 deg/s, 4 arcsec times the change of the sine of latitude; measured to true is the way back
     rate = -SETUP.test.errors.star_tracker.thermal.amplitude[1] * np.radians(-0.063)
     assert found["pitch rate"]["truth"] == pytest.approx(rate, rel=0.05)
+    # Student's distribution of two degrees of freedom has no variance
+    for count in (4, 5):
+        few = fitted("yaw", np.linspace(0.5, 0.8, count), np.linspace(1e-4, 2e-4, count), 1e-12 * np.eye(count))
+        assert len(rate_priors(full.campaign, (few,))) == (count == 5)
 
 
 # Effects on the light

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, between, intersect_pair
+from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, intersect_pair
 from optics.geometry.tree import Motion
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from twin.monitor.truth import trace_truth
@@ -127,13 +127,6 @@ def test_intersection_of_two_rays_is_exact_and_knows_its_limits() -> None:
         intersect_pair(line, line, down, down)
     with pytest.raises(ValueError, match="four finite numbers"):
         line.corrected([0.0, np.nan, 0.0, 0.0])
-
-
-def test_values_between_measurements() -> None:
-    values = np.array([[0.0, 1.0, 2.0, 3.0], [10.0, 1.0, 0.0, 4.0]])
-    found = between([-1.0, 0.0, 2.5, 10.0, 12.0], [0.0, 10.0], values)
-    assert found[:, 0] == pytest.approx([0.0, 0.0, 2.5, 10.0, 10.0])
-    assert found[2] == pytest.approx([2.5, 1.0, 1.5, 3.25])
 
 
 # What monitoring buys
