@@ -99,13 +99,12 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
     """The equations of a block.
 
     Args:
-        block: what is observed.
+        block: what is observed; its `check` has found nothing.
         datum: whether a shift that all control points share is an unknown, known to `DATUM`.
 
     Raises:
         BlockError: a block that cannot be used.
     """
-    block.check()
     times = _times(block)
     every: list[Process] = []
     by_pass: dict[tuple[str, str], tuple[Process, ...]] = {}

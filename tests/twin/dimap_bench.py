@@ -1,7 +1,7 @@
-"""DIMAP files of passes that never were, written by hand in the format, and the format's model anew in plain NumPy.
+"""DIMAP files of passes that never were, written by hand in the format, and the format's model anew.
 
-The oracle shares nothing with the program: its own XML parser, Lagrange's polynomial of eight points, quaternions to
-matrices by the textbook, the ellipsoid of constant height by bisection.
+The oracle shares nothing with the program: its own XML parser, Lagrange's polynomial of eight points, and the ellipsoid
+of constant height by a root.
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ from datetime import date, timedelta
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import BarycentricInterpolator
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 
@@ -64,10 +67,8 @@ class Scene:
         speed = (
             radius * n * np.stack([-np.sin(u), np.cos(u) * np.cos(inclination), np.cos(u) * np.sin(inclination)], -1)
         )
-        turn = OMEGA * (seconds - self.start)
-        c, s = np.cos(turn), np.sin(turn)
-        fixed = np.stack([c * place[:, 0] + s * place[:, 1], c * place[:, 1] - s * place[:, 0], place[:, 2]], -1)
-        speed = np.stack([c * speed[:, 0] + s * speed[:, 1], c * speed[:, 1] - s * speed[:, 0], speed[:, 2]], -1)
+        turned = Rotation.from_rotvec(np.outer(seconds - self.start, [0.0, 0.0, -OMEGA]))
+        fixed, speed = turned.apply(place), turned.apply(speed)
         return fixed, speed - np.cross([0.0, 0.0, OMEGA], fixed)
 
     def quaternions(self, seconds: np.ndarray) -> np.ndarray:
@@ -76,28 +77,10 @@ class Scene:
         down = -place / np.linalg.norm(place, axis=1, keepdims=True)
         right = np.cross(down, speed)
         right /= np.linalg.norm(right, axis=1, keepdims=True)
-        level = np.stack([np.cross(right, down), right, down], axis=-1)
-        t = seconds - self.start
-        found = []
-        for matrix, pitch, roll in zip(level, self.pitch + self.rate[0] * t, self.roll + self.rate[1] * t, strict=True):
-            c, s = np.cos(pitch), np.sin(pitch)
-            ahead = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-            c, s = np.cos(roll), np.sin(roll)
-            aside = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
-            found.append(_quaternion(matrix @ ahead @ aside))
-        return np.array([q if q @ found[0] > 0 else -q for q in found])
-
-
-def _quaternion(m: np.ndarray) -> np.ndarray:
-    k = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], 0, 0, 0],
-            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0, 0],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(k)[1][:, -1]
+        level = Rotation.from_matrix(np.stack([np.cross(right, down), right, down], axis=-1))
+        look = np.array([self.pitch, self.roll]) + np.outer(seconds - self.start, self.rate)
+        found = np.roll((level * Rotation.from_euler("YX", look)).as_quat(), 1, axis=1)
+        return found * np.sign(found @ found[0])[:, None]
 
 
 def clock(scene: Scene, second: float) -> str:
@@ -134,35 +117,12 @@ def dimap(scene: Scene) -> str:
     settings = "".join(f"<{name}>{value}</{name}>" for name, value in scene.settings.items())
     unit = "microsecond" if scene.version.startswith("3") else "ms"
     period = scene.period * (1e6 if unit == "microsecond" else 1e3)
-    return f"""<?xml version="1.0" encoding="UTF-8" standalone="no"?>
-<Dimap_Document>
-  <Metadata_Identification><METADATA_FORMAT version="{scene.version}">DIMAP</METADATA_FORMAT>
-    <METADATA_PROFILE>{scene.profile}</METADATA_PROFILE><METADATA_SUBPROFILE>PRODUCT</METADATA_SUBPROFILE>
-  </Metadata_Identification>
-  <Dataset_Identification><DATASET_NAME>SCENE_P</DATASET_NAME></Dataset_Identification>
-  <Geoposition><Geoposition_Models><Rational_Function_Model><Component><COMPONENT_PATH href="RPC_SCENE.XML" />
-  </Component></Rational_Function_Model></Geoposition_Models></Geoposition>
-  <Processing_Information><Product_Settings><Geometric_Settings>{settings}</Geometric_Settings>
-  </Product_Settings></Processing_Information>
-  <Raster_Data><Raster_Dimensions><NROWS>{scene.lines}</NROWS><NCOLS>{scene.pixels}</NCOLS><NBANDS>1</NBANDS>
-  </Raster_Dimensions></Raster_Data>
-  <Geometric_Data><Refined_Model>
-      <Time>
-        <Time_Range><START>{clock(scene, scene.start)}</START><END>{clock(scene, last)}</END></Time_Range>
-        <Time_Stamp><LINE_PERIOD unit="{unit}">{period!r}</LINE_PERIOD></Time_Stamp>
-      </Time>
-      <Ephemeris><EPHEMERIS_USED>CORRECTED</EPHEMERIS_USED><Point_List>
-{points}
-      </Point_List></Ephemeris>
-      <Attitudes>{_attitude(scene, last)}</Attitudes>
-      <Geometric_Calibration><Instrument_Calibration>
-          <Swath_Range><FIRST_COL>{scene.first_column}</FIRST_COL>
-            <LAST_COL>{scene.first_column + scene.pixels - 1}</LAST_COL></Swath_Range>
-          {looks}
-      </Instrument_Calibration></Geometric_Calibration>
-  </Refined_Model></Geometric_Data>
-</Dimap_Document>
-"""
+    text = Path(__file__).with_name("dimap_scene.xml").read_text("utf-8")
+    ends = {"start": clock(scene, scene.start), "end": clock(scene, last)}
+    more = {"last_column": scene.first_column + scene.pixels - 1, "attitude": _attitude(scene, last)}
+    return text.format(
+        scene=scene, settings=settings, unit=unit, period=period, points=points, looks=looks, **ends, **more
+    )
 
 
 def _attitude(scene: Scene, last: float) -> str:
@@ -214,19 +174,8 @@ def rpc(model: RationalPolynomial, version: str = "2.15") -> str:
             strict=True,
         )
     )
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<Dimap_Document>
-  <Metadata_Identification><METADATA_FORMAT version="{version}">DIMAP</METADATA_FORMAT>
-    <METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE><METADATA_SUBPROFILE>RPC</METADATA_SUBPROFILE>
-  </Metadata_Identification>
-  <Rational_Function_Model><Global_RFM>
-      <{ground}>
-{rows}      </{ground}>
-      <RFM_Validity>
-{sizes}      </RFM_Validity>
-  </Global_RFM></Rational_Function_Model>
-</Dimap_Document>
-"""
+    text = Path(__file__).with_name("dimap_rpc.xml").read_text("utf-8")
+    return text.format(version=version, ground=ground, rows=rows, sizes=sizes)
 
 
 def write(folder: Path, scene: Scene, name: str = "DIM_SCENE.XML") -> Path:
@@ -271,16 +220,8 @@ class Oracle:
         return 3600.0 * int(hour) + 60.0 * int(minute) + float(second)
 
     def _lagrange(self, t: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        k = int(np.clip(np.searchsorted(x, t) - 4, 0, len(x) - 8)) if len(x) >= 8 else 0
-        x, y = x[k : k + 8], y[k : k + 8]
-        total = np.zeros(y.shape[1])
-        for i in range(len(x)):
-            weight = 1.0
-            for j in range(len(x)):
-                if j != i:
-                    weight *= (t - x[j]) / (x[i] - x[j])
-            total += weight * y[i]
-        return total
+        k = int(np.clip(np.searchsorted(x, t) - 4, 0, max(len(x) - 8, 0)))
+        return np.asarray(BarycentricInterpolator(x[k : k + 8], y[k : k + 8])(t))
 
     def ground(self, row: float, column: float, height: float) -> np.ndarray:
         """Where a pixel sees the ground, Earth-fixed, metres."""
@@ -290,26 +231,16 @@ class Oracle:
             q = np.array([sum(c * u**n for n, c in enumerate(part)) for part in self.parts])
         else:
             q = self._lagrange(t, *self.samples)
-        w, x, y, z = q / np.sqrt(q @ q)
-        turn = np.array(
-            [
-                [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-            ]
-        )
+        turn = Rotation.from_quat(np.roll(q, -1)).as_matrix()
         c = column + self.first - 1
         psi = [sum(a * c**n for n, a in enumerate(terms)) for terms in (self.xlos, self.ylos)]
         look = turn @ np.array([psi[1], -psi[0], 1.0])
         station = self._lagrange(t, self.time, self.place)
-        low, high = 0.0, 1.2e6
         look = look / np.linalg.norm(look)
         # the nearer crossing of the surface of this height lies before the point of closest approach
-        high = min(high, -station @ look)
-        for _ in range(90):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if _height(station + middle * look) > height else (low, middle)
-        return station + 0.5 * (low + high) * look
+        ends = 0.0, min(1.2e6, -station @ look)
+        away = brentq(lambda d: _height(station + d * look) - height, *ends, xtol=1e-9)
+        return station + away * look
 
 
 def _height(point: np.ndarray) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scenes.specs.orbit.flight import OrbitSpec
+from scenes.yaml.yaml_file import read_yaml
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.trajectory import Attitude, Trajectory
@@ -112,6 +113,22 @@ COMMENT states""".splitlines()
         lines.append(f"{calendar(t, scale)} " + " ".join(repr(float(x)) for x in (*r, *v)))
     path.write_text("\n".join(lines) + "\n", "utf-8")
     return path
+
+
+def oem_xml(path: Path) -> None:
+    s = sampled("GCRS", 10.0)
+    states = "\n".join(
+        f"<stateVector><EPOCH>{calendar(t)}</EPOCH>"
+        + "".join(f"<{n}>{float(v)!r}</{n}>" for n, v in zip("XYZ", r / 1e3, strict=True))
+        + "".join(f"<{n}_DOT>{float(v)!r}</{n}_DOT>" for n, v in zip("XYZ", w / 1e3, strict=True))
+        + "</stateVector>"
+        for t, r, w in zip(s.seconds, s.position, s.velocity, strict=True)
+    )
+    meta = "<OBJECT_ID>A</OBJECT_ID><CENTER_NAME>EARTH</CENTER_NAME><REF_FRAME>GCRF</REF_FRAME>"
+    path.write_text(
+        f'<?xml version="1.0"?><oem id="CCSDS_OEM_VERS" version="2.0"><body><segment><metadata>{meta}'
+        f"<TIME_SYSTEM>UTC</TIME_SYSTEM></metadata><data>{states}</data></segment></body></oem>"
+    )
 
 
 def aem(path: Path, scale: str = "UTC", direction: str = "A2B", first: bool = False, step: float = 0.25) -> Path:
@@ -225,30 +242,7 @@ def check_files(
         for k in (0, LINES - 1)
     ]
     csv(folder / "lines.csv", ("camera", "line", "date_time"), *zip(*times, strict=True))
-    return {
-        "name": "pass",
-        "camera": "th1",
-        "platform": {
-            "orbit": {"file": "orbit.csv", "frame": "ITRS", "time_scale": "UTC"},
-            "attitude": {
-                "file": "attitude.csv",
-                "frame": "ITRS",
-                "time_scale": "UTC",
-                "scalar": "last",
-                "turns": "body_to_frame",
-                "body_axes": AXES,
-            },
-            "earth": {"ut1_utc": f"{EARTH.dut1} s"},
-        },
-        "lines": {"file": "lines.csv", "time_scale": "UTC", "moment": "middle"},
-        "ground": {"file": "ground.csv", "crs": "EPSG:4979", "sigma": ["1 m", "1 m"]},
-        "image_points": {
-            "file": "image_points.csv",
-            "centre": "integer",
-            "first_pixel": 0,
-            "first_pixel_sees": "right",
-        },
-    }
+    return specification("check")
 
 
 def match_files(folder: Path, flown: Any) -> dict[str, object]:
@@ -276,21 +270,8 @@ def match_files(folder: Path, flown: Any) -> dict[str, object]:
     control = flown.patch.control
     (folder / "photo.tiff").write_bytes(tiff(control.orthophoto.values[None], map_facts(control.orthophoto, "")))
     (folder / "dem.tiff").write_bytes(tiff(control.dem.values[None], map_facts(control.dem, "", heights=True)))
-    time = {"time_scale": "UTC", "epoch": flown.spec.orbit.epoch}
-    return {
-        "name": "pass",
-        "camera": "th1",
-        "platform": {
-            "orbit": {"file": "orbit.csv", "frame": "ITRS", **time},
-            "attitude": {
-                **{"file": "attitude.csv", "frame": "ITRS", **time},
-                **{"scalar": "last", "turns": "body_to_frame", "body_axes": AXES},
-            },
-        },
-        "lines": {"file": "lines.csv", "moment": "middle", **time},
-        "images": images,
-        "orthophoto": {"file": "photo.tiff"},
-        "dem": {"file": "dem.tiff"},
-        "control_sigma": ["1 m", "2 m"],
-        "points": {"control": 60, "check": 20, "tie": 40, "reach": 40, "template": 31},
-    }
+    return {**specification("match"), "images": images}
+
+
+def specification(kind: str) -> dict[str, Any]:
+    return dict(read_yaml(Path(__file__).with_name("orbit_passes.yaml")).data[kind])

@@ -1,7 +1,7 @@
 """A pass of th1 over 40 N 116 E for tests of its images, and grounds by formulas."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -10,6 +10,7 @@ from scenes.specs.load import load_detector
 from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.orbit.setup import load_three_line_camera
 from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.jitter import Jitter
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
@@ -49,3 +50,15 @@ def lines() -> dict[str, ImagedLine]:
 @cache
 def optics() -> dict[str, LineOptics]:
     return optics_of(load_three_line_camera("th1"), LINES, LINE_TIME, {"th1_line": load_detector("th1_line")})
+
+
+def lost() -> Sensor:
+    """The nadir line turned so far that it looks past the Earth."""
+    nadir = lines()["nadir"].sensor
+    return replace(nadir, trajectory=replace(nadir.trajectory, attitude=Attitude(offset=(0.0, 1.4, 0.0))))
+
+
+def shaken() -> Sensor:
+    """The nadir line for 100 lines of a body that shakes a hundred times from line to line."""
+    nadir, jitter = lines()["nadir"].sensor, Jitter(np.array([1.37e5]), np.full((1, 3), 1e-3), np.zeros((1, 3)))
+    return replace(nadir, trajectory=replace(nadir.trajectory, jitter=jitter), first_line_time=0.0, lines=100)

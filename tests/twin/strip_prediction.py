@@ -31,7 +31,9 @@ def predicted(campaign: Campaign, one: FieldPass) -> tuple[np.ndarray, np.ndarra
     seen = (project @ shared[in_ties]).T
     answer = -np.linalg.solve(seen @ shared[in_ties] + prior, seen)
     covariance, own = np.linalg.inv(prior), np.eye(len(prior))
-    gain = _intersection(campaign, one, in_check, shared, point, where, covariance, control + ties, check)
+    lon, lat, _ = one.data.earth.geodetic(one.check_ground.mean(axis=0))
+    rows = (in_check, shared, point, where)
+    gain = _intersection(east_north_up(lon, lat), rows, covariance, control + ties, check)
     found = []
     for by_ties, by_shared in ((0.0 * answer, own), (answer, own + answer @ shared[in_ties])):
         b, c = (gain @ shared[in_check] @ noise for noise in (by_ties, by_shared))
@@ -55,31 +57,17 @@ def _derivatives(
     state = State(values, (ground,), np.zeros(shared.size))
     at = assemble([field], laboratory, parameters, state, campaign.noise, (), weights, shared)
     where = np.repeat(np.concatenate([r.point for r in field.rays.values()]), 2)
-    return (
-        at.design_shared.toarray(),
-        at.design_point.toarray(),
-        where,
-        shared.precision.toarray(),
-    )
+    return at.design_shared.toarray(), at.design_point.toarray(), where, shared.precision.toarray()
 
 
 def _intersection(
-    campaign: Campaign,
-    one: FieldPass,
-    rows: np.ndarray,
-    shared: np.ndarray,
-    point: np.ndarray,
-    where: np.ndarray,
-    covariance: np.ndarray,
-    first: int,
-    count: int,
+    axes: np.ndarray, at: tuple[np.ndarray, ...], covariance: np.ndarray, first: int, count: int
 ) -> np.ndarray:
     """(3n, rows) from whitened image points of the check points to their east, north, up: each ray weighs by all of
     its own noise, what rays share does not count."""
+    rows, shared, point, where = at
     places = np.flatnonzero(rows)
     gain = np.zeros((3 * count, len(places)))
-    lon, lat, _ = one.data.earth.geodetic(one.check_ground.mean(axis=0))
-    axes = east_north_up(lon, lat)
     for k in range(count):
         mine = np.flatnonzero(where[places] == first + k)
         at = places[mine]

@@ -1,20 +1,16 @@
 """Cameras that drift from field to field in an in-orbit calibration, with and without an on-board monitor."""
 
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import twin.orbit.__main__ as command
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
-from tests.twin.commands import edited_copy, invoke, refused
 from twin.orbit.calibration.camera_drift import (
     adjust_field_with_readings,
     adjust_with_readings,
@@ -28,7 +24,6 @@ from twin.orbit.calibration.schemes import FieldErrors
 from twin.orbit.calibration.schemes import tested as at_checks
 from twin.orbit.flight.line_camera import drifted_payload
 
-run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "calibrate_monitor.yaml"
 WHOLE = resolve_calibration(EXAMPLE)
 KEPT = ("Beijing", "Anhui", "Xinjiang")
@@ -113,29 +108,3 @@ def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
     cameras = {k: alone.cameras[k].drifted(last.readings[k]) for k in LINES}
     errors = at_checks(campaign, last, cameras, alone.bias(KEPT[0]))
     assert FieldErrors.pooled([errors]).height_rms == pytest.approx(abs(height_per_arcsec(campaign)), rel=0.05)
-
-
-BAD = {
-    "line": ("  backward: {angles", "  after: {angles", "drift.after", ["no such line", "backward"]),
-    "negative": (
-        "principal_distance: 10 um}",
-        "principal_distance: -10 um}",
-        "monitor.principal_distance",
-        ["outside the limits"],
-    ),
-    "negative drift": ("forward: {angles: [1 arcsec", "forward: {angles: [-1 arcsec", "drift", ["outside"]),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input(case: str, tmp_path: Path) -> None:
-    old, new, key, words = BAD[case]
-    refused(run, "calibrate", edited_copy(EXAMPLE, tmp_path, (old, new)), key, words)
-
-
-def test_a_monitor_needs_a_drift(tmp_path: Path) -> None:
-    lines = EXAMPLE.read_text("utf-8").splitlines()
-    start = next(k for k, line in enumerate(lines) if line.startswith("drift:"))
-    path = tmp_path / "small.yaml"
-    path.write_text("\n".join(lines[:start] + lines[start + 3 :]), "utf-8")
-    refused(run, "calibrate", path, "monitor", ["nothing that it reads", "drift"])

@@ -1,27 +1,21 @@
 """Passes of an in-orbit calibration adjusted on tie points before check points are intersected."""
 
-from functools import partial
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.linalg import eigh
 from scipy.stats import chi2
 
-import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
-from tests.twin.commands import edited_copy, invoke, refused
 from tests.twin.strip_prediction import predicted
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.schemes import tested as at_checks
 from twin.orbit.calibration.strip import adjusted_strip
 from twin.orbit.calibration.strip import tested_in_strip as in_strip
 
-run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "calibrate_strip.yaml"
 WHOLE = resolve_calibration(EXAMPLE)
 ARCSEC = np.pi / 648000
@@ -46,36 +40,21 @@ def setup_with(slow: float) -> CalibrationSetup:
     return WHOLE.model_copy(update={"test": test.model_copy(update=changes)})
 
 
-def mean_squares(before: np.ndarray, after: np.ndarray, passes: int) -> np.ndarray:
-    """(2, draws) mean squares of so many passes by covariances (n, n) before and after: what an adjustment takes out is
-    independent of what it leaves."""
-    rng, drawn = np.random.default_rng(9), 20000
-    rows = []
-    for covariance in (after, before - after):
-        values, axes = np.linalg.eigh(covariance)
-        half = axes * np.sqrt(np.maximum(values, 0.0))
-        rows.append(rng.standard_normal((drawn * passes, len(half))) @ half.T)
-    both = np.array([rows[0] + rows[1], rows[0]])
-    return np.mean(both.reshape(2, drawn, -1) ** 2, axis=2)
-
-
 @pytest.mark.second
 def test_slow_errors_are_taken_out_as_the_covariances_say() -> None:
     """Two passes with the true camera, 5 arcsec every 20 s, 200 ties; false alarm 1e-3 for each limit.
 
-    Mean squares of heights before and after, and their ratio, lie within what draws with all covariances give. Points
-    share the few slow errors of a pass, so that these limits are wide. Sharper is a look at the three shapes of height
-    errors over the points that gain most (variances fall to a tenth, a quarter, a half): what is left of them and
-    what was taken out are independent and each have their predicted variance. Nothing taken out is refused for certain.
+    Looked at are the three shapes of height errors over the points that gain most (variances fall to a tenth, a
+    quarter, a half): what is left of them and what was taken out are independent and each have their predicted
+    variance. Nothing taken out is refused for certain.
     """
-    squares, fits, passes = [], np.zeros(2), 2
+    fits, passes = np.zeros(2), 2
     for seed in range(passes):
         campaign = fly_fields(setup_with(5.0), np.random.SeedSequence(seed))
         one = campaign.passes[0]
         strip = adjusted_strip(campaign, one, campaign.truth, one.bias)
         before = at_checks(campaign, one, campaign.truth, one.bias)
         after = in_strip(campaign, one, strip, campaign.truth, one.bias)
-        squares.append((before.height_rms**2, after.height_rms**2))
         assert 1e-6 < strip.p_value < 1.0 - 1e-6
         heights = [law[:, 2, :, 2] for law in predicted(campaign, one)]
         gains, shapes = eigh(*heights)
@@ -84,23 +63,5 @@ def test_slow_errors_are_taken_out_as_the_covariances_say() -> None:
         assert gains[-1] > 5.0
     for fit in fits:
         assert 5e-4 < chi2.sf(fit, passes * 3) < 1.0 - 5e-4
-    drawn, found = mean_squares(*heights, passes), np.mean(squares, axis=0)
-    for value, row in ((found[0], drawn[0]), (found[1], drawn[1]), (found[1] / found[0], drawn[1] / drawn[0])):
-        least, most = np.quantile(row, [5e-4, 1.0 - 5e-4])
-        assert least < value < most
     # of the RMS; it changes with places of points by some thousandths
     assert np.sqrt(np.trace(heights[1]) / np.trace(heights[0])) == pytest.approx(0.52, abs=0.01)
-
-
-BAD = {
-    "few ties": ("ties: 300", "ties: 5", "strip.ties", ["too few tie points", "20 or more"]),
-    "long strip": ("length: 360 km", "length: 990 km", "strip.length", ["tie points", "shorter strip"]),
-    "exact": ("image: 0.3", "image: 0.3\n  switched_on: false", "strip", ["nothing to adjust"]),
-    "interval": ("interval: 20 s", "interval: 0 s", "errors.star_tracker.slow.interval", ["greater than zero"]),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input(case: str, tmp_path: Path) -> None:
-    old, new, key, words = BAD[case]
-    refused(run, "calibrate", edited_copy(EXAMPLE, tmp_path, (old, new)), key, words)

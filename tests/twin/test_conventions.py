@@ -15,8 +15,7 @@ from scenes.models.camera_model import collimated, field_direction
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import ElementaryMotion, line_family
-from twin.monitor.truth import LineSight, trace_truth, truth_jacobian
-from twin.orbit.flight.line_camera import traced_line_cameras
+from twin.monitor.truth import trace_truth, truth_jacobian
 
 CAMERA = "forward"
 PLANE = f"base/{CAMERA}/focal_plane"
@@ -178,41 +177,6 @@ def test_parity_of_the_image_space(truth, scales):
     assert truth["rear_node about Y"][ALPHA] == pytest.approx(-f_y / f_x, rel=1e-3)
     assert truth["rear_node about X"][BETA] == pytest.approx(-1.0, rel=1e-3)
     assert truth["rear_node about Z"][GAMMA] == pytest.approx(+f_y / f_x, rel=1e-3)
-
-
-def test_principal_distance_is_eq_3_of_paper_004(gf7_pair, backend):
-    """F = sum(L tan W) / sum(tan^2 W), here from collimated beams traced forward, not from backward chief rays."""
-    model = gf7_pair.cameras[CAMERA]
-    half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
-    bare = model.bare_assembly()
-    angle = np.linspace(-1, 1, 41) * np.arctan(half / model.line_principal_distance)
-    travel = np.array([field_direction(model.spec, w, 0.0) for w in angle])
-    launch = collimated(backend, assemble(bare, [("M1", "M2")]), travel, np.zeros((1, 2)))[:, 0]
-    hits = trace(backend, assemble(bare, ["imaging"]), make_rays(backend, launch, travel)).numpy()[0][0]
-    sight = -travel @ model.camera_frame.rotation
-    tangent = -sight[:, 1] / sight[:, 2]
-    position = hits[:, 0]
-    eq_3 = np.sum(position * tangent) / np.sum(tangent**2)
-    assert trace_truth(gf7_pair, backend, [{}]).principal_distance[CAMERA] == pytest.approx(eq_3, rel=2e-4)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
-def test_the_truth_and_the_pixels_in_orbit_see_the_whole_line(name: str, instrument, backend):
-    """The looks of its very ends, sent back into the camera, arrive at the outer edges of the first and last pixels."""
-    chosen = instrument(name)
-    sight = LineSight(chosen, backend).trace([{}])[:, 0]
-    lines = traced_line_cameras(chosen, backend)
-    for looks, (camera, model) in zip(sight, chosen.cameras.items(), strict=True):
-        line, seen = model.spec.line, lines[camera]
-        assert seen.pixels == line.pixels
-        edges = np.array([-0.5, line.pixels - 0.5])
-        np.testing.assert_allclose(looks[[0, -1]], seen.look(edges), rtol=0, atol=1e-14)
-        start = seen.origin(edges) + 5.0 * looks[[0, -1]]
-        imaging = assemble(chosen.assembly, [f"{camera}/imaging"])
-        hits = trace(backend, imaging, make_rays(backend, start, -looks[[0, -1]])).numpy()[0][0]
-        # rounding of a path of 20 m; a pixel is 7e-6 m
-        np.testing.assert_allclose(hits[:, 1], [-0.5 * 7e-6 * line.pixels, 0.5 * 7e-6 * line.pixels], atol=1e-12)
 
 
 def test_the_intersection_angle_grows_with_d_alpha_of_the_forward_camera(gf7_pair, backend):

@@ -10,7 +10,6 @@ import rasterio
 from rasterio.transform import from_origin
 
 from scenes.specs.measured.pass_files import GroundFileSpec, RasterFileSpec
-from scenes.yaml.errors import InputError
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.ground.grid import GroundFrame
@@ -113,100 +112,6 @@ def test_heights_above_a_geoid(tmp_path: Path, ending: str) -> None:
     np.testing.assert_allclose(height - PLACES[:, 2], 0.1 * (90.0 - lat) + east, rtol=0, atol=1e-5)
 
 
-def test_a_geoid_that_does_not_reach(tmp_path: Path) -> None:
-    """Nor one that holds nothing there, nor one of other numbers than undulations."""
-    table(tmp_path, PLACES[:1])
-    for west, value, words in (
-        (10.0, 0.0, "beyond the grid of the geoid"),
-        (114.0, -99.0, "holds nothing"),
-        (114.0, 151.0, "no heights of a geoid"),
-    ):
-        how = {"driver": "GTiff", "width": 4, "height": 4, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-        place = from_origin(west, 42.0, 1.0, 1.0)
-        with rasterio.open(tmp_path / "n.tif", "w", transform=place, nodata=-99.0, **how) as file:
-            file.write(np.full((4, 4), value, "f4"), 1)
-        with pytest.raises(InputError, match=words):
-            read(tmp_path, file="g.csv", crs="EPSG:4326", heights="geoid", geoid="n.tif", sigma=["1 m", "1 m"])
-
-
-BASE = {"file": "g.csv", "crs": "EPSG:4979", "sigma": ["1 m", "1 m"]}
-GOOD = "point,latitude [deg],longitude [deg],height [m]\na,40,116,10\n"
-WRONG_CSV = [
-    (GOOD, {"crs": None}, "system of the coordinates is not said"),
-    (GOOD, {"crs": "EPSG:99999"}, "no such coordinate reference system"),
-    (GOOD, {"crs": "EPSG:4326"}, "does not say what heights are counted from"),
-    (GOOD, {"heights": "ellipsoid"}, "says itself what its heights are"),
-    (GOOD, {"crs": "EPSG:4326+5773"}, "no exact way"),
-    (GOOD, {"crs": "EPSG:32650", "heights": "ellipsoid"}, "are not coordinates of"),
-    (GOOD, {"sigma": None}, "a point without sigmas"),
-    (GOOD.replace("40,116", "116,40"), {}, "no longitude and latitude"),
-    (GOOD.replace(",10", ",10000000"), {}, "no place on the ground"),
-    (GOOD + "a,41,116,0\n", {}, "there twice"),
-    (GOOD.replace("height [m]", "height"), {}, "without a unit"),
-    (GOOD.replace("height [m]", "height [m],x [m]").replace(",10", ",10,1"), {}, "one complete set"),
-    (GOOD.replace("point,", "point,role,").replace("a,", "a,boss,"), {}, "no such role"),
-    (
-        GOOD.replace("height [m]", f"height [m],sigma [m],{','.join(SIGMAS)}").replace(",10", ",10,1,1,1,1"),
-        {},
-        "in two ways",
-    ),
-    (GOOD.replace("height [m]", "height [m],sigma_up [m]").replace(",10", ",10,1"), {}, "sigmas are not complete"),
-]
-
-
-POINT = {"type": "Feature", "id": "a", "properties": {}, "geometry": {"type": "Point", "coordinates": [116, 40, 1]}}
-WRONG_JSON = [
-    ("{", "not JSON"),
-    ("[" * 100_000, "nested too deeply|not JSON"),
-    ("[]", "no features"),
-    ({"features": []}, "no features"),
-    ({"features": [1]}, "not a feature"),
-    ({"features": [{**POINT, "geometry": None}]}, "not a point"),
-    ({"features": [{**POINT, "geometry": {"type": "LineString", "coordinates": []}}]}, "not a point"),
-    ({"features": [{**POINT, "geometry": {"type": "Point", "coordinates": [1, 2]}}]}, "not a place"),
-    ({"features": [{**POINT, "geometry": {"type": "Point", "coordinates": [1, 2, "3"]}}]}, "not a place"),
-    ('{"features": [{"id": 1, "geometry": {"type": "Point", "coordinates": [1, 2, NaN]}}]}', "not a place"),
-    ('{"features": [{"id": 1, "geometry": {"type": "Point", "coordinates": [1, 2, 1e999]}}]}', "not a place"),
-    ({"features": [{**POINT, "id": None}]}, "without a name"),
-    ({"features": [POINT, POINT]}, "there twice"),
-    ({"features": [POINT], "crs": {"type": "name"}}, "member `crs`"),
-    ({"features": [{**POINT, "properties": {"sigma_east": -1}}]}, "not sigmas"),
-    ({"features": [{**POINT, "properties": {"role": 3}}]}, "no such role"),
-]
-
-
-WRONG_GCP = [
-    ("", "no points"),
-    ("1 40 116 10 1 1\n", "not a ground control point"),
-    ("1 40 116 10 1 1 1 image.tif 3\n", "not a ground control point"),
-    ("1 40 116 ten 1 1 1\n", "not a number"),
-    ("1 40 116 inf 1 1 1\n", "not a finite number"),
-    ("1 40 116 10 1 0 1\n", "not a sigma"),
-    ("1 40 116 10 1 -1 1\n", "not a sigma"),
-    ("1 40 116 10 1 1 1 image.tif 3 4 0 1\n", "not a sigma"),
-    ("1 40 116 10 1 1 1 image.tif 3 x 1 1\n", "not a number"),
-    ("1 40 116 10 1 1 1\n1 41 116 10 1 1 1\n", "there twice"),
-    ("1 116 40 10 1 1 1\n", "no longitude and latitude"),
-    ("1 40 116 1e5 1 1 1\n", "no place on the ground"),
-]
-
-
-WRONG = [
-    *(("csv", text, {**BASE, **change}, told) for text, change, told in WRONG_CSV),
-    *(("geojson", data, {"sigma": ["1 m", "1 m"]}, told) for data, told in WRONG_JSON),
-    *(("gcp", text, {"crs": "EPSG:4979"}, told) for text, told in WRONG_GCP),
-]
-
-
-@pytest.mark.parametrize("case", WRONG, ids=[f"{case[0]}-{k}" for k, case in enumerate(WRONG)])
-def test_a_file_of_points_that_is_wrong(tmp_path: Path, case: tuple[Any, ...]) -> None:
-    kind, data, said, told = case
-    (tmp_path / f"g.{kind}").write_text(data if isinstance(data, str) else json.dumps(data))
-    with pytest.raises(InputError, match=told) as error:
-        read(tmp_path, **{k: v for k, v in {**said, "file": f"g.{kind}"}.items() if v is not None})
-    assert kind == "csv" or error.value.file.endswith(f"g.{kind}")
-
-
 # --- maps -------------------------------------------------------------------------------------------------
 
 FRAME = GroundFrame(np.radians(116.0), np.radians(40.0))
@@ -270,55 +175,6 @@ def test_a_projected_map_keeps_its_pixels_and_its_gaps(tmp_path: Path) -> None:
     assert part.values.size < values.size
 
 
-WRONG_MAP = [
-    ({"file": "nothing.tif"}, "no such file"),
-    ({"file": "text.tif"}, "not a raster"),
-    ({"file": "cut.tif"}, "not a raster|heights|without values"),
-    ({"file": "plain.tif"}, "without a place"),
-    ({"file": "utm.tif"}, "heights are counted from is not said"),
-    ({"file": "utm.tif", "heights": "ellipsoid", "band": 2}, "no such band"),
-    ({"file": "utm.tif", "heights": "ellipsoid", "crs": "EPSG:4326"}, "says another system"),
-    ({"file": "utm.tif", "heights": "geoid", "geoid": "utm.tif"}, "a geoid in another system"),
-    ({"file": "complex.tif", "heights": "ellipsoid"}, "no grey values or heights"),
-    ({"file": "high.tif", "heights": "ellipsoid"}, "no heights of ground"),
-    ({"file": "far.tif", "heights": "ellipsoid"}, "does not show what the images show"),
-    ({"file": "image.png", "heights": "ellipsoid"}, "a raster of another format"),
-    ({"file": "tall.tif", "heights": "ellipsoid"}, "no heights of ground"),
-    ({"file": "empty.tif", "heights": "ellipsoid"}, "a map without values"),
-    ({"file": "utm.tif", "heights": "ellipsoid", "crs": "EPSG:99999"}, "no system that PROJ knows"),
-]
-
-
-@pytest.mark.parametrize(("said", "told"), WRONG_MAP)
-def test_a_map_that_is_wrong(tmp_path: Path, said: dict[str, Any], told: str) -> None:
-    utm(tmp_path / "utm.tif")
-    (tmp_path / "text.tif").write_text("no TIFF")
-    (tmp_path / "cut.tif").write_bytes((tmp_path / "utm.tif").read_bytes()[:3000])
-    (tmp_path / "plain.tif").write_bytes(tiff(np.zeros((1, 40, 40), "f4"), map_facts(raster(), "").__class__()))
-    with rasterio.open(tmp_path / "image.png", "w", driver="PNG", width=4, height=4, count=1, dtype="uint8") as file:
-        file.write(np.zeros((4, 4), "u1"), 1)
-    how = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "crs": "EPSG:32650"}
-    for name, dtype, corner, value in (
-        ("complex.tif", "complex64", (499_000.0, 4_429_000.0), 1.0),
-        ("high.tif", "float32", (499_700.0, 4_428_400.0), -32768.0),
-        ("tall.tif", "float32", (499_700.0, 4_428_400.0), 15_000.0),
-        ("empty.tif", "float32", (499_700.0, 4_428_400.0), np.nan),
-        ("far.tif", "float32", (299_000.0, 4_429_000.0), 1.0),
-    ):
-        place = from_origin(*corner, 20.0, 20.0)
-        with rasterio.open(tmp_path / name, "w", dtype=dtype, transform=place, **how) as file:
-            file.write(np.full((40, 40), value, dtype), 1)
-    frame = GroundFrame(np.radians(117.0), np.radians(40.0))
-
-    def used() -> None:
-        user = UserMap.open(RasterFileSpec.model_validate(said), tmp_path, heights=True)
-        user.limits()
-        user.part(frame, (-400.0, 500.0, -300.0, 600.0), heights=True)
-
-    with pytest.raises(InputError, match=told):
-        used()
-
-
 def test_the_header_of_a_gcp_file_is_its_system(tmp_path: Path) -> None:
     """`# WKT:` as the Ames Stereo Pipeline writes it: latitude, longitude, height above its datum."""
     import pyproj
@@ -329,11 +185,3 @@ def test_the_header_of_a_gcp_file_is_its_system(tmp_path: Path) -> None:
     plain = read(tmp_path, file="plain.gcp", crs="EPSG:4979").points
     for more in ({}, {"crs": "EPSG:4326"}):
         assert read(tmp_path, file="g.gcp", **more).points.itrs == pytest.approx(plain.itrs, abs=1e-6)
-    with pytest.raises(InputError, match="said differently by the file"):
-        read(tmp_path, file="g.gcp", crs="EPSG:4267")
-    (tmp_path / "g.gcp").write_text(f"# WKT: {pyproj.CRS('EPSG:32650').to_wkt('WKT1_GDAL')}\n{row}")
-    with pytest.raises(InputError, match="a header with a projection"):
-        read(tmp_path, file="g.gcp")
-    (tmp_path / "g.gcp").write_text(f"# WKT: PROJCS[]\n{row}")
-    with pytest.raises(InputError, match="cannot be read"):
-        read(tmp_path, file="g.gcp")

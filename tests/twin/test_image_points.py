@@ -1,34 +1,29 @@
 """Points measured in rendered images, against the exact sensor; the commands that use them."""
 
-from functools import partial
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-import twin.orbit.__main__ as command
 from analysis.orbit.three_line_model import BIAS
+from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.specs.orbit.setup import resolve_calibration, resolve_simulate
-from tests.tiers import quick
-from tests.twin.commands import edited_copy, invoke, refused
 from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.field_images import FieldImages
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.screening import screened
+from twin.orbit.images import image_points
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
 from twin.orbit.images.point_judgement import judged, true_ground
 from twin.orbit.images.simulate_run import Simulation, run_simulation
 
-run = partial(invoke, command.app)
 SIMULATE, CALIBRATE = (SCENES / ORBIT / f"{name}.yaml" for name in ("simulate", "calibrate_images"))
-POINTS = "points: {control: 200, check: 100, tie: 200, reach: 40, template: 31}"
-SIZE = "lines: 1000, pixels: 1000}"
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +74,19 @@ def test_true_ground_is_the_map_less_its_errors(flown: Simulation, control: Matc
 
 
 @pytest.mark.second
+def test_what_is_not_known_of_heights_adds_its_variance(flown: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three times the sigma of the reference's heights is nine times what it adds to a match's covariance."""
+    agreed, seen = image_points.consensus, []
+    monkeypatch.setattr(image_points, "consensus", lambda *a, **k: seen.append(k["covariance"]) or agreed(*a, **k))
+    for sigma in (0.0, 1.0, 3.0):
+        map_points(flown.patch, asked().model_copy(update={"control": 60, "check": 20, "height_sigma": sigma}))
+    none, one, three = seen[:: len(flown.patch.images)]
+    good = np.abs(none).max(axis=(1, 2)) < 1.0  # of the others nothing is known
+    np.testing.assert_allclose((three - none)[good], 9.0 * (one - none)[good], rtol=0, atol=1e-12)
+    assert (one - none)[good].max() > 1e-3
+
+
+@pytest.mark.second
 def test_tie_points_are_five_times_better(flown: Simulation, control: MatchedPoints) -> None:
     """The same ground on the same day: 0.05 px."""
     spec = asked().model_copy(update={"tie": 40})
@@ -93,21 +101,23 @@ def test_tie_points_are_five_times_better(flown: Simulation, control: MatchedPoi
     assert alone.in_all.sum() >= 10
 
 
-# what is wrong, key, what to do about it
-BAD = {
-    "small patch": (("lines: 1000, pixels: 1000}", "lines: 100, pixels: 100}"), "points", ["no room", "larger patch"]),
-    "even": (("template: 31", "template: 30"), "points.template", ["odd"]),
-    "none": ((POINTS, "points: {control: 0, check: 0, tie: 0}"), "points", ["no points"]),
-    "few": ((POINTS, "points: {control: 3}"), "points", ["too few matches", "accepted"]),
-}
-
-
 @pytest.mark.second
-@pytest.mark.parametrize("case", quick(1, BAD))
-def test_bad_input(case: str, tmp_path: Path) -> None:
-    change, key, words = BAD[case]
-    changes = [change] if change[0] == SIZE else [change, (SIZE, "lines: 200, pixels: 200}")]
-    refused(run, "simulate", edited_copy(SIMULATE, tmp_path, *changes), key, words)
+def test_ground_without_points_is_refused(flown: Simulation) -> None:
+    """A map of other ground, a map and an image of one grey value."""
+    patch, maps = flown.patch, flown.patch.control
+    photo, nadir = maps.orthophoto, flown.patch.images["nadir"]
+    grey = FrozenMap({**patch.images, "nadir": replace(nadir, frame=np.zeros_like(nadir.frame))})
+    for points, wrong, words in (
+        (map_points, replace(patch, control=replace(maps, orthophoto=replace(photo, west=1e5))), "no place of the"),
+        (
+            map_points,
+            replace(patch, control=replace(maps, orthophoto=replace(photo, values=np.zeros_like(photo.values)))),
+            "the orthophoto has no distinct places",
+        ),
+        (tie_points, replace(patch, images=grey), "nadir: no distinct point is seen"),
+    ):
+        with pytest.raises(image_points.PointsError, match=words):
+            points(wrong, asked())
 
 
 def two_patches() -> OrbitCalibrationSpec:
@@ -144,13 +154,3 @@ def test_calibration_from_images() -> None:
     assert one.screening is not None
     assert one.screening.wrong_left == 0
     assert one.screening.right_lost <= 0.02 * one.screening.entered
-
-
-def test_patches_outside_are_refused(tmp_path: Path) -> None:
-    first = "{pixel: 700, track: -22 km}"
-    for pixel, key, words in (
-        (12700, "images.patches[0].pixel", "outside"),
-        (60, "images.patches", "patch 1"),
-    ):
-        path = edited_copy(CALIBRATE, tmp_path, (first, f"{{pixel: {pixel}, track: -22 km}}"))
-        refused(run, "calibrate", path, key, [words])

@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 
 from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec
-from scenes.yaml.errors import InputError
-from scenes.yaml.spec import validate
-from scenes.yaml.yaml_file import parse_yaml
 from tests.tiers import quick
 from tests.twin.pushbroom_bench import LINE_TIME, PLACE, Ground, lines
 from twin.orbit.flight.jitter import Jitter
@@ -163,20 +160,6 @@ def test_readings_follow_slow_jitter_and_not_what_is_faster_than_they() -> None:
         measured = true.with_errors(ErrorsSpec(), 3)
         turn = np.einsum("nji,njk->nik", measured.body_to_itrs(t), true.body_to_itrs(t))[:, 2, 1] / ARCSEC
         assert rest[0] <= np.max(np.abs(turn)) < rest[1]
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("{lines: [{frequency: 0 Hz, amplitude: 1 1 1 arcsec}]}", "greater than zero"),
-        ("{lines: [{frequency: 1 s, amplitude: 1 1 1 arcsec}]}", "not of a frequency"),
-        ("{bands: [{first: 5 Hz, last: 5 Hz, level: 1 1 1 arcsec^2/Hz}]}", "the band is empty"),
-        ("{bands: [{first: 5 Hz, last: 6 Hz, level: 1 1 1 arcsec}]}", "spectral density"),
-    ],
-)
-def test_what_is_no_jitter_is_told(text: str, told: str) -> None:
-    with pytest.raises(InputError, match=told):
-        validate(AttitudeSpec, parse_yaml(f"jitter: {text}\n", "a.yaml"))
 
 
 # --- images -----------------------------------------------------------------------------------------------------------

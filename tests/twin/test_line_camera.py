@@ -17,6 +17,7 @@ from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from twin.monitor.truth import LineSight
 from twin.orbit.flight.line_camera import (
     LinePiece,
     along_track_angle,
@@ -131,7 +132,11 @@ def test_traced_lines_between_the_traced_points(gf7_pair, backend, state) -> Non
     assembly = gf7_pair.assembly
     placed = assembly.place([state])
     rng = np.random.default_rng(4)
-    for name, camera in cameras.items():
+    sight = LineSight(gf7_pair, backend).trace([state])[:, 0]
+    for ends, (name, camera) in zip(sight, cameras.items(), strict=True):
+        # what tells the truth of a camera sees the whole line, too
+        edges = camera.look(np.array([-0.5, camera.pixels - 0.5]))
+        np.testing.assert_allclose(ends[[0, -1]], edges, rtol=0, atol=1e-12)
         pixel = np.concatenate([[-0.5, 0.0, camera.pixels - 0.5], rng.uniform(-0.5, camera.pixels - 0.5, 120)])
         y = (pixel - 0.5 * (camera.pixels - 1)) * gf7_pair.cameras[name].spec.line.pitch
         line = np.stack([0 * y, y, 0 * y], axis=-1)
@@ -169,40 +174,29 @@ def test_traced_looks(gf7_pair, backend) -> None:
     assert dihedral_angle(*cameras.values()) == pytest.approx(math.radians(31.0), abs=1e-9)
 
 
-def test_a_turn_about_the_look_changes_the_planes_but_not_the_looks() -> None:
-    """Normals of ideal lines at looks 0 and a, the second turned by g about its look: cos = cos a cos g exactly."""
-    a, g = math.radians(25.0), math.radians(2.0)
-    cameras = line_cameras(
-        payload(nadir={"look": "0 deg"}, forward={"look": "25 deg", "rotate": ["0 deg", "0 deg", "2 deg"]})
-    )
-    nadir, forward = cameras["nadir"], cameras["forward"]
-    assert look_angle(forward, nadir) == pytest.approx(a, abs=1e-15)
-    expected = math.acos(math.cos(a) * math.cos(g))
-    assert expected - a > 0.07 * math.radians(1.0)  # what is tested is not small
-    assert dihedral_angle(forward, nadir) == pytest.approx(expected, abs=1e-13)
-    assert dihedral_angle(nadir, forward) == pytest.approx(expected, abs=1e-13)
-
-
-def test_a_turn_within_the_plane_changes_the_look_but_not_the_planes() -> None:
-    """A camera rolled by w about its own X keeps its plane; the angle of the looks has cos = cos a cos w exactly."""
-    a, w = math.radians(25.0), math.radians(1.5)
-    cameras = line_cameras(
-        payload(nadir={"look": "0 deg"}, backward={"look": "-25 deg", "rotate": ["1.5 deg", "0 deg", "0 deg"]})
-    )
-    assert dihedral_angle(*cameras.values()) == pytest.approx(a, abs=1e-13)
-    assert look_angle(*cameras.values()) == pytest.approx(math.acos(math.cos(a) * math.cos(w)), abs=1e-14)
-
-
-def test_the_angle_along_the_track() -> None:
-    """The turn about Y alone, with its sign, whatever the roll and the turn about the look: to second order, which is
-    the roll (5 arcmin) squared times the angle."""
-    a = math.radians(2.0)
-    spec = payload(nadir={"look": "0 deg"}, ahead={"look": "2 deg", "rotate": ["5 arcmin", "0 deg", "10 arcmin"]})
-    nadir, ahead = line_cameras(spec).values()
-    assert along_track_angle(ahead, nadir) == pytest.approx(a, rel=5e-6)
+def test_turns_of_a_camera_change_the_angles_of_looks_and_of_planes() -> None:
+    """At looks 0 and a: turned by g about its look, the planes have cos = cos a cos g exactly; rolled by w about its
+    own X, a camera keeps its plane and the looks have cos = cos a cos w; along the track the turn about Y counts,
+    with its sign, whatever the roll and the turn about the look: to second order, the roll squared times the angle.
+    """
+    a, g, w = math.radians(25.0), math.radians(2.0), math.radians(1.5)
+    nadir, turned, rolled, ahead = line_cameras(
+        payload(
+            nadir={"look": "0 deg"},
+            turned={"look": "25 deg", "rotate": ["0 deg", "0 deg", "2 deg"]},
+            rolled={"look": "-25 deg", "rotate": ["1.5 deg", "0 deg", "0 deg"]},
+            ahead={"look": "2 deg", "rotate": ["5 arcmin", "0 deg", "10 arcmin"]},
+        )
+    ).values()
+    assert look_angle(turned, nadir) == pytest.approx(a, abs=1e-15)
+    assert dihedral_angle(turned, nadir) == pytest.approx(math.acos(math.cos(a) * math.cos(g)), abs=1e-13)
+    assert dihedral_angle(nadir, turned) == pytest.approx(dihedral_angle(turned, nadir), abs=1e-13)
+    assert dihedral_angle(nadir, rolled) == pytest.approx(a, abs=1e-13)
+    assert look_angle(nadir, rolled) == pytest.approx(math.acos(math.cos(a) * math.cos(w)), abs=1e-14)
+    assert along_track_angle(ahead, nadir) == pytest.approx(g, rel=5e-6)
     assert along_track_angle(nadir, ahead) == -along_track_angle(ahead, nadir)
-    assert look_angle(ahead, nadir) > 1.0008 * a
-    assert dihedral_angle(ahead, nadir) > 1.003 * a
+    assert look_angle(ahead, nadir) > 1.0008 * g
+    assert dihedral_angle(ahead, nadir) > 1.003 * g
 
 
 def test_normals_point_forward_and_a_bent_line_has_a_best_plane() -> None:

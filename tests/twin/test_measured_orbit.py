@@ -1,10 +1,7 @@
 """Calibration in orbit on files: the simulation's measurements read back, other conventions, independent solutions."""
 
-import csv
-import json
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +14,6 @@ import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data_setup import (
-    is_measured,
-    resolve_any_angle,
     resolve_measured_angle,
     resolve_measured_calibration,
 )
@@ -31,12 +26,12 @@ from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back, scaled, set_keys, small
-from twin.orbit.angle.angle_run import SimulatedAngleRun, run_angle
+from twin.orbit.angle.angle_run import run_angle
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
 from twin.orbit.calibration.calibration_export import simulation_exported
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.schemes import schemes_tested
-from twin.orbit.flight.earth import Earth, east_north_up
+from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import along_track_angle, changed_payload, line_cameras
 from twin.orbit.flight.sensor import Sensor
@@ -92,16 +87,6 @@ def test_files_give_the_estimates_of_the_simulation(campaign, files) -> None:
         _ = again.passes[0].bias
 
 
-def _columns(file) -> dict[str, np.ndarray]:
-    """Numbers and names of a table, by the csv module alone."""
-    with file.open(newline="") as stream:
-        heads, *rows = list(csv.reader(stream))
-    return {
-        head.split("[")[0].strip(): np.array([float(c) if c[-1].isdigit() and c[0] not in "ckt" else c for c in column])
-        for head, column in zip(heads, zip(*rows, strict=True), strict=True)
-    }
-
-
 @pytest.mark.second
 def test_scipy_finds_the_same_from_the_files(tmp_path) -> None:
     """Collinearity written anew from the definition of the look in camera.json, splines and least squares of SciPy.
@@ -118,33 +103,26 @@ def test_scipy_finds_the_same_from_the_files(tmp_path) -> None:
     _, again = read_back(file)
     ours = simultaneous(again)
 
-    folder = tmp_path / FIELDS[0]
     orbit, attitude, lines, ground, images = (
-        _columns(folder / f"{k}.csv") for k in ("orbit", "attitude", "lines", "ground", "image_points")
+        np.genfromtxt(tmp_path / FIELDS[0] / f"{k}.csv", delimiter=",", names=True, dtype=None, autostrip=True)
+        for k in ("orbit", "attitude", "lines", "ground", "image_points")
     )
-    path = CubicSpline(orbit["time"].astype(float), np.stack([orbit[k] for k in "xyz"], -1).astype(float))
-    turn = CubicSpline(
-        attitude["time"].astype(float), np.stack([attitude[f"q{k}"] for k in range(1, 5)], -1).astype(float)
-    )
+    path = CubicSpline(orbit["time_s"], np.stack([orbit[f"{k}_m"] for k in "xyz"], -1))
+    turn = CubicSpline(attitude["time_s"], np.stack([attitude[f"q{k}"] for k in range(1, 5)], -1))
     camera = read_yaml(tmp_path / "camera.yaml").data
-    control = np.flatnonzero(ground["role"] == "control")
-    ids = ground["point"][control].tolist()
-    given = np.stack([ground[k][control] for k in "xyz"], -1).astype(float)
-    used = np.flatnonzero([p in ids for p in images["point"]])
-    which = np.array([ids.index(p) for p in images["point"][used]])
+    control = ground[ground["role"] == "control"]
+    ids = control["point"].tolist()
+    given = np.stack([control[f"{k}_m"] for k in "xyz"], -1)
+    images = images[np.isin(images["point"], ids)]
+    which = np.array([ids.index(p) for p in images["point"]])
     names = list(camera["lines"])[:3]
-    line_of = np.array([names.index(c) for c in images["camera"][used]])
-    seconds = np.empty(len(used))
+    line_of = np.array([names.index(c) for c in images["camera"]])
+    seconds = np.empty(len(images))
     for k, name in enumerate(names):
-        rows = lines["camera"] == name
-        here = line_of == k
-        seconds[here] = np.interp(
-            images["line"][used][here].astype(float),
-            lines["line"][rows].astype(float),
-            lines["time"][rows].astype(float),
-        )
+        rows = lines[lines["camera"] == name]
+        seconds[line_of == k] = np.interp(images["line"][line_of == k], rows["line"], rows["time_s"])
     pitch = 6.5e-6
-    y = pitch * (images["pixel"][used].astype(float) - 0.5 * (camera["pixels"] - 1))
+    y = pitch * (images["pixel"] - 0.5 * (camera["pixels"] - 1))
     station, body = path(seconds), Rotation.from_quat(turn(seconds)).as_matrix()
     start, mounts, distortion = [], [], []
     for name in names:
@@ -272,17 +250,6 @@ def test_two_lines_calibrate(campaign, files) -> None:
         assert abs(error) < 5.0 * two.sigma[f"{line} f"]
 
 
-def test_points_in_a_gap_of_the_readings_are_refused(files) -> None:
-    edit(
-        files.parent / "Beijing/attitude.csv",
-        lambda heads, rows: (heads, [r for r in rows if not -1.0 < float(r[0]) < 1.0]),
-    )
-    with pytest.raises(InputError, match="gap of the readings") as told:
-        read_back(files)
-    assert told.value.file.endswith("image_points.csv")
-    assert told.value.line is not None
-
-
 @pytest.mark.second
 def test_ccds_that_do_not_lie_in_line_are_known_not_estimated(tmp_path) -> None:
     """A nadir line of two CCDs, one a pixel and a half off: flown with them and analysed with them, the calibration is
@@ -373,36 +340,6 @@ def test_intersection_angles_of_measured_passes(tmp_path) -> None:
     assert chi2.cdf(square, np.size(z)) > 1e-6
 
 
-def test_the_angle_command_on_measurements(files) -> None:
-    """Other time, other angles; numbers in angle.json; a line without points is refused by its key."""
-    folder = files.parent
-    file = angle_file(folder, angles={"wide": ["forward", "backward"]}, time="1 s")
-    result = run("angle", file, "--out", folder / "run", "--quiet")
-    assert result.exit_code == 0, result.output
-    numbers = json.loads((folder / "run/angle.json").read_text())["measured"]["Beijing"]
-    assert numbers["time_s"] == 1.0
-    assert numbers["points"] == {"forward": 44, "backward": 44}
-    assert numbers["along_track"]["wide_deg"] == pytest.approx(49.98, abs=0.02)
-    assert 0.05 < numbers["along_track"]["wide_arcsec_sigma"] < 1.0
-    refused = run("angle", angle_file(folder, angles={"wide": ["forward", "multispectral"]}), "--out", folder / "no")
-    assert refused.exit_code == 2
-    assert "angles.wide" in refused.stderr
-    refused = run("angle", angle_file(folder, time="10 min"), "--out", folder / "no")
-    assert refused.exit_code == 2
-    assert "time: orbit or attitude are not known then" in " ".join(refused.stderr.split())
-    for kept, words in ((2, "which lines the angles lie between is not said"), (0, "too few line cameras")):
-        for name in FIELDS:
-            edit(
-                folder / name / "image_points.csv",
-                lambda heads, rows, kept=kept: (
-                    heads,
-                    [*[r for r in rows if r[1] == "forward"][:kept], *(r for r in rows if r[1] == "nadir")],
-                ),
-            )
-        with pytest.raises(InputError, match=words):
-            run_measured_angle(resolve_measured_angle(angle_file(folder)))
-
-
 @pytest.mark.second
 def test_velocities_and_one_table_of_the_platform_may_be_left_to_the_positions(campaign, files) -> None:
     """Aberration by the derivative of noisy positions, 0.1 m/s or 3e-10 rad off; orbit and attitude at the same times
@@ -414,10 +351,7 @@ def test_velocities_and_one_table_of_the_platform_may_be_left_to_the_positions(c
     same(simultaneous(campaign), simultaneous(again), 0.01)
     data = dict(read_yaml(files.parent / "data.yaml").data)
     one = dict(data["passes"]["Beijing"])
-    with (folder / "attitude.csv").open() as stream:
-        attitude = np.loadtxt(stream, delimiter=",", skiprows=1)
-    with (folder / "orbit.csv").open() as stream:
-        orbit = np.loadtxt(stream, delimiter=",", skiprows=1)
+    attitude, orbit = (np.loadtxt(folder / f"{k}.csv", delimiter=",", skiprows=1) for k in ("attitude", "orbit"))
     place = CubicSpline(orbit[:, 0], orbit[:, 1:])(attitude[:, 0])
     rows = np.column_stack([attitude[:, 0], place, attitude[:, 1:]])
     text = "time [s],x [m],y [m],z [m],q1,q2,q3,q4\n" + "\n".join(",".join(map(repr, r)) for r in rows.tolist())
@@ -427,18 +361,6 @@ def test_velocities_and_one_table_of_the_platform_may_be_left_to_the_positions(c
     (files.parent / "data.yaml").write_text(dump_yaml(data))
     # the orbit's readings are now told as 8 a second: their noise is stated by an interval
     same(simultaneous(campaign), simultaneous(read_back(files)[1]), 0.01)
-
-
-def test_files_of_simulations_and_of_measurements_are_told_apart() -> None:
-    """All shipped ones; a simulation of angles has a key `passes`, too."""
-    folder = SCENES / ORBIT
-    # a block of several passes names them
-    blocks = {"adjust.yaml", "adjust_gf7.yaml"}
-    assert not any(is_measured(file) for file in folder.glob("*.yaml") if file.name not in blocks)
-    assert is_measured(folder / "measured/angle.yaml")
-    assert is_measured(folder / "measured/calibrate.yaml")
-    assert not is_measured("angle")
-    assert resolve_any_angle(folder / "angle.yaml").test.name == "angle"
 
 
 @pytest.mark.second
@@ -466,14 +388,6 @@ def test_points_of_simulated_images_are_exported_where_they_were_found(tmp_path)
         line, pixel = sensor.image(one.ground.itrs[some.point])
         off = np.median(np.abs([some.line - line, some.pixel - pixel]), axis=1)
         assert off.max() < 0.6
-    # the map's one error in plan moves all of them: each has the variance of as many as there are
-    known, control = done.points.control, test.control
-    count = int(np.sum(known.in_all & ~known.check))
-    first = np.flatnonzero(given)[:1]
-    axes = east_north_up(*Earth().geodetic(one.ground.itrs[first])[:2])[0]
-    variance = np.diagonal(axes @ one.ground.covariance[first[0]] @ axes.T)
-    assert variance[:2] == pytest.approx(control.sigma**2 * count, rel=1e-6)
-    assert variance[2] == pytest.approx(test.points.height_sigma**2, rel=1e-6)
     nothing = done.setup.model_copy(update={"test": done.setup.test.model_copy(update={"points": None})})
     with pytest.raises(InputError, match="images alone give no tables"):
         simulation_exported(replace(done, setup=nothing, points=None))
@@ -508,16 +422,3 @@ def test_angles_of_a_simulation_and_of_its_exported_files(tmp_path, changes) -> 
     apart = one.resection.angles(pairs) - two.resection.angles(pairs)
     assert np.abs(apart).max() < rounding
     assert two.resection.angle_covariance(pairs) == pytest.approx(spread, rel=1e-8)
-
-
-def test_angles_that_files_cannot_hold_are_not_exported(files) -> None:
-    """Traced lines, which no payload's file says; and measurements, which are files already."""
-    traced = SimulatedAngleRun.__new__(SimulatedAngleRun)
-    measured = SimpleNamespace(setup=resolve_measured_angle(angle_file(files.parent)))
-    object.__setattr__(traced, "setup", resolve_angle(SCENES / ORBIT / "angle_gf7.yaml"))
-    for run_, key, words in (
-        (traced, "camera", "the lines of an instrument are traced"),
-        (measured, "data", "measurements are files already"),
-    ):
-        with pytest.raises(InputError, match=rf"{key}: {words}"):
-            angle_exported(run_)

@@ -1,27 +1,19 @@
 """Angles of other cameras from ground points: a traced stereo pair that has changed, and off-axis lines of th1."""
 
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import twin.orbit.__main__ as command
 from analysis.units import ARCSEC
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from tests.tiers import quick
-from tests.twin.commands import edited_copy, invoke, refused
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, run_angle, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 
-run = partial(invoke, command.app)
 PAIR, LINES = (resolve_angle(SCENES / ORBIT / f"{name}.yaml") for name in ("angle_gf7", "angle_off_axis"))
-
-
-GRADIENT = ", gradient: [0.2 K/m, 0 K/m, 0.4 K/m]"
 
 
 def without_errors(setup: AngleSetup) -> AngleSetup:
@@ -100,38 +92,3 @@ def test_parallel_lines_are_folded_and_the_report_says_so() -> None:
 
 
 # The command
-
-
-# what is wrong, key, what to do about it
-BAD = {
-    "node": (
-        "base/backward/focal_plane: {",
-        "base/backward/focal_plan: {",
-        "perturb.base/backward/focal_plan",
-        ["no such node", "did you mean 'base/backward/focal_plane'"],
-    ),
-    "pivot": (
-        "pivot: rear_node",
-        "pivot: middle",
-        "perturb.base/backward/focal_plane.pivot",
-        ["no such pivot", "rear_node"],
-    ),
-    "cold": ("change: 0.5 K", "change: -300 K", "perturb.base.temperature", ["absolute zero", "above 0 K"]),
-    "off the mirrors": (
-        "[1 arcsec, -2 arcsec, 6 arcsec]",
-        "[1 arcsec, -4 deg, 6 arcsec]",
-        "perturb",
-        ["smaller changes"],
-    ),
-    "line": ("[forward, backward]", "[forward, nadir]", "angles.alpha", ["no such line", "forward, backward"]),
-    "outside the line": ("last: 32667", "last: 32768", "strips.last", ["outside the line", "32767.5"]),
-    "instrument": ("camera: gf7_pair", "camera: gf7_pear", "camera", ["payloads or instruments", "'gf7_pair'"]),
-}
-
-
-@pytest.mark.parametrize("case", quick(3, BAD))
-def test_bad_input(case: str, tmp_path: Path) -> None:
-    old, new, key, words = BAD[case]
-    path = edited_copy(SCENES / ORBIT / "angle_gf7.yaml", tmp_path, (GRADIENT, ""), (old, new))
-    line = refused(run, "angle", path, key, words)
-    assert key.split(".")[-1] in path.read_text("utf-8").splitlines()[line - 1]

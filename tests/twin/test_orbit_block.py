@@ -10,9 +10,8 @@ from scenes.specs.load import SCENES
 from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
 from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
 from scenes.yaml.errors import InputError
-from twin.orbit.block.block_numbers import CHANGE
 from twin.orbit.block.block_report import block_report
-from twin.orbit.block.block_run import ALL, NOTHING, CameraChange, run_adjustment
+from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
 from twin.orbit.block.drawn_block import draw_block
 from twin.orbit.block.measured_block import measured_block
 from twin.orbit.block.pass_knowledge import change_covariance
@@ -118,21 +117,6 @@ def test_sensors_that_are_not_there_are_refused():
         without_sensors(resolve_adjust(FILE), ["controls"])
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "told"),
-    [
-        ("lines: [forward, backward]", "lines: [forward, nadir]", "it is not said how nadir may have changed"),
-        ("between: [A, B]", "between: [A, C]", "no such star tracker in the passes"),
-        ("interval: 1 s}", "interval: 1 s, time: 3 s}", "a white law has no `time:`"),
-        ("seed: 1", "seed: 1\ncomponents: [noise]", "no such group of variances"),
-        ("orbit: {law: constant", "gyro: {law: constant", "one name for two laws"),
-    ],
-)
-def test_files_that_contradict_themselves_are_refused(tmp_path, old, new, told):
-    with pytest.raises(InputError, match=told):
-        setup(tmp_path, (old, new))
-
-
 def test_scenes_that_share_no_ground_are_an_error_with_a_key(tmp_path):
     text = FILE.read_text("utf-8")
     backward = text[text.index("  backward:\n") : text.index("monitor: {angles")]
@@ -140,17 +124,6 @@ def test_scenes_that_share_no_ground_are_an_error_with_a_key(tmp_path):
     alone = setup(tmp_path, *one, ("longitude: 117.4 deg, ", "longitude: 120 deg, "))
     with pytest.raises(BenchError, match=r"only 0 of .* places of the area are seen by two scenes"):
         run_adjustment(alone, None, 1)
-
-
-def test_changes_of_cameras_have_arcseconds_and_micrometres():
-    """Found, sigma, sigma before the block and truth, each of the four under its own key and unit."""
-    scale = np.array([np.pi / 648000.0] * 3 + [1e-6])
-    rows = [scale * (10.0 * k + np.arange(1.0, 5.0)) for k in range(4)]
-    numbers = CHANGE(CameraChange(*rows))
-    for k, end in enumerate(("", "_sigma", "_sigma_before", "_true")):
-        for j, key in enumerate(("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")):
-            assert numbers[f"{key}{end}"] == pytest.approx(10.0 * k + j + 1.0, rel=1e-12), (key, end)
-    assert CHANGE(CameraChange(*rows[:3], None))["d_f_um_true"] is None
 
 
 def test_ground_points_that_are_none_are_refused():
@@ -223,20 +196,3 @@ def test_monitor_readings_of_measured_passes_hold_the_cameras(tmp_path):
     assert np.sqrt(known.covariance[3, 3]) == pytest.approx(0.1e-6, rel=1e-3)
     assert np.allclose(block.monitored["forward"].covariance, block.known["forward"].covariance)
     assert np.isfinite(given[block.points.role == "check"]).all()
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "told"),
-    [
-        ("names: own", "names: own\ntrackers: {Peking: A}", "no such pass"),
-        ("names: own", "names: own\nwithout: [monitor]", "no monitor to do without"),
-        ("  nadir: {lasting", "  middle: {lasting", "no such line"),
-    ],
-)
-def test_measured_files_that_name_what_is_not_there_are_refused(tmp_path, old, new, told):
-    text = MEASURED.read_text("utf-8").replace("data: .", f"data: {MEASURED.parent}")
-    assert old in text
-    file = tmp_path / "adjust.yaml"
-    file.write_text(text.replace(old, new), "utf-8")
-    with pytest.raises(InputError, match=told):
-        resolve_any_adjust(file)

@@ -14,6 +14,7 @@ from twin.orbit.measured.platform_files import platform_table, read_platform
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/orbit_files.md"
 BLOCKS = re.findall(r"^```csv\n(.*?)^```", PAGE.read_text("utf-8"), re.M | re.S)
+assert len(BLOCKS) == 8  # and all are read here
 GPS = {"frame": "ITRS", "time_scale": "GPS"}
 TURN = {"scalar": "last", "turns": "body_to_frame", "body_axes": ["forward", "right", "down"]}
 ANGLES = {"sequence": "xyz", "nadir": "geodetic", "steering": "yaw", "body_axes": ["forward", "right", "down"]}
@@ -55,7 +56,3 @@ def test_ground_points(tmp_path: Path) -> None:
         lon, lat, height = Earth().geodetic(found.points.itrs[0])
         np.testing.assert_allclose(np.degrees([lon, lat]), [116.0123456, 40.0123456], rtol=0, atol=1e-10)
         assert float(height) == pytest.approx(512.34, abs=1e-6)
-
-
-def test_every_block_is_read_here() -> None:
-    assert len(BLOCKS) == 8

@@ -1,37 +1,28 @@
 """Jitter of a pass, found in what the lines of a camera saw: simulated, exported, read back."""
 
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import twin.orbit.__main__ as command
 from analysis.orbit.jitter_lines import Found, search
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data_setup import resolve_any_jitter
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec
 from scenes.specs.orbit.setup import JitterSetup, load_three_line_camera
-from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from scenes.yaml.yaml_file import read_yaml
 from tests.tiers import quick
-from tests.twin.commands import invoke
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.jitter import sights
 from twin.orbit.jitter.jitter_numbers import JITTER, blind_multiples
-from twin.orbit.jitter.jitter_report import _summary as jitter_table
 from twin.orbit.jitter.jitter_report import _warnings as jitter_warnings
-from twin.orbit.jitter.jitter_report import jitter_report
 from twin.orbit.jitter.jitter_run import JitterRun, fly_strip, run_jitter
 from twin.orbit.jitter.sights import SightsError, sights_of
 from twin.orbit.jitter.steady_platform import SteadyPlatform
-from twin.run.procedure import BenchError
 
 ARCSEC = np.pi / 648000.0
-run = partial(invoke, command.app)
 READINGS = 0.25
 """Seconds between readings of the attitude: 4 Hz."""
 RATE = 0.01
@@ -112,31 +103,6 @@ def test_an_oscillation_of_the_body_is_found_about_its_axes(oscillating: JitterR
     assert numbers["oscillations"][0]["true_amplitude_arcsec"] == pytest.approx({"roll": 2.4, "pitch": 1.0})
 
 
-def test_numbers_and_table_of_a_search_have_their_units(oscillating: JitterRun) -> None:
-    """Angles in arcseconds, in pixels and in degrees, times in milliseconds, and chances of what is left."""
-    one = oscillating.passes["jitter"]
-    lines, found = one.found.lines, one.found
-    (row,) = jitter_table(oscillating).rows
-    amplitude, sigma, pixel = lines.amplitude[0], lines.amplitude_sigma[0], one.sights.pixel
-    per_axis = [v for a, s in zip(amplitude, sigma, strict=True) for v in (a / ARCSEC, s / ARCSEC, a / pixel)]
-    expected = [lines.frequency[0], lines.frequency_sigma[0], *per_axis, lines.chance[0], 0.65, 2.4, 1.0]
-    assert row[0] == "jitter"
-    assert row[1:] == pytest.approx(expected, rel=1e-9)
-    told = JITTER(oscillating)["passes"]["jitter"]
-    (first,) = told["oscillations"]
-    for k, axis in enumerate(("roll", "pitch")):
-        assert first["amplitude_arcsec"][axis] == pytest.approx(amplitude[k] / ARCSEC)
-        assert first["amplitude_arcsec_sigma"][axis] == pytest.approx(sigma[k] / ARCSEC)
-        assert first["amplitude_px"][axis] == pytest.approx(amplitude[k] / pixel)
-        assert first["phase_deg"][axis] == pytest.approx(np.degrees(lines.phase[0, k]))
-        seen = found.detectable[~found.before.blind][:, k]
-        assert told["detectable_arcsec"][axis] == pytest.approx(np.median(seen) / ARCSEC)
-    assert told["chance_of_the_next"] == found.after.chance(found.after.power[found.after.best])
-    assert told["pixel_arcsec"] == pytest.approx(pixel / ARCSEC)
-    assert told["gap_ms"]["blue to green"] == pytest.approx(121.6, abs=0.2)
-    assert list(told["noise_factor"].values()) == pytest.approx(np.sqrt(found.factors[:-1]))
-
-
 @pytest.mark.second
 @pytest.mark.parametrize(("pair", "blind"), quick(1, [(("blue", "green"), 8.223), (("green", "red"), 9.765)]))
 def test_two_bands_are_blind_at_the_inverse_of_their_gap(pair: tuple[str, str], blind: float) -> None:
@@ -189,19 +155,6 @@ def test_the_noise_of_measured_lines_gives_rows_no_oscillation() -> None:
     assert not [seed for seed in range(3) if len(searched(one, seed).lines.frequency)]
 
 
-@pytest.mark.second
-def test_an_alias_is_reported_in_words_and_numbers() -> None:
-    """21 Hz on even rows of 10 a second is 1 Hz to them: what cannot be told apart is in result and warnings."""
-    points = {"count": 160, "duration": "10 s", "rows": "100 ms", "height": "300 m"}
-    line = {"frequency": "21 Hz", "amplitude": "0.8 0 0 arcsec", "phase": "0 deg"}
-    ask = {"highest": "4 Hz", "height": "300 m"}
-    found = run_jitter(setup(attitude=attitude(line), points=points, search=ask), None, 2)
-    first = JITTER(found)["passes"]["jitter"]["oscillations"][0]
-    assert min(abs(f - 21.0) for f in (first["frequency_hz"], *first["aliases_hz"])) < 0.02
-    assert first["in_search"] == (first["frequency_hz"] < 4.0)
-    assert any("beyond the search" in text or "may as well be" in text for text in jitter_report(found).warnings)
-
-
 def test_steady_readings_are_those_of_a_pass_without_noise() -> None:
     """Polynomials through exact readings: the orbit to a millimetre, the attitude to a thousandth of an arcsecond."""
     one = setup(attitude={"steering": "yaw"}, errors={})
@@ -213,22 +166,7 @@ def test_steady_readings_are_those_of_a_pass_without_noise() -> None:
     np.testing.assert_allclose(turn, np.broadcast_to(np.eye(3), turn.shape), rtol=0, atol=1e-3 * ARCSEC)
 
 
-def test_what_cannot_be_searched_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    data = dict(read_yaml(SCENES / ORBIT / "jitter.yaml").data)
-    for change, told in (
-        ({"lines": ["blue", "grren"]}, "did you mean 'green'"),
-        ({"lines": ["blue"]}, "two lines or more"),
-        ({"search": {"highest": "0.05 Hz"}}, "no frequencies to look at"),
-        ({"search": {"highest": "9 Hz", "axes": ["roll", "roll"]}}, "no axis, or one twice"),
-        ({"time": "25 s"}, "outside the orbit data"),
-    ):
-        path.write_text(dump_yaml({**data, **change}))
-        with pytest.raises(InputError) as error:
-            resolve_any_jitter(path)
-        assert told in str(error.value), change
-    with pytest.raises(BenchError, match="are seen by all of"):
-        run_jitter(setup(time="9.6 s", points={"count": 100, "duration": "0.7 s"}), None, 1)
+def test_lines_without_points_cannot_be_searched() -> None:
     one = setup()
     measured, _ = fly_strip(one, 1)
     with pytest.raises(SightsError, match="0 points"):

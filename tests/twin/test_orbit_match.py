@@ -1,29 +1,20 @@
 """Points measured in a user's images: the simulation's images and maps, through files alone."""
 
-import shutil
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 import tifffile
 
-import twin.orbit.__main__ as command
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import MatchSetup
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.orbit.setup import load_three_line_camera, resolve_simulate
-from scenes.yaml.errors import InputError
-from tests.tiers import quick
 from tests.twin import orbit_file_bench as bench
-from tests.twin.commands import invoke
 from twin.orbit.images.simulate_run import Simulation, run_simulation
 from twin.orbit.matching.match_run import Match, run_match
-
-run = partial(invoke, command.app)
 
 
 @pytest.fixture(scope="module")
@@ -99,18 +90,10 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
             "first_pixel_sees": "left",
             "window": {"row": 10, "column": 5, "rows": window.lines, "columns": window.pixels},
         }
-    lines = (folder / "lines.csv").read_text().splitlines()
-    shifted = [lines[0]]
-    for line in lines[1:]:
-        name, number, time = line.split(",")
-        shifted.append(f"{name},{int(number) + 10},{time}")
     # the table of times begins 10 lines before the window, so that its first line is the image's
-    step = 0.7e-3
-    first = {line.split(",")[0]: float(line.split(",")[2]) for line in reversed(lines[1:])}
-    rows = []
-    for name, time in first.items():
-        rows += [f"{name},0,{time - 10 * step!r}", *(r for r in shifted[1:] if r.startswith(f"{name},"))]
-    (tmp_path / "lines.csv").write_text("\n".join([lines[0], *rows]) + "\n")
+    table = [row.split(",") for row in (folder / "lines.csv").read_text().splitlines()[1:]]
+    table = [(name, int(k) and int(k) + 10, float(s) - (0.0 if int(k) else 7e-3)) for name, k, s in table]
+    bench.csv(tmp_path / "lines.csv", ("camera", "line", "time [s]"), *zip(*table, strict=True))
     other = {**data, "images": images, "lines": {**data["lines"], "file": str(tmp_path / "lines.csv")}}
     again = matched(folder, other)
     for name, row in found.measurements.images.items():
@@ -121,46 +104,3 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
         a, b = np.array(pairs).T
         np.testing.assert_allclose(there.pixel[b], row.pixel[a], rtol=0, atol=0.02)
         np.testing.assert_allclose(there.line[b] - 10.0, row.line[a], rtol=0, atol=0.02)
-
-
-WIDE = {"row": 0, "column": 0, "rows": 9999, "columns": 40}
-WRONG = [
-    ({"images": {"nadir": {"file": "photo.tiff", "first_pixel_sees": "up"}}}, None),
-    ({"orthophoto": {"file": "nadir.tiff"}}, "without a place"),
-    ({"dem": {"file": "photo.tiff"}}, "counted from is not said"),
-    ({"images": {"front": {"file": "nadir.tiff", "first_pixel_sees": "right"}}}, "no such line"),
-    ({"images": {"nadir": {"file": "none.tiff", "first_pixel_sees": "right"}}}, "no such file"),
-    ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel": 11_900, "first_pixel_sees": "right"}}}, "wider than"),
-    ({"images": {"nadir": {"file": "nadir.tiff", "first_line": 50, "first_pixel_sees": "right"}}}, "longer than its"),
-    ({"images": {"nadir": {"file": "nan.tiff", "first_pixel_sees": "right"}}}, "grey values that are not finite"),
-    ({"images": {"nadir": {"file": "complex.tiff", "first_pixel_sees": "right"}}}, "values that are no grey values"),
-    ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel_sees": "right", "window": WIDE}}}, "a window outside of"),
-    ({"images": {"nadir": {"file": "nadir.tiff", "band": 2, "first_pixel_sees": "right"}}}, "no such band"),
-]
-
-
-@pytest.mark.parametrize(("change", "told"), quick(0, WRONG))
-def test_what_does_not_fit_is_refused(files, change: dict[str, Any], told: str | None) -> None:
-    folder, data = files
-    if told is None:
-        with pytest.raises(Exception, match="first_pixel_sees"):
-            OrbitMatchSpec.model_validate({**data, **change})
-        return
-    with pytest.raises(InputError, match=told):
-        matched(folder, {**data, **change})
-
-
-@pytest.mark.second
-def test_heights_that_no_ground_has_are_refused(files, tmp_path: Path) -> None:
-    """One of them, as a flipped bit makes it, would put the ground beyond the Earth."""
-    folder, data = files
-    dem = tmp_path / "dem.tiff"
-    shutil.copy(folder / "dem.tiff", dem)
-    with rasterio.open(dem, "r+") as file:
-        values = file.read(1)
-        values[3, 4] = 1e30
-        file.write(values, 1)
-    with pytest.raises(
-        InputError, match=r"dem.tiff: no heights of ground; found .* to 1e\+30 m, allowed: up to 20000 m"
-    ):
-        matched(folder, {**data, "dem": {"file": str(dem)}})

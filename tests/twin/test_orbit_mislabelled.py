@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from analysis.calibration.plausibility import FarPointsError
+from scenes.specs.measured.orbit_data_setup import resolve_any_calibration
 from tests.tiers import quick
 from tests.twin.orbit_files import FIELDS, edit, export, flown, read_back, set_keys, small
 from twin.orbit.calibration.calibration_run import run_calibration
+from twin.orbit.calibration.campaign import campaign_of
 from twin.orbit.calibration.screening import mislabelled
+from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import duplicates
 from twin.run.procedure import BenchError
 
@@ -22,12 +25,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return export(tmp_path_factory.mktemp("data"), setup, flown(setup)).parent
 
 
-def swapped(folder: Path, place: Path, share: float, table: str, seed: int = 1) -> set[tuple[str, str]]:
-    """Copy the files with names of control points exchanged in pairs; field and name of all of them."""
-    shutil.copytree(folder, place)
+@pytest.fixture
+def file(folder: Path, tmp_path: Path) -> Path:
+    """The test file of a copy that is not screened where it is read."""
+    shutil.copytree(folder, tmp_path / "data")
+    set_keys(tmp_path / "data" / "calibrate.yaml", screening="none")
+    return tmp_path / "data" / "calibrate.yaml"
+
+
+def swapped(place: Path, share: float, table: str, seed: int = 1) -> set[tuple[str, str]]:
+    """Exchange names of control points in pairs; field and name of all of them."""
     random, found = np.random.default_rng(seed), set()
     for name in FIELDS:
-        control = {row[0] for row in rows_of(folder / name / "ground.csv") if row[1] == "control"}
+        control = {row[0] for row in rows_of(place / name / "ground.csv") if row[1] == "control"}
 
         def change(heads: list[str], rows: list[list[str]], control=control, name=name):
             which = heads.index("camera") if table == "image_points" else heads.index("role")
@@ -54,19 +64,13 @@ CASES = [(table, share) for share in (0.2, 0.04, 0.4) for table in ("image_point
 
 
 @pytest.mark.parametrize(("table", "share"), quick(1, CASES))
-def test_exchanged_names_are_found_and_no_others(folder: Path, tmp_path: Path, table: str, share: float) -> None:
+def test_exchanged_names_are_found_and_no_others(file: Path, table: str, share: float) -> None:
     """In the images each line has pairs of its own, so that up to three times the share of the points is in one."""
-    wrong = swapped(folder, tmp_path / "data", share, table)
-    file = tmp_path / "data" / "calibrate.yaml"
-    set_keys(file, screening="none")
+    wrong = swapped(file.parent, share, table)
     with pytest.raises(FarPointsError, match=r"image points of (Beijing|Anhui) lie elsewhere") as refused:
         read_back(file)
     named = str(refused.value)
     assert any(f"{point} in" in named for _, point in wrong)
-    from scenes.specs.measured.orbit_data_setup import resolve_any_calibration
-    from twin.orbit.calibration.campaign import campaign_of
-    from twin.orbit.measured.measurement_tables import read_measurements
-
     setup = resolve_any_calibration(file)
     campaign = campaign_of(setup.test, setup.camera, read_measurements(setup.data, setup.camera), True)
     found = set()
@@ -78,44 +82,33 @@ def test_exchanged_names_are_found_and_no_others(folder: Path, tmp_path: Path, t
     assert found == wrong
 
 
-def test_check_points_with_exchanged_coordinates_are_found(folder: Path, tmp_path: Path) -> None:
-    shutil.copytree(folder, tmp_path / "data")
-    file = tmp_path / "data" / "calibrate.yaml"
-    set_keys(file, screening="none")
-
+def test_check_points_with_exchanged_coordinates_are_found(file: Path) -> None:
     def change(heads, rows):
         checks = [k for k, row in enumerate(rows) if row[1] == "check"]
         rows[checks[0]][0], rows[checks[5]][0] = rows[checks[5]][0], rows[checks[0]][0]
         return heads, rows
 
-    edit(tmp_path / "data" / FIELDS[0] / "ground.csv", change)
+    edit(file.parent / FIELDS[0] / "ground.csv", change)
     _, campaign = read_back(file)
     masks, check = mislabelled(campaign, campaign.passes[0])
     assert check.sum() == 2
     assert not any(mask.any() for mask in masks.values())
 
 
-def test_a_refusal_of_a_measured_test_points_to_its_data(folder: Path, tmp_path: Path) -> None:
-    swapped(folder, tmp_path / "data", 0.2, "image_points")
-    file = tmp_path / "data" / "calibrate.yaml"
-    set_keys(file, screening="none")
-    from scenes.specs.measured.orbit_data_setup import resolve_any_calibration
-
+def test_a_refusal_of_a_measured_test_points_to_its_data(file: Path) -> None:
+    swapped(file.parent, 0.2, "image_points")
     with pytest.raises(BenchError, match="lie elsewhere than those around") as refused:
         run_calibration(resolve_any_calibration(file), None, 0)
     assert refused.value.key == ("data",)
     assert "screening: robust" in refused.value.remedy
 
 
-def test_one_point_under_two_names_is_said(folder: Path, tmp_path: Path) -> None:
-    shutil.copytree(folder, tmp_path / "data")
+def test_one_point_under_two_names_is_said(file: Path) -> None:
     for table in ("ground", "image_points"):
         edit(
-            tmp_path / "data" / FIELDS[0] / f"{table}.csv",
+            file.parent / FIELDS[0] / f"{table}.csv",
             lambda heads, rows: (heads, [*rows, *(["copy", *row[1:]] for row in rows if row[0] == rows[0][0])]),
         )
-    file = tmp_path / "data" / "calibrate.yaml"
-    set_keys(file, screening="none")
     _, campaign = read_back(file)
     one, other = campaign.passes
     assert f"{one.control_ids[0]} = copy" in duplicates(one.control_ids, one.control_ground)

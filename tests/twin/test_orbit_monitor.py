@@ -1,17 +1,15 @@
 """From the on-board monitor to heights on the ground, end to end, and as a user runs it."""
 
-from functools import partial
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, between, intersect_pair
+from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, intersect_pair
 from optics.geometry.tree import Motion
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
-from tests.tiers import quick
-from tests.twin.commands import invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
 from twin.orbit.monitoring.monitoring_run import rms, run_monitor
@@ -19,36 +17,19 @@ from twin.run.procedure import silent
 
 ARCSEC = np.pi / 648000
 FALSE_ALARM = 1e-6
-SMALL = """
-name: small
-instrument: gf7_pair
-reference: 0 min
-interval: 20 min
-repeats: 30
-frames: 2
-course:
-  times: [0 min, 10 min, 20 min, 30 min, 40 min]
-  temperature:
-    base/forward/monitor/left/prism_180:
-      change: [0 K, 0 K, 0 K, 0 K, 0 K]
-      gradient: [[0 K/m, 0 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m],
-        [0 K/m, 0 K/m, 0 K/m]]
-motion:
-  base/forward: {rotate: [0.4 arcsec, 1.2 arcsec, 0.6 arcsec], period: 94.6 min}
-  base/backward: {rotate: [-0.3 arcsec, -1.2 arcsec, -0.8 arcsec], period: 94.6 min}
-  base/backward/focal_plane: {rotate: [0.3 arcsec, -0.4 arcsec, 2 arcsec], pivot: rear_node, duration: 30 min}
-orbit:
-  epoch: 2021-06-21T02:40:00Z
-  before: 2 min
-  after: 42 min
-  passing: {longitude: 116 deg, latitude: 60 deg}
-ground: {points: 60, first: 1500, last: 31267, height: 500 m, relief: 400 m}
-errors: {image: 0.3}
-seed: 3
-"""
+JOB = (Path(__file__).parents[1] / "golden/jobs/monitor.yaml").read_text("utf-8")
+for old, new in (
+    ("repeats: 8", "repeats: 30"),
+    ("points: 20", "points: 60"),
+    ("intervals: .*\n", ""),
+    (r"\d+ mK/m", "0 K/m"),
+    ("change: .*", "change: [0 K, 0 K, 0 K, 0 K, 0 K]"),
+):
+    assert re.search(old, JOB)
+    JOB = re.sub(old, new, JOB)
 HOT = "[0 K/m, 0 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m],\n        [0 K/m, 0 K/m, 0 K/m]]"
-WARM = SMALL.replace(HOT, "[2 mK/m, 9 mK/m, 5 mK/m], [4 mK/m, 18 mK/m, 10 mK/m],\n        [8 mK/m, 20 mK/m, 30 mK/m]]")
-assert WARM != SMALL
+WARM = JOB.replace(HOT, "[2 mK/m, 9 mK/m, 5 mK/m], [4 mK/m, 18 mK/m, 10 mK/m],\n        [8 mK/m, 20 mK/m, 30 mK/m]]")
+assert WARM != JOB
 
 
 def write(folder: Path, text: str) -> Path:
@@ -65,7 +46,7 @@ def changed(setup: MonitorSetup, **errors) -> MonitorSetup:
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory) -> MonitorSetup:
-    return resolve_monitor(write(tmp_path_factory.mktemp("monitor"), SMALL))
+    return resolve_monitor(write(tmp_path_factory.mktemp("monitor"), JOB))
 
 
 @pytest.fixture(scope="module")
@@ -148,13 +129,6 @@ def test_intersection_of_two_rays_is_exact_and_knows_its_limits() -> None:
         line.corrected([0.0, np.nan, 0.0, 0.0])
 
 
-def test_values_between_measurements() -> None:
-    values = np.array([[0.0, 1.0, 2.0, 3.0], [10.0, 1.0, 0.0, 4.0]])
-    found = between([-1.0, 0.0, 2.5, 10.0, 12.0], [0.0, 10.0], values)
-    assert found[:, 0] == pytest.approx([0.0, 0.0, 2.5, 10.0, 10.0])
-    assert found[2] == pytest.approx([2.5, 1.0, 1.5, 3.25])
-
-
 # What monitoring buys
 
 
@@ -197,6 +171,7 @@ def test_noise_is_as_large_as_its_sigma(noisy) -> None:
     """Repeats with everything drawn anew, and every time's own measurement, each against its own sigma, for all share
     the reference's noise: false alarm 1e-6 each."""
     seen, free = noisy.scatter, len(noisy.scatter.heights) - 1
+    assert seen.spread == pytest.approx(np.std(seen.heights, ddof=1))
     total = free * (seen.spread / seen.sigma) ** 2
     assert chi2.ppf(FALSE_ALARM, free) < total < chi2.isf(FALSE_ALARM, free)
     assert 1e-4 < seen.sigma < 0.01
@@ -246,37 +221,3 @@ def test_smoothed_heights(stated) -> None:
 
 
 # The command
-
-
-# what is wrong, key, what to do about it
-BAD = {
-    "node": ("base/backward: {", "base/backwards: {", "motion.base/backwards", ["no such node", "'base/backward'"]),
-    "pivot": ("pivot: rear_node", "pivot: front", "motion.base/backward/focal_plane.pivot", ["no such pivot"]),
-    "too far": ("-1.2 arcsec, -0.8", "-500 arcsec, -0.8", "course", ["keep the beams on the mirrors"]),
-    "cold": (
-        "change: [0 K, 0 K, 0 K, 0 K, 0 K]",
-        "change: [0 K, 0 K, 0 K, -300 K, 0 K]",
-        "course.temperature.base/forward/monitor/left/prism_180.change[3]",
-        ["absolute zero", "30 min"],
-    ),
-    "interval": ("interval: 20 min", "interval: 50 min", "interval", ["longer than the course"]),
-    "disturbances": ("repeats: 30", "disturbances: orbits", "disturbances.file", ["did you mean 'orbit'"]),
-    "cause": (
-        "repeats: 30",
-        "disturbances: {causes: {focal_plane_mounts: {bodies: base/*/focal_planes}}}",
-        "disturbances.causes.focal_plane_mounts.bodies[0]",
-        ["base/forward/focal_plane"],
-    ),
-    "short orbit": ("after: 42 min", "after: 2401 s", "orbit.after", ["a minute before the first and after"]),
-    "no overlap": ("ground: {", "attitude: {offset: [0 deg, 0 deg, 15 deg]}\nground: {", "cameras", ["steering: yaw"]),
-}
-
-
-@pytest.mark.parametrize("case", quick(1, BAD))
-def test_bad_input(case: str, tmp_path: Path) -> None:
-    import twin.orbit.__main__ as command
-
-    old, new, key, words = BAD[case]
-    assert SMALL.count(old) == 1
-    path = write(tmp_path, SMALL.replace(old, new))
-    refused(partial(invoke, command.app), "monitor", path, key, words)

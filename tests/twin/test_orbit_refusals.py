@@ -1,25 +1,290 @@
-"""What functions of orbit and laboratory refuse that no file of a command's tests leads to."""
+"""What commands and readers in orbit refuse, and that they name it: cases in orbit_refusals.yaml, and functions that no
+file leads to."""
 
+import re
+import shutil
 from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace as Ns
 from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
+import tifffile
+from rasterio.transform import from_origin
 
+import twin.orbit.__main__ as command
+from analysis.orbit.forward_intersection import CalibratedLine
+from optics.numerics.physical_error import UnphysicalError
+from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec
+from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resolve_measured_angle
+from scenes.specs.measured.pass_files import GroundFileSpec, PlatformFilesSpec, RasterFileSpec, with_absolute_files
+from scenes.specs.orbit.setup import load_three_line_camera, resolve_angle, resolve_simulate
 from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from tests.tiers import quick
+from tests.twin import dimap_bench, orbit_files
+from tests.twin import orbit_file_bench as bench
+from tests.twin.commands import edited_copy, invoke, refused
+from tests.twin.pushbroom_bench import lost
 from twin.laboratory.distortion_run import _check_angles
 from twin.orbit.angle.angle_flight import angle_camera
-from twin.orbit.export.export_run import read_exportable
+from twin.orbit.angle.angle_run import SimulatedAngleRun
+from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
+from twin.orbit.block.point_workers import PointWorkers
+from twin.orbit.conventions.check_run import run_check
+from twin.orbit.export.estimated_change import ground_rows
+from twin.orbit.export.export_run import read_exportable, run_export
+from twin.orbit.export.polynomial_export import read_polynomial_source
 from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.export.rpc_files import read_rpc
+from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.point_judgement import true_ground
+from twin.orbit.images.simulate_run import run_simulation
 from twin.orbit.jitter.sights import SightsError, sights_of
+from twin.orbit.matching.match_run import run_match
+from twin.orbit.measured.dimap_sensor import read_scene
+from twin.orbit.measured.earth_orientation import read_earth_orientation
+from twin.orbit.measured.ground_files import read_ground_points
+from twin.orbit.measured.map_part import UserMap
+from twin.orbit.measured.platform_files import platform_table, read_platform
 from twin.orbit.monitoring.monitor_series import MonitorSeries
+from twin.run.cli import InputErrorText
+from twin.run.cluster import ClusterError
+from twin.run.data_files import FrameFacts, tiff
+from twin.run.procedure import BenchError
 
+ROOT = Path(__file__).resolve().parents[2]
+TABLE = read_yaml(Path(__file__).with_name("orbit_refusals.yaml")).data
+JOBS = [one for job in TABLE["jobs"] for one in quick(job["quick"], [(job, *case) for case in job["cases"]])]
+
+
+@pytest.mark.parametrize(("job", "old", "new", "key", "words"), JOBS)
+def test_a_job_is_refused_by_line_and_key(
+    job: dict[str, Any], old: str, new: str, key: str, words: list[str], tmp_path: Path
+) -> None:
+    source = ROOT / job["file"]
+    base = [(a, b.replace("{folder}", str(source.parent))) for a, b in job.get("base", ())]
+    path = edited_copy(source, tmp_path, *base, (old, new))
+    refused(partial(invoke, command.app), job["command"], path, key, words)
+
+
+# --- files --------------------------------------------------------------------------------------------------
+
+
+def campaign_files(folder: Path) -> None:
+    setup = orbit_files.small()
+    fields = type(setup.test.fields)({"Beijing": setup.test.fields["Beijing"]})
+    test = setup.test.model_copy(update={"fields": fields, "schemes": (("Beijing",),)})
+    setup = setup.model_copy(update={"test": test})
+    orbit_files.export(folder, setup, orbit_files.flown(setup))
+
+
+def platform_files(folder: Path) -> None:
+    bench.orbit_csv(folder / "orbit.csv")
+    bench.attitude_csv(folder / "attitude.csv")
+    bench.oem_xml(folder / "a.xml")
+    for kind in (bench.oem, bench.aem, bench.sp3):
+        kind(folder / f"a.{kind.__name__}")
+
+
+def map_files(folder: Path) -> None:
+    """Maps in UTM: a good one, and others by numbers, place and format."""
+    how: dict[str, Any] = {"driver": "GTiff", "count": 1, "width": 150, "height": 120}
+    near = (499_000.0, 4_429_000.0)
+    for name, dtype, corner, value in (
+        ("utm.tif", "float32", near, 100.0),
+        ("complex.tif", "complex64", near, 1.0),
+        ("high.tif", "float32", near, -32768.0),
+        ("tall.tif", "float32", near, 15_000.0),
+        ("empty.tif", "float32", near, np.nan),
+        ("far.tif", "float32", (299_000.0, 4_429_000.0), 1.0),
+        ("nosystem.tif", "float32", near, 1.0),
+        ("geoid.tif", "float32", None, 1.0),
+        ("hollow.tif", "float32", None, -99.0),
+        ("wild.tif", "float32", None, 151.0),
+    ):
+        place = from_origin(*corner, 20.0, 20.0) if corner else from_origin(0.0, 1.0, 0.01, 0.01)
+        crs = None if name == "nosystem.tif" else "EPSG:32650" if corner else "EPSG:4326"
+        more = {"dtype": dtype, "crs": crs, "transform": place, "nodata": None if corner else -99.0}
+        with rasterio.open(folder / name, "w", **how, **more) as file:
+            file.write(np.full((120, 150), value, dtype), 1)
+    with rasterio.open(folder / "image.png", "w", driver="PNG", width=4, height=4, count=1, dtype="uint8") as file:
+        file.write(np.zeros((4, 4), "u1"), 1)
+    (folder / "text.tif").write_text("no TIFF")
+    (folder / "cut.tif").write_bytes((folder / "utm.tif").read_bytes()[:3000])
+    (folder / "plain.tif").write_bytes(tiff(np.zeros((1, 40, 40), "f4"), FrameFacts()))
+
+
+def scene_files(folder: Path) -> None:
+    dimap_bench.write(folder, dimap_bench.Scene())
+    dimap_bench.write(folder, dimap_bench.Scene(attitude="samples"), "DIM_SAMPLES.XML")
+
+
+def rpc_files(folder: Path) -> None:
+    scene = dimap_bench.Scene()
+    sensor = read_scene(dimap_bench.write(folder, scene)).sensor
+    model = RationalPolynomial.fit(sensor, 0, scene.pixels, (0.0, 2000.0))
+    (folder / "a_RPC.TXT").write_text(model.text())
+    (folder / "RPC.XML").write_text(dimap_bench.rpc(model))
+    (folder / "plain.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts()))
+
+
+def match_files(folder: Path) -> dict[str, Any]:
+    setup = resolve_simulate(SCENES / ORBIT / "simulate.yaml")
+    patch = setup.test.patch.model_copy(update={"lines": 320, "pixels": 320})
+    test = setup.test.model_copy(update={"patch": patch, "points": None, "oversampling": 2})
+    for name, value in (("nan", np.full((40, 40), np.nan, "f4")), ("complex", np.zeros((40, 40), "c8"))):
+        tifffile.imwrite(folder / f"{name}.tiff", value)
+    size = {"width": 20_000, "height": 20_000, "count": 1, "dtype": "uint8"}
+    rasterio.open(folder / "large.tiff", "w", driver="GTiff", SPARSE_OK=True, **size).close()
+    return bench.match_files(folder, run_simulation(setup.model_copy(update={"test": test}), None, 3))
+
+
+def map_used(folder: Path, spec: dict[str, Any]) -> None:
+    user = UserMap.open(RasterFileSpec.model_validate(spec), folder, heights=True)
+    user.limits()
+    user.part(GroundFrame(np.radians(117.0), np.radians(40.0)), (-400.0, 500.0, -300.0, 600.0), heights=True)
+
+
+def angle_used(folder: Path, spec: dict[str, Any]) -> None:
+    (folder / "angle.yaml").write_text(dump_yaml(spec))
+    run_measured_angle(resolve_measured_angle(folder / "angle.yaml"))
+
+
+def used(kind: type, setup: type, run: Callable[..., object], folder: Path, spec: dict[str, Any]) -> None:
+    test = with_absolute_files(kind.model_validate(spec), folder)
+    run(setup.model_construct(test=test, camera=load_three_line_camera("th1")), None, 0)
+
+
+READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, dict[str, Any]], object]]] = {
+    "campaign": (campaign_files, lambda folder, _: orbit_files.read_back(folder / "calibrate.yaml")),
+    "angle": (campaign_files, angle_used),
+    "platform": (
+        platform_files,
+        lambda folder, spec: platform_table(
+            *read_platform(PlatformFilesSpec.model_validate(spec), folder), bench.EPOCH
+        ),
+    ),
+    "earth": (lambda _: None, lambda folder, _: read_earth_orientation(folder / "eop.txt")),
+    "ground": (map_files, lambda folder, spec: read_ground_points(GroundFileSpec.model_validate(spec), folder)),
+    "map": (map_files, map_used),
+    "scene": (scene_files, lambda folder, spec: read_scene(folder / spec.get("file", "DIM_SCENE.XML"))),
+    "rpc": (rpc_files, lambda folder, spec: read_rpc(folder / spec["file"])),
+    "check": (partial(bench.check_files, count=8), partial(used, OrbitCheckSpec, CheckSetup, run_check)),
+    "match": (match_files, partial(used, OrbitMatchSpec, MatchSetup, run_match)),
+}
+"""What writes the good files of a kind into a folder and returns their specification, and what reads them."""
+FILES = [
+    pytest.param(part, row, marks=[pytest.mark.second] if part.get("second") else [], id=f"{name}-{k}")
+    for name, part in TABLE["files"].items()
+    for k, row in enumerate(part["cases"])
+]
+
+
+def edited(text: str, edit: Any) -> str:
+    """Return a text after one edit of the table; rows count from 1 as messages do."""
+    rows = text.split("\n")
+    match edit:
+        case [int(row), int(cell), new]:
+            cells = rows[row - 1].split(",")
+            rows[row - 1] = ",".join([*cells[:cell], new, *cells[cell + 1 :]])
+        case {"text": new}:
+            return str(new)
+        case {"kept": numbers}:
+            rows = [rows[0], *(rows[k - 1] for k in numbers), ""]
+        case {"first": count}:
+            rows = [*rows[:count], ""]
+        case {"without": row}:
+            del rows[row - 1]
+        case {"again": row}:
+            rows.insert(row, rows[row - 1])
+        case {"column": [head, value]}:
+            rows = [f"{row}{f',{value}' if k else f', {head}'}" for k, row in enumerate(rows) if row]
+        case {"sub": [old, new]}:
+            return re.sub(old, new, text, flags=re.M)
+        case [old, new]:
+            return text.replace(old, new)
+    return "\n".join(rows)
+
+
+def merged(spec: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    """Return a specification with other values; None takes a key away."""
+    found = spec | {k: merged(spec.get(k, {}), v) if isinstance(v, dict) else v for k, v in change.items()}
+    return {k: v for k, v in found.items() if v is not None}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, dict[str, Any]]]:
+    @cache
+    def made(reader: str) -> tuple[Path, dict[str, Any]]:
+        folder = tmp_path_factory.mktemp(reader)
+        return folder, READERS[reader][0](folder) or {}
+
+    return made
+
+
+def test_the_command_ends_with_2_and_writes_nothing(good, tmp_path: Path) -> None:
+    shutil.copytree(good("campaign")[0], tmp_path, dirs_exist_ok=True)
+    (tmp_path / "Beijing/ground.csv").write_text("point\n")
+    out, data = tmp_path / "run", tmp_path / "again"
+    result = invoke(command.app, "calibrate", tmp_path / "calibrate.yaml", "--out", out, "--export", data)
+    assert (result.exit_code, out.exists(), data.exists()) == (2, False, False)
+    assert "ground.csv:1" in result.stderr
+
+
+def test_a_scene_of_which_a_part_looks_past_the_earth_is_not_exported(tmp_path: Path) -> None:
+    """The look turns by ten degrees over the image, whose middle sees the ground near the limb."""
+    scene = dimap_bench.write(tmp_path, dimap_bench.Scene(pitch=1.0, rate=(0.2, 0.0)))
+    result = invoke(command.app, "export", scene, "--out", tmp_path / "run")
+    assert (result.exit_code, (tmp_path / "run").exists()) == (2, False)
+    told = " ".join(result.stderr.split())
+    assert "a look misses the Earth; allowed: an orbit over ground that every line sees" in told
+
+
+@pytest.mark.parametrize(("part", "row"), FILES)
+def test_a_file_is_refused_by_words(part: dict[str, Any], row: list[Any], good, tmp_path: Path) -> None:
+    folder, spec = good(part["reader"])
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    spec = merged(spec, part.get("spec", {}))
+    for name, text in part.get("files", {}).items():
+        (tmp_path / name).write_text(text)
+    words, *items = row
+    file = tmp_path
+    for item in items:
+        if isinstance(item, str):
+            file = tmp_path / item
+        elif "said" in item:
+            spec = merged(spec, item["said"])
+        else:
+            before = file.read_bytes().decode("latin-1") if file.exists() else None
+            after = edited(before or "", item)
+            assert after != before
+            file.write_bytes(after.replace("␀", "\0").encode("latin-1"))
+    with pytest.raises((InputError, BenchError, UnphysicalError)) as caught:
+        READERS[part["reader"]][1](tmp_path, spec)
+    for word in [words] if isinstance(words, str) else words:
+        assert word in str(caught.value)
+
+
+# --- functions ----------------------------------------------------------------------------------------------
+
+
+def calibrated() -> CalibratedLine:
+    camera = lost().camera
+    return CalibratedLine(camera.pixels, camera.directions, camera.origins, np.eye(3), 0.65)
+
+
+GONE: Any = Ns(submit=lambda *_: Ns(status="lost"), next_finished=lambda look: look())
 FILE = Path("scene.ntf")
+TRACED = SimulatedAngleRun.__new__(SimulatedAngleRun)
+object.__setattr__(TRACED, "setup", resolve_angle(SCENES / ORBIT / "angle_gf7.yaml"))
+MEASURED: Any = Ns(setup=resolve_measured_angle(SCENES / ORBIT / "measured/angle.yaml"))
 PLACES = np.column_stack([np.zeros((2, 3)), [-179.9, 179.9], np.zeros(2)])
 SPOT = Ns(reading=np.ones((1, 1)), lines=np.full((1, 1), 3), file=Ns(file="spots.csv"), head="reading [deg]")
 UNMADE: Any = Ns(setup=None, test=None, camera=None, instrument=None, images={"nadir": 1}, kind="other", name="th1")
@@ -31,6 +296,14 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
         ValueError,
         "how its line nadir forms an",
     ),
+    (lambda: angle_exported(TRACED), InputError, "camera: the lines of an instrument are traced"),
+    (lambda: angle_exported(MEASURED), InputError, "data: measurements are files already"),
+    (lambda: command._ground("1 m", None), InputErrorText, "give both"),
+    (lambda: command._ground("1 s", "2 m"), InputErrorText, "--lowest, --highest: .*'0 m' and '2000 m'"),
+    (lambda: command._ground("5 m", "1 m"), InputErrorText, "--lowest must be below --highest"),
+    (lambda: run_export(UNMADE, UNMADE, None, changes={}), ValueError, "only the cameras of an instrument"),
+    (lambda: PointWorkers(GONE, 1).results(abs, [(1,)]), ClusterError, "a worker was lost"),
+    (lambda: ground_rows(lost(), calibrated(), np.zeros(4), 0.0), ValueError, "a look misses the Earth"),
     (lambda: angle_camera(UNMADE, None), ValueError, "an instrument's lines need a backend"),
     (lambda: RationalPolynomial.through(PLACES, PLACES), ValueError, "the 180th meridian or a pole"),
     (lambda: sights_of(UNMADE, {}, ("blue",), None, None), SightsError, "no image points of blue"),
@@ -46,6 +319,7 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
         InputError,
         "only the scene of a DIMAP file has bands",
     ),
+    (lambda: read_polynomial_source(Path("a_RPC.TXT"), "B0"), InputError, "only the scene of a DIMAP file has bands"),
 ]
 
 
@@ -53,6 +327,7 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
 def test_what_is_refused(case: tuple[Any, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     FILE.write_text("NITF")
+    (tmp_path / "a_RPC.TXT").write_text("LINE_OFF: 1")
     call, error, words = case
     with pytest.raises(error, match=words):
         call()

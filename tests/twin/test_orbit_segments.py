@@ -1,5 +1,6 @@
 """What of an orbit's file may be joined: segments, usable times, steps that are too wide, older versions."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,9 @@ def test_older_and_unfinished_files_of_sp3(tmp_path: Path) -> None:
         found = read_sp3(old, name)
         assert (found.scale, found.frame) == ("GPS", "ITRS")
         assert np.array_equal(found.position, whole.position)
+    alone = re.sub(r"^[PV]G01.*\n", "", text.replace("+    2   G01L51", "+    1   L51"), flags=re.M)
+    (tmp_path / "one.sp3").write_text(alone, "utf-8")
+    assert np.array_equal(read_sp3(tmp_path / "one.sp3", None).position, whole.position)
     unfinished = tmp_path / "u.sp3"
     unfinished.write_text(text.replace("EOF\n", ""), "utf-8")
     assert np.array_equal(read_sp3(unfinished, "L51").position, whole.position)

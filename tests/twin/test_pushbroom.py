@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from scipy import constants
 from scipy.special import erf
-from scipy.stats import chi2
 
 from analysis.mtf.slanted_edge import measure_edge
 from scenes.specs.load import load_detector
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, TerrainSpec
 from scenes.specs.orbit.setup import load_three_line_camera
-from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, optics
+from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, lost, optics, shaken
 from twin.orbit.flight.line_camera import LineCamera
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.terrain import Terrain
@@ -118,22 +117,6 @@ def test_grey_ground_has_the_grey_value_of_the_hand() -> None:
     assert grey.mean() == pytest.approx(20.0 + 0.025 * (0.55 * expected + 14.0), rel=1e-4)
 
 
-def test_noise_follows_the_photon_transfer() -> None:
-    """Variance of a pixel's grey values over frames: K^2 (electrons + read noise^2) + 1/12 for rounding; false alarm
-    1e-6 to either side, at three levels."""
-    ccd, count, checked = optics()["nadir"].ccd, 64, 0
-    for share in (0.05, 0.3, 0.7):
-        photons = np.full((16, 40), share * ccd.detector.full_well_e / ccd.detector.quantum_efficiency)
-        frames = ccd.expose(photons[None], 5000, lines()["nadir"].pattern, count, np.random.SeedSequence(8))[0]
-        variance = frames.astype(float).var(axis=0, ddof=1).mean()
-        electrons = share * ccd.detector.full_well_e + 14.0
-        expected = 0.025**2 * (electrons + 60.0**2) + 1.0 / 12.0
-        freedom = (count - 1) * photons.size
-        assert 1e-6 < chi2.sf(variance / expected * freedom, freedom) < 1.0 - 1e-6
-        checked += 1
-    assert checked == 3
-
-
 @pytest.mark.second
 @pytest.mark.parametrize(("name", "direction"), [("nadir", "x"), ("nadir", "y"), ("forward", "x"), ("forward", "y")])
 def test_an_edge_on_the_ground_has_the_mtf_of_the_optics(name: str, direction: str) -> None:
@@ -225,6 +208,18 @@ def test_steep_terrain_is_refused() -> None:
             looked()
 
 
+def test_looks_that_cannot_be_followed_are_refused() -> None:
+    """A window at the image's end, looks past the Earth, an attitude that no node follows."""
+    flat, inside = Terrain.flat(600.0), Window(40, 6000, 10, 10)
+    for sensor, window, words in (
+        (lines()["nadir"].sensor, Window(0, 0, 40, 40), "does not lie"),
+        (lost(), Window(64_000, 6000, 40, 40), "a look misses the Earth"),
+        (shaken(), inside, "an attitude so rough"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            look_map(sensor, FRAME, flat, window)
+
+
 HILLS = TerrainSpec.model_validate({"kind": "fractal", "relief": "60 m", "height": "600 m", "exponent": 2.3})
 GROUND = GroundSpec(terrain=HILLS)
 
@@ -235,6 +230,7 @@ def test_what_cannot_be_imaged() -> None:
         ((PLACE[0] + 0.02, PLACE[1]), (60, 60), "place"),
         ((PLACE[0], PLACE[1] + 0.12), (60, 60), "span"),
         (PLACE, (60, 11990), "size"),
+        (PLACE, (12_000, 60), "size"),
     ]
     for place, size, part in cases:
         with pytest.raises(PatchError) as caught:

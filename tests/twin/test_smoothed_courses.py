@@ -1,5 +1,5 @@
 """Courses drawn from stated disturbances with their laws in time, traced, measured and smoothed: chi-square of the
-series, sigmas that hold, and heights between the measurements against linear interpolation.
+series, and sigmas that hold.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,6 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.estimators import Posterior, Shifts
 from analysis.monitor.recovery import recover
 from analysis.monitor.series_smoother import SmoothedSeries, smooth
 from analysis.spots.spot_positions import SeriesNoise
@@ -58,7 +57,7 @@ class Courses:
         experiment: the instrument.
         times: (T,) seconds; at: numbers of those that are measured.
         truth: (N, T, 8) true parameters; height: (N, T) true errors of heights without correction, metres.
-        shifts: (N, M, 8) px, and covariances (N, M, 8, 8).
+        shifts: (N, M, 8) px.
         noise: of each course.
     """
 
@@ -68,7 +67,6 @@ class Courses:
     truth: np.ndarray
     height: np.ndarray
     shifts: np.ndarray
-    covariance: np.ndarray
     noise: Sequence[White | SeriesNoise]
 
     @property
@@ -92,22 +90,6 @@ class Courses:
         first, second = (camera.geometry.principal_distance_m for camera in self.experiment.cameras.values())
         rows = geometry.rows((first, second))
         return np.asarray(rows[len(rows) // 2, 2])
-
-    @cached_property
-    def alone(self) -> np.ndarray:
-        """(N, M, 8) what each measurement says alone."""
-        out = []
-        for shifts, covariance in zip(self.shifts, self.covariance, strict=True):
-            after = shifts.reshape(len(shifts), -1, 2)
-            gain = Posterior().gain(Shifts(0.0 * after, after, covariance, self.experiment.cameras, self.stated))
-            out.append(np.einsum("mpd,md->mp", gain, shifts))
-        return np.array(out)
-
-    @cached_property
-    def interpolated(self) -> np.ndarray:
-        """(N, T, 8) linear between these."""
-        when = self.times[self.at]
-        return np.array([np.stack([np.interp(self.times, when, v) for v in one.T], axis=-1) for one in self.alone])
 
     def left(self, values: np.ndarray) -> np.ndarray:
         """(N, T) error of heights that are corrected by values (N, T, 8), metres."""
@@ -151,29 +133,7 @@ def traced(experiment: MonitorExperiment, times: np.ndarray, at: np.ndarray, cou
     shifts = (place[1:] - place[0]).reshape(count, len(at), -1)
     rng = np.random.default_rng(seed + 1)
     shifts = shifts + NOISE * (rng.standard_normal(shifts.shape) + rng.standard_normal((count, 1, shifts.shape[2])))
-    covariance = np.broadcast_to(2.0 * NOISE**2 * np.eye(shifts.shape[2]), (*shifts.shape, shifts.shape[2]))
-    noise = [White(shifts.shape[2])] * count
-    return Courses(experiment, times, at, truth, height, shifts, covariance, noise)
-
-
-def imaged(experiment: MonitorExperiment, times: np.ndarray, at: np.ndarray, count: int, seed: int) -> Courses:
-    """Spots from exposed images; each course has a detector and a reference image of its own."""
-    states = states_of(experiment, times, count, seed)
-    truth, height = truths(experiment, states, count)
-    shifts, covariance, noises = [], [], []
-    for n in range(count):
-        seen = [states[n * len(times) + k] for k in at]
-        own = seed + 1 + n
-        before = experiment.frames_before(9, own)
-        after = experiment.frames_after(experiment.path.expected_photons(seen), 9, own)
-        found = recover(before, after, experiment.calibration, threads=2, keep_parts=True)
-        assert found.parts is not None
-        noise = SeriesNoise(found.parts[0], len(at))
-        noise.add(found.parts[1])
-        shifts.append(found.shift)
-        covariance.append(found.shift_covariance)
-        noises.append(noise)
-    return Courses(experiment, times, at, truth, height, np.array(shifts), np.array(covariance), noises)
+    return Courses(experiment, times, at, truth, height, shifts, [White(shifts.shape[2])] * count)
 
 
 def check_chi_square(courses: Courses) -> None:
@@ -199,21 +159,6 @@ def check_sigmas(courses: Courses) -> None:
         assert squares.max() < chi2.isf(one, count), name
 
 
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def factors(courses: Courses) -> tuple[float, float]:
-    """By which heights between the measurements, smoothed, are better than linear between them; and heights at the
-    measurements than by each alone."""
-    between = np.setdiff1d(np.arange(len(courses.times)), courses.at)
-    smoothed, linear = (courses.left(v) for v in (courses.values("smoothed"), courses.interpolated))
-    return (
-        rms(linear[:, between]) / rms(smoothed[:, between]),
-        rms(linear[:, courses.at]) / rms(smoothed[:, courses.at]),
-    )
-
-
 TIMES = MINUTES * np.arange(0.0, 101.0, 10.0)
 
 
@@ -221,17 +166,6 @@ TIMES = MINUTES * np.arange(0.0, 101.0, 10.0)
 def test_a_few_courses(experiment) -> None:
     """Twelve courses over half an orbit."""
     courses = traced(experiment("gf7_pair"), TIMES[:5], np.array([0, 2, 4]), 12, 1)
-    check_chi_square(courses)
-    check_sigmas(courses)
-    between, at = factors(courses)
-    assert between > 1.1
-    assert at > 0.9
-
-
-@pytest.mark.second
-def test_courses_by_images(experiment) -> None:
-    """The whole chain, with detectors' patterns that stay from image to image."""
-    courses = imaged(experiment("gf7_pair"), TIMES[:5], np.arange(0, 5, 2), 6, 3)
     check_chi_square(courses)
     check_sigmas(courses)
 

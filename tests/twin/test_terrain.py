@@ -94,22 +94,6 @@ def test_a_correlated_field_has_its_covariance() -> None:
     assert white.std() == pytest.approx(1.0, abs=0.03)
 
 
-@pytest.mark.second
-def test_reflectance() -> None:
-    """Mean and contrast as asked for, within what 100 fields' chance and clipping leave, 20%; the same seed gives the
-    same ground, and a date on which a quarter has changed leaves the rest alone."""
-    ground = reflectance(EXTENT, TEXTURE, SEED)
-    values = ground.coefficients
-    assert values.mean() == pytest.approx(0.18, rel=0.2)
-    assert values.std() / values.mean() == pytest.approx(0.3, rel=0.25)
-    assert np.array_equal(reflectance(EXTENT, TEXTURE, SEED).coefficients, values)
-    later = reflectance(EXTENT, TEXTURE, SEED, 0.25).coefficients
-    different = np.mean(later != values)
-    # fields are 0.6 of the ground less lanes and gaps between blocks; 5 sigma of 150 fields
-    assert 0.05 < different < 0.25
-    assert not np.array_equal(reflectance(EXTENT, TEXTURE, np.random.SeedSequence(8)).coefficients, values)
-
-
 def test_nothing_beyond_the_ground() -> None:
     ground = reflectance(EXTENT, TEXTURE, SEED)
     corners = np.array([EXTENT.west, EXTENT.east]), np.array([EXTENT.south, EXTENT.north])

@@ -214,7 +214,7 @@ def export(
         stated = {name: _sigma(name, *one) for name, one in sigmas.items() if one[0] is not None}
         uncertainty = CameraUncertainty.of(**stated) if stated else None
         points = None if control is None else read_control(control, correction.value)
-        read = read_polynomial_source(source) or read_exportable(source, seed, band)
+        read = read_polynomial_source(source, band) or read_exportable(source, seed, band)
         return read, _ground(lowest, highest), Wishes(uncertainty, points)
 
     def work(given: tuple[Exportable, tuple[float, float] | None, Wishes], session: Session) -> Result:

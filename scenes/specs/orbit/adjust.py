@@ -328,6 +328,9 @@ class OrbitAdjustSpec(TitledSpec):
             for j, name in enumerate(angle.between):
                 if name not in trackers:
                     raise unknown("no such star tracker in the passes", name, trackers, ("angles", k, "between", j))
+            if len(set(angle.between)) == 1:
+                problem, place = "an angle of a star tracker with itself", ("angles", k, "between")
+                raise Problem(problem, angle.between[0], "two star trackers", within=place)
         lasting = [one for one in self.errors.attitude.values() if (one.law, one.shared_by) == ("constant", "tracker")]
         if self.angles and not lasting:
             problem = "an angle between star trackers that have no constant error"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise
+from analysis.orbit.calibration_parameters import CalibrationField, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import INTERIOR, LineModel, Rays
 from optics.geometry.pose import about_axis, rotation_matrix
@@ -412,8 +412,6 @@ def _field_pass(
     for row in one.images.values():
         np.add.at(rays, row.point, 1)
     known = (role == "control") & (rays > 0)
-    if not np.any(known):
-        raise CalibrationError(f"field {one.name!r}: no image shows a control point")
     _, latitude, height = earth.geodetic(one.ground.itrs[known])
     pitch = {name: payload.pitch_of(name) for name in one.images}
     own = FrozenMap({name: models[name] for name in one.images})

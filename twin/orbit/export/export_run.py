@@ -167,8 +167,13 @@ def read_exportable(path: Path, seed: int | None = None, band: str | None = None
         allowed = "the scene's DIM_NAME.XML, or its rational polynomials as NAME_RPC.TXT, RPC_NAME.XML or GeoTIFF"
         raise InputError(Issue("a NITF file, which is not read", str(path), allowed=allowed))
     if band is not None:
-        raise InputError(Issue("only the scene of a DIMAP file has bands", str(path), None, ("band",), band))
+        raise no_bands(path, band)
     return read_source(path, seed)
+
+
+def no_bands(path: Path, band: str) -> InputError:
+    """Return the error of a band that was asked for of a source without bands."""
+    return InputError(Issue("only the scene of a DIMAP file has bands", str(path), None, ("band",), band))
 
 
 _SCENES = (".xml", ".dim")
@@ -324,8 +329,8 @@ def _of_angle(
     for name, line in chosen.items():
         pitch = _pitch(setup, name)
         time = setup.test.time
-        step = _line_time(line, flown.trajectory, flown.earth, time)
         room = min(time - flown.trajectory.first, flown.trajectory.last - time)
+        step = _line_time(line, flown.trajectory, flown.earth, time) if room > 2.0 * _PROBE else np.inf
         lines = min(line.pixels, int(2.0 * room / step) - 1)
         if lines < 2:
             raise BenchError("the orbit ends at the moment of the test", ("time",), "a longer orbit")
@@ -359,14 +364,18 @@ def _pitch(setup: AngleSetup, name: str) -> float:
     return float(setup.cameras[setup.instrument.cameras[name].camera].line.pitch)
 
 
+_PROBE = 1e-3
+"""Seconds over which the motion of an image is looked at."""
+
+
 def _line_time(line: LineCamera, trajectory: Trajectory, earth: Any, time: float) -> float:
     """Seconds in which the image of the line's middle moves by a pixel along the track."""
     middle = np.array([0.5 * (line.pixels - 1)])
-    probe = Sensor(line, trajectory, earth, 1e-3, time, 1)
+    probe = Sensor(line, trajectory, earth, _PROBE, time, 1)
     ground = probe.ground(np.array([0.0, 0.0]), middle + np.array([-0.5, 0.5]), 0.0)
-    after = replace(probe, first_line_time=time + 1e-3).ground(np.array([0.0]), middle, 0.0)
+    after = replace(probe, first_line_time=time + _PROBE).ground(np.array([0.0]), middle, 0.0)
     before = probe.ground(np.array([0.0]), middle, 0.0)
-    return 1e-3 * float(np.linalg.norm(ground[1] - ground[0]) / np.linalg.norm(after[0] - before[0]))
+    return _PROBE * float(np.linalg.norm(ground[1] - ground[0]) / np.linalg.norm(after[0] - before[0]))
 
 
 def _exported(

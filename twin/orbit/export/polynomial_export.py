@@ -12,6 +12,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.export.export_report import FOLDER
+from twin.orbit.export.export_run import no_bands
 from twin.orbit.export.quality import Controlled, Quality, Wishes
 from twin.orbit.export.quality_run import controlled_line
 from twin.orbit.export.quality_sections import CONTROL, control_section, quality_answers, quality_warnings
@@ -55,17 +56,20 @@ class PolynomialExport:
     control: Controlled
 
 
-def read_polynomial_source(path: Path) -> PolynomialSource | None:
+def read_polynomial_source(path: Path, band: str | None = None) -> PolynomialSource | None:
     """Rational polynomials, where a file holds them alone; None for another file.
 
     Args:
         path: of it.
+        band: that was asked for, which polynomials do not have.
 
     Raises:
-        InputError: it holds polynomials that cannot be read.
+        InputError: it holds polynomials that cannot be read, or a band is asked for.
     """
     if not path.is_file() or not is_rpc(path):
         return None
+    if band is not None:
+        raise no_bands(path, band)
     name = _UNSAFE.sub("_", _ENDING.sub("", path.stem)) or "image"
     return PolynomialSource(name, str(path), read_rpc(path), dump_yaml({"source": str(path)}))
 

@@ -185,7 +185,6 @@ def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Or
     Raises:
         ValueError: no such orbit: the place lies beyond the inclination's latitudes, it is too high to be
             sun-synchronous, or it runs into the Earth.
-        RuntimeError: the integration failed.
     """
     rotation = earth.rotation(spec.epoch, -spec.before, spec.after)
     to_gcrs = rotation.celestial(0.0).T
@@ -233,8 +232,7 @@ def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
     )
     if found.status == 1 or above_ground(0.0, state) < 0.0:
         raise UnphysicalError(f"the orbit runs into the Earth {found.t[-1]:.0f} s from its epoch")
-    if not found.success:
-        raise RuntimeError(f"the orbit could not be followed: {found.message}")
+    assert found.success, found.message
     return found.sol
 
 
