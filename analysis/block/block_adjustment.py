@@ -157,10 +157,8 @@ class _Factor:
     """A factor of a positive definite matrix, whose unknowns are brought to one size first."""
 
     def __init__(self, matrix: sparse.csc_matrix) -> None:
-        diagonal = matrix.diagonal()
-        if not np.all(diagonal > 0):
-            raise BlockError("block: an unknown that nothing determines")
-        self.size = 1.0 / np.sqrt(diagonal)
+        # every unknown has a prior, so that none of these is zero
+        self.size = 1.0 / np.sqrt(matrix.diagonal())
         self.scaled = (sparse.diags(self.size) @ matrix @ sparse.diags(self.size)).tocsc()
         self.count = matrix.shape[0]
         try:
@@ -181,8 +179,6 @@ class _Factor:
 
     def inverse(self) -> Array:
         """(P, P), whole: several times faster from a whole factor than column by column from a sparse one."""
-        if self.count > _MOST:
-            raise BlockError(f"block: {self.count} unknowns beside the points; at most {_MOST} are adjusted at once")
         found, failed = dpotrf(self.scaled.toarray(order="F"), lower=1, clean=0, overwrite_a=1)
         if failed:
             raise BlockError(_SINGULAR)
@@ -225,6 +221,8 @@ def adjust_block(
     check_places(block)
     assembly = assembled(block, datum)
     reduction = assembly.reduction
+    if reduction.size > _MOST:
+        raise BlockError(f"block: {reduction.size} unknowns beside the points; at most {_MOST} are adjusted at once")
     points: Reduction | SharedReduction = reduction if pool is None else SharedReduction.of(reduction, pool)
     groups = [*(one.group for one in reduction.sets), *(one.group for one in reduction.priors)]
     weight = tuple(np.ones(len(one.point)) for one in reduction.sets)

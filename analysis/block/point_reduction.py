@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from analysis.block.packets import Packets
-from analysis.block.processes import BlockError
 from analysis.block.reweighting import standardised_packets
 
 __all__ = ["Bundle", "Checked", "Eliminated", "PriorGroup", "Reduced", "Reduction", "Rows", "State"]
@@ -169,8 +168,6 @@ class Reduction:
             places.append(np.arange(len(columns)))
             tables += list(columns[where])
             first += len(where)
-        if not points:
-            raise BlockError("block: no observations")
         order = np.lexsort((np.concatenate(codes), np.concatenate(points)))
         every: list[Indices] = [np.concatenate(v).astype(np.intp)[order] for v in (points, codes, owners, places)]
         point, code, owner, place = every

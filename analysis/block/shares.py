@@ -65,7 +65,8 @@ class SharedReduction:
             first[one.point] = np.minimum(first[one.point], k)
             last[one.point] = k
         order = np.lexsort((last, first))
-        points = tuple(np.sort(part) for part in np.array_split(order[last[order] >= 0], pool.count))
+        seen = order[last[order] >= 0]
+        points = tuple(np.sort(part) for part in np.array_split(seen, min(pool.count, len(seen))))
         packets = tuple(whole.packets_at(part) for part in points)
         held = tuple(pool.hold([whole.restricted(part) for part in points]))
         columns = tuple(pool.results(_columns, [(one,) for one in held]))

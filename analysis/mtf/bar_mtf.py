@@ -284,7 +284,7 @@ def _start(grey: Array, frequency: ArrayLike | None) -> Array:
         allowed = np.all(np.abs(near - wanted[:, None, None]) * shape[:, None, None] <= 1.0, axis=0)
         return _peak(power, near, allowed)
     turns = np.arange(-math.ceil(abs(wanted)), math.ceil(abs(wanted)) + 1)
-    best, strongest = None, -1.0
+    best, strongest = np.zeros(2), -1.0
     for row_turn in turns:
         for column_turn in turns:
             shifted = cells + np.array([row_turn, column_turn])[:, None, None]
@@ -292,8 +292,6 @@ def _start(grey: Array, frequency: ArrayLike | None) -> Array:
             allowed &= (shifted[1] > 0) | ((shifted[1] == 0) & (shifted[0] > 0))
             if allowed.any() and power[allowed].max() > strongest * (1.0 + 1e-9):
                 best, strongest = _peak(power, shifted, allowed), float(power[allowed].max())
-    if best is None:
-        raise BarError(f"no frequency of {float(wanted):g} cycles/pixel fits the region: state it in cycles/pixel")
     return best
 
 
@@ -308,8 +306,6 @@ def _other_alias(fitted: Array, frequency: ArrayLike | None) -> Array | None:
 
 
 def _peak(power: Array, cells: Array, allowed: NDArray[np.bool]) -> Array:
-    if not allowed.any():
-        raise BarError("the region is too small for the stated frequency: take one of several periods of the bars")
     index = int(np.argmax(np.where(allowed, power, -1.0)))
     return cells.reshape(2, -1)[:, index].copy()
 

@@ -369,8 +369,12 @@ def line_orientation(fit: InteriorOrientation) -> LineOrientation:
     point = p / (1.0 + 3.0 * k3 / f)
     values = np.array([(point - c) / f, f, point, -k3 / f**3])
     for _ in range(_STEPS):
-        angle, columns, rate = _model(values, fit.position)
-        solve = gain(columns * rate[:, None])
+        with np.errstate(all="ignore"):  # steps of a camera that is none may end anywhere
+            angle, columns, rate = _model(values, fit.position)
+            weighted = columns * rate[:, None]
+        if not np.all(np.isfinite(weighted)):
+            break
+        solve = gain(weighted)
         step = solve @ ((fit.angle - angle) * rate)
         values = values + step
         spread = solve @ fit.noise @ solve.T

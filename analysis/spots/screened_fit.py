@@ -217,6 +217,8 @@ def fit_screened(
             break
     design, level = model.design(theta)
     spot_image.check_edge(theta[None, :2], *template.shape, EDGE_PX)
+    if not np.all(np.diag(inverse) > 0.0):
+        raise np.linalg.LinAlgError("fewer pixels than unknowns")
     weak = theta[2] < _FLUX_SIGMAS * np.sqrt(inverse[2, 2])
     spot_image.reject(np.array([weak]), f"no spot: the flux is not significant (below {_FLUX_SIGMAS:g} sigma)")
     influence = inverse[:2] @ weighted

@@ -1,7 +1,8 @@
 """A block adjusted once more: one dense normal matrix of all unknowns, in a parametrisation of its own.
 
 Unknowns are the readings themselves (radians, metres) with dense covariances, the values of walks and slow processes,
-and points east, north and up. Derivatives are central differences through the test's own projection.
+and points east, north and up. Each kind of observation is a function of a few quantities (turn, shift, change of the
+camera, point) that are linear in the unknowns; its derivatives are central differences.
 """
 
 from __future__ import annotations
@@ -12,203 +13,149 @@ from scipy.spatial.transform import Rotation
 from tests.analysis.drawn_blocks import EAST, LOOKS, NORTH, UP, basis, project
 
 FRAME = np.stack([EAST, NORTH, UP])
-ZERO = np.zeros(3)
+TURN, METRES, CHANGE = [1e-6] * 3, [1.0] * 3, [1e-6, 1e-6, 1e-6, 1e-5]
+"""Steps of the differences: radians, metres, and of a camera's change."""
 
 
 class DenseBlock:
     """Adjusted block: `ground` (m, 3), `ground_covariance` (m, 3, 3), `changes`, `turns` at the times of scenes."""
 
-    def __init__(self, block, steps=5):
+    def __init__(self, block, steps=3):
         self.block = block
         self.size = 0
-        self.priors = []  # columns, covariance, mean
+        self.priors = []  # columns, weight matrix, mean
         self.turn_of, self.shift_of = {}, {}
         self._processes()
-        self._cameras()
-        self.common = None
-        if block.terrain is not None:
-            self.common = self._new(np.array([[block.terrain.common**2]]))
-        used = np.zeros(len(block.points.ids), bool)
-        for s in block.scenes:
-            used[s.rays.point] = True
-        self.points = np.flatnonzero(used)
-        self.place = np.full(len(used), -1)
-        self.place[self.points] = np.arange(len(self.points))
-        self.first_point = self.size
-        total = self.size + 3 * len(self.points)
-        u = np.zeros(total)
-        self.origin = block.points.start[self.points]
+        self.change = {}
+        for name in block.cameras:
+            known = (block.monitored or block.known)[name]
+            columns = self._new(known.covariance, known.mean.ravel())
+            self.change |= {(one.name, name): columns[4 * k : 4 * k + 4] for k, one in enumerate(block.passes)}
+        common = [] if block.terrain is None else self._new(np.array([[block.terrain.common**2]]))
+        self.points = np.unique(np.concatenate([s.rays.point for s in block.scenes]))
+        self.total = self.size + 3 * len(self.points)
+        self.packets = list(self._packets(common))
+        u = np.zeros(self.total)
         for _ in range(steps):
             normal, right, self.chi_square = self._equations(u)
-            step = np.linalg.solve(normal, right)
-            u = u - step
+            u = u - np.linalg.solve(normal, right)
         normal, _, self.chi_square = self._equations(u)
         scale = 1 / np.sqrt(np.diag(normal))
         self.covariance = scale[:, None] * np.linalg.inv(scale[:, None] * normal * scale) * scale
         self.u = u
-        local = u[self.first_point :].reshape(-1, 3)
-        self.ground = self.origin + local @ FRAME
-        blocks = [self.first_point + 3 * k + np.arange(3) for k in range(len(self.points))]
+        self.ground = block.points.start[self.points] + u[self.size :].reshape(-1, 3) @ FRAME
+        blocks = self.size + np.arange(3 * len(self.points)).reshape(-1, 3)
         self.ground_covariance = np.array([FRAME.T @ self.covariance[np.ix_(b, b)] @ FRAME for b in blocks])
 
-    def _new(self, covariance, mean=None):
+    def _new(self, covariance, mean=0.0):
         columns = self.size + np.arange(len(covariance))
         self.size += len(covariance)
-        self.priors.append((columns, np.linalg.inv(covariance), np.zeros(len(covariance)) if mean is None else mean))
+        self.priors.append((columns, np.linalg.inv(covariance), mean))
         return columns
-
-    def _moments(self, name):
-        rows = [s.rays.time for s in self.block.scenes if s.of == name]
-        return np.concatenate(rows + [f.time for f in self.block.footprints if f.of == name])
 
     def _processes(self):
         block = self.block
         self.constants = {}
+
+        def moments_of(name):
+            rows = [s.rays.time for s in block.scenes if s.of == name]
+            return np.concatenate(rows + [f.time for f in block.footprints if f.of == name])
+
         for terms, kept in ((block.attitude, self.turn_of), (block.station, self.shift_of)):
-            for one in block.passes:
-                kept[one.name] = []
             for term in terms:
                 scopes = {}
                 for one in block.passes:
                     scope = {"pass": one.name, "tracker": one.tracker, "block": ""}[term.scope]
                     scopes.setdefault(scope, []).append(one.name)
                 for scope, names in scopes.items():
-                    moments = np.concatenate([self._moments(n) for n in names])
+                    moments = np.concatenate([moments_of(n) for n in names])
                     _, spread = basis(term.law, moments[:1], moments)
-                    columns = [self._new(s**2 * spread) if s > 0 else None for s in term.law.sigma]
+                    columns = [self._new(s**2 * spread) for s in term.law.sigma]
                     if term.scope == "tracker" and term.law.kind == "constant":
                         self.constants[scope] = np.array([c[0] for c in columns])
                     for name in names:
-                        kept[name].append((term.law, moments, columns))
-
-    def _cameras(self):
-        block = self.block
-        self.change = {}
-        for name in block.cameras:
-            known = (block.monitored or block.known)[name]
-            columns = self._new(known.covariance, known.mean.ravel())
-            for k, one in enumerate(block.passes):
-                self.change[one.name, name] = columns[4 * k : 4 * k + 4]
+                        kept.setdefault(name, []).append((term.law, moments, columns))
 
     def _matrix(self, parts, times):
-        """(n, 3, size) of the process values by the unknowns."""
-        found = np.zeros((len(times), 3, self.size))
+        """(n, 3, total) of the process values by the unknowns."""
+        found = np.zeros((len(times), 3, self.total))
         for law, moments, columns in parts:
-            own, _ = basis(law, times, moments)
             for axis, where in enumerate(columns):
-                if where is not None:
-                    found[:, axis, where] += own
+                found[:, axis, where] += basis(law, times, moments)[0]
         return found
 
     def turns(self, name, times):
         """(n, 3) turns and covariances (n, 3, 3)."""
         matrix = self._matrix(self.turn_of[name], times)
-        spread = self.covariance[: self.size, : self.size]
-        return matrix @ self.u[: self.size], matrix @ spread @ np.swapaxes(matrix, 1, 2)
+        return matrix @ self.u, matrix @ self.covariance @ np.swapaxes(matrix, 1, 2)
 
-    def _axes(self, name):
-        return next(s.rays.attitude[0] for s in self.block.scenes if s.of == name)
+    def _packets(self, common):
+        """Yield matrices (n, k, total) of the quantities, whitened misclosures (n, d) by them, steps (k,)."""
+        block, unit, points = self.block, np.eye(self.total), self.block.points
+        place = np.zeros(len(points.ids), int)
+        place[self.points] = np.arange(len(self.points))
 
-    def _equations(self, u):
-        total = self.size + 3 * len(self.points)
-        x, ground = u[: self.size], self.origin + u[self.size :].reshape(-1, 3) @ FRAME
-        rows, misses = [], []
+        def at(point):
+            return unit[self.size + 3 * place[point][:, None] + np.arange(3)]
 
-        def add(seen, miss, by_point, parts, white):
-            """Rows of packets (n, d): whiten, spread over the columns."""
-            design = np.zeros((*miss.shape, total))
-            for matrix, by in parts:
-                design[:, :, : self.size] += by @ matrix
-            where = self.size + 3 * self.place[seen][:, None] + np.arange(3)
-            for k in range(len(seen)):
-                design[k][:, where[k]] += by_point[k]
-            rows.append((white @ design).reshape(-1, total))
-            misses.append(np.einsum("nij,nj->ni", white, miss).ravel())
+        def arms(one, point, q):
+            """From the corrected station to points, in corrected body axes."""
+            axes = next(s.rays.attitude[0] for s in block.scenes if s.of == one.of)
+            ray = getattr(one, "rays", one)
+            body = ray.attitude @ Rotation.from_rotvec(q[:, :3]).as_matrix()
+            there = points.start[point] + q[:, -3:] @ FRAME
+            return np.einsum("nji,nj->ni", body, there - ray.station - q[:, 3:6] @ axes.T)
 
-        def slopes(function, count, step):
-            found = []
-            for k in range(count):
-                d = np.zeros(count)
-                d[k] = step
-                found.append((function(d) - function(-d)) / (2 * step))
-            return np.stack(found, axis=-1)
+        for scene in block.scenes:
+            rays = scene.rays
+            change = np.tile(unit[self.change[scene.of, scene.camera]], (len(rays.point), 1, 1))
+            turn, shift = (self._matrix(of[scene.of], rays.time) for of in (self.turn_of, self.shift_of))
 
-        for scene in self.block.scenes:
-            rays, axes = scene.rays, self._axes(scene.of)
-            turn_matrix = self._matrix(self.turn_of[scene.of], rays.time)
-            shift_matrix = self._matrix(self.shift_of[scene.of], rays.time)
-            turn, shift = turn_matrix @ x, shift_matrix @ x
-            change = x[self.change[scene.of, scene.camera]]
-            at = ground[self.place[rays.point]]
+            def seen(q, scene=scene, rays=rays):
+                arm = arms(scene, rays.point, q)
+                return (project(LOOKS[scene.camera], q[0, 6:10], arm) - rays.image) / block.image
 
-            def seen(dt=0, ds=0, dc=0, dp=ZERO, kept=(rays, axes, turn, shift, change, at, LOOKS[scene.camera])):
-                rays, axes, turn, shift, change, at, look = kept
-                body = rays.attitude @ Rotation.from_rotvec(turn + dt).as_matrix()
-                arm = np.einsum("nji,nj->ni", body, at + dp @ FRAME - rays.station - (shift + ds) @ axes.T)
-                return project(look, change + dc, arm) - rays.image
+            matrix = np.concatenate([turn, shift, change, at(rays.point)], axis=1)
+            yield matrix, seen, [*TURN, *METRES, *CHANGE, *METRES]
+        for one in block.footprints:
+            turn, shift = (self._matrix(of[one.of], one.time) for of in (self.turn_of, self.shift_of))
 
-            change_matrix = np.zeros((len(rays.point), 4, self.size))
-            change_matrix[:, np.arange(4), self.change[scene.of, scene.camera]] = 1.0
-            unit = np.array([1e-6, 1e-6, 1e-6, 1e-5])
-            by_change = slopes(lambda d, seen=seen, unit=unit: seen(dc=d * unit), 4, 1.0) / unit
-            parts = [
-                (turn_matrix, slopes(lambda d, seen=seen: seen(dt=d), 3, 1e-6)),
-                (shift_matrix, slopes(lambda d, seen=seen: seen(ds=d), 3, 1.0)),
-                (change_matrix, by_change),
-            ]
-            white = np.broadcast_to(np.eye(2) / self.block.image, (len(rays.point), 2, 2))
-            add(rays.point, seen(), slopes(lambda d, seen=seen: seen(dp=d), 3, 1.0), parts, white)
-        for one in self.block.footprints:
-            axes = self._axes(one.of)
-            turn_matrix = self._matrix(self.turn_of[one.of], one.time)
-            shift_matrix = self._matrix(self.shift_of[one.of], one.time)
-            turn, shift = turn_matrix @ x, shift_matrix @ x
-            at = ground[self.place[one.point]]
-
-            def hit(dt=0, ds=0, dp=ZERO, one=one, axes=axes, turn=turn, shift=shift, at=at):
-                body = one.attitude @ Rotation.from_rotvec(turn + dt).as_matrix()
-                arm = np.einsum("nji,nj->ni", body, at + dp @ FRAME - one.station - (shift + ds) @ axes.T)
+            def hit(q, one=one):
+                arm = arms(one, one.point, q)
                 far = np.linalg.norm(arm, axis=1)
                 # the beam looks down: angles about body X and Y
                 off = np.cross(one.aim, arm / far[:, None])[:, :2]
-                return np.concatenate([(far - one.distance)[:, None], off], axis=1)
+                return np.column_stack([(far - one.distance) / one.sigma[0], off / one.sigma[1]])
 
-            parts = [
-                (turn_matrix, slopes(lambda d, hit=hit: hit(dt=d), 3, 1e-6)),
-                (shift_matrix, slopes(lambda d, hit=hit: hit(ds=d), 3, 1.0)),
-            ]
-            white = np.broadcast_to(np.diag(1 / np.array([one.sigma[0], *[one.sigma[1]] * 2])), (len(one.point), 3, 3))
-            add(one.point, hit(), slopes(lambda d, hit=hit: hit(dp=d), 3, 1.0), parts, white)
-        points = self.block.points
+            yield np.concatenate([turn, shift, at(one.point)], axis=1), hit, [*TURN, *METRES, *METRES]
         control = np.flatnonzero(points.role == "control")
-        if len(control):
-            local = (ground[self.place[control]] - points.start[control]) @ FRAME.T
-            weight = np.linalg.inv(FRAME @ points.covariance[control[0]] @ FRAME.T)
-            white = np.broadcast_to(np.linalg.cholesky(weight).T, (len(control), 3, 3))
-            add(control, local, np.broadcast_to(np.eye(3), (len(control), 3, 3)), [], white)
-        t = self.block.terrain
+        for k in control:
+            root = np.linalg.cholesky(np.linalg.inv(FRAME @ points.covariance[k] @ FRAME.T))
+            yield at(np.array([k])), lambda q, root=root: q @ root, METRES
+        t = block.terrain
         if t is not None:
-            above = ((ground[self.place[t.point]] - t.place) @ UP - x[self.common[0]])[:, None]
-            matrix = np.zeros((len(t.point), 1, self.size))
-            matrix[:, 0, self.common[0]] = 1.0
-            by_point = np.broadcast_to(np.array([[0.0, 0.0, 1.0]]), (len(t.point), 1, 3))
-            white = (1 / t.sigma)[:, None, None]
-            add(t.point, above, by_point, [(matrix, np.full((len(t.point), 1, 1), -1.0))], white)
-        design, miss = np.concatenate(rows), np.concatenate(misses)
-        normal, right = design.T @ design, design.T @ miss
-        square = float(miss @ miss)
+            matrix = np.concatenate([np.tile(unit[common], (len(t.point), 1, 1)), at(t.point)], axis=1)
+
+            def above(q):
+                height = (points.start[t.point] - t.place + q[:, 1:] @ FRAME) @ UP - q[:, 0]
+                return (height / t.sigma)[:, None]
+
+            yield matrix, above, [1.0, *METRES]
+        for angle in block.angles:
+            a, b = (self.constants[name] for name in angle.between)
+            yield (unit[a] - unit[b])[None], lambda q, angle=angle: (q - angle.value) / angle.sigma, TURN
+
+    def _equations(self, u):
+        normal, right, square = np.zeros((self.total, self.total)), np.zeros(self.total), 0.0
+        for matrix, misclosure, step in self.packets:
+            q = matrix @ u
+            moves = np.diag(step)
+            slopes = [(misclosure(q + move) - misclosure(q - move)) / (2 * move.max()) for move in moves]
+            design, miss = (np.stack(slopes, axis=-1) @ matrix).reshape(-1, self.total), misclosure(q).ravel()
+            normal, right, square = normal + design.T @ design, right + design.T @ miss, square + miss @ miss
         for columns, weight, mean in self.priors:
-            off = x[columns] - mean
+            off = u[columns] - mean
             normal[np.ix_(columns, columns)] += weight
             right[columns] += weight @ off
-            square += float(off @ weight @ off)
-        for angle in self.block.angles:
-            a, b = (self.constants[name] for name in angle.between)
-            for axis in range(3):
-                row = np.zeros(total)
-                row[a[axis]], row[b[axis]] = 1.0, -1.0
-                off = (row @ u - angle.value[axis]) / angle.sigma[axis]
-                normal += np.outer(row, row) / angle.sigma[axis] ** 2
-                right += row * off / angle.sigma[axis]
-                square += off**2
+            square += off @ weight @ off
         return normal, right, square

@@ -7,7 +7,7 @@ cubic spline runs, sums of steps, amplitudes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -54,15 +54,11 @@ class Plan:
     station: tuple[Term, ...] = (Term(Law("orbit", "constant", (0.5, 0.5, 0.5))),)
     image: float = 0.3 * PITCH
     control_sigma: tuple[float, float] = (0.2, 0.3)
-    camera: tuple[np.ndarray, np.ndarray] = field(
-        default_factory=lambda: (
-            np.array([2 * ARCSEC, 2 * ARCSEC, 4 * ARCSEC, 30e-6]),
-            np.array([1 * ARCSEC, 1 * ARCSEC, 2 * ARCSEC, 15e-6]),
-        )
+    camera: tuple[tuple[float, ...], tuple[float, ...]] = (
+        (2 * ARCSEC, 2 * ARCSEC, 4 * ARCSEC, 30e-6),
+        (1 * ARCSEC, 1 * ARCSEC, 2 * ARCSEC, 15e-6),
     )
-    monitor: np.ndarray | None = field(
-        default_factory=lambda: np.array([0.3 * ARCSEC, 0.3 * ARCSEC, 2 * ARCSEC, 10e-6])
-    )
+    monitor: tuple[float, ...] | None = (0.3 * ARCSEC, 0.3 * ARCSEC, 2 * ARCSEC, 10e-6)
     footprints: int = 2
     laser: tuple[float, float] = (0.2, 3e-6)
     terrain: tuple[float, float] | None = (4.0, 1.0)
@@ -77,15 +73,10 @@ class Drawn:
     Attributes:
         block: what was observed.
         ground: (m, 3) true points.
-        turn, shift: pass -> functions of times (n,) to true corrections (n, 3).
-        change: scene -> (4,) true change of its camera.
     """
 
     block: Block
     ground: np.ndarray
-    turn: dict
-    shift: dict
-    change: dict
 
 
 def basis(law: Law, times: np.ndarray, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -194,7 +185,7 @@ def draw(plan: Plan, random: np.random.Generator, true: Plan | None = None) -> D
         return lambda t: sum((f(t) for f in parts), np.zeros((len(t), 3)))
 
     turn, shift = ({k: summed(v) for k, v in d.items()} for d in (turn, shift))
-    common, own = plan.camera
+    common, own = np.array(plan.camera)
     constant = {c: common * random.standard_normal(4) for c in plan.cameras}
     change = {f"{p.name}/{c}": constant[c] + own * random.standard_normal(4) for p in passes for c in plan.cameras}
     size = len(passes)
@@ -203,12 +194,11 @@ def draw(plan: Plan, random: np.random.Generator, true: Plan | None = None) -> D
     monitored = None
     if plan.monitor is not None:
         monitored = {}
-        noise = np.kron(np.eye(size), np.diag(plan.monitor**2))
+        sigma = np.array(plan.monitor)
+        noise = np.kron(np.eye(size), np.diag(sigma**2))
         gain = law @ np.linalg.inv(law + noise)
         for c in plan.cameras:
-            read = np.array([change[f"{p.name}/{c}"] for p in passes]) + plan.monitor * random.standard_normal(
-                (size, 4)
-            )
+            read = np.array([change[f"{p.name}/{c}"] for p in passes]) + sigma * random.standard_normal((size, 4))
             monitored[c] = CameraKnowledge((gain @ read.ravel()).reshape(size, 4), law - gain @ law)
 
     def at(name: str, when: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -251,8 +241,8 @@ def draw(plan: Plan, random: np.random.Generator, true: Plan | None = None) -> D
         here = np.arange(plan.control, count)
         error = plan.terrain[0] * random.standard_normal(len(here)) + plan.terrain[1] * random.standard_normal()
         place = ground[here] + error[:, None] * UP
-        normal, sigma = np.broadcast_to(UP, (len(here), 3)), np.full(len(here), plan.terrain[0])
-        terrain = Terrain(here, place, normal, sigma, plan.terrain[1])
+        normal, height = np.broadcast_to(UP, (len(here), 3)), np.full(len(here), plan.terrain[0])
+        terrain = Terrain(here, place, normal, height, plan.terrain[1])
     angles: tuple[TrackerAngle, ...] = ()
     if plan.angle is not None and set(constants) == {"A", "B"}:
         value = constants["A"] - constants["B"] + plan.angle * random.standard_normal(3)
@@ -264,7 +254,7 @@ def draw(plan: Plan, random: np.random.Generator, true: Plan | None = None) -> D
         passes, tuple(scenes), cameras, known, plan.attitude, plan.station, plan.image, points, monitored,
         tuple(footprints), terrain, angles,
     )  # fmt: skip
-    return Drawn(block, ground, turn, shift, change)
+    return Drawn(block, ground)
 
 
 def _hits(plan: Plan, k: int, count: int) -> np.ndarray:
@@ -273,11 +263,9 @@ def _hits(plan: Plan, k: int, count: int) -> np.ndarray:
 
 def without_errors_in_images(drawn: Drawn, scene: str, rows: np.ndarray, shift: np.ndarray) -> Drawn:
     """The block with some image points of a scene moved by (k, 2) metres."""
-    scenes = []
-    for one in drawn.block.scenes:
-        if one.name == scene:
-            image = one.rays.image.copy()
-            image[rows] += shift
-            one = replace(one, rays=replace(one.rays, image=image))
-        scenes.append(one)
-    return replace(drawn, block=replace(drawn.block, scenes=tuple(scenes)))
+    (one,) = (s for s in drawn.block.scenes if s.name == scene)
+    image = one.rays.image.copy()
+    image[rows] += shift
+    moved = replace(one, rays=replace(one.rays, image=image))
+    scenes = tuple(moved if s is one else s for s in drawn.block.scenes)
+    return replace(drawn, block=replace(drawn.block, scenes=scenes))

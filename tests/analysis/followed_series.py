@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.filter_state import Belief, Innovation, Observed
-from analysis.monitor.jump_detection import Jump, Step
+from analysis.monitor.jump_detection import Jump, Step, Steps, steps
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.series_following import hinted, smoothed
 from analysis.monitor.series_smoother import SeriesChanges
+from analysis.monitor.state_space import StateSpace
 
 Array = NDArray[np.float64]
 
@@ -52,82 +54,46 @@ class Followed:
     left_out: tuple[int, ...] = ()
 
 
-def follow(
-    how: SeriesFilter,
-    observed: Sequence[Observed],
-    wanted: ArrayLike,
-    start: float | None = None,
-    advance: Callable[[int], None] = lambda done: None,
-) -> Followed:
-    """All readings of a series, one by one, and what all of them say of times past.
-
-    Args:
-        how: the filter.
-        observed: N readings in the order of time.
-        wanted: (T,) times, seconds, in any order.
-        start: time before which nothing is read, seconds; the earliest of all by default.
-        advance: called with the number of readings that are done.
-    """
-    times = np.asarray(wanted, np.float64)
-    earliest = min([*(one.time for one in observed[:1]), *times.tolist(), *([] if start is None else [start])])
-    order = np.argsort(times, kind="stable")
-    belief, filtered = how.start(earliest), _of_nothing(len(times))
-    innovations: list[Innovation] = []
-    left: list[Array] = []
-    bad: list[int] = []
-    ahead = 0
+def follow(how: SeriesFilter, observed: Sequence[Observed], wanted: ArrayLike) -> Followed:
+    """Follow all readings of a series, N in the order of time, and smooth: parameters at (T,) times in any order."""
+    times, moments = np.asarray(wanted, np.float64), [one.time for one in observed]
+    earliest = min(*moments[:1], *times.tolist())
+    beliefs, innovations, bad = [how.start(earliest)], [], []
     for k, one in enumerate(observed):
-        if ahead < len(order) and times[order[ahead]] < one.time:
-            now = how.blended(belief)
-        while ahead < len(order) and times[order[ahead]] < one.time:
-            filtered[order[ahead]] = how.parameters(now, times[order[ahead]])
-            ahead += 1
-        left.append(belief.left)
-        belief, found = how.update(belief, one)
+        belief, found = how.update(beliefs[-1], one)
+        beliefs.append(belief)
+        innovations.append(found)
         if found.earlier is not None:
             bad.pop()
         if found.bad is not None:
             bad.append(k)
-        innovations.append(found)
-        advance(k + 1)
-    now = how.blended(belief)
-    for k in order[ahead:]:
-        filtered[k] = how.parameters(now, times[k])
+    known = np.searchsorted(moments, times, side="right").tolist()
+    now = {n: how.blended(beliefs[n]) for n in set(known)}
+    filtered = [how.parameters(now[n], time) for n, time in zip(known, times.tolist(), strict=True)]
     jumps = tuple(one.jump for one in innovations if one.jump is not None)
     knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
-    begin = knowing.start(earliest)
     good = [k for k in range(len(observed)) if k not in bad]
     taken = [observed[k] for k in good]
-    begin, left = hinted(how, knowing, begin, taken, [left[k] for k in good])
+    begin, left = hinted(how, knowing, knowing.start(earliest), taken, [beliefs[k].left for k in good])
     late = smoothed(knowing, begin, taken, times, left, knowing.parameters_of)
-    width = how.stated.parameters.shape[0]
-    return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief, tuple(bad))
+    return Followed(series_of(filtered), series_of(late), tuple(innovations), jumps, beliefs[-1], tuple(bad))
 
 
-def _of_nothing(count: int) -> list[tuple[Array, Array]]:
-    return [(np.empty(0), np.empty(0))] * count
-
-
-def forecast(how: SeriesFilter, belief: Belief, times: ArrayLike) -> SeriesChanges:
-    """Forecast from what is known: parameters at times that are not before the newest reading.
-
-    Args:
-        how: the filter.
-        belief: so far.
-        times: (T,) seconds.
-    """
-    now = how.blended(belief)
-    found = [how.parameters(now, time) for time in np.asarray(times, np.float64).tolist()]
-    return series_of(found, how.stated.parameters.shape[0])
-
-
-def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:
-    """Parameters and covariances at T times as one series; what noise alone does is not known, NaN.
-
-    Args:
-        found: (P,) and (P, P) at each time.
-        width: P.
-    """
-    values = np.array([one for one, _ in found]).reshape(-1, width)
-    total = np.array([one for _, one in found]).reshape(-1, width, width)
+def series_of(found: Sequence[tuple[Array, Array]]) -> SeriesChanges:
+    """Parameters (P,) and covariances (P, P) at T times as one series; what noise alone does is not known, NaN."""
+    values, total = (np.array(each) for each in zip(*found, strict=True))
     return SeriesChanges(values, np.full_like(total, np.nan), total)
+
+
+def whole_steps(told: Disturbances, times: Array, shifts: Array, noise: float) -> Steps:
+    """Scores and information of steps before every reading, by the Cholesky factor of the whole series' covariance."""
+    space, width = StateSpace(told), shifts.shape[1]
+    pairs = np.zeros((len(times), width, len(times), width))
+    for i, early in enumerate(times):
+        mean, covariance = space.start(early)
+        for j in range(i, len(times)):
+            rows = [space.outputs(mean, covariance, t)[1][:width] for t in (early, times[j])]
+            pairs[j, :, i] = rows[1] @ space.moved(covariance, early, times[j]) @ rows[0].T
+            pairs[i, :, j] = pairs[j, :, i].T
+    root = np.linalg.cholesky(pairs.reshape(shifts.size, -1) + noise**2 * np.eye(shifts.size))
+    return steps(root, np.linalg.solve(root, shifts.ravel()), times, slice(0, len(times)), None)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from analysis.matching.correlation import search
 from analysis.matching.matches import Matches, MatchOptions, match, resampled
 from tests.analysis.texture_image import Texture, lattice
 
@@ -57,21 +56,17 @@ def textured(side, *, slope=1.0, noise=0.1, relief=0.0, length=12.0, radiometry=
     )
 
 
-def layered(side, *, step=2.0, noise=0.05, faint=1.0, seed=0) -> tuple[Pair, np.ndarray]:
+def layered(side, *, step=2.0, noise=0.05, seed=0) -> tuple[Pair, np.ndarray]:
     """Textures in two layers, the near one with winding edges before the far one and hiding what is behind it.
 
-    step: px along columns by which the near layer is displaced against the far one; faint: contrast of the far layer
-    over that of the near one, which is 1.
+    step: px along columns by which the near layer is displaced against the far one.
 
     Returns:
         The pair, and (n,) which windows of 25 px hold an edge; what is hidden in the second image is among them.
     """
     size = 47 * (side - 1) + 57
     grid = np.arange(-24.0, size + 24.0, 0.5)
-    far, near = (
-        ndimage.spline_filter(contrast * (Texture(seed + k).grid(grid, grid) - 800.0) / 120.0, 5)
-        for k, contrast in ((1, faint), (2, 1.0))
-    )
+    far, near = (ndimage.spline_filter((Texture(seed + k).grid(grid, grid) - 800.0) / 120.0, 5) for k in (1, 2))
     wave = ndimage.gaussian_filter(np.random.default_rng(seed + 5).standard_normal((size + 60,) * 2), 25.0, mode="wrap")
     # zero on the edge; about the distance from it, px
     slope = np.hypot(*np.gradient(wave))
@@ -125,8 +120,3 @@ def _pair(shown, size, places, noise, disparity, radiometry, seed) -> Pair:
         there = np.stack([places[:, 0] - SHIFT[0], places[:, 1] - SHIFT[1] - disparity(*true.T)], axis=1)
         true = 0.5 * (true + there)
     return Pair(first, second, places, true)
-
-
-def parabola(pair: Pair) -> np.ndarray:
-    """Errors (n, 2) of normalised cross-correlation with a parabola through its peak."""
-    return search(pair.second, pair.templates(), pair.predicted(), 4).place - pair.true

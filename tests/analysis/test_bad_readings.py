@@ -13,7 +13,8 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.series_filter import SeriesFilter
 from tests.analysis.followed_series import follow, of_shifts
-from tests.analysis.stated_motions import disturbances
+from tests.analysis.stated_motions import SpotNoise, disturbances
+from tests.analysis.test_series_smoother import conditioned
 
 NOISE, COUNT, EVERY, DAYS = 0.001, 6, 900.0, 30
 DRIFT = 60.0
@@ -80,30 +81,6 @@ def drawn(told: Disturbances, seed: int, bad: int, jumps: int) -> Series:
     return Series(times, shifts, motions @ told.parameters.T, tuple(which), slips)
 
 
-def dense(told: Disturbances, one: Series, at: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean and covariance of the parameters at a time, by the joint normal of all good readings and of the
-    jumps at their known times; nothing of the filter is used.
-    """
-    good = [k for k in range(DAYS) if k not in one.bad and one.times[k] <= at]
-    when = np.append(one.times[good], at)
-    both = np.concatenate([told.spots, told.parameters])
-    prior = np.zeros((len(when), len(both), len(when), len(both)))
-    for k, law in enumerate(told.laws):
-        if law.white:
-            together = (when[:, None] == when).astype(float)
-        elif law.jump:
-            come = when >= one.times[one.jumps[told.bodies[k]]] if told.bodies[k] in one.jumps else np.zeros(len(when))
-            together = np.outer(come, come).astype(float)
-        else:
-            together = np.exp(-np.abs(when[:, None] - when) / DRIFT)
-        prior += np.einsum("tu,i,j->tiuj", together, both[:, k], both[:, k])
-    n = len(good)
-    spread = prior[:n, :COUNT, :n, :COUNT].reshape(n * COUNT, -1) + NOISE**2 * np.eye(n * COUNT)
-    across = prior[n, COUNT:, :n, :COUNT].reshape(-1, n * COUNT)
-    gain = np.linalg.solve(spread, across.T).T
-    return gain @ one.shifts[good].ravel(), prior[n, COUNT:, n, COUNT:] - gain @ across.T
-
-
 def read_of(one: Series) -> tuple[Observed, ...]:
     return of_shifts(one.times, one.shifts, NOISE**2 * np.eye(COUNT))
 
@@ -119,7 +96,10 @@ def test_the_state_is_that_of_the_good_readings() -> None:
         found = follow(how, read_of(one), [one.times[-1]])
         assert set(found.left_out) <= set(one.bad)
         left += len(found.left_out)
-        mean, covariance = dense(told, replace(one, bad=found.left_out), float(one.times[-1]))
+        good = np.delete(np.arange(DAYS), found.left_out)
+        own = SpotNoise(NOISE**2 * np.eye(COUNT))
+        known = conditioned(told, one.times[good], one.shifts[good], own, one.times[-1:], None)
+        mean, covariance = known[0][0], known[1][0]
         for course in (found.filtered, found.smoothed):
             sigma = np.sqrt(np.diag(covariance))
             assert np.all(np.abs(course.values[0] - mean) < 1e-6 * sigma)

@@ -8,7 +8,6 @@ import pytest
 from analysis.block.block import Term
 from analysis.block.block_adjustment import adjust_block
 from analysis.block.processes import Law
-from optics.numerics.threads import one_blas_thread
 from tests.analysis.drawn_blocks import ARCSEC, PITCH, Plan, draw, without_errors_in_images
 from tests.analysis.refusals import refuses
 from twin.orbit.block.point_workers import point_workers
@@ -61,16 +60,17 @@ def same(found, other):
 
 
 @pytest.mark.second
-@one_blas_thread()
 def test_shares_that_went_through_bytes_give_the_same_adjustment():
     block = spoilt()
     whole = adjust_block(block, robust="reject")
     assert len(whole.rejected()) >= 3
     same(adjust_block(block, robust="reject", pool=Posted(3)), whole)
+    # fewer points than processes: none has an empty share
+    few = draw(Plan(ties=3, control=2, check=1, footprints=0, attitude=LAWS), np.random.default_rng(7)).block
+    same(adjust_block(few, pool=Posted(9)), adjust_block(few))
 
 
 @pytest.mark.second
-@one_blas_thread()
 def test_workers_of_the_engine_of_studies_give_the_same_adjustment():
     block = spoilt()
     with point_workers(2, None, lambda text: None) as pool:

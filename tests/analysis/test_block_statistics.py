@@ -12,7 +12,6 @@ from analysis.block.block_adjustment import adjust_block
 from analysis.block.law_tests import law_tests
 from analysis.block.network import datum_test, network_of, open_combinations
 from analysis.block.processes import BlockError, Law, Support
-from optics.numerics.threads import one_blas_thread
 from tests.analysis.drawn_blocks import ARCSEC, EAST, PITCH, Plan, draw, without_errors_in_images
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
@@ -28,7 +27,6 @@ def plan(law, **changes):
     return replace(small, **changes)
 
 
-@one_blas_thread()
 def judged(law, missing, blocks, seed):
     """P-values of the sum of chi-squares and of that of check points, over drawn blocks without some sensors."""
     square = freedom = check = count = 0
@@ -63,7 +61,6 @@ def test_chi_square_and_check_points_with_and_without_all_sensors(law):
 
 
 @pytest.mark.parametrize(("stated", "true"), quick(2, [(WHITE, WALK), (WALK, WHITE), (WHITE, WHITE), (WALK, WALK)]))
-@one_blas_thread()
 def test_a_wrong_law_is_told_and_a_right_one_is_not(stated, true):
     for seed in range(3):
         made = plan(stated, ties=60, half=5e3, image=0.1 * PITCH)
@@ -80,7 +77,6 @@ def test_a_wrong_law_is_told_and_a_right_one_is_not(stated, true):
             assert "not that of the readings" in str(test)
 
 
-@one_blas_thread()
 def test_one_tenth_of_gross_errors_is_found_by_name():
     drawn = draw(plan(WHITE, ties=60, half=4e3), np.random.default_rng(2))
     random = np.random.default_rng(3)
@@ -99,7 +95,6 @@ def test_one_tenth_of_gross_errors_is_found_by_name():
     assert np.max(np.abs(found.ground[where] - right.ground[where]) / sigma) < 1.5
 
 
-@one_blas_thread()
 def test_control_in_another_datum_is_told_with_its_shift():
     drawn = draw(plan(WHITE, control=6), np.random.default_rng(5))
     points = drawn.block.points
@@ -122,7 +117,6 @@ def test_swapped_coordinates_are_refused_by_name():
         adjust_block(replace(drawn.block, points=replace(points, start=start)))
 
 
-@one_blas_thread()
 def test_a_network_in_two_parts_and_scenes_that_share_nothing_are_named():
     drawn = draw(plan(WHITE, passes=3, footprints=0), np.random.default_rng(5))
     block = drawn.block
@@ -145,7 +139,6 @@ def test_a_network_in_two_parts_and_scenes_that_share_nothing_are_named():
     assert "P0/fore" in network_of(replace(block, scenes=tuple(alone))).alone
 
 
-@one_blas_thread()
 def test_open_combinations_without_any_control_are_shifts_and_turns_of_all_passes():
     drawn = draw(plan(WHITE, control=0, monitor=None, terrain=None, footprints=0), np.random.default_rng(5))
     found = open_combinations(adjust_block(drawn.block))
@@ -157,7 +150,6 @@ def test_open_combinations_without_any_control_are_shifts_and_turns_of_all_passe
     assert any({"P0 pitch", "P0 fore d_alpha", "P0 back d_alpha"} <= names for names in named)
 
 
-@one_blas_thread()
 def test_variance_components_find_a_wrong_image_sigma():
     stated = plan(WHITE, ties=60, half=4e3)
     block = replace(draw(stated, np.random.default_rng(8)).block, image=0.5 * stated.image)
@@ -185,7 +177,6 @@ def test_spread_of_laws_and_laws_that_make_no_sense():
 
 
 @pytest.mark.second
-@one_blas_thread()
 def test_serial_correlation_has_unit_variance_under_the_right_law():
     every = []
     for seed in range(30):

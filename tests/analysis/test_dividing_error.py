@@ -105,16 +105,6 @@ def test_two_gross_errors_that_hide_each_other_are_named() -> None:
     assert sum(int(series(seed).suspect.any()) for seed in range(100)) <= 2
 
 
-def test_sign() -> None:
-    """Dividing error = reading - true angle, so that the corrected reading is the reading minus it."""
-    choice = choose(series(5), names=("cubic_spline",))
-    made = compensate(series(5), choice)
-    reading = np.radians([95.3, 101.7])
-    true = reading - curve(reading)
-    assert np.max(np.abs(made.correct(reading) - true)) < 0.05 * ARCSEC
-    assert np.max(np.abs(reading - true)) > 0.2 * ARCSEC
-
-
 @pytest.mark.second
 def test_misfits_are_told_apart() -> None:
     """A constant that the calibration does not share, and an error that is new at every reading."""

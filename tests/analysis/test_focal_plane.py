@@ -2,13 +2,13 @@
 is built from planes and rotation matrices of OpenCV, in the optics' frame, and never from the slopes that are fitted.
 """
 
-import cv2
 import numpy as np
 import pytest
 from scipy import stats
 
 from analysis.focal_plane.plane_fit import LineLevel, ObservabilityError, fit_focal_plane
 from tests.analysis.refusals import refuses
+from tests.analysis.test_planes import rotation
 from tests.tiers import quick
 
 FALSE_ALARM = 1e-6
@@ -18,10 +18,6 @@ UM, MM = 1e-6, 1e-3
 FIELDS = np.linspace(-115 * MM, 115 * MM, 5)
 PLACE = np.array([(x, y) for x in (0.0, -10 * MM, -5 * MM, 5 * MM, 10 * MM) for y in FIELDS])
 SIGMA = np.where(PLACE[:, 0] == 0, 3 * UM, 8 * UM)
-
-
-def rotation(vector):
-    return cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0]
 
 
 def on_plane(place):

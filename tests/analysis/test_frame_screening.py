@@ -9,9 +9,7 @@ from analysis.spots import frame_screening
 from analysis.spots.frame_screening import noise_ratio, screen_frames, shown_noise
 from analysis.spots.noise import NoiseModel
 
-NOISE = NoiseModel(
-    gain_dn_per_e=0.5, dark_noise_e=4.0, dark_signal_e=0.1, offset_dn=50.0, prnu=0.005, dsnu_e=1.0, saturation_dn=4095.0
-)
+NOISE = NoiseModel(0.5, 4.0, 0.1, 50.0, 0.005, 1.0, 4095.0)
 SHAPE = 40, 44
 
 

@@ -97,12 +97,3 @@ def test_rows_are_those_of_rays_from_an_orbit(place, camera, parameter):
     # weights of twin.orbit differ by the ranges' squares, which matters where rays pass each other beside
     assert other[[0, 2]] == pytest.approx(expected[[0, 2]], abs=4e-3 * largest)
     assert other[1] == pytest.approx(expected[1], rel=0.15, abs=3e-3 * largest)
-
-
-def test_height_by_the_textbook():
-    """Two rays at incidences i and j: one that is turned by d_alpha meets the other range / cos i / (tan i - tan j)
-    higher or lower; found with the nominal one, which looks less far forward, the point is below."""
-    ground = geometry()
-    i, j = ground.incidences_rad
-    height = ground.matrices[4, 2, 0]
-    assert -height == pytest.approx(ground.ranges_m[0] / math.cos(i) / (math.tan(i) - math.tan(j)), rel=1e-9)

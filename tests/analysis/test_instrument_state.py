@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -14,9 +15,7 @@ from analysis.instrument_state.known_combinations import combinations
 from analysis.instrument_state.next_move import Actuators, best_move, measurement_worth, truncated_move
 from analysis.instrument_state.state_estimate import MeasuredGroup, StateEstimate, StatePrior, estimate_state
 from analysis.measurement_error import UndeterminedError
-from analysis.monitor.disturbances import TimeLaw
 from tests.analysis.refusals import refuses
-from tests.analysis.stated_motions import disturbances
 
 M = 7
 
@@ -103,23 +102,6 @@ def test_linear_models_have_the_closed_form(free: bool) -> None:
     assert found.converged
 
 
-def test_spots_alone_are_the_monitors_posterior() -> None:
-    """One group of spots on a linear instrument is the best linear unbiased prediction of the monitor, to 1e-9."""
-    rng = np.random.default_rng(5)
-    prior = random_prior(rng)
-    safe = prior.sigma
-    spots, parameters = rng.normal(size=(8, M)) / safe, rng.normal(size=(4, M)) / safe
-    laws, correlation = (TimeLaw(white=True),) * M, prior.covariance / np.outer(safe, safe)
-    stated = disturbances(laws, spots * safe, parameters * safe, prior.labels, correlation, safe)
-    noise, shift = 0.01 * np.eye(8) + 0.003, rng.normal(size=8)
-    group = MeasuredGroup("spots", "spots", ("x",) * 8, shift, noise, np.zeros((8, 0)), np.zeros(0), tuple("aabbccdd"))
-    found = estimate_state(prior, [group], lambda x: x @ spots.T, lambda x: spots, false_alarm=1e-300)
-    gain = stated.best_gain(noise)
-    assert_allclose(parameters @ found.mean, gain @ shift, rtol=1e-9, atol=1e-9 * np.abs(gain @ shift).max())
-    total = stated.misfit(gain) + gain @ noise @ gain.T
-    assert_allclose(parameters @ found.covariance @ parameters.T, total, atol=1e-9 * np.abs(total).max())
-
-
 def test_agreements_are_predictions_from_all_others() -> None:
     """Of each measurement and block: its mean and covariance by one joint normal of all other numbers."""
     rng = np.random.default_rng(7)
@@ -200,6 +182,7 @@ def test_nothing_and_impossible_errors_are_refused() -> None:
         refuses(UndeterminedError, said, estimate_state, prior, [group(spread)], *still)
     refuses(UndeterminedError, "no light", estimate_state, prior, [group(np.eye(2))], lambda x: x * np.nan, still[1])
     refuses(ValueError, "are not those of 2 numbers", group, np.eye(3))
+    refuses(ValueError, "need as many labels and blocks", replace, group(np.eye(2)), blocks=("a",))
 
 
 def test_combinations_are_independent_and_keep_their_prior_where_nothing_is_measured() -> None:

@@ -217,6 +217,8 @@ def test_terms_that_cannot_be_told_apart_are_named():
     with pytest.raises(OrientationError, match="cannot separate principal_distance, radial3 "):
         fit(angle=pair, terms=("principal_distance", "radial3"))
     assert fit(angle=pair, terms=("constant", "principal_distance")).degrees_of_freedom == 3
+    # two points tell two terms, and nothing of a third
+    assert not fit(angle=GF7[[0, -1]], terms=("constant", "principal_distance")).point.observable
     # half a field is poor but enough, and the correlation says so
     half = fit(angle=np.deg2rad(np.linspace(0, 1.25, 55)), terms=("constant", "principal_distance"))
     assert half.correlation[0, 1] < -0.8

@@ -10,16 +10,7 @@ from analysis.monitor import series_smoother
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.jump_detection import candidates
 from analysis.monitor.series_smoother import smooth
-from optics.numerics.threads import one_blas_thread
 from tests.analysis.stated_motions import SpotNoise, disturbances
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Small matrices are quicker so."""
-    with one_blas_thread():
-        yield
-
 
 NOISE = 0.2
 """Of the shifts below, px."""

@@ -10,7 +10,6 @@ from analysis.spots.learnt_template import FittedSpot, learn_template, learnt_sh
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, fit_screened
 from analysis.spots.spot_positions import SeriesNoise, SpotError
-from analysis.spots.spot_template import SpotTemplate
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
 
@@ -138,4 +137,3 @@ def test_a_shape_that_is_mostly_noise_is_refused():
     # as if the frames before had hundreds of times the noise, in the shape only
     with pytest.raises(SpotError, match="mostly noise"):
         learnt_shift(learnt, replace(first, counts=np.full(SHAPE, 1e-5)), second, NOISE, SHAPE)
-    assert isinstance(learnt.shape, SpotTemplate)

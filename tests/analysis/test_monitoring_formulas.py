@@ -15,7 +15,6 @@ from analysis.monitor.monitoring import (
     paper_joint,
     paper_single,
 )
-from analysis.monitor.recovery import joint
 from analysis.units import ARCSEC
 from tests.analysis.refusals import refuses
 
@@ -82,23 +81,6 @@ def test_derived_inverts_a_plane_mirror_return():
 
 
 @pytest.mark.parametrize("name", list(FUNCTIONS))
-def test_signs(name):
-    """One test per sign: a spot that moves to larger columns on both sides is a negative d_alpha, and so on."""
-    before = np.zeros((2, 2))
-    cases = {
-        0: np.array([[0.0, 1.0], [0.0, 1.0]]),
-        1: np.array([[1.0, 0.0], [1.0, 0.0]]),
-        2: np.array([[0.0, 1.0], [0.0, -1.0]]),
-        3: np.array([[1.0, 0.0], [-1.0, 0.0]]),
-    }
-    sign = {0: -1, 1: -1, 2: -1, 3: 1}
-    for parameter, after in cases.items():
-        vector = FUNCTIONS[name](before, after, ZERO, GEOMETRY).vector
-        assert np.sign(vector[parameter]) == sign[parameter]
-        assert np.all(np.delete(vector, parameter) == 0)
-
-
-@pytest.mark.parametrize("name", list(FUNCTIONS))
 def test_covariance_is_propagated(name):
     """By differences of the formula itself with every spot coordinate."""
     root = np.random.default_rng(1).standard_normal((4, 4)) * 1e-2
@@ -133,13 +115,3 @@ def test_geometry_options_and_errors():
     refuses(ValueError, "paper_single", coefficients, "paper", other)
     refuses(ValueError, "2 channels", derived, np.zeros(4), np.zeros(4), ZERO, other)
     refuses(ValueError, "finite", derived, np.full((2, 2), np.nan), np.zeros((2, 2)), ZERO, other)
-
-
-def test_covariances_of_spots_stand_by_themselves():
-    left, right = np.array([[1.0, 0.5], [0.5, 2.0]]), np.array([[3.0, 0.0], [0.0, 4.0]])
-    out = joint(np.array([[left, right, 2 * left]]))[0]
-    assert out.shape == (6, 6)
-    assert np.array_equal(out[:2, :2], left)
-    assert np.array_equal(out[2:4, 2:4], right)
-    assert np.array_equal(out[4:, 4:], 2 * left)
-    assert out.sum() == 3 * left.sum() + right.sum()

@@ -13,6 +13,9 @@ import tifffile
 from scipy.special import ndtr
 
 from analysis.mtf.__main__ import app
+from analysis.mtf.edge_location import EdgeError
+from analysis.mtf.edge_pages import measure_pages
+from tests.analysis.refusals import refuses
 from tests.tiers import quick
 from tests.twin.commands import invoke
 
@@ -84,6 +87,7 @@ def test_json_against_the_formula(edge_tiff):
     half = math.sqrt(math.log(2) / 2) / (math.pi * BLUR)
     assert data["mtf50_cycles_per_mm"] == pytest.approx(half / 0.007, abs=0.2)
     assert (data["dark_dn"], data["bright_dn"]) == pytest.approx((1000, 11000), abs=2)
+    refused("--pitch is given twice", edge_tiff, *EDGE, "--pixel-size", "7 um")
 
 
 def test_bars_with_even_fields(tmp_path):
@@ -110,18 +114,6 @@ def test_luminance_weighs_the_channels(tmp_path):
     assert data["bright_dn"] == pytest.approx(11000 * (0.2126 * 0.5 + 0.7152 + 0.0722 * 0.25), rel=1e-3)
 
 
-@pytest.mark.parametrize("imagej", [False, True])
-def test_pages_are_averaged(tmp_path, imagej):
-    path = tmp_path / "pages.tiff"
-    pages = np.stack([edge_frame(50.0, seed) for seed in range(16)])
-    tifffile.imwrite(path, pages, photometric="minisblack", imagej=imagej)
-    all_pages = run_json(path, "--roi", ROI, "--pitch", "7 um")
-    four = run_json(path, "--roi", ROI, "--pitch", "7 um", "--frames", 4)
-    # the noise is estimated from some 3000 pixels of each: 2%
-    assert four["noise_dark_dn"] == pytest.approx(2 * all_pages["noise_dark_dn"], rel=0.1)
-    assert all_pages["noise_dark_dn"] == pytest.approx(50 / 4, rel=0.1)
-
-
 @pytest.mark.parametrize(("far", "turn"), quick(1, [(0.3, 0.005), (4.0, 0.0)]))
 def test_pages_between_which_the_edge_moves_are_laid_over_each_other(tmp_path, far, turn):
     """Their mean gave 0.0220 +- 0.0017 for 0.0891 where it moves by 1 px rms, and not a word."""
@@ -142,16 +134,19 @@ def test_pages_between_which_the_edge_moves_are_laid_over_each_other(tmp_path, f
     assert np.max(np.abs(moved)) < 5.0
 
 
-def test_still_pages_are_averaged_to_the_bit(tmp_path):
+@pytest.mark.parametrize("imagej", [False, True])
+def test_still_pages_are_averaged_to_the_bit(tmp_path, imagej):
     """One page in 10 000 images would be laid over each other by chance."""
     pages = np.stack([edge_frame(30.0, k) for k in range(9)])
-    tifffile.imwrite(tmp_path / "pages.tiff", pages, photometric="minisblack")
-    tifffile.imwrite(tmp_path / "mean.tiff", pages.mean(axis=0))
-    several = run_json(tmp_path / "pages.tiff", "--roi", ROI, "--pitch", "7 um")
-    mean = run_json(tmp_path / "mean.tiff", "--roi", ROI, "--pitch", "7 um")
-    for key in ("mtf", "sigma", "noise_bias", "position_px", "angle_deg"):
-        assert several[key] == mean[key]
-    assert not several["pages"]["aligned"]
+    tifffile.imwrite(tmp_path / "pages.tiff", pages, photometric="minisblack", imagej=imagej)
+    for more, used in (((), 9), (("--frames", 4), 4)):
+        tifffile.imwrite(tmp_path / "mean.tiff", pages[:used].mean(axis=0))
+        several, mean = run_json(tmp_path / "pages.tiff", *EDGE, *more), run_json(tmp_path / "mean.tiff", *EDGE)
+        for key in ("mtf", "sigma", "noise_bias", "position_px", "angle_deg"):
+            assert several[key] == mean[key]
+        assert not several["pages"]["aligned"]
+        # of some 3000 pixels of each side: 2 %
+        assert several["noise_dark_dn"] == pytest.approx(30.0 / used**0.5, rel=0.1)
 
 
 def test_rounding_and_repeated_pages_enter_the_sigma(tmp_path):
@@ -170,6 +165,30 @@ def test_rounding_and_repeated_pages_enter_the_sigma(tmp_path):
         assert first["mtf"][at] == pytest.approx(gaussian_mtf(at / 64), abs=4 * sigma)
         assert 0.002 < sigma < 0.03
     assert first["noise_dark_dn"] == pytest.approx(12**-0.5, rel=0.1)
+
+
+def page(shift, seed):
+    return edge_frame(30.0, seed, shift=shift)[10:74, 20:84].astype(float)
+
+
+def flat(seed):
+    return 6000.0 + np.random.default_rng(seed).normal(0, 30, (64, 64))
+
+
+SOFT = 6000.0 + 5000.0 * np.tanh((np.arange(64) - 31) / 12.0)
+PAGES = {
+    "it is even but for noise": lambda: [flat(1), flat(2)],
+    "single pages are too noisy": lambda: [page(-12, 1), page(12, 2), flat(3)],
+    "page 6 of those that are not repeated shows no edge": lambda: [*(page(k / 2, k) for k in range(6)), flat(9)],
+    "4000000 in all are possible": lambda: [page(12 * (-1) ** (k % 2), k % 10) + k for k in range(1000)],
+    "the edge does not look alike in them": lambda: [*(page(k / 2, k) for k in range(4)), SOFT + 0.01 * flat(9)],
+    "within 10 px of the region's side": lambda: [*(page(k / 5, k) for k in range(20)), page(25, 99)],
+}
+
+
+@pytest.mark.parametrize("said", quick(4, PAGES))
+def test_pages_that_cannot_be_measured_together(said):
+    refuses(EdgeError, said, measure_pages, np.stack(PAGES[said]()))
 
 
 def test_pages_of_different_size_must_be_chosen(tmp_path):
@@ -319,9 +338,15 @@ def test_bars(tmp_path, frequency):
     assert (data["dark_dn"], data["bright_dn"]) == pytest.approx((50, 1050), abs=1)
 
 
+FIELDS = {"--bars": "0.5 cycles/pixel", "--dark": "0,0,9,9", "--bright": "9,9,9,9"}
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
+        ({"--pitch": None}, "--pitch is missing"),
+        ({"--csv": "/proc/mtf.csv"}, "/proc/mtf.csv cannot be written"),
+        (FIELDS | {"--csv": "mtf.csv"}, "--plot and --csv are for an edge's curve"),
         ({"--pitch": "7"}, 'not a length with its unit: write it as "7 um"'),
         ({"--pitch": "7 furlong"}, "not a length with its unit"),
         ({"--pitch": "-7 um"}, "must lie between 1 nm and 10 mm"),
@@ -355,7 +380,7 @@ def test_bad_input(edge_tiff, tmp_path, changed, message):
     options = {"--roi": ROI, "--pitch": "7 um"} | changed
     if "--plot" in options:
         options["--plot"] = str(tmp_path / options["--plot"])
-    result = run(edge_tiff, *[word for pair in options.items() for word in pair])
+    result = run(edge_tiff, *[word for pair in options.items() for word in pair if pair[1] is not None])
     assert result.exit_code == 2
     assert result.stdout == ""
     assert message in result.stderr

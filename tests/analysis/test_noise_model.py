@@ -6,15 +6,7 @@ import pytest
 from analysis.spots.noise import NoiseModel
 from tests.analysis.refusals import refuses
 
-NOISE = NoiseModel(
-    gain_dn_per_e=0.5,
-    dark_noise_e=4.0,
-    dark_signal_e=10.0,
-    offset_dn=100.0,
-    prnu=0.01,
-    dsnu_e=2.0,
-    saturation_dn=4095.0,
-)
+NOISE = NoiseModel(0.5, 4.0, 10.0, 100.0, 0.01, 2.0, 4095.0)
 
 
 def test_by_hand():

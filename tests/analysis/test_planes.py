@@ -3,7 +3,7 @@ elements, the WGS84 ellipsoid and rays turned by OpenCV's rotations; no plane is
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -240,10 +240,17 @@ def test_nearly_vertical_plane_is_announced():
                 assert plane.condition > 1e4 * max(p.condition for p in safe)
             else:
                 assert not fit_plane(station, strip, "corrected").near_vertical
+    # a bias counts from a tenth of its sigma on
+    east = np.array([1.0, 0.0, 0.0])
+    for share, near in ((0.09, False), (0.11, True)):
+        biased = replace(safe[0], bias=share * east * np.sqrt(safe[0].covariance[0, 0]))
+        assert biased.near_vertical == near
     # without noise nothing is left in that direction
     for method in ("printed", "corrected"):
         refuses(PlaneError, "vertical in this frame", fits, Pass(*_local(SCENE, orbital(SCENE))), method)
     assert intersection_angles(*fits(SCENE, "tls", turn=orbital(SCENE))).values == pytest.approx(LOOK, abs=1e-13)
+    with pytest.raises(PlaneError, match="has no form z = a0 x"):
+        _ = fits(Pass(*_local(SCENE, orbital(SCENE))), "tls")[1].coefficients
 
 
 def _local(scene, turn):

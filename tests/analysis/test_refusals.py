@@ -5,25 +5,29 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import pytest
 import tifffile
+from astropy.io import fits
 
 from analysis.block.block import Term
 from analysis.block.block_adjustment import adjust_block
 from analysis.block.plausible_block import pruned
 from analysis.block.processes import BlockError, Law
-from analysis.images.image_file import ImageError, ImageFile
+from analysis.images.fits_image import fits_cards
+from analysis.images.image_file import ImageError, ImageFile, Region
 from analysis.matching.correlation import distinct_points
 from analysis.matching.matches import MatchOptions, resampled
 from analysis.measurement_error import UndeterminedError
-from analysis.monitor.estimators import Posterior, Shifts
+from analysis.monitor.estimators import ESTIMATORS, Posterior, Shifts
+from analysis.monitor.filter_state import Observed
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.model_fit import gain, observability
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
+from analysis.monitor.recovery import measure_spots
+from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import StateSpace
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import measure_pages
-from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField
+from analysis.orbit.calibration_parameters import CalibrationError
 from analysis.orbit.forward_intersection import (
     CalibratedLine,
     IntersectionError,
@@ -34,7 +38,6 @@ from analysis.orbit.forward_intersection import (
 from analysis.orbit.image_correction import image_correction
 from analysis.orbit.jitter_lines import splined
 from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
-from analysis.orbit.three_line_model import LineModel, Rays
 from analysis.orientation.interior import OrientationError, fit_interior_orientation, line_orientation
 from analysis.spots.centroid import difference_covariance, energy_centroid, gaussian_fit, maximum_likelihood_fit
 from analysis.spots.frame_screening import FramesError
@@ -44,15 +47,12 @@ from analysis.spots.spot_positions import noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.turntable.angle_fits import cross_validate, fit
 from analysis.turntable.dividing_error import CalibrationSeries
-from analysis.wavefront_maps.map_files import MapError, read_map
-from analysis.wavefront_maps.zernike_table import read_zernikes
-from analysis.wavefront_maps.zernike_terms import annular_terms
-from tests.analysis import wavefront_files
 from tests.analysis.drawn_blocks import Plan, draw
 from tests.analysis.refusals import refuses
 from tests.analysis.stated_motions import TimeLaw, disturbances
+from tests.analysis.test_monitor_limits import some_cameras
 from tests.analysis.test_spot_centroids import NOISE, SHAPE, airy
-from tests.analysis.test_three_line_model import SEEN, cameras, make_rays
+from tests.analysis.test_three_line_model import SEEN
 
 
 def test_blocks():
@@ -69,6 +69,7 @@ def test_blocks():
         return {"scenes": (replace(first, **changes), *block.scenes[1:])}
 
     for said, changes in {
+        "no observations": {"scenes": ()},
         "two passes or two scenes have one name": {"scenes": (first, *block.scenes)},
         "no pass is called 'other'": scene(of="other"),
         "nothing is known of camera 'other'": scene(camera="other"),
@@ -82,6 +83,7 @@ def test_blocks():
     }.items():
         refuses(BlockError, said, adjust_block, replace(block, **changes))
     refuses(BlockError, "no sensor is called 'radar'; there are", block.without, "radar")
+    refuses(BlockError, "no convergence in 1 steps", adjust_block, block, iterations=1)
     lonely = replace(block.without("control"), scenes=(first,), terrain=None)
     refuses(BlockError, "no point is seen by two scenes, and none is control", pruned, lonely)
 
@@ -92,12 +94,24 @@ def test_images(tmp_path):
     refuses(ImageError, "page 9 does not exist", ImageFile.open, path, None, 9, "")
     os.mkfifo(tmp_path / "pipe")
     refuses(ImageError, "a device, a pipe or a socket", ImageFile.open, tmp_path / "pipe")
-    refuses(MapError, "a device, a pipe or a socket", read_map, tmp_path / "pipe")
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((8, 9), np.uint8))
     data = (tmp_path / "a.png").read_bytes()
-    for spoilt in (data[:8] + data[33:], data[:-12]):  # without a header, without an end
+    cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((80, 90), np.uint8))
+    # without a header, without an end
+    for spoilt in (data[:8] + data[33:], data[:-12], (tmp_path / "a.jpg").read_bytes()[:100]):
         (tmp_path / "b.png").write_bytes(spoilt)
         refuses(ImageError, "cut off or damaged", ImageFile.open, tmp_path / "b.png")
+    refuses(ImageError, "page 9 does not exist", ImageFile.open, tmp_path / "a.png", None, 9, "")
+    tifffile.imwrite(path, np.zeros((3, 8, 9)), photometric="minisblack", volumetric=True, tile=(16, 16, 16))
+    refuses(ImageError, "pages of rows and columns are needed", ImageFile.open, path)
+    tifffile.imwrite(path, shape=(40, 4000, 4000), dtype=np.uint16, photometric="minisblack")
+    whole = {"--roi": Region(0, 0, 2000, 2000)}
+    refuses(ImageError, "in all do not fit into memory", ImageFile.open(path).read, whole)
+    fits.PrimaryHDU(np.zeros((8, 9)), fits.Header({"OBSERVER": "one"})).writeto(tmp_path / "a.fits")
+    assert fits_cards(tmp_path / "a.fits", 0)["OBSERVER"] == "one"
+    data = (tmp_path / "a.fits").read_bytes().replace(b"'one     '", b"'one      ")
+    (tmp_path / "a.fits").write_bytes(data)
+    refuses(ImageError, "its header is damaged", fits_cards, tmp_path / "a.fits", 0)
 
 
 def test_matching():
@@ -130,26 +144,19 @@ def test_monitor():
     refuses(ValueError, "Jacobians must be finite", gain, eye, np.nan * see, see)
     for value, said in ((np.nan, "must be finite"), (-1.0, "finite and > 0")):
         refuses(ValueError, said, MonitorGeometry, value, 0.7, 7e-6)
+    refuses(ValueError, "d_f_per_alpha_m must be finite", MonitorGeometry, 5.5, 0.7, 7e-6, d_f_per_alpha_m=np.inf)
+    odd = replace(some_cameras()["c0"], channels=("up", "down"))
+    refuses(ValueError, "called left and right, found up, down", ESTIMATORS["paper_single"].camera_gain, odd, eye)
+    how = SeriesFilter(disturbances(laws[:1], see[:, :1], see[:, :1]))
+    refuses(UndeterminedError, "need noise", how.update, how.start(0.0), Observed(0.0, np.zeros(4), 0.0 * eye))
+    refuses(ValueError, "no centroid 'mean'; there are", measure_spots, np.zeros((1, 9, 9)), 1, None, "mean", 1)
     refuses(ValueError, r"need \(..., 4\) and \(..., 4, 4\)", CameraParameters.from_vector, np.zeros(3), eye)
 
 
 def test_orbit():
-    rays, points, line = make_rays(SEEN)["nadir"], SEEN.points, cameras()["nadir"]
-    for said, sigma, control in (
-        (r"control must be \(40,\)", 1.0, np.ones(3, bool)),
-        ("covariances must be", -np.tile(np.eye(3), (40, 1, 1)), None),
-        ("covariances must be", np.eye(3), None),
-        ("sigma must be finite, and positive or zero for all axes", (1.0, 0.0), None),
-        ("sigma must be finite, and positive or zero for all axes", np.nan, None),
-    ):
-        refuses(CalibrationError, said, CalibrationField.of, "Beijing", {"nadir": rays}, points, sigma, control)
+    points = SEEN.points
     refuses(CalibrationError, "finite coordinates", check_errors, points, points[:3])
     refuses(CalibrationError, "none was intersected", check_errors, np.nan * points, points)
-    refuses(ValueError, "a row of whole numbers", Rays.of, rays.point + 0.5, rays.image, rays.station, rays.attitude)
-    refuses(ValueError, "not below zero", LineModel.of, np.eye(3), [0.65, 0, 0], half_length=-1.0)
-    refuses(
-        UndeterminedError, "behind a camera", line.seen, line.axes @ [[0.0], [0.0], [-1.0]] @ [[1.0]], rays.image[:1]
-    )
     one = CalibratedLine(1, np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)), np.eye(3), 0.65)
     refuses(ValueError, "principal distance must stay positive", one.corrected, [0.0, 0.0, 0.0, -1.0])
     refuses(ValueError, "four finite numbers", one.corrected, [0.0, 0.0, np.nan, 0.0])
@@ -177,6 +184,10 @@ def test_edges_and_angles():
     three = ("constant", "principal_distance", "principal_point")
     found = fit_interior_orientation(np.tan(angle), angle, 1e-6, three)
     refuses(OrientationError, "no line's orientation follows from the terms", line_orientation, found)
+    wide = 15.0 * angle
+    for bent in (-50.0, 500.0):
+        found = fit_interior_orientation(5.5 * np.tan(wide) + bent * np.tan(wide) ** 3, wide, 1e-6, (*three, "radial3"))
+        refuses(OrientationError, "do not converge", line_orientation, found)
     refuses(ValueError, "take 2 or more", cross_validate, "polynomial", angle, angle, 1.0, folds=1)
     refuses(ValueError, "must be", fit, "polynomial", angle, angle[:3], 1.0)
     present = np.arange(60).reshape(20, 3) > 2
@@ -220,32 +231,3 @@ def test_photon_transfer():
         refuses(FramesError, said, photon_transfer, first, second)
         refuses(FramesError, said, pixel_correction, noise, first, second)
     refuses(FramesError, "not noisier than the dark ones", photon_transfer, dark, flat)
-
-
-@pytest.mark.parametrize(
-    ("said", "head"),
-    [
-        ("is too long for a table", "# unit: nm\nZ4\n" + "1\n" * 5_100_000),
-        ("a coefficient is not a finite number", "# unit: waves\n# wavelength: 1000 m\nZ4\n1e308\n"),
-        ("a length is needed: 632.8 nm", "# unit: nm\n# wavelength: 2 waves\nZ4\n1\n"),
-    ],
-)
-def test_zernike_tables(said, head, tmp_path):
-    path = tmp_path / "z.csv"
-    path.write_text("# order: fringe\n# normalised: peak\n" + head)
-    refuses(MapError, said, read_zernikes, path)
-
-
-def test_wavefront_maps(tmp_path):
-    path, wave = tmp_path / "a.dat", wavefront_files.wave()
-    for place, data, said in (
-        (168, b"\x40\x00\x00\x00", "its header has wavelength 2 m"),
-        (68, b"\xff\xff\xff\xff", "65535 x 65535 points, more than"),
-    ):
-        wavefront_files.metropro(path, wave)
-        whole = path.read_bytes()
-        path.write_bytes(whole[:place] + data + whole[place + 4 :])
-        refuses(MapError, said, read_map, path)
-    wavefront_files.datx(path, wave.ravel())
-    refuses(MapError, "is no map of numbers", read_map, path)
-    refuses(ValueError, "a radius of 0 to 1 of the ring's", annular_terms, 4, np.ones(3), np.ones(3), 1.0)

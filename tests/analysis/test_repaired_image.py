@@ -5,25 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from scipy.special import j1
 
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import ScreenedFrames
 from analysis.spots.noise import NoiseModel
-from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
-from analysis.spots.spot_positions import SpotPositions
+from analysis.spots.screened_fit import EDGE_PX, FitTerms, ScreenedFit, fit_screened
+from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import repaired_centroid
+from tests.analysis.refusals import refuses
+from tests.analysis.test_spot_centroids import airy
 
 NOISE = NoiseModel(0.16, 12.0, 0.5, 100.0, 0.005, 5.0, 16100.0)
 PLACE, LIGHT, FRAMES = (31.4, 30.7), 4e5, 9
 OTHER = (42.3, 41.2, 0.03)
-
-
-def airy(row: float, column: float, shape: tuple[int, int]) -> np.ndarray:
-    r, c = np.indices(shape)
-    x = np.maximum(np.hypot(r - row, c - column) * (3.8317059702075125 / 6.0), 1e-9)
-    return np.asarray((2 * j1(x) / x) ** 2)
 
 
 @dataclass
@@ -50,7 +45,7 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def template() -> SpotTemplate:
-    return SpotTemplate.from_image(airy(60.2, 59.6, (120, 120)), 60.2, 59.6, (64, 64))
+    return SpotTemplate.from_image(airy(60.2, 59.6, (120, 120), 6.0), 60.2, 59.6, (64, 64))
 
 
 def bench(template: SpotTemplate, kind: str) -> Bench:
@@ -90,6 +85,21 @@ def test_a_repaired_image_has_the_centre_of_the_clean_one(template, measure, kin
     np.testing.assert_allclose(found.position, clean.position, rtol=0, atol=3e-6)
     # and without repair it is another one
     assert np.abs(measure(np.minimum(dirty.image, 9000.0)[None], NOISE).position - clean.position).max() > 1e-3
+
+
+def test_a_spot_that_ends_at_the_side_is_refused(template):
+    """It was inside in the image before, from whose place the fit starts."""
+    whole = np.full((64, 64), 9.0), np.ones((64, 64), bool), NOISE, template, FitTerms()
+    inside, side = (120.0 + LIGHT * template.evaluate(EDGE_PX + by, 30.7)[0][0] for by in (2.0, -1.0))
+    near = fit_screened(inside, *whole)
+    refuses(SpotError, "edge", fit_screened, side, *whole, near)
+
+
+def test_three_pixels_tell_no_spot(template):
+    good = np.zeros((64, 64), bool)
+    good[30:33, 31] = True
+    image = 120.0 + LIGHT * template.evaluate(31.0, 31.0)[0][0]
+    refuses(SpotError, "too few good pixels", fit_screened, image, np.full((64, 64), 9.0), good, NOISE, template)
 
 
 @pytest.mark.parametrize("measure", MEASURES)

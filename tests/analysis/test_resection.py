@@ -156,6 +156,8 @@ def test_bad_input():
     with pytest.raises(ResectionError, match="reference 'left' is none of the lines forward, nadir, backward"):
         resect(station, lines, reference="left")
     refuses(ResectionError, "no lines", resect, station, {})
+    bare = replace(lines["nadir"], strip=replace(lines["nadir"].strip, points=np.zeros((0, 3))))
+    refuses(ResectionError, "the nadir line has no points", resect, station, lines | {"nadir": bare})
     refuses(ResectionError, "positive definite", resect, Station.of(SCENE.station, np.diag([1.0, 1.0, 0.0])), lines)
     with pytest.raises(ResectionError, match="no convergence"):
         resect(Station.of(noisy(SCENE, np.random.default_rng(1), 0, 9).station, 1.0), lines, iterations=1)

@@ -150,6 +150,13 @@ def expected_score(square, noise=1.0, coloured=1.0, second=50.0):
     return relief, variance, coloured + 0.0 * square, error
 
 
+def shared(seen, error, good=True):
+    """Mean of what relief may be, by windows that say little: normal by precision, cut off at zero; and its sigma."""
+    weight = np.where(good, error**-2.0, 0.0)
+    mean, sigma = weight @ seen / weight.sum(), weight.sum() ** -0.5
+    return stats.truncnorm.mean(-mean / sigma, np.inf, loc=mean, scale=sigma), sigma
+
+
 def test_relief_of_each_window_comes_back_where_noise_is_low():
     square = np.array([0.1, 0.4, 0.9, 1.6])
     for coloured in (1.0, 1.5):
@@ -161,7 +168,7 @@ def test_relief_of_each_window_comes_back_where_noise_is_low():
 
 @pytest.mark.parametrize("coloured", [1.0, 1.1])
 def test_windows_that_say_little_share_the_mean_of_what_relief_may_be(coloured):
-    """Normal by precision, cut off at zero; the mean of a half-normal distribution where nothing is seen."""
+    """The mean of a half-normal distribution where nothing is seen."""
     none, some = np.zeros(9), np.array([0.3, -0.2, 0.8, 0.0, 0.1, 0.5, 0.0, -0.1, 0.4])
     second = np.linspace(20.0, 60.0, 9)
     for square in (none, some):
@@ -169,14 +176,11 @@ def test_windows_that_say_little_share_the_mean_of_what_relief_may_be(coloured):
         for good in (np.ones(9, bool), np.arange(9) < 6):
             # no relief within the accuracy is seen where noise takes it all
             assert np.all(square < 2.5 * error)
-            weight = np.where(good, error**-2.0, 0.0)
-            mean, sigma = weight @ square / weight.sum(), weight.sum() ** -0.5
-            shared = stats.truncnorm.mean(-mean / sigma, np.inf, loc=mean, scale=sigma)
+            expected, sigma = shared(square, error, good)
             tau, usual = relief.square(variance, colour, good)
-            assert tau == pytest.approx(np.full(9, shared), rel=1e-9)
-            assert usual == pytest.approx(shared, rel=1e-9)
+            assert [*tau, usual] == pytest.approx([expected] * 10, rel=1e-9)
             if square is none:
-                assert shared == pytest.approx(sigma * np.sqrt(2.0 / np.pi), rel=1e-9)
+                assert usual == pytest.approx(sigma * np.sqrt(2.0 / np.pi), rel=1e-9)
 
 
 def test_a_window_that_stands_out_has_its_own_relief_and_counts_a_little():
@@ -190,12 +194,10 @@ def test_a_window_that_stands_out_has_its_own_relief_and_counts_a_little():
         relief, variance, colour, error = expected_score(square)
         assert plain < error[4]
         assert square[4] == pytest.approx(size * error[4], rel=1e-9)
-        weight = error**-2.0
-        mean, sigma = weight[4] * 2.5 * error[4] / weight.sum(), weight.sum() ** -0.5
-        shared = stats.truncnorm.mean(-mean / sigma, np.inf, loc=mean, scale=sigma)
+        expected, _ = shared(np.where(np.arange(9) == 4, 2.5 * error, 0.0), error)
         tau, usual = relief.square(variance, colour, np.ones(9, bool))
-        assert tau == pytest.approx(np.where((np.arange(9) == 4) & alone, square[4], shared), rel=1e-9)
-        assert usual == pytest.approx(shared, rel=1e-9)
+        assert tau == pytest.approx(np.where((np.arange(9) == 4) & alone, square[4], expected), rel=1e-9)
+        assert usual == pytest.approx(expected, rel=1e-9)
 
 
 def test_windows_without_a_score_take_what_the_others_share():
@@ -209,11 +211,8 @@ def test_windows_without_a_score_take_what_the_others_share():
         array[2] = whole
         # four share what five did: the mean of a normal cut off at zero rises with its standard deviation
         assert tau[2] == tau[0] > all_of[0]
-    # colour so strong that the residuals' variance says more than the score: nothing is known
-    tau, nothing = relief.square(variance, 100.0 * colour, np.ones(5, bool))
-    assert np.all(tau == 0.0)
-    assert nothing == 0.0
-    tau, nothing = relief.square(variance, colour, np.zeros(5, bool))
-    assert np.all(tau == 0.0)
-    assert nothing == 0.0
+    # colour so strong that the residuals' variance says more than the score, or no good window: nothing is known
+    for strong, good in ((100.0, np.ones(5, bool)), (1.0, np.zeros(5, bool))):
+        tau, nothing = relief.square(variance, strong * colour, good)
+        assert not np.any([*tau, nothing])
     assert usual >= 0.2

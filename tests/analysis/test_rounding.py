@@ -12,6 +12,7 @@ from analysis.spots.frame_screening import FramesError, noise_ratio, screen_fram
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import photon_transfer, pixel_correction
 from analysis.spots.spot_template import SpotTemplate
+from tests.analysis.refusals import refuses
 from tests.analysis.test_spot_centroids import SHAPE, airy
 
 
@@ -138,6 +139,9 @@ def test_coarse_frames_are_no_cosmic_rays_and_have_no_other_noise(shape):
 
 
 def test_frames_without_a_pixel_that_can_be_used_are_refused():
+    rng, places = np.random.default_rng(1), [(31, 31)] * 4 + [(20 + 5 * k, 50 - 6 * k) for k in range(5)]
+    moving = np.stack([mean_of(1, 20000.0 * airy(*place, (64, 64)), coarse(0.2), rng) for place in places])
+    refuses(FramesError, "of 9 frames are unlike the others or dark", screen_frames, moving, coarse(0.2))
     frames = np.full((4, 16, 16), 100.0)
     with pytest.raises(FramesError, match="every pixel of frames 1, 2, 3, 4 is saturated or known to be bad"):
         screen_frames(frames + np.arange(256.0).reshape(16, 16), coarse(), np.ones((16, 16), bool))

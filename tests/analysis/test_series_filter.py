@@ -7,13 +7,13 @@ import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed
-from analysis.monitor.jump_detection import steps
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.series_following import jointly
 from analysis.monitor.series_smoother import smooth
 from analysis.monitor.state_space import HeatInputs, StateSpace
-from tests.analysis.followed_series import follow, forecast, of_shifts
+from tests.analysis.followed_series import follow, of_shifts, whole_steps
 from tests.analysis.stated_motions import SpotNoise, correlation_of, disturbances
+from tests.analysis.test_series_smoother import joint_normal
 
 LAWS = (
     TimeLaw(),
@@ -79,19 +79,7 @@ def test_times_together_are_those_of_the_joint_normal() -> None:
     left = [np.zeros(0)] * len(times)
     for asked in (wanted, np.append(wanted, [66.0, 70.0])):
         mean, covariance = jointly(how, how.start(-3.0), read, asked, left)
-        every = np.concatenate([times, asked])
-        both = np.concatenate([told.spots, told.parameters])
-        prior = np.zeros((len(every), len(both), len(every), len(both)))
-        for law in dict.fromkeys(told.laws):
-            own = np.array([one == law for one in told.laws])
-            together = both[:, own] @ told.correlation[np.ix_(own, own)] @ both[:, own].T
-            prior += np.einsum("tu,ij->tiuj", law.covariance(every[:, None], every), together)
-        seen, sought = np.s_[: len(times), :SPOTS], np.s_[len(times) :, SPOTS:]
-        spread = prior[seen][:, :, : len(times), :SPOTS].reshape((shifts.size,) * 2) + BOTH.covariance(shifts)
-        across = prior[sought][:, :, : len(times), :SPOTS].reshape(-1, shifts.size)
-        before = prior[sought][:, :, len(times) :, SPOTS:].reshape((mean.size,) * 2)
-        gain = np.linalg.solve(spread, across.T).T
-        after = before - gain @ across.T
+        gain, before, after, _ = joint_normal(told, times, BOTH, asked, None)
         sigma, start = np.sqrt(np.diag(after)), np.sqrt(np.diag(before))
         assert np.all(np.abs(mean.ravel() - gain @ shifts.ravel()) <= 1e-9 * sigma + 1e-10 * start)
         off = np.abs(covariance.reshape(after.shape) - after)
@@ -119,18 +107,7 @@ def test_what_is_looked_for_is_that_of_the_whole_series() -> None:
     belief = how.start(times[0])
     for one in of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)):
         belief, _ = how.update(belief, one)
-    space = StateSpace(told)
-    pairs = np.zeros((len(times), SPOTS, len(times), SPOTS))
-    for i, early in enumerate(times):
-        mean, covariance = space.start(early)
-        for j in range(i, len(times)):
-            rows = [space.outputs(mean, covariance, t)[1][:SPOTS] for t in (early, times[j])]
-            pairs[j, :, i] = rows[1] @ space.moved(covariance, early, times[j]) @ rows[0].T
-            pairs[i, :, j] = pairs[j, :, i].T
-    spread = pairs.reshape(len(times) * SPOTS, -1) + NOISE**2 * np.eye(len(times) * SPOTS)
-    root = np.linalg.cholesky(spread)
-    white = np.linalg.solve(root, shifts.ravel())
-    whole = steps(root, white, times, slice(0, len(times)), None)
+    whole = whole_steps(told, times, shifts, NOISE)
     # the first reading has none before it, and of two readings of one moment the second has none either
     assert np.array_equal(belief.until, whole.until)
     assert np.allclose(belief.state.score, whole.score, rtol=1e-9, atol=1e-9 * np.abs(whole.score).max())
@@ -211,13 +188,13 @@ def test_a_sensor_says_what_a_body_does() -> None:
     read, shift = np.array([0.3, -0.2]), np.full(SPOTS, 0.4)
     belief, _ = how.update(belief, Observed(1.0, read, 1e-4 * np.eye(2), (0, 1)))
     belief, _ = how.update(belief, Observed(1.0, shift, NOISE**2 * np.eye(SPOTS)))
-    found = forecast(how, belief, [1.0])
+    values, total = how.parameters(how.blended(belief), 1.0)
     rows = np.concatenate([np.pad(heat.rows, ((0, 0), (0, 2))), told.spots])
     noise = np.diag([1e-4, 1e-4, *[NOISE**2] * SPOTS])
     across = told.parameters @ rows.T
     gain = across @ np.linalg.inv(rows @ rows.T + noise)
-    assert np.allclose(found.values[0], gain @ np.concatenate([read, shift]), rtol=1e-6, atol=1e-14)
-    assert np.allclose(found.total[0], told.parameters @ told.parameters.T - gain @ across.T, rtol=1e-5, atol=1e-18)
+    assert np.allclose(values, gain @ np.concatenate([read, shift]), rtol=1e-6, atol=1e-14)
+    assert np.allclose(total, told.parameters @ told.parameters.T - gain @ across.T, rtol=1e-5, atol=1e-18)
 
 
 def test_motions_of_a_state_are_those_of_one_joint_normal() -> None:

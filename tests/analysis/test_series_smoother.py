@@ -69,8 +69,9 @@ def dense(stated: Disturbances, times: np.ndarray, reference: float | None) -> n
     return out.reshape(len(times) * len(stated.laws), -1)
 
 
-def conditioned(stated, measured, shifts, noise, times, reference):
-    """Mean and covariance of the parameters at times, given shifts, by one joint matrix of all motions."""
+def joint_normal(stated, measured, noise, times, reference):
+    """By one joint matrix of all motions: the gain of the parameters at times by shifts, the covariance of the
+    parameters before and after, and that of the shifts."""
     every = np.concatenate([measured, times])
     motions = dense(stated, every, reference)
     m, t = len(measured), len(times)
@@ -79,8 +80,15 @@ def conditioned(stated, measured, shifts, noise, times, reference):
     cut = m * len(stated.laws)
     spread = a @ motions[:cut, :cut] @ a.T + noise.covariance(np.arange(m))
     across = b @ motions[cut:, :cut] @ a.T
-    gain = across @ np.linalg.inv(spread)
-    left = b @ motions[cut:, cut:] @ b.T - gain @ across.T
+    gain = np.linalg.solve(spread, across.T).T
+    before = b @ motions[cut:, cut:] @ b.T
+    return gain, before, before - gain @ across.T, spread
+
+
+def conditioned(stated, measured, shifts, noise, times, reference):
+    """Mean and covariance of the parameters at times, given shifts, that by noise alone, and chi-square."""
+    gain, _, left, spread = joint_normal(stated, measured, noise, times, reference)
+    m, t = len(measured), len(times)
     width = len(stated.parameters)
     blocks = left.reshape(t, width, t, width)[np.arange(t), :, np.arange(t)]
     own = gain @ noise.covariance(np.arange(m)) @ gain.T
@@ -122,33 +130,6 @@ def test_as_conditioning_all_times_together(reference) -> None:
         close(found.filtered.values[k], values[0], prior)
         close(found.filtered.total[k], spread[0], prior)
         close(found.filtered.noise[k], by_noise[0], prior)
-
-
-def test_what_has_to_stay() -> None:
-    """The order of measurements is no matter; motions that are new at each time leave each time to its own measurement;
-    at the reference nothing has moved; what never moves stays there for good."""
-    rng = np.random.default_rng(6)
-    stated = some(rng)
-    measured, times = np.array([0.0, 10.0, 30.0, 60.0]), np.array([10.0, 40.0])
-    (own, shared), shifts = random_noise(rng, len(measured)), rng.standard_normal((4, 4))
-    found = smooth(stated, measured, shifts, noise_of(own, shared), times)
-    prior, mixed = stated.parameter_covariance, np.array([2, 0, 3, 1])
-    other = smooth(stated, measured[mixed], shifts[mixed], noise_of(own[mixed], shared), times[::-1])
-    for one, two in ((other.filtered, found.filtered), (other.smoothed, found.smoothed)):
-        close(one.values[::-1], two.values, prior)
-        close(one.total[::-1], two.total, prior)
-    assert other.innovations == pytest.approx(found.innovations[mixed], rel=1e-6)
-    white = replace(stated, laws=(WHITE,) * len(stated.laws))
-    alone = smooth(white, measured, shifts, noise_of(own, 0.0 * shared), times)
-    only = smooth(white, measured[1:2], shifts[1:2], noise_of(own[1:2], 0.0 * shared), [10.0])
-    close(alone.smoothed.values[0], only.smoothed.values[0], prior)
-    assert not alone.smoothed.values[1].any()
-    close(alone.smoothed.total[1], prior, prior)
-    still = replace(stated, laws=(CONSTANT,) * len(stated.laws))
-    for each, when in ((stated, [10.0]), (still, times)):
-        stays = smooth(each, measured, shifts, noise_of(own, shared), when, 10.0).smoothed
-        assert not stays.total.any()
-        assert not stays.values.any()
 
 
 def test_long_series_in_pieces(monkeypatch) -> None:

@@ -2,7 +2,6 @@
 statistics of rounding, and the coupling of focus and line level through an inclined mounting surface.
 """
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,14 +10,11 @@ from analysis.focal_plane import shims
 from analysis.focal_plane.plane_fit import LineLevel, RigidMotion, fit_focal_plane
 from analysis.focal_plane.shims import Mount, ShimError
 from tests.analysis.refusals import refuses
+from tests.analysis.test_planes import rotation
 
 ARCMIN, DEG = np.pi / 10800, np.pi / 180
 UM, MM = 1e-6, 1e-3
 STEP = 10 * UM
-
-
-def rotation(vector):
-    return cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0]
 
 
 def inclined(angle, azimuth=0.0):
@@ -76,16 +72,6 @@ def test_exact_shims_reproduce_the_wanted_motion(angle, azimuth, count):
         fine = shim_plan(wanted, Mount(mount.holes, mount.normal, mount.clearance, 1e-15))
         assert fine.achieved.rotation == pytest.approx(wanted.rotation, abs=1e-13)
         assert fine.achieved.shift == pytest.approx(wanted.shift, abs=1e-14)
-
-
-def test_thickness_signs():
-    """A thicker shim lifts along +n; a tilt about +X' lifts the +Y' side."""
-    mount = make_mount()
-    lift = shim_plan(RigidMotion.of([0, 0, 0], [0, 0, 0.1 * MM]), mount)
-    assert lift.change == pytest.approx(np.full(4, 0.1 * MM), abs=1e-17)
-    tilt = shim_plan(RigidMotion.of([2 * ARCMIN, 0, 0], [0, 0, 0]), mount)
-    assert np.array_equal(np.sign(tilt.change), np.sign(mount.holes[:, 1]))
-    assert tilt.change == pytest.approx(2 * ARCMIN * mount.holes[:, 1], rel=1e-3)
 
 
 @pytest.mark.parametrize("angle", [6 * DEG, 20 * DEG])

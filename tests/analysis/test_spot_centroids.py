@@ -29,7 +29,7 @@ from analysis.spots.spot_template import SpotTemplate
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
 
-FALSE_ALARM = 1e-6
+FALSE_ALARM, FIRST_ZERO_PX = 1e-6, 7.0
 SHAPE = (96, 96)
 FRAMES = 9
 GAIN, DARK_NOISE_E, OFFSET, PRNU, DSNU_E = 0.06, 16.0, 64.0, 0.01, 5.0
@@ -37,9 +37,9 @@ NOISE = NoiseModel(GAIN, DARK_NOISE_E, 0.0, OFFSET, PRNU, DSNU_E, 4095.0)
 PEAK_E, SKY_E = 50000.0, 3.0
 
 
-def airy(row, column, shape=SHAPE):
+def airy(row, column, shape=SHAPE, zero=FIRST_ZERO_PX):
     r, c = np.indices(shape)
-    x = np.maximum(np.hypot(r - row, c - column) * (3.8317059702075125 / 7.0), 1e-9)
+    x = np.maximum(np.hypot(r - row, c - column) * (3.8317059702075125 / zero), 1e-9)
     return (2 * j1(x) / x) ** 2
 
 

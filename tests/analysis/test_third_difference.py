@@ -31,25 +31,9 @@ def test_a_smooth_orbit_leaves_its_third_derivative(step, floor):
     assert cubic.rms == pytest.approx(12.0)
 
 
-def test_biases_and_drifts_are_not_seen_and_smoothing_hides_noise():
-    rng = np.random.default_rng(2)
-    noise, time = rng.standard_normal(4000), np.arange(4000.0)
-    plain = third_difference(time, noise)
-    assert third_difference(time, noise + 100.0 + 0.5 * time).rms == pytest.approx(plain.rms, rel=1e-9)
-    smoothed = third_difference(time, np.convolve(noise, np.ones(9) / 9, "same"))
-    # the mean of nine has a third of the sigma; third differences say 1/9 sqrt(2 x 6 / 20), far too good
-    assert smoothed.white_sigma[0] == pytest.approx(np.sqrt(12 / 20) / 9, rel=0.1)
-
-
 def test_bad_series_are_told():
     time = np.arange(10.0)
     refuses(ValueError, "five samples", third_difference, time[:4], time[:4])
     refuses(ValueError, "finite", third_difference, time, np.where(time == 3, np.nan, time))
     refuses(ValueError, "the step after sample 4 is 2 s", third_difference, np.delete(time, 5), np.delete(time, 5))
     refuses(ValueError, "rise evenly", third_difference, time[::-1], time)
-
-
-def test_constants_of_white_noise_are_those_of_the_binomials():
-    weights = np.array([1.0, -3.0, 3.0, -1.0])
-    overlap = np.correlate(weights, weights, "full")
-    assert pytest.approx(np.sqrt(overlap[3])) == WHITE_GAIN

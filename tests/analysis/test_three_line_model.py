@@ -2,6 +2,7 @@
 rotations; its partials against a complex step; forward intersection against the points of the pass."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -283,32 +284,40 @@ def test_intersection_covariance_holds():
 
 
 def test_bad_input_is_told():
-    rays = make_rays(SEEN)["nadir"]
-    with pytest.raises(ValueError, match="image of ray 3 is not finite"):
-        Rays.of(rays.point, np.where(np.arange(40)[:, None] == 3, np.nan, rays.image), rays.station, rays.attitude)
-    refuses(ValueError, "appears twice", Rays.of, np.zeros(40, int), rays.image, rays.station, rays.attitude)
-    refuses(ValueError, r"image must be \(40, 2\)", Rays.of, rays.point, rays.image[:, :1], rays.station, rays.attitude)
-    for matrix in (2 * np.eye(3), np.diag([1.0, 1.0, -1.0])):
-        refuses(ValueError, "must be a rotation", LineModel.of, matrix, INTERIOR["nadir"])
-    for sizes in (((3, 2), 3, 3), ((3, 3), 2, 3), ((3, 3), 3, 4)):
-        with pytest.raises(ValueError, match=r"to_body must be \(3, 3\), interior and position \(3,\)"):
-            LineModel.of(*(np.ones(size) for size in sizes))
-    for interior, position, k1 in (([0, 0, 0], 0.0, 0.0), ([0.65, np.nan, 0], 0.0, 0.0), ([0.65, 0, 0], np.inf, 0.0)):
-        refuses(ValueError, "finite and f positive", LineModel.of, np.eye(3), interior, [position, 0, 0], k1)
-    refuses(ValueError, "finite and f positive", LineModel.of, np.eye(3), [0.65, 0, 0], k1=np.nan)
-    with pytest.raises(ValueError, match="behind a camera"):
-        partials(cameras()["nadir"], rays, 2 * rays.station, np.zeros(3), np.zeros(3))
-    level = Rays.of(rays.point, rays.image, 0.0 * rays.station, np.tile(np.eye(3), (40, 1, 1)))
-    # beside it, where the depth is zero
-    with pytest.raises(ValueError, match="behind a camera"):
-        partials(LineModel.of(np.eye(3), [0.65, 0, 0]), level, np.tile([5e5, 0, 0], (40, 1)), np.zeros(3), np.zeros(3))
-    refuses(CalibrationError, "no point is seen by two lines", intersect, {"nadir": rays}, cameras(), Noise(PITCH))
-    with pytest.raises(CalibrationError, match="parallel"):
-        intersect({"nadir": rays, "again": rays}, {k: cameras()["nadir"] for k in ("nadir", "again")}, Noise(PITCH))
-    with pytest.raises(CalibrationError, match="point that does not exist"):
-        CalibrationField.of("Beijing", {"nadir": rays}, SEEN.points[:10], 1.0)
-    with pytest.raises(CalibrationError, match="tie point 0 is seen by 1 lines"):
-        CalibrationField.of("Beijing", {"nadir": rays}, SEEN.points, 1.0, control=np.zeros(40, bool))
-    with pytest.raises(CalibrationError, match=r"geocentric \(ITRS\) and in metres"):
-        CalibrationField.of("Beijing", {"nadir": rays}, SEEN.points / 1e3, 1.0)
-    refuses(CalibrationError, "finite", CalibrationField.of, "Beijing", {"nadir": rays}, np.full((40, 3), np.nan), 1.0)
+    rays, nadir, still, eye = make_rays(SEEN)["nadir"], cameras()["nadir"], np.zeros(3), np.eye(3)
+    lost = np.where(np.arange(40)[:, None] == 3, np.nan, rays.image)
+    level = Rays.of(rays.point, rays.image, 0.0 * rays.station, np.tile(eye, (40, 1, 1)))
+    beside = np.tile([5e5, 0, 0], (40, 1))  # where the depth is zero
+    twice = {"nadir": rays, "again": rays}
+    field = partial(CalibrationField.of, "Beijing", {"nadir": rays})
+    for said, call, *arguments in (
+        ("image of ray 3 is not finite", Rays.of, rays.point, lost, rays.station, rays.attitude),
+        ("appears twice", Rays.of, np.zeros(40, int), rays.image, rays.station, rays.attitude),
+        (r"image must be \(40, 2\)", Rays.of, rays.point, rays.image[:, :1], rays.station, rays.attitude),
+        ("a row of whole numbers", Rays.of, rays.point + 0.5, rays.image, rays.station, rays.attitude),
+        ("must be a rotation", LineModel.of, 2 * eye, INTERIOR["nadir"]),
+        ("must be a rotation", LineModel.of, np.diag([1.0, 1.0, -1.0]), INTERIOR["nadir"]),
+        (r"to_body must be \(3, 3\), interior and position \(3,\)", LineModel.of, eye[:, :2], still, still),
+        (r"to_body must be \(3, 3\), interior and position \(3,\)", LineModel.of, eye, still[:2], still),
+        (r"to_body must be \(3, 3\), interior and position \(3,\)", LineModel.of, eye, still, np.zeros(4)),
+        ("finite and f positive", LineModel.of, eye, still),
+        ("finite and f positive", LineModel.of, eye, [0.65, np.nan, 0]),
+        ("finite and f positive", LineModel.of, eye, [0.65, 0, 0], [np.inf, 0, 0]),
+        ("finite and f positive", LineModel.of, eye, [0.65, 0, 0], still, np.nan),
+        ("not below zero", partial(LineModel.of, half_length=-1.0), eye, [0.65, 0, 0]),
+        ("behind a camera", nadir.seen, -nadir.axes[:, 2:], rays.image[:1]),
+        ("behind a camera", partials, nadir, rays, 2 * rays.station, still, still),
+        ("behind a camera", partials, LineModel.of(eye, [0.65, 0, 0]), level, beside, still, still),
+        ("no point is seen by two lines", intersect, {"nadir": rays}, cameras(), Noise(PITCH)),
+        ("parallel", intersect, twice, dict.fromkeys(twice, nadir), Noise(PITCH)),
+        ("point that does not exist", field, SEEN.points[:10], 1.0),
+        ("tie point 0 is seen by 1 lines", field, SEEN.points, 1.0, np.zeros(40, bool)),
+        (r"geocentric \(ITRS\) and in metres", field, SEEN.points / 1e3, 1.0),
+        ("finite", field, np.full((40, 3), np.nan), 1.0),
+        (r"control must be \(40,\)", field, SEEN.points, 1.0, np.ones(3, bool)),
+        ("covariances must be", field, SEEN.points, -np.tile(eye, (40, 1, 1))),
+        ("covariances must be", field, SEEN.points, eye),
+        ("sigma must be finite, and positive or zero for all axes", field, SEEN.points, (1.0, 0.0)),
+        ("sigma must be finite, and positive or zero for all axes", field, SEEN.points, np.nan),
+    ):
+        refuses(CalibrationError if call in (intersect, field) else ValueError, said, call, *arguments)

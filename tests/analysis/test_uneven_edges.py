@@ -178,14 +178,8 @@ def bars(light, where, seed=0):
     share = np.full(shape, 0.5)
     for k in range(12):
         h = 2 * k + 1
-        share += (
-            2
-            / np.pi
-            / h
-            * (-1) ** k
-            * truth(h * frequency, np.degrees(angle), blur)
-            * np.cos(h * (2 * np.pi * (down * row + along * column) + 1.0))
-        )
+        size = 2 / np.pi / h * (-1) ** k * truth(h * frequency, np.degrees(angle), blur)
+        share += size * np.cos(h * (2 * np.pi * (down * row + along * column) + 1.0))
     lit = light(row / 20, column / 20)
     beside = light(row[14:26, 14:26] / 20, (column[14:26, 14:26] + 32.0) / 20)
     bright, image = 1000 + 19000 * (lit if where == "field" else beside), 1000 + 19000 * share * lit

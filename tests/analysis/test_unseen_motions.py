@@ -54,10 +54,3 @@ def test_modes_move_quantities_and_no_spot() -> None:
     whole = sum(np.outer(mode.quantities, mode.quantities) for mode in modes)
     np.testing.assert_allclose(whole, floor(one, rows), rtol=1e-8, atol=1e-12)
     assert [mode.sigma for mode in modes] == sorted((mode.sigma for mode in modes), reverse=True)
-
-
-def test_motions_that_spots_see_in_full_leave_nothing() -> None:
-    one = stated(4)
-    seen = np.arange(MOTIONS) < SPOTS
-    only = one.scaled(seen.astype(float))
-    assert np.abs(floor(only, np.eye(PARAMETERS))).max() < 1e-12

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.jump_detection import steps
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.series_following import hinted, smoothed
-from analysis.monitor.state_space import StateSpace
-from tests.analysis.followed_series import follow, of_shifts
+from tests.analysis.followed_series import follow, of_shifts, whole_steps
 from tests.analysis.stated_motions import disturbances
 from tests.tiers import quick
 
@@ -102,16 +100,7 @@ def test_the_way_back_has_scores_of_steps_before_every_reading() -> None:
     start = how.start(times[0])
     smoothed(how, start, of_shifts(times, shifts, NOISE**2 * np.eye(4)), [], none, how.parameters_of, note)
 
-    space = StateSpace(told)
-    pairs = np.zeros((len(times), 4, len(times), 4))
-    for i, early in enumerate(times):
-        mean, covariance = space.start(early)
-        for j in range(i, len(times)):
-            rows = [space.outputs(mean, covariance, t)[1][:4] for t in (early, times[j])]
-            pairs[j, :, i] = rows[1] @ space.moved(covariance, early, times[j]) @ rows[0].T
-            pairs[i, :, j] = pairs[j, :, i].T
-    root = np.linalg.cholesky(pairs.reshape(4 * len(times), -1) + NOISE**2 * np.eye(4 * len(times)))
-    whole = steps(root, np.linalg.solve(root, shifts.ravel()), times, slice(0, len(times)), None)
+    whole = whole_steps(told, times, shifts, NOISE)
     level, spots = how.space.level_of([3, 4, 5]), told.spots[:, 3:]
     own = score[1:] @ level
     assert np.allclose(own, whole.score @ spots, rtol=1e-8, atol=1e-8 * np.abs(own).max())

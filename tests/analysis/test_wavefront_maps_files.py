@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import os
 import warnings
 from pathlib import Path
 
@@ -239,7 +240,27 @@ BAD = {
     "empty": (lambda p: p.write_bytes(b""), "is empty"),
     "folder": (lambda p: p.mkdir(), "is a folder"),
     "nothing": (lambda p: None, "there is no file"),
+    "pipe": (os.mkfifo, "a device, a pipe or a socket"),
+    "resolution": (lambda p: patched(p, 218, b"\0\3"), "phase resolution 3; 0, 1 and 2 exist"),
+    "no number": (lambda p: p.write_text("5 5 1 1 0 0 0\n" + "inf 0 0 0 0\n" * 25), "a point is not a finite number"),
+    "infinite": (lambda p: p.write_text("# unit: nm\n1 2\n3 inf\n"), "holds an infinite number; write nan"),
+    "too many": (lambda p: unstored(p, 70_000), "70000 x 70000 points, more than"),
+    "2 m": (lambda p: patched(p, 168, b"\x40\0\0\0"), "its header has wavelength 2 m"),
+    "size of the phase": (lambda p: patched(p, 68, b"\xff\xff\xff\xff"), "65535 x 65535 points, more than"),
+    "line": (lambda p: write.datx(p, WAVE.ravel()), "is no map of numbers"),
 }
+
+
+def unstored(path, side):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("Data/Surface/1", (side, side), "f8", chunks=True)
+
+
+def patched(path, place, data):
+    """A MetroPro file with other bytes in its header."""
+    write.metropro(path, WAVE)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:place] + data + whole[place + len(data) :])
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -257,6 +278,7 @@ def test_bad_files_are_told_with_their_name(tmp_path, case):
 def test_statements_that_are_not_needed_are_refused(tmp_path):
     path = tmp_path / "a.dat"
     write.metropro(path, WAVE)
+    refuses(MapError, "cannot be read: Input/output error", read_map, "/proc/self/mem")
     refuses(MapError, "take the statement of unit", read_map, path, unit="nm")
     refuses(MapError, "page 1 was named", read_map, path, page=1)
     refuses(MapError, "says wavelength", read_map, path, wavelength=5e-7)

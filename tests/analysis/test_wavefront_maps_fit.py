@@ -7,12 +7,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from analysis.measurement_error import UndeterminedError
-from analysis.wavefront_maps.map_files import read_map
 from analysis.wavefront_maps.pupil_fit import Pupil, find_pupil, fit_map
 from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
 from analysis.wavefront_maps.zernike_terms import circle_terms
 from tests.analysis.refusals import refuses
-from tests.analysis.wavefront_files import real_file
 from tests.tiers import quick
 
 
@@ -143,20 +141,6 @@ def test_terms_that_the_light_does_not_tell_apart():
     with pytest.raises(UndeterminedError, match="0 lit pixels lie within the pupil"):
         fit_map(map_of(values), range(1, 5), Pupil(500.0, 50.0, 45.0))
     refuses(MapError, "ascending order", fit_map, map_of(values), [1, 4, 2], Pupil(50.0, 50.0, 45.0))
-
-
-def test_a_real_interferogram_is_fitted(tmp_path):
-    """The aperture of a real part fills its map from edge to edge; the fit is the plain least squares of all pixels."""
-    measured = read_map(real_file(tmp_path))
-    found = fit_map(measured, range(1, 16))
-    assert 2.0 * found.pupil.radius == pytest.approx(420.0, abs=10.0)
-    assert found.points > 0.97 * measured.lit.sum()
-    rows, columns = np.nonzero(np.isfinite(found.residual))
-    x, y = found.pupil.unit(columns, rows)
-    direct, *_ = np.linalg.lstsq(circle_terms(range(1, 16), x, y), measured.values[rows, columns], rcond=None)
-    np.testing.assert_allclose(found.coefficients, direct, rtol=0, atol=1e-19)
-    # what polishing leaves is correlated: a thousandth of the pixels count
-    assert found.independent < 1e-2 * found.points
 
 
 @pytest.mark.second

@@ -87,6 +87,7 @@ def test_orders_of_every_program():
         orders = [to_nm(j) for j in range(first, first + MOST_TERMS)]
         assert len(set(orders)) == MOST_TERMS
         assert [noll_to_nm(nm_to_noll(n, m)) for n, m in orders] == orders
+    refuses(ValueError, "a radius of 0 to 1 of the ring's", annular_terms, 4, np.ones(3), np.ones(3), 1.0)
     for to_nm, index in ((noll_to_nm, 0), (noll_to_nm, MOST_TERMS + 1), (fringe_to_nm, 38), (ansi_to_nm, -1)):
         refuses(ValueError, "are known", to_nm, index)
 
@@ -123,20 +124,18 @@ UNITS = {
     "mm": 1e-3,
     "um": 1e-6,
     "µm": 1e-6,
-    "\N{GREEK SMALL LETTER MU}m": 1e-6,
+    "\u03bcm": 1e-6,
     "nm": 1e-9,
     "waves": 632.8e-9,
 }
 
 
 def text_of(order: str, size: str, unit: str, form: str, statements: bool = True) -> str:
-    x, y = ring(0.0, 50)
     names, values = [], []
     # in no order of its own
     for noll, metres in sorted(WAVE.items(), key=lambda item: item[1]):
         # the program's own term, scaled so that it reaches 1 at the edge where it has unit peak
         own = 1.0 if size == "rms" else edge_value(*noll_to_nm(noll))
-        assert np.allclose(metres * own * (circle_terms([noll], x, y) / own), metres * circle_terms([noll], x, y))
         names.append(INDICES[order][noll])
         values.append(repr(metres * own / UNITS[unit]))
     head = f"# order: {order}\n# normalised: {size}\n# unit: {unit}\n# wavelength: 632.8 nm\n# by someone\n"
@@ -196,6 +195,10 @@ BAD = {
     "rows": (SAID + "Z4\n", "no row below"),
     "nothing": (SAID, "holds no table"),
     "wavelength": (SAID + "# wavelength: 632.8\nZ4\n1\n", "a positive length with its unit is needed"),
+    "waves long": (SAID + "# wavelength: 2 waves\nZ4\n1\n", "a length is needed: 632.8 nm"),
+    "huge": (SAID.replace("nm", "waves") + "# wavelength: 1000 m\nZ4\n1e308\n", "coefficient is not a finite number"),
+    "cell": (SAID + "Z4\n" + "1" * 140_000, "is no table: field larger than field limit"),
+    "long": (SAID + "Z4\n" + "1\n" * 5_100_000, "is too long for a table"),
 }
 
 
@@ -218,3 +221,7 @@ def test_statements_that_contradict_the_table(tmp_path):
         refuses(MapError, "take the statement away", read_zernikes, path, **said)
     refuses(MapError, "there is no file", read_zernikes, Path(tmp_path / "other.csv"))
     refuses(MapError, "is no file", read_zernikes, tmp_path)
+    refuses(MapError, "cannot be read: Input/output error", read_zernikes, "/proc/self/mem")
+    with path.open("wb") as file:
+        file.truncate(101_000_000)
+    refuses(MapError, "101 MB, more than 100: save a smaller map", read_zernikes, path)

@@ -111,11 +111,8 @@ def table(path: Path, values: np.ndarray, head: str = "# unit: nm\n# spacing: 0.
 
 
 def zernikes(path: Path) -> None:
-    path.write_text(
-        "# order: fringe\n# normalised: peak\n# unit: nm\nfield [deg],Z4,Z5,Z7\n-1,10,20,-5\n0,11,,3\n".replace(
-            ",,", ",2,"
-        )
-    )
+    head = "# order: fringe\n# normalised: peak\n# unit: nm\nfield [deg],Z4,Z5,Z7\n"
+    path.write_text(head + "-1,10,20,-5\n0,11,2,3\n")
 
 
 WRITERS = {"dat": metropro, "datx": datx, "int": codev, "zemax": zemax, "fits": fits_map, "table": table}
