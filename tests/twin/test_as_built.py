@@ -13,6 +13,7 @@ from scenes.specs.resolved import resolve, resolve_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.scenes.lens.colour_cameras import colour_camera
+from tests.twin.study_bench import TEXTS
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_run import run_camera
 from twin.main_job.render_job import render_job
@@ -20,14 +21,6 @@ from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.truth import LINE_POINTS, LineSight
 
-STATE = """
-  forward/M2: {shift: [2 um, -3 um, 4 um], rotate: [1 arcsec, 0.5 arcsec, 2 arcsec], pivot: centre, radius: 50 ppm,
-    conic: 1.0e-5, figure: {Z5: 8 nm, Z9: 3 nm}}
-  base/forward/focal_plane: {shift: 0 2 20 um, rotate: 3 5 10 arcsec, pivot: rear_node}
-  forward/monitor/left/prism_180: {rotate: 5 3 8 arcsec, shift: 10 0 0 um}
-  backward/monitor/right/prism_0: {rotate: 5 3 8 arcsec}
-  base/backward: {rotate: 0.2 -0.1 0.3 arcsec, shift: 3 0 5 um}
-"""
 THEN = {
     "base/forward/M2": Motion((1e-5, 2e-5, 0.0), (1e-6, 0.0, 3e-6), "centre", radius=1e-5, figure={5: 1e-8, 7: 2e-9}),
     "base/forward/focal_plane": Motion((1e-5, 0.0, 2e-5), (0.0, 1e-6, 0.0), "origin"),
@@ -45,7 +38,7 @@ def read(folder, text: str, name: str = "own.yaml"):
 @pytest.fixture(scope="module")
 def pair(backend, tmp_path_factory):
     """The instrument as drawn and as built, and states of both that are the same: as built, and moved on top of it."""
-    spec = read(tmp_path_factory.mktemp("pair"), f"name: own\ndesign: gf7_pair\nas_built: {STATE}")
+    spec = read(tmp_path_factory.mktemp("pair"), TEXTS["as_built"])
     cameras = load_cameras(spec)
     drawn, built = (build_instrument(one, cameras, backend) for one in (spec.as_drawn, spec))
     bodies = {body.path: body for body in drawn.assembly.tree.bodies}

@@ -23,10 +23,8 @@ def page(folder, study, values, failed=None) -> str:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(content)
     text = (folder / "report.html").read_text("utf-8")
-    # one file: nothing is fetched from elsewhere
-    assert not re.search(r"""(src|href)=["'](https?:|//)""", text)
     assert "<script" not in text
-    assert breaches(text) == []
+    assert breaches(text) == []  # nothing is fetched from elsewhere
     for name in re.findall(r'href="(artefacts/[^"]+|statistics.json)"', text):
         assert (folder / name).stat().st_size > 0, name
     verdict = json.loads((folder / "statistics.json").read_text("utf-8"))["verdict"]
