@@ -17,7 +17,6 @@ from tests.twin.study_bench import TEXTS
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_run import run_camera
 from twin.main_job.render_job import render_job
-from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.truth import LINE_POINTS, LineSight
 
@@ -66,18 +65,6 @@ def test_spots_through_all_prisms(backend, pair) -> None:
     )
     at_rest = MonitorPath(drawn, backend).coarse_trace([{}]).place
     assert np.all(np.max(np.abs(places[:, :1] - at_rest), axis=-1) > 0.5)
-
-
-def test_image_quality(backend, pair) -> None:
-    """MTF along and across the line as the camera stands: as built it is a few arcseconds off the drawing's."""
-    drawn, built, ((there, _), _) = pair
-    found, expected = image_quality(built, backend, [{}]), image_quality(drawn, backend, [there])
-    for name in ("forward", "backward"):
-        one, other = found.cameras[name], expected.cameras[name]
-        np.testing.assert_allclose(one.wfe, other.wfe, rtol=0.0, atol=ROUNDING / 450e-9)
-        for axis in ("mtf_along_line", "mtf_along_track"):
-            # of a camera that turns by 1e-6 the frequency does, too
-            np.testing.assert_allclose(getattr(one, axis), getattr(other, axis), rtol=0.0, atol=1e-7)
 
 
 def test_bodies_that_are_drawn_and_hit(pair) -> None:

@@ -97,7 +97,7 @@ def test_a_run_folder(tmp_path, monkeypatch) -> None:
     assert (out / "again" / "design.json").read_bytes() == (out / "design.json").read_bytes()
 
 
-def test_a_journal_that_cannot_be_kept_is_told(tmp_path) -> None:
+def test_a_journal_that_cannot_be_kept_is_reported(tmp_path) -> None:
     with pytest.raises(RunFolderError, match="Is a directory"), Journal(tmp_path, "design"):
         pass
     beam = Beam(*np.ones(9))

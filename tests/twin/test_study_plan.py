@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
+from scenes.specs.load import EXAMPLES
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
@@ -105,19 +106,13 @@ def test_a_table_of_other_than_text_is_told_with_its_line(tmp_path) -> None:
 
 
 M2 = "base/forward/M2"
-NEUTRAL = {
-    "figure, Z11": ("30 nm", "10 nm"),
-    "radius": ("40 ppm", "90 ppm"),
-    "conic": ("0.2", "0.1"),
-    "temperature, change": ("3 K", "1 K"),
-}
 
 
-@pytest.mark.parametrize("key", NEUTRAL)
+@pytest.mark.parametrize("key", TEXTS["neutral"])
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_place_without_a_value_starts_where_nothing_happens(tmp_path, key, order) -> None:
     """The base of a derivative and of a knob is the job's own, whichever values the factor lists and in which order."""
-    values = f"values: [{', '.join(NEUTRAL[key][::order])}]"
+    values = f"values: {str(TEXTS['neutral'][key][::order]).replace(chr(39), '')}"
     path = write_study(tmp_path, ("base/forward/M2, shift, 2]", f"{M2}, {key}]"), (NORMAL, values))
     made = resolve_study(path)
     assert GradientFactor.of(made, "m2z").value == 0.0
@@ -235,6 +230,9 @@ def test_a_config_yaml_that_is_damaged_is_refused(tmp_path, monkeypatch) -> None
     ):
         with pytest.raises(InputError, match=told):
             study_from_text(dump_yaml(data))
+    focus = f"lab focus, file: {EXAMPLES.parent / 'lab/measured/focus.yaml'}"
+    with pytest.raises(InputError, match="measurements cannot be varied"):
+        resolve_study(write_study(tmp_path / "lab", ("render, file: job.yaml", focus)))
     with pytest.raises(InputError, match="cannot run 'orbit nothing' in a study"):
         setup._job("orbit nothing")
     monkeypatch.setattr(setup.yaml_file, "LARGEST_BYTES", 3000)

@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 from scenes.specs.study import ParetoSpec
+from tests.twin.study_bench import TEXTS
 from tests.twin.study_data import columns, dataset, study_of
 from twin.study.report import study_statistics as estimates
 from twin.study.report.conclusions import warnings
@@ -25,19 +26,6 @@ PI = math.pi
 
 def draws(n: int, seed: int = 3) -> np.ndarray:
     return np.random.default_rng(seed).normal(5.0, 2.0, n)
-
-
-def test_quantiles_of_a_normal_sample() -> None:
-    n = 40_000
-    found = estimates.describe(draws(n), sampled=True)
-    z = -stats.norm.ppf(FALSE_ALARM / 2.0)
-    found_at = (found.median.value, found.p95.value, found.p997.value, *found.tails)
-    q = np.array([0.5, 0.95, 0.997, 0.00135, 0.99865])
-    places = stats.norm.ppf(q, 5.0, 2.0)
-    # the sample quantile's standard deviation is sqrt(q(1-q)/n)/density
-    assert np.all(np.abs(found_at - places) < z * np.sqrt(q * (1.0 - q) / n) / stats.norm.pdf(places, 5.0, 2.0))
-    assert found.normality.normal
-    assert not estimates.describe(np.exp(draws(500)), sampled=True).normality.normal
 
 
 @pytest.mark.parametrize("q", [0.5, 0.95])
@@ -218,7 +206,8 @@ def test_statistics_of_few_runs_are_those_of_scipy() -> None:
         log = np.log(stats.tstd(values)) + np.array([-1.0, 1.0]) * stats.norm.ppf(0.975) * spread
         assert np.log(found.std.interval) == pytest.approx(log, rel=1e-12)
         assert (found.low, found.high) == (values.min(), values.max())
-        assert (found.median.value, found.p95.value) == pytest.approx(np.percentile(values, (50.0, 95.0)), rel=1e-12)
+        places = found.median.value, found.p95.value, found.p997.value, *found.tails
+        assert places == pytest.approx(np.percentile(values, (50.0, 95.0, 99.7, 0.135, 99.865)), rel=1e-12)
         shape = found.normality
         assert (shape is None) == (n < 20)
     expected = (stats.skew(values), stats.kurtosis(values), stats.normaltest(values).pvalue)
@@ -441,14 +430,7 @@ def test_a_normal_distribution_cut_far_from_its_mean(limits) -> None:
     np.testing.assert_allclose(functions.T @ functions / len(x), np.eye(2), atol=1e-2)
 
 
-WARNED = {
-    "failed and are in no statistic": {"failed": 3},
-    "the others no longer follow the design": {"failed": 20},
-    "states a variance of noise": {"noise": 50.0},
-    "σ does not hold in 3 of 60 runs": {"doubts": 3},
-    "has no finite number in 2 runs that did not fail": {"missing": 2},
-    "10 runs are few": {"runs": 10},
-}
+WARNED = TEXTS["warned"]
 
 
 @pytest.mark.parametrize("text", [None, *WARNED])

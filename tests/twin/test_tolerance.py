@@ -42,17 +42,6 @@ def drawn(bench: ToleranceBench) -> np.ndarray:
     return np.random.default_rng(5).uniform(-1.0, 1.0, (12, len(bench.numbers)))
 
 
-def test_without_tolerances_the_camera_is_the_designed_one(bench: ToleranceBench, backend) -> None:
-    tried = bench.try_out(np.zeros((2, len(bench.numbers))))
-    camera = CameraOptics.within(bench.instrument, bench.camera, backend, states_of(bench.compensators, tried.moves)[0])
-    rms = max(wave.rms for wave in camera.wavefronts(bench.fields))
-    values = bench.values(tried.parts)
-    assert values[0, 0] == pytest.approx(rms, rel=1e-6)
-    # what the adjustments alone do to lines of sight and distances: they start from a design that is nearly in focus
-    assert values[0, 3] < 1e-6
-    np.testing.assert_array_equal(values[0], values[1])
-
-
 @pytest.mark.second
 def test_a_camera_is_that_of_the_main_program(bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path) -> None:
     """The worst camera, written as a job, traced by everything that other commands use."""
@@ -290,7 +279,7 @@ def test_an_allocation_is_the_cheapest_that_keeps_its_margin(target: float, real
 def told_warnings(**changes: Any) -> list[str]:
     """Return the warnings of a run of 40 good cameras with one compensator, but for what is changed."""
     own: dict[str, Any] = {
-        "problems": ("",) * 40, "unlit": "", "settled": 0.0, "paired": True, "level": 1.0, "moves": 0.5, "plan": None,
+        "lost": [], "unlit": "", "settled": 0.0, "paired": True, "level": 1.0, "moves": 0.5, "plan": None,
     }  # fmt: skip
     own |= changes
     merit = SimpleNamespace(merit=SimpleNamespace(name="w"), levels=(1.0,) * 3, linear=(own["level"],) * 3)
@@ -304,7 +293,9 @@ def told_warnings(**changes: Any) -> list[str]:
         ),
         SimpleNamespace(problems=(own["unlit"],), model=SimpleNamespace(paired=own["paired"])),
         SimpleNamespace(
-            problems=own["problems"], settled=np.full(40, own["settled"]), moves=np.full((40, 1), own["moves"])
+            problems=[*own["lost"], *("",) * 40][:40],
+            settled=np.full(40, own["settled"]),
+            moves=np.full((40, 1), own["moves"]),
         ),
         (merit,),
         own["plan"],
@@ -313,27 +304,12 @@ def told_warnings(**changes: Any) -> list[str]:
     )
 
 
-PLAN = {"reached": True, "unrounded": True, "predicted": (0.5, 0.92)}
-SAID = {
-    "1 of 40 cameras have no light and count as failed: dark": {"problems": ("dark",) + ("",) * 39},
-    "tolerance tilt: no light at its limit (dark)": {"unlit": "dark"},
-    "the adjustments of 40 cameras have not settled": {"settled": 1.0},
-    "1 numbers vary: the second order has no products": {"paired": False},
-    "w: the linear model's value for 90 % of the cameras differs by 6 %": {"level": 1.06},
-    "compensator focus stands at the end of its range in 100.0 %": {"moves": -1.0},
-    "limits rounded to the grades do not reach a yield of 90 %": {"plan": PLAN | {"reached": False}},
-    "no limits that were found": {"plan": PLAN | {"reached": False, "unrounded": False}},
-    "the allocated limits yield 90.0 % of cameras of their own, and the model 99.9 %": {
-        "plan": PLAN | {"predicted": (0.5, 0.999)}
-    },
-}
-
-
-@pytest.mark.parametrize("text", [None, *SAID])
+@pytest.mark.parametrize("text", [None, *TEXTS["warnings"]])
 def test_each_warning_is_there_where_it_holds_and_no_other(text) -> None:
-    case: dict[str, Any] = {"level": 1.04, "moves": 0.99, "plan": PLAN} if text is None else dict(SAID[text])
-    plan = {"plan": SimpleNamespace(**case["plan"])} if "plan" in case else {}
-    said = told_warnings(**case | plan)
+    case = {"level": 1.04, "moves": 0.99, "plan": {}} if text is None else dict(TEXTS["warnings"][text])
+    if "plan" in case:
+        case["plan"] = SimpleNamespace(**{"reached": True, "unrounded": True, "predicted": (0.5, 0.92), **case["plan"]})
+    said = told_warnings(**case)
     assert [one[: len(text or "")] for one in said] == ([] if text is None else [text])
 
 
@@ -504,17 +480,17 @@ def test_what_the_engine_of_studies_warns_of_is_passed_on(backend, tmp_path, mon
 
 
 @pytest.mark.second
-def test_a_corrupt_chunk_of_cameras_is_told_and_drawn_again(backend, tmp_path) -> None:
-    told: list[str] = []
+def test_a_corrupt_chunk_of_cameras_is_reported_and_drawn_again(backend, tmp_path) -> None:
+    warned: list[str] = []
     setup = budget(tmp_path, "few")
     bench = ToleranceBench(setup, backend)
-    force = Workforce(1, journal=tmp_path / "journal", warn=told.append)
+    force = Workforce(1, journal=tmp_path / "journal", warn=warned.append)
     first = draw_samples(setup, bench, backend, 20, 3, force)
-    assert told == []
+    assert warned == []
     (chunk, *_) = (tmp_path / "journal").rglob("*.npz")
     chunk.write_bytes(b"x")
     again = draw_samples(setup, bench, backend, 20, 3, force)
-    assert [f"chunk {chunk.name} is corrupt" in text for text in told] == [True]
+    assert [f"chunk {chunk.name} is corrupt" in text for text in warned] == [True]
     np.testing.assert_array_equal(again.values, first.values)
 
 

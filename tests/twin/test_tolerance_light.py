@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from optics.numerics.backend import Backend
-from scenes.models.camera_model import CameraModel, coloured
+from scenes.models.camera_model import CameraModel
 from scenes.specs.camera import CameraSpec
 from scenes.specs.tolerance import ToleranceSetup
 from scenes.yaml.errors import InputError
@@ -133,18 +133,6 @@ def test_wavefronts_over_the_light_are_those_of_our_own_trace(case: str, bench: 
     # rays aimed to 1e-8 m, wavefronts by polynomials that leave a thousandth of a wave at most
     np.testing.assert_allclose(np.sqrt(tried.parts[0, :2]), np.sqrt(squares), rtol=2e-4)
     assert abs(abs(tried.moves[0, 0]) - abs(focus)) < 2e-6
-
-
-def test_an_abbe_number_changes_other_wavelengths_alone(bench: ToleranceBench) -> None:
-    """The index at the d line stays, and the Abbe number is another by what is stated."""
-    spec, assembly = bench.optics.model.spec, bench.instrument.assembly
-    lens = f"{bench.optics.path.root}/L1"
-    state = states_of(bench.numbers, np.array([[0.03, 0.0, 0.0, 0.0]]))[0]
-    lines = (D_LINE, 486.1327e-9, 656.2725e-9)
-    n_d, n_f, n_c = (assembly.index(lens, coloured(spec, bench.optics.path.root, state, line)[lens]) for line in lines)
-    plain = [spec.index_behind("L1", line) for line in lines]
-    assert n_d == pytest.approx(plain[0], abs=1e-15)
-    assert (n_d - 1.0) / (n_f - n_c) == pytest.approx(1.03 * (plain[0] - 1.0) / (plain[1] - plain[2]), rel=1e-12)
 
 
 def test_an_abbe_number_acts_at_a_design_wavelength_beside_the_d_line(backend: Backend, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from twin.uncertainty import coverage
 from twin.uncertainty.coverage import FALSE, HALF_WIDTHS, Coverage, run_states
 from twin.uncertainty.monitor_limits import BEST, expected_covariance, find_limits
 from twin.uncertainty.uncertainty_numbers import STATES, uncertainty_numbers
-from twin.uncertainty.uncertainty_report import limits_section, uncertainty_report
+from twin.uncertainty.uncertainty_report import uncertainty_report
 
 FRAMES = 9
 TOGETHER, SHAKEN = TEXTS["together"], TEXTS["shaken"]
@@ -294,13 +294,6 @@ def test_bad_input_is_one_message(tmp_path, words, found):
     assert result.exit_code == 2, result.output
     assert re.search(found, result.output.replace("\n", " ")), result.output
     assert not (tmp_path / "out").exists()
-
-
-def test_without_a_statement_the_section_says_how_to_make_one():
-    section = limits_section(None)
-    assert "noise" in section.text[0]
-    assert "disturbances: orbit" in section.text[0]
-    assert section.artefacts == ()
 
 
 def test_disturbances_that_change_no_camera_leave_nothing_to_measure(monkeypatch):

@@ -269,7 +269,7 @@ def _by_engine(
     with _journal(folder, plan.setup.fingerprint):
         store = ChunkStore(folder, plan)
         store.open()
-        _tell(force, store.corrupt)
+        _warn_of(force, store.corrupt)
         progress = Progress(done=lambda done, total: advance(part, done, total), warn=force.warn)
         engine = Engine(plan, store, backend.name, progress)
         if store.missing:
@@ -279,12 +279,12 @@ def _by_engine(
                 else cluster.local_workers(_workers(plan, force))
             )
             with who as workers:
-                _tell(force, workers.warnings)
+                _warn_of(force, workers.warnings)
                 engine.run(workers, memory.largest_memory())
         return store.result()
 
 
-def _tell(force: Workforce, texts: Sequence[str]) -> None:
+def _warn_of(force: Workforce, texts: Sequence[str]) -> None:
     for text in texts:
         force.warn(text)
 

@@ -447,10 +447,7 @@ def _whole(
         advance(WHOLE, k, len(factors))
         step = PART * factor.spread
         runs = [Run(s, factor.values(factor.value + share * step), None) for s, share in enumerate(SHARES)]
-        try:
-            outcomes = setup.job.evaluate(setup.tree, runs, backend)
-        except InputError as error:
-            raise _refused(setup, factor, step, error) from None
+        outcomes = setup.job.evaluate(setup.tree, runs, backend)
         for outcome in outcomes:
             if isinstance(outcome, Failure):
                 text = f"the factor cannot be varied by {step:g} {factor.unit} about the base: {outcome.message}"
