@@ -1,25 +1,37 @@
-"""A cheap study for tests of the engine: a monitor with small CCDs and one frame."""
+"""Studies and budgets of tests: a cheap study of a monitor with small CCDs and one frame, and files of text."""
 
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
 
 from scenes.specs.load import INSTRUMENTS, LIBRARY
 from tests.twin.commands import replaced
+from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from scenes.yaml.yaml_file import dump_yaml
 
 ROOT = Path(__file__).resolve().parents[2]
-STUDY = """name: study
-base: {command: render, file: job.yaml}
-factors:
-  m2z: {key: [job, perturb, base/forward/M2, shift, 2], normal: {mean: 0 um, sigma: 1 um}}
-  m2x: {key: [job, perturb, base/forward/M2, shift, 0], uniform: [-1 um, 1 um]}
-design: {kind: monte_carlo, runs: 100, seed: 3}
-responses:
-  df: {key: [recovered, cameras, forward, model, d_f_um], sigma: [recovered, cameras, forward, model, d_f_um_sigma]}
-  true_df: {key: [truth, cameras, forward, d_f_um]}
-"""
+HERE = Path(__file__).parent
+TEXTS: dict[str, Any] = yaml.safe_load((HERE / "study_texts.yaml").read_text("utf-8"))
+STUDY: str = TEXTS["study"]
+
+
+def refusals(group: str) -> list[Any]:
+    """Return cases for ``parametrize``: rows of a group of refused_inputs.yaml."""
+    rows = yaml.safe_load((HERE / "refused_inputs.yaml").read_text("utf-8"))[group]
+    return [pytest.param(*row, id=str(row[-1])) for row in rows]
+
+
+def budget(folder: Path, name: str = "gf7", **changes: Any) -> ToleranceSetup:
+    """Read a tolerance budget of study_texts.yaml with other keys at its top from a file."""
+    file = folder / "budget.yaml"
+    file.write_text(dump_yaml({**TEXTS[name], **changes}), "utf-8")
+    return resolve_tolerance(file)
 
 
 def write_study(folder: Path, *changes: tuple[str, str], text: str = STUDY) -> Path:

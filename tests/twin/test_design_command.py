@@ -2,6 +2,7 @@
 
 import json
 import re
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,56 +13,28 @@ from typer.testing import CliRunner
 from optics.design.merit_function import Operands
 from optics.design.optimiser import DesignError, Held, _require_held, judged
 from scenes.models.camera_design import beams_of, prescription_of, resolve_design
+from scenes.models.monitor_layout import Beam
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import EXAMPLES, LIBRARY, load_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.scenes.refusals.tables import good
+from tests.twin.commands import edited_copy, invoke, refused
+from tests.twin.study_bench import TEXTS, refusals
 from twin.design.__main__ import app
 from twin.design.design_run import HELD_BY, _held_text
+from twin.design.layout_bench import BeamFacts
+from twin.design.search_workers import Journal
+from twin.run.run_folder import RunFolderError
 
 EXAMPLE = EXAMPLES / "design_gf7_short.yaml"
-SHORT = """\
-camera: gf7
-name: small
-vary:
-  {vary}
-  image: [z]
-envelope: {envelope}
-steps: 1
-starts: 1
-"""
-
-
-HELD_BACK = """\
-camera: gf7
-name: held
-vary:
-  M1: [conic]
-  M2: [conic, z]
-  M3: [conic, z]
-  image: [z]
-envelope: 100 percent
-clearance: {clearance}
-steps: 2
-starts: 1
-"""
 
 
 def run(tmp_path: Path, envelope: str, camera: str = "gf7", vary: str = ""):
     file = tmp_path / "small.yaml"
-    file.write_text(SHORT.format(envelope=envelope, vary=vary).replace("gf7", camera), "utf-8")
+    file.write_text(TEXTS["short"].format(envelope=envelope, vary=vary).replace("gf7", camera), "utf-8")
     return CliRunner().invoke(app, [str(file), "--out", str(tmp_path / "out"), "--quiet"])
-
-
-def test_an_envelope_that_cannot_be_had(tmp_path) -> None:
-    result = run(tmp_path, "50 percent")
-    assert result.exit_code == 2
-    assert "small.yaml:6: envelope: no prescription near the start holds all constraints" in result.output.replace(
-        "\n", ""
-    )
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -73,31 +46,22 @@ def test_an_envelope_that_cannot_be_had(tmp_path) -> None:
 )
 def test_constraints_that_contradict_the_camera(tmp_path, envelope: str, clearance: str, key: str, remedy: str) -> None:
     """An envelope of 22 mm, a clearance of 20 m: told with the key that asks too much, whatever is lost on the way."""
-    text = EXAMPLE.read_text("utf-8")
-    for old, new in (
-        ("79.8 percent", envelope),
-        ("20 mm", clearance),
-        ("steps: 8", "steps: 1"),
-        ("starts: 6", "starts: 1"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    file = tmp_path / "much.yaml"
-    file.write_text(text, "utf-8")
-    result = CliRunner().invoke(app, [str(file), "--out", str(tmp_path / "out"), "--quiet"])
-    told = result.output.replace("\n", "")
-    assert result.exit_code == 2, told
-    line = 1 + next(n for n, own in enumerate(text.splitlines()) if own.startswith(f"{key}:"))
-    assert f"much.yaml:{line}: {key}: no prescription near the start holds all constraints" in told
-    assert remedy in told
-    assert not (tmp_path / "out").exists()
+    changes = ("79.8 percent", envelope), ("20 mm", clearance), ("steps: 8", "steps: 1"), ("starts: 6", "starts: 1")
+    file = edited_copy(EXAMPLE, tmp_path, *changes)
+    refused(
+        lambda _, *words: invoke(app, *words),
+        "",
+        file,
+        key,
+        ("no prescription near the start holds all constraints", remedy),
+    )
 
 
 @pytest.mark.second
 def test_a_telescope_about_its_axis_is_told_its_clearance(tmp_path) -> None:
     """Its beam passes through its secondary, and the message names the clearance with which it can be designed."""
     (tmp_path / "axis.yaml").write_text(good("cassegrain out of focus"), "utf-8")
-    file, text = tmp_path / "on_axis.yaml", SHORT.format(envelope="101 percent", vary="M2: [conic]")
+    file, text = tmp_path / "on_axis.yaml", TEXTS["short"].format(envelope="101 percent", vary="M2: [conic]")
     file.write_text(text.replace("camera: gf7", "camera: axis.yaml"), "utf-8")
     refused = CliRunner().invoke(app, [str(file), "--out", str(tmp_path / "out"), "--quiet"])
     assert refused.exit_code == 2
@@ -118,18 +82,12 @@ def test_a_run_folder(tmp_path, monkeypatch) -> None:
     camera = validate(CameraSpec, read_yaml(out / "artefacts" / "small.yaml"))
     gf7 = load_camera("gf7")
     assert camera.name == "small"
-    assert camera.image.z == pytest.approx(gf7.image.z, abs=1e-3)
-    assert camera.image.z != gf7.image.z
+    assert 0.0 < abs(camera.image.z - gf7.image.z) < 1e-3
     assert camera.bands == gf7.bands
-    again = resolve_design(out / "config.yaml")
-    assert again.camera == gf7
+    assert resolve_design(out / "config.yaml").camera == gf7
     page = (out / "report.html").read_text("utf-8")
     told = json.loads((out / "design.json").read_text("utf-8"))
     assert told["improved"]  # by 0.1 %
-    assert "Improved: small has a wavefront error of 0.0237 waves" in page
-    assert "A local optimum: from one start it is not known whether there is a better one" in page
-    (start,) = told["starts"]
-    assert (start["drawn"], start["steps"], start["problem"]) == (False, 1, "")
     assert told["local_optimum"]
     # what the report says makes it again does
     command = re.search(r"<pre>(python -m twin.design .*)</pre>", page)[1].split()
@@ -137,6 +95,20 @@ def test_a_run_folder(tmp_path, monkeypatch) -> None:
     result = CliRunner().invoke(app, command[3:])
     assert result.exit_code == 0, result.output
     assert (out / "again" / "design.json").read_bytes() == (out / "design.json").read_bytes()
+
+
+def test_a_journal_that_cannot_be_kept_is_reported(tmp_path) -> None:
+    with pytest.raises(RunFolderError, match="Is a directory"), Journal(tmp_path, "design"):
+        pass
+    beam = Beam(*np.ones(9))
+    with Journal(tmp_path / "journal", "design") as journal:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as on a full disk
+        try:
+            with pytest.raises(RunFolderError, match="what it holds is kept, go on with --resume"):
+                journal.keep(beam, BeamFacts(beam))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_constraint_that_blocks_is_named(tmp_path) -> None:
@@ -183,7 +155,7 @@ def test_what_a_constraint_is_worth(tmp_path) -> None:
     found = []
     for clearance in ("306 mm", "305.9 mm"):
         file = tmp_path / "held.yaml"
-        file.write_text(HELD_BACK.format(clearance=clearance), "utf-8")
+        file.write_text(TEXTS["held_back"].format(clearance=clearance), "utf-8")
         out = tmp_path / clearance.split()[0]
         result = CliRunner().invoke(app, [str(file), "--out", str(out), "--quiet"])
         assert result.exit_code == 0, result.output
@@ -196,18 +168,7 @@ def test_what_a_constraint_is_worth(tmp_path) -> None:
     assert errors[1] > errors[0] / 2
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("  M3: [z", "  M4: [z", "vary.M4: no such mirror"),
-        ("image: [z]", "image: [radius]", "the image is a plane"),
-        ("camera: gf7\n", "camera: gf8\n", "camera: no such name in cameras"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "message"), refusals("design"))
 def test_what_is_wrong_with_a_file(tmp_path, old: str, new: str, message: str) -> None:
-    text = EXAMPLE.read_text("utf-8")
-    assert old in text
-    file = tmp_path / "wrong.yaml"
-    file.write_text(text.replace(old, new), "utf-8")
     with pytest.raises(InputError, match=message):
-        resolve_design(file)
+        resolve_design(edited_copy(EXAMPLE, tmp_path, (old, new)))

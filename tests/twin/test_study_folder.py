@@ -1,7 +1,7 @@
 """The folder of a study: whose it is, what --force may remove from it, and which program may go on with it."""
 
-import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -140,6 +140,19 @@ def test_what_is_replaced_stands_until_the_new_study_is_complete(setup, tmp_path
     assert [place.name for place in tmp_path.iterdir()] == ["run"]
 
 
+def test_a_whole_study_that_cannot_be_put_in_place_stays(setup, tmp_path) -> None:
+    """Its place was taken meanwhile by what is no folder."""
+    path = finish(tmp_path / "run", setup, "old")
+    with StudyFolder(path, setup, force=True) as folder:
+        write_manifest(folder, "twin.study", 1.5e9, 1.0)
+        shutil.rmtree(path)
+        path.symlink_to("nowhere")
+        with pytest.raises(RunFolderError, match=r"complete in .*\.run\.next and cannot be put in place .*--resume"):
+            folder.__exit__()
+        folder._working = False
+    assert is_run_folder(tmp_path / ".run.next")
+
+
 def test_force_drops_what_was_begun_to_replace_a_run(setup, tmp_path) -> None:
     path = finish(tmp_path / "run", setup, "old")
     work(path, setup, force=True)
@@ -258,10 +271,10 @@ def test_files_put_there_during_the_study_are_kept(setup, tmp_path, complete) ->
 def test_a_state_that_is_not_ours(setup, tmp_path) -> None:
     path = tmp_path / "run"
     path.mkdir()
-    (path / "study_state.json").write_text(json.dumps({"program": "other", "fingerprint": "x"}))
     (path / "study.csv").write_text("somebody's")
-    with pytest.raises(RunFolderError, match="not the folder of a study"):
-        work(path, setup, force=True)
+    for words, options in (("--force does not replace it", {"force": True}), ("nothing to resume", {"resume": True})):
+        with pytest.raises(RunFolderError, match=words):
+            work(path, setup, **options)
     for text in ("", "[]", "{}", '{"program": "twin.study", "fingerprint": 1}', "[" * 100_000):
         (path / "study_state.json").write_text(text)
         with pytest.raises(RunFolderError, match="cannot be read"):

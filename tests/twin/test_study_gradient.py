@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.twin.study_bench import write_study
+from tests.twin.study_bench import TEXTS, refusals, write_study
 from twin.study.__main__ import app
 from twin.study.gradient.study_gradient import AD, TRACED, WHOLE, study_gradient
 from twin.study.runs.base_job import Run
@@ -16,28 +16,11 @@ AGREEMENT = 1e-6
 """Differences extrapolated to the fifth power of the step leave 1e-8, rounding of the traces 1e-9 of an entry; entries
 are judged down to 1e-3 of the largest."""
 RUNNER = CliRunner()
-STUDY = """name: study
-base: {command: render, file: job.yaml}
-factors:
-  m2z: {key: [job, perturb, base/forward/M2, shift, 2], normal: {mean: 0 um, sigma: 1 um}}
-  both: {keys: [[job, perturb, base/forward/M2, shift, 0], [job, perturb, base/backward/M2, shift, 0]],
-    uniform: [-2 um, 2 um]}
-  turn: {key: [job, perturb, base/forward/focal_plane, rotate, 2], uniform: [-10 arcsec, 10 arcsec]}
-  coma: {key: [job, perturb, base/forward/M1, figure, Z7], uniform: [-10 nm, 10 nm]}
-  warmth: {key: [job, perturb, base, temperature, change], uniform: [-1 K, 1 K]}
-  exposure: {key: [instrument, monitor, area_ccd, exposure], uniform: [7 ms, 8 ms]}
-design: {kind: monte_carlo, runs: 4, seed: 3}
-responses:
-  df: {key: [recovered, cameras, forward, model, d_f_um]}
-  error: {key: [recovered, cameras, forward, model, d_f_um], minus: [truth, cameras, forward, d_f_um]}
-  gamma: {key: [recovered, cameras, forward, paper_single, d_gamma_arcsec]}
-  angle: {key: [recovered, intersection_angle, derived, change_arcsec]}
-"""
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    return write_study(tmp_path_factory.mktemp("gradient"), text=STUDY)
+    return write_study(tmp_path_factory.mktemp("gradient"), text=TEXTS["gradient"])
 
 
 @pytest.fixture(scope="module")
@@ -77,25 +60,11 @@ def test_an_error_is_what_is_recovered_minus_what_is_true(whole):
     assert 1e-4 < abs(rows["error"][k] / rows["df"][k]) < 0.1
 
 
-OF_STATED = """name: study
-base: {command: render, file: job.yaml}
-factors:
-  m2z: {key: [job, perturb, base/forward/M2, shift, 2], normal: {mean: 0 um, sigma: 1 um}}
-  stated: {key: [disturbances, causes, mirror_mounts, shift, 2], uniform: [0.2 um, 0.4 um]}
-design: {kind: monte_carlo, runs: 4, seed: 3}
-responses:
-  df: {key: [recovered, cameras, forward, posterior, d_f_um]}
-  height: {key: [recovered, ground, posterior, height_m]}
-  total: {key: [recovered, cameras, forward, model, d_f_um_sigma]}
-  agreement: {key: [recovered, disturbances, chi_square]}
-"""
-
-
 @pytest.mark.second
 def test_readings_by_posterior_are_differentiated(tmp_path, backend):
     """By motions through the trace; by what is stated with differences, and so is all that depends on the noise."""
     # about a state that is moved: there a change of what is stated changes the reading
-    path = write_study(tmp_path, text=OF_STATED)
+    path = write_study(tmp_path, text=TEXTS["of_stated"])
     job = tmp_path / "job.yaml"
     job.write_text(job.read_text("utf-8") + "perturb: {base/forward/M2: {shift: 0 0 1 um}}\n", "utf-8")
     found = study_gradient(resolve_study(path), backend)
@@ -135,27 +104,23 @@ def test_options_of_runs_are_refused(small):
         assert (result.exit_code, f"{option[0]} has no meaning" in result.output) == (2, True), option
 
 
-WARMTH = "warmth: {key: [job, perturb, base, temperature, change], uniform: [-1 K, 1 K]}"
-ANGLE = "key: [recovered, intersection_angle, derived, change_arcsec]"
-REFUSED = [
-    (
-        WARMTH,
-        "centroid: {key: [job, analysis, centroid], values: [ml, energy]}",
-        "no derivative by what is not a number",
-    ),
-    (WARMTH, "frames: {key: [instrument, monitor, frames], values: [4, 8]}", "does not allow values beside its own"),
-    (ANGLE, "key: [recovered, centroid]", "not a number in the base"),
-    (ANGLE, "key: [recovered, nothing]", "no such key"),
-]
+@pytest.mark.second
+@pytest.mark.parametrize(("old", "new", "words"), refusals("gradient"))
+def test_what_has_no_derivative_is_refused(tmp_path, old, new, words):
+    coma = "  coma: {key: [job, perturb, base/forward/M1, figure, Z7], uniform: [-10 nm, 10 nm]}\n"
+    path = write_study(tmp_path, (old, new), (coma, ""), text=TEXTS["gradient"])
+    (tmp_path / "far.yaml").write_text(
+        f"{(tmp_path / 'job.yaml').read_text()}perturb: {{base/forward/M2: {{shift: 0 0 9 mm}}}}"
+    )
+    result = RUNNER.invoke(app, [str(path), "--gradient", "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2, result.output
+    assert words in result.output
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.second
-@pytest.mark.parametrize(("old", "new", "told"), REFUSED, ids=["text", "whole number", "text response", "no response"])
-def test_what_has_no_derivative_is_refused(tmp_path, old, new, told):
-    coma = "  coma: {key: [job, perturb, base/forward/M1, figure, Z7], uniform: [-10 nm, 10 nm]}\n"
-    path = write_study(tmp_path, (old, new), (coma, ""), text=STUDY)
+def test_a_factor_whose_step_loses_the_light_is_refused(tmp_path):
+    """A sigma needs whole runs, 7.5 mm either side of the base."""
+    path = write_study(tmp_path, ("d_f_um], sigma", "d_f_um_sigma], sigma"), ("sigma: 1 um", "sigma: 15 mm"))
     result = RUNNER.invoke(app, [str(path), "--gradient", "--out", str(tmp_path / "out")])
-    assert result.exit_code == 2, result.output
-    assert told in result.output
-    assert "study.yaml" in result.output
-    assert not (tmp_path / "out").exists()
+    assert (result.exit_code, "the factor cannot be varied by 7500 um" in result.output) == (2, True), result.output

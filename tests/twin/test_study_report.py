@@ -23,10 +23,8 @@ def page(folder, study, values, failed=None) -> str:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(content)
     text = (folder / "report.html").read_text("utf-8")
-    # one file: nothing is fetched from elsewhere
-    assert not re.search(r"""(src|href)=["'](https?:|//)""", text)
     assert "<script" not in text
-    assert breaches(text) == []
+    assert breaches(text) == []  # nothing is fetched from elsewhere
     for name in re.findall(r'href="(artefacts/[^"]+|statistics.json)"', text):
         assert (folder / name).stat().st_size > 0, name
     verdict = json.loads((folder / "statistics.json").read_text("utf-8"))["verdict"]
@@ -41,20 +39,6 @@ def page(folder, study, values, failed=None) -> str:
     return words
 
 
-@pytest.mark.second
-def test_grid_of_two_numbers(tmp_path) -> None:
-    study = study_of(
-        "{a: {key: [job, a], values: [30 mm, 40 mm, 50 mm]}, b: {key: [job, b], range: [10 um, 80 um], count: 8}}",
-        "{kind: grid}",
-        TWO,
-        "{sobol: true, pareto: [{x: y, y: z, best_y: max}]}",
-    )
-    x = columns(study)
-    words = page(tmp_path, study, {"y": x["a"] * x["b"], "z": np.log(x["b"])})
-    assert "is the knee" in words
-    assert "Enough runs?" not in words
-
-
 CASES = {
     "all failed": ("{kind: monte_carlo, runs: 30, seed: 1}", lambda x: x, 30, "the value is NaN in all runs"),
     "all but one failed": ("{kind: monte_carlo, runs: 30, seed: 1}", lambda x: x, 29, "29 of 30 runs failed"),
@@ -63,6 +47,7 @@ CASES = {
     "one": ("{kind: monte_carlo, runs: 1, seed: 1}", lambda x: x, 0, "1 run"),
     "not finite": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: np.where(x > 0.5, np.nan, x), 0, "no finite"),
     "infinite": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: np.where(x > 0.5, np.inf, x), 0, "no finite"),
+    "a long front": ("{kind: monte_carlo, runs: 60, seed: 1}", lambda x: -x, 0, "50 of 60, evenly through the front"),
     "tiny": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: 1e-30 * x, 0, "e−3"),
     "large": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: 1e9 + x, 0, "1.00e9"),
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,62 +10,26 @@ import numpy as np
 import pytest
 
 from scenes.specs.job import checked_nodes
+from scenes.specs.load import LIBRARY
 from scenes.specs.resolved import resolve
-from scenes.specs.tolerance import (
-    AllocationSpec,
-    MeritSpec,
-    ToleranceSetup,
-    ToleranceSpec,
-    amount_si,
-    resolve_tolerance,
-)
+from scenes.specs.tolerance import AllocationSpec, MeritSpec, ToleranceSpec, amount_si
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
-from scenes.yaml.yaml_file import YamlFile, dump_yaml, parse_yaml
+from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
+from tests.twin.study_bench import TEXTS, budget, refusals
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.run_folder import RunFolderError
-from twin.tolerance import allocation, merit_models, samples, tolerance_run
+from twin.study.runs.plan import Plan
+from twin.tolerance import allocation, given_warnings, merit_models, samples, tolerance_run
 from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
 from twin.tolerance.merits import Merit
-from twin.tolerance.samples import Workforce, draw_samples
+from twin.tolerance.samples import Workforce, draw_samples, study_of
 from twin.tolerance.tolerance_bench import ToleranceBench
+from twin.tolerance.tolerance_report import tolerance_report
 from twin.tolerance.tolerance_run import TOLERANCE, Yield, run_tolerance, worst_jobs
 from twin.tolerance.variations import spectrum_shares, states_of
-
-BUDGET: dict[str, Any] = {
-    "instrument": "gf7",
-    "tolerances": {
-        "despace": {"motion": "M2 shift z", "limit": "20 um"},
-        "tilt": {"motion": "M2 rotate x about centre", "limit": "10 arcsec", "law": "uniform"},
-        "radius": {"motion": "M1 radius", "limit": "50 ppm"},
-        "conic": {"motion": "M3 conic", "limit": 1e-4},
-        "figure": {"motion": "M3 figure", "limit": "5 nm", "terms": ["Z5", "Z11"]},
-    },
-    "compensators": {
-        "focus": {"motion": "focal_plane shift z", "range": "1 mm"},
-        "turn": {"motion": "focal_plane rotate x", "range": "5 arcmin"},
-    },
-    "merits": {
-        "wavefront": {"kind": "wavefront", "at_most": 0.06},
-        "mtf": {"kind": "mtf", "at_least": 0.35, "fields": [[0.0, 0.0], [1.0, 0.0]]},
-        "boresight": {"kind": "boresight", "at_most": "10 arcsec"},
-        "f": {"kind": "principal_distance", "at_most": "0.5 mm"},
-        "distortion": {"kind": "distortion", "at_most": "1 um"},
-        "chief": {"kind": "chief_ray", "at_most": "10 arcmin"},
-        "roll": {"kind": "roll", "at_most": "10 arcsec"},
-    },
-    "samples": 40,
-    "seed": 3,
-}
-
-
-def budget(folder: Path, **changes: Any) -> ToleranceSetup:
-    """The budget with other keys at its top, read from a file."""
-    file = folder / "budget.yaml"
-    file.write_text(dump_yaml({**BUDGET, **changes}), "utf-8")
-    return resolve_tolerance(file)
 
 
 @pytest.fixture(scope="module")
@@ -76,17 +40,6 @@ def bench(backend, tmp_path_factory: pytest.TempPathFactory) -> ToleranceBench:
 @pytest.fixture(scope="module")
 def drawn(bench: ToleranceBench) -> np.ndarray:
     return np.random.default_rng(5).uniform(-1.0, 1.0, (12, len(bench.numbers)))
-
-
-def test_without_tolerances_the_camera_is_the_designed_one(bench: ToleranceBench, backend) -> None:
-    tried = bench.try_out(np.zeros((2, len(bench.numbers))))
-    camera = CameraOptics.within(bench.instrument, bench.camera, backend, states_of(bench.compensators, tried.moves)[0])
-    rms = max(wave.rms for wave in camera.wavefronts(bench.fields))
-    values = bench.values(tried.parts)
-    assert values[0, 0] == pytest.approx(rms, rel=1e-6)
-    # what the adjustments alone do to lines of sight and distances: they start from a design that is nearly in focus
-    assert values[0, 3] < 1e-6
-    np.testing.assert_array_equal(values[0], values[1])
 
 
 @pytest.mark.second
@@ -113,7 +66,7 @@ def test_a_camera_is_that_of_the_main_program(bench: ToleranceBench, drawn: np.n
 def test_a_compensator_without_a_range_changes_nothing(
     bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path
 ) -> None:
-    idle = {**BUDGET["compensators"], "idle": {"motion": "M3 shift z", "range": "0 um", "step": "1 um"}}
+    idle = {**TEXTS["gf7"]["compensators"], "idle": {"motion": "M3 shift z", "range": "0 um", "step": "1 um"}}
     other = ToleranceBench(budget(tmp_path, compensators=idle), backend)
     np.testing.assert_array_equal(other.try_out(drawn * other.sizes).parts, bench.try_out(drawn * bench.sizes).parts)
 
@@ -132,7 +85,7 @@ def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBe
             away = tried.moves.copy()
             away[:, c] += sign * step
             assert np.all(squares(bench, away) > best - 1e-12)
-    one = {"focus": BUDGET["compensators"]["focus"]}
+    one = {"focus": TEXTS["gf7"]["compensators"]["focus"]}
     fewer = ToleranceBench(budget(tmp_path, compensators=one), backend)
     without = squares(fewer, fewer.try_out(drawn * fewer.sizes).moves)
     assert np.all(best <= without + 1e-10)
@@ -197,7 +150,7 @@ def test_models_and_limits_hold_against_exact_traces(bench: ToleranceBench, draw
 def test_a_group_moves_as_one_body(backend, tmp_path) -> None:
     """All mirrors and the focal plane together: the image stays, only where it looks turns."""
     every = {"motion": "M1 rotate x", "limit": "20 arcsec", "carrying": ["M2", "M3", "focal_plane"]}
-    merits = {k: BUDGET["merits"][k] for k in ("wavefront", "boresight", "f", "distortion")}
+    merits = {k: TEXTS["gf7"]["merits"][k] for k in ("wavefront", "boresight", "f", "distortion")}
     # rays are those of the designed directions: a field of a degree does not end at 20 arcsec
     setup = budget(tmp_path, tolerances={"all": every}, compensators={}, merits=merits)
     bench = ToleranceBench(setup, backend)
@@ -211,17 +164,7 @@ def test_a_group_moves_as_one_body(backend, tmp_path) -> None:
 
 @pytest.mark.second
 def test_an_obscured_camera_is_that_of_the_camera_program(backend, tmp_path) -> None:
-    setup = budget(
-        tmp_path,
-        instrument="ritchey_chretien",
-        tolerances={"tilt": {"motion": "M2 rotate x", "limit": "20 arcsec"}},
-        compensators={},
-        merits={
-            "w": {"kind": "wavefront", "at_most": 0.1, "fields": [[0.0, 0.0], [1.0, 0.0]]},
-            "m": {"kind": "mtf", "at_least": 0.1, "fields": [[0.0, 0.0], [1.0, 0.0]]},
-        },
-    )
-    bench = ToleranceBench(setup, backend)
+    bench = ToleranceBench(budget(tmp_path, "obscured"), backend)
     tried = bench.values(bench.try_out(np.array([[0.0], [1.0]]) * bench.sizes).parts)
     for x, values in zip((0.0, 1.0), tried, strict=True):
         camera = bench.optics.in_state(states_of(bench.numbers, np.array([[x]]) * bench.sizes)[0])
@@ -230,18 +173,9 @@ def test_an_obscured_camera_is_that_of_the_camera_program(backend, tmp_path) -> 
         assert values[1] == pytest.approx(least, abs=1e-4)
 
 
-def test_shares_of_a_figure_and_of_a_yield() -> None:
-    shares = spectrum_shares(tuple(range(5, 37)), 3.0)
-    assert np.sum(shares**2) == pytest.approx(1.0)
-    assert shares[0] > shares[-1]
-    one = Yield.count(np.arange(100) < 90)
-    assert (one.low, one.high) == pytest.approx((0.8238, 0.9510), abs=1e-4)
-    assert [one.judged(p) for p in (0.8, 0.9, 0.97)] == ["met", "open", "missed"]
-
-
 def test_a_budget_from_a_script(backend, tmp_path) -> None:
     """Whole, in this process: its numbers are those of the cameras that it has drawn."""
-    merits = {k: BUDGET["merits"][k] for k in ("wavefront", "mtf", "f")}
+    merits = {k: TEXTS["gf7"]["merits"][k] for k in ("wavefront", "mtf", "f")}
     run = run_tolerance(budget(tmp_path, merits=merits, samples=20), backend)
     numbers, values = TOLERANCE(run), run.samples.values
     good = np.stack([values[:, 0] <= 0.06, values[:, 1] >= 0.35, values[:, 2] <= 0.5e-3], axis=1)
@@ -345,7 +279,7 @@ def test_an_allocation_is_the_cheapest_that_keeps_its_margin(target: float, real
 def told_warnings(**changes: Any) -> list[str]:
     """Return the warnings of a run of 40 good cameras with one compensator, but for what is changed."""
     own: dict[str, Any] = {
-        "problems": ("",) * 40, "unlit": "", "settled": 0.0, "paired": True, "level": 1.0, "moves": 0.5, "plan": None,
+        "lost": [], "unlit": "", "settled": 0.0, "paired": True, "level": 1.0, "moves": 0.5, "plan": None,
     }  # fmt: skip
     own |= changes
     merit = SimpleNamespace(merit=SimpleNamespace(name="w"), levels=(1.0,) * 3, linear=(own["level"],) * 3)
@@ -359,7 +293,9 @@ def told_warnings(**changes: Any) -> list[str]:
         ),
         SimpleNamespace(problems=(own["unlit"],), model=SimpleNamespace(paired=own["paired"])),
         SimpleNamespace(
-            problems=own["problems"], settled=np.full(40, own["settled"]), moves=np.full((40, 1), own["moves"])
+            problems=[*own["lost"], *("",) * 40][:40],
+            settled=np.full(40, own["settled"]),
+            moves=np.full((40, 1), own["moves"]),
         ),
         (merit,),
         own["plan"],
@@ -368,65 +304,22 @@ def told_warnings(**changes: Any) -> list[str]:
     )
 
 
-PLAN = {"reached": True, "unrounded": True, "predicted": (0.5, 0.92)}
-SAID = {
-    "1 of 40 cameras have no light and count as failed: dark": {"problems": ("dark",) + ("",) * 39},
-    "tolerance tilt: no light at its limit (dark)": {"unlit": "dark"},
-    "the adjustments of 40 cameras have not settled": {"settled": 1.0},
-    "1 numbers vary: the second order has no products": {"paired": False},
-    "w: the linear model's value for 90 % of the cameras differs by 6 %": {"level": 1.06},
-    "compensator focus stands at the end of its range in 100.0 %": {"moves": -1.0},
-    "limits rounded to the grades do not reach a yield of 90 %": {"plan": PLAN | {"reached": False}},
-    "no limits that were found": {"plan": PLAN | {"reached": False, "unrounded": False}},
-    "the allocated limits yield 90.0 % of cameras of their own, and the model 99.9 %": {
-        "plan": PLAN | {"predicted": (0.5, 0.999)}
-    },
-}
+@pytest.mark.parametrize("text", [None, *TEXTS["warnings"]])
+def test_each_warning_is_there_where_it_holds_and_no_other(text) -> None:
+    case = {"level": 1.04, "moves": 0.99, "plan": {}} if text is None else dict(TEXTS["warnings"][text])
+    if "plan" in case:
+        case["plan"] = SimpleNamespace(**{"reached": True, "unrounded": True, "predicted": (0.5, 0.92), **case["plan"]})
+    said = told_warnings(**case)
+    assert [one[: len(text or "")] for one in said] == ([] if text is None else [text])
 
 
-def test_each_warning_is_there_where_it_holds_and_no_other() -> None:
-    assert told_warnings(level=1.04, moves=0.99, settled=0.0) == []
-    assert told_warnings(plan=SimpleNamespace(**PLAN)) == []
-    for text, case in SAID.items():
-        plan = {"plan": SimpleNamespace(**case["plan"])} if "plan" in case else {}
-        (said,) = told_warnings(**case | plan)
-        assert said.startswith(text), said
-
-
-BAD = [
-    (
-        "{tolerances: {a: {motion: M2 shift z, limit: 1 um, costs: [[1 um, 1.0], [2 um, 3.0]]}}}",
-        "costs no more",
-        "tolerances",
-    ),
-    (
-        "{tolerances: {a: {motion: M2 shift z, limit: 1 um, cost: 2.0, costs: [[1 um, 3.0], [2 um, 1.0]]}}}",
-        "in place of cost",
-        "tolerances",
-    ),
-    ("{tolerances: {a: {motion: M7 shift z, limit: 1 um}}}", "no such node", "tolerances"),
-    ("{tolerances: {a: {motion: M2 shift z 3 um, limit: 1 um}}}", "without an amount", "tolerances"),
-    ("{tolerances: {a: {motion: M2 shift z, limit: 3.0}}}", "unit", "tolerances"),
-    ("{tolerances: {a: {motion: M2 shift z, limit: 3 arcsec}}}", "length", "tolerances"),
-    ("{tolerances: {a: {motion: M2 shift z, limit: 0 um}}}", "greater than zero", "tolerances"),
-    ("{tolerances: {a: {motion: M2 conic, limit: 3 um}}}", "pure number", "tolerances"),
-    ("{tolerances: {a: {motion: focal_plane radius, limit: 3 ppm}}}", "does not allow radius", "tolerances"),
-    ("{camera: gf9}", "no such camera", "camera"),
-    ("{merits: {m: {kind: mtf, at_most: 0.3}}}", "at_least", "merits"),
-    ("{merits: {m: {kind: mtf, at_least: 0.3, frequency: 5000.0}}}", "cut-off", "merits"),
-    ("{merits: {b: {kind: boresight, at_most: 1 arcsec}}}", "need fields", "merits"),
-    ("{tolerances: {a: {motion: gf7 shift z, limit: 1 um, carrying: [M2]}}}", "already", "tolerances"),
-    ("{tolerances: {a: {motion: M2 shift z, limit: 1 um, terms: [Z5, Z9]}}}", "figure", "tolerances"),
-    ("{compensators: {c: {motion: M2 shift z, range: -1 um}}}", "not negative", "compensators"),
-    ("{instrument: gf7_pair}", "the instrument has several cameras", "camera"),
-]
-"""Keys in place of the budget's own, what the message says, and the key that it names."""
-
-
-@pytest.mark.parametrize(("changes", "words", "key"), BAD, ids=[case[1] for case in BAD])
-def test_bad_input_is_told_with_its_key(changes: str, words: str, key: str, backend, tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("name", "changes", "key", "words"),
+    [pytest.param(name, *row.values, id=row.id) for name in ("gf7", "pair") for row in refusals(name)],
+)
+def test_bad_input_is_told_with_its_key(name: str, changes: dict, key: str, words: str, backend, tmp_path) -> None:
     with pytest.raises(InputError) as caught:
-        ToleranceBench(budget(tmp_path, **parse_yaml(changes).data), backend)
+        ToleranceBench(budget(tmp_path, name, **changes), backend)
     for part in (words, key, "budget.yaml:"):
         assert part in str(caught.value)
 
@@ -464,12 +357,12 @@ def test_margins_losses_and_verdicts_of_merits() -> None:
     assert losses[:2] == pytest.approx([0.01, 0.05])
     assert np.isnan(losses[2])
     one = Yield.count(np.arange(100) < 90)
-    assert [one.judged(p) for p in (one.low, one.low + 1e-9, one.high, one.high + 1e-9)] == [
-        "met",
-        "open",
-        "open",
-        "missed",
-    ]
+    assert (one.low, one.high) == pytest.approx((0.8238, 0.9510), abs=1e-4)
+    judged = [one.judged(p) for p in (one.low, one.low + 1e-9, one.high, one.high + 1e-9)]
+    assert judged == ["met", "open", "open", "missed"]
+    shares = spectrum_shares(tuple(range(5, 37)), 3.0)
+    assert np.sum(shares**2) == pytest.approx(1.0)
+    assert shares[0] > shares[-1]
 
 
 def test_models_of_scaled_tolerances_are_the_model_of_scaled_draws() -> None:
@@ -518,3 +411,122 @@ def test_cameras_have_errors_of_their_own(backend, tmp_path, monkeypatch) -> Non
     found = tolerance_run._judged(budget(tmp_path), backend, SimpleNamespace(limits={}), 3, None, None)
     assert (found.passed, found.of) == (4, 4)
     assert asked != [3]
+
+
+def test_warnings_of_instrument_and_engine_reach_the_report(backend, tmp_path, monkeypatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(given_warnings, "blur_warnings", lambda setup, backend: ("the camera is blurred",))
+    monkeypatch.setattr(given_warnings, "unstated_shadows", lambda model, way: "M2 stands in its beam")
+    monkeypatch.setattr(
+        given_warnings, "moved_into_beams", lambda *state: ("left: M2 has moved and would take 3 rays",)
+    )
+
+    def drawn(*given: Any) -> Any:
+        force: Workforce = given[5]
+        force.warn("a chunk is corrupt")
+        return draw_samples(*given[:5], replace(force, journal=None), *given[6:])
+
+    monkeypatch.setattr(tolerance_run, "draw_samples", drawn)
+    run = run_tolerance(budget(tmp_path, "few"), backend, force=Workforce(warn=told.append))
+    assert run.warnings[:4] == (
+        "the camera is blurred",
+        "camera gf7: M2 stands in its beam",
+        "a chunk is corrupt",
+        "in 10 of the 10 worst cameras, left: M2 has moved and would take 3 rays",
+    )
+    assert told == ["a chunk is corrupt"]
+    assert tolerance_report(run).warnings == run.warnings
+
+
+def test_a_camera_whose_own_parts_stand_in_its_beam_is_told(backend, tmp_path) -> None:
+    """As the commands for cameras tell it; the file states no shadow at all."""
+    data: dict[str, Any] = dict(read_yaml(LIBRARY / "cameras" / "cassegrain.yaml").data)
+    first, second = (data["mirrors"][name] for name in ("M1", "M2"))
+    data["mirrors"] = {"M1": {key: value for key, value in first.items() if key != "edges"}, "M2": second}
+    file = tmp_path / "bare.yaml"
+    file.write_text(dump_yaml(data), "utf-8")
+    wavefront = {"kind": "wavefront", "at_most": 0.1, "fields": [[0.0, 0.0]]}
+    tolerances = {"tilt": {"motion": "M2 rotate x", "limit": "5 arcsec"}}
+    setup = budget(
+        tmp_path, "few", instrument=str(file), tolerances=tolerances, compensators={}, merits={"w": wavefront}
+    )
+    found = given_warnings.given_warnings(setup, ToleranceBench(setup, backend))
+    assert any("its own parts stand in its beam" in text for text in found)
+
+
+def test_what_the_engine_of_studies_warns_of_is_passed_on(backend, tmp_path, monkeypatch) -> None:
+    told: list[str] = []
+    setup = budget(tmp_path, "few", limits={"memory": "1 GB"})
+    bench = ToleranceBench(setup, backend)
+    plan = Plan.of(study_of(setup, bench, 20, 3))
+    assert samples._workers(plan, Workforce(workers=8, warn=told.append)) == 2
+    assert told == ["2 workers instead of 8: no more fit into the budget's 1 GB"]
+    seen = []
+
+    class Halted(Exception):
+        pass
+
+    def engine(plan: Any, store: Any, name: str, progress: Any) -> Any:
+        progress.warn("the processes need more")
+        seen.append(name)
+        raise Halted
+
+    monkeypatch.setattr(samples, "Engine", engine)
+    force = Workforce(1, journal=tmp_path / "journal", warn=told.append)
+    with pytest.raises(Halted):
+        draw_samples(setup, bench, backend, 20, 3, force)
+    assert seen
+    assert told[-1] == "the processes need more"
+
+
+@pytest.mark.second
+def test_a_corrupt_chunk_of_cameras_is_reported_and_drawn_again(backend, tmp_path) -> None:
+    warned: list[str] = []
+    setup = budget(tmp_path, "few")
+    bench = ToleranceBench(setup, backend)
+    force = Workforce(1, journal=tmp_path / "journal", warn=warned.append)
+    first = draw_samples(setup, bench, backend, 20, 3, force)
+    assert warned == []
+    (chunk, *_) = (tmp_path / "journal").rglob("*.npz")
+    chunk.write_bytes(b"x")
+    again = draw_samples(setup, bench, backend, 20, 3, force)
+    assert [f"chunk {chunk.name} is corrupt" in text for text in warned] == [True]
+    np.testing.assert_array_equal(again.values, first.values)
+
+
+@pytest.mark.second
+def test_moves_of_compensators_stand_beside_each_sensitivity(backend, tmp_path) -> None:
+    setup = budget(tmp_path, "few")
+    run = run_tolerance(setup, backend)
+    bench = run.bench
+    ends = np.zeros((2, len(bench.numbers)))
+    ends[:, 0] = (-1.0, 1.0)
+    moved = bench.try_out(ends * bench.sizes).moves
+    np.testing.assert_allclose(sensitivities(bench).moves[0], moved, rtol=1e-6)
+    numbers = TOLERANCE(run)["tolerances"]
+    assert numbers["despace"]["moves_at_plus"]["focus"].endswith(" um")
+    assert float(numbers["despace"]["moves_at_plus"]["focus"].split()[0]) == pytest.approx(1e6 * moved[1, 0], rel=1e-6)
+    assert numbers["figure"]["moves_at_plus"] == {"focus": None, "turn": None}
+
+
+@pytest.mark.parametrize("loose", [30.0, pytest.param(1.0, marks=pytest.mark.second)])
+def test_an_allocation_is_reached_by_the_limits_of_its_table(loose: float, backend, tmp_path, monkeypatch) -> None:
+    """Graded limits that come out too loose are not reported as if they were those before rounding."""
+    setup = budget(tmp_path, "few", allocation={"target": 0.8})
+    bench = ToleranceBench(setup, backend)
+    found = sensitivities(bench)
+    drawn = draw_samples(setup, bench, backend, 60, 3, Workforce())
+    graded = allocation._graded
+
+    def too_loose(*given: Any) -> Any:
+        limits, rounded = graded(*given)
+        return limits, rounded * loose
+
+    monkeypatch.setattr(allocation, "_graded", too_loose)
+    monkeypatch.setattr(allocation, "ROUNDS", 2)
+    spec = setup.test.allocation
+    assert spec is not None
+    told = allocation.allocate(setup, bench, found.model, drawn, spec)
+    assert told.unrounded
+    assert told.reached == (loose == 1.0)
+    assert (told.predicted[1] >= spec.target) == told.reached

@@ -11,40 +11,27 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from optics.numerics.backend import Backend
-from scenes.models.camera_model import CameraModel, coloured, field_direction
+from scenes.models.camera_model import CameraModel
 from scenes.specs.camera import CameraSpec
-from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from scenes.specs.tolerance import ToleranceSetup
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from scenes.yaml.yaml_file import dump_yaml
+from tests.own_trace import OwnCamera, Traced
 from tests.scenes.lens.colour_cameras import colour_camera
+from tests.twin import study_bench
+from tests.twin.study_bench import TEXTS
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance
 from twin.tolerance.variations import states_of
 
 D_LINE = 587.5618e-9
 FIELDS = [[0.0, 0.0], [1.0, 0.0]]
-BUDGET: dict[str, Any] = {
-    "instrument": "lens.yaml",
-    "tolerances": {
-        "crown_abbe": {"motion": "L1 abbe", "limit": "1 percent"},
-        "flint_abbe": {"motion": "L3 abbe", "limit": "0.8 percent", "law": "uniform"},
-        "flint_index": {"motion": "L3 index", "limit": 5e-4},
-        "decentre": {"motion": "L3 shift x", "carrying": ["L4"], "limit": "50 um"},
-    },
-    "compensators": {"focus": {"motion": "focal_plane shift z", "range": "10 mm"}},
-    "merits": {
-        "wavefront": {"kind": "wavefront", "at_most": 0.2, "fields": FIELDS},
-        "mtf": {"kind": "mtf", "at_least": 0.3, "fields": FIELDS, "frequency": 30.0},
-    },
-    "samples": 20,
-}
 
 
 def budget(folder: Path, camera: CameraSpec | None = None, **changes: Any) -> ToleranceSetup:
     """The budget of a camera, an achromat by default, with other keys at its top."""
     (folder / "lens.yaml").write_text(dump_yaml((camera or colour_camera("achromat")).plain()), "utf-8")
-    (folder / "budget.yaml").write_text(dump_yaml({**BUDGET, **changes}), "utf-8")
-    return resolve_tolerance(folder / "budget.yaml")
+    return study_bench.budget(folder, "lens", **changes)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +40,7 @@ def bench(backend: Backend, tmp_path_factory: pytest.TempPathFactory) -> Toleran
 
 
 class OwnTrace:
-    """The achromat in plain NumPy: spheres, Snell's law, paths, the wavefronts of all lines about one point.
+    """The achromat in plain NumPy: the wavefronts of all lines about one point.
 
     Of the twin it takes the prescription, the catalogue's indices, the stop's radius and the exit pupil's distance.
     """
@@ -67,38 +54,21 @@ class OwnTrace:
         inner = np.stack([(r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()], axis=-1)
         self.points, self.share = np.concatenate([np.zeros((1, 2)), inner]), np.repeat(w / w.sum() / 31, 31)
 
-    def _index(self, face: str, line: float, errors: Mapping[str, float]) -> float:
-        """Behind a face where light enters glass: of another Abbe number and another index."""
-        glass = self.spec.mirrors[face].glass
-        assert glass is not None
-        at_d, here = glass.index(D_LINE, "air"), glass.index(line, "air")
-        return at_d + (here - at_d) / (1.0 + errors.get(f"{face} abbe", 0.0)) + errors.get(f"{face} index", 0.0)
-
-    def _beam(self, field: list[float], line: float, errors: Mapping[str, float], focus: float) -> tuple:
-        along = field_direction(self.spec, field[0] * self.spec.field.x, field[1] * self.spec.field.y)
-        names = list(self.spec.mirrors)
-        surface = self.spec.mirrors[names[0]]
-        x, y = self.stop * self.points.T
-        p = np.stack([x, y, surface.radius - np.sqrt(surface.radius**2 - x**2 - y**2)], axis=-1)
-        d = np.tile(along, (len(p), 1))
-        path, n = p @ along, 1.0
-        for name in names:
-            one = self.spec.mirrors[name]
-            x_off = errors.get("decentre", 0.0) if name in ("L3", "L4") else 0.0
-            centre = np.array([x_off, 0.0, one.z + one.radius])
-            # where the ray meets the sphere, on the side of the vertex
-            b = np.sum(d * (p - centre), axis=-1)
-            root = np.sqrt(b**2 - np.sum((p - centre) ** 2, axis=-1) + one.radius**2)
-            t = -b - np.sign(one.radius) * root
-            p, path = p + t[:, None] * d, path + n * t
-            after = self._index(name, line, errors) if one.glass is not None else 1.0
-            normal = (p - centre) / one.radius
-            normal = normal * np.sign(np.sum(d * normal, axis=-1))[:, None]
-            ratio, cosine = n / after, np.sum(d * normal, axis=-1)
-            d = ratio * d + (np.sqrt(1.0 - ratio**2 * (1.0 - cosine**2)) - ratio * cosine)[:, None] * normal
-            n = after
-        t = (self.spec.image.z + focus - p[:, 2]) / d[:, 2]
-        return p + t[:, None] * d, d, path + t
+    def _beam(self, field: list[float], line: float, errors: Mapping[str, float], focus: float) -> Traced:
+        """Rays of one wavelength through lenses of another Abbe number and another index, and decentred ones."""
+        mirrors = {}
+        for name, one in self.spec.mirrors.items():
+            new: dict[str, Any] = {"decentre": (errors.get("decentre", 0.0) if name in ("L3", "L4") else 0.0, 0.0)}
+            if one.glass is not None:
+                at_d, here = one.glass.index(D_LINE, "air"), one.glass.index(line, "air")
+                behind = at_d + (here - at_d) / (1.0 + errors.get(f"{name} abbe", 0.0))
+                new |= {"glass": None, "index": behind + errors.get(f"{name} index", 0.0)}
+            mirrors[name] = one.model_copy(update=new)
+        image = self.spec.image.model_copy(update={"z": self.spec.image.z + focus})
+        camera = OwnCamera(self.spec.model_copy(update={"mirrors": mirrors, "image": image}))
+        radius, (x, y) = self.spec.mirrors["L1"].radius, self.stop * self.points.T
+        start = np.stack([x, y, radius - np.sqrt(radius**2 - x**2 - y**2)], axis=-1)
+        return camera.trace(start, camera.heading(field[0] * self.spec.field.x, field[1] * self.spec.field.y))
 
     def square(self, field: list[float], errors: Mapping[str, float], focus: float) -> float:
         """Mean square error over the light, waves of the design wavelength: piston is taken out of every line by
@@ -107,14 +77,14 @@ class OwnTrace:
         assert self.spec.spectrum is not None
         lines, weights = self.spec.spectrum.rule(1)
         beams = [self._beam(field, float(line), errors, focus) for line in lines]
-        middle = np.sum([w * p[0] for w, (p, _, _) in zip(weights, beams, strict=True)], axis=0)
+        middle = np.sum([w * beam.place[0] for w, beam in zip(weights, beams, strict=True)], axis=0)
         rows, right, each = [], [], []
-        for k, (position, direction, path) in enumerate(beams):
-            offset = position - middle
-            along = np.sum(direction * offset, axis=-1)
+        for k, beam in enumerate(beams):
+            offset = beam.place - middle
+            along = np.sum(beam.way * offset, axis=-1)
             # back along the ray to the sphere about the middle
             back = along + np.sqrt(along**2 + self.radius**2 - np.sum(offset**2, axis=-1)) - self.radius
-            error = (path - back)[1:] / self.spec.wavelength
+            error = (beam.path - back)[1:] / self.spec.wavelength
             rows.append(np.column_stack([np.eye(len(lines))[np.full(len(error), k)], self.points[1:]]))
             right.append(error - error.mean())
             each.append(weights[k] * self.share)
@@ -165,24 +135,12 @@ def test_wavefronts_over_the_light_are_those_of_our_own_trace(case: str, bench: 
     assert abs(abs(tried.moves[0, 0]) - abs(focus)) < 2e-6
 
 
-def test_an_abbe_number_changes_other_wavelengths_alone(bench: ToleranceBench) -> None:
-    """The index at the d line stays, and the Abbe number is another by what is stated."""
-    spec, assembly = bench.optics.model.spec, bench.instrument.assembly
-    lens = f"{bench.optics.path.root}/L1"
-    state = states_of(bench.numbers, np.array([[0.03, 0.0, 0.0, 0.0]]))[0]
-    lines = (D_LINE, 486.1327e-9, 656.2725e-9)
-    n_d, n_f, n_c = (assembly.index(lens, coloured(spec, bench.optics.path.root, state, line)[lens]) for line in lines)
-    plain = [spec.index_behind("L1", line) for line in lines]
-    assert n_d == pytest.approx(plain[0], abs=1e-15)
-    assert (n_d - 1.0) / (n_f - n_c) == pytest.approx(1.03 * (plain[0] - 1.0) / (plain[1] - plain[2]), rel=1e-12)
-
-
 def test_an_abbe_number_acts_at_a_design_wavelength_beside_the_d_line(backend: Backend, tmp_path: Path) -> None:
     """The camera of one line, C, is one whose crown has another index there."""
     red = colour_camera("achromat").model_copy(update={"wavelength": 656.2725e-9, "spectrum": None})
     own, twin_index = red.index_behind("L1"), red.index_behind("L1", D_LINE)
     change = (own - twin_index) * (1.0 / 1.01 - 1.0)
-    merits = {"wavefront": BUDGET["merits"]["wavefront"]}
+    merits = {"wavefront": TEXTS["lens"]["merits"]["wavefront"]}
     tolerances = {
         "abbe": {"motion": "L1 abbe", "limit": "1 percent"},
         "index": {"motion": "L1 index", "limit": abs(change)},
@@ -222,6 +180,11 @@ def test_light_of_a_band_takes_as_many_wavelengths_as_it_needs(backend: Backend,
     assert alone[0] < 0.8 * values[0]
 
 
+def test_a_blurred_camera_has_no_mtf_for_tolerances(backend: Backend, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"merits\.mtf: the MTF of the designed camera is not settled"):
+        ToleranceBench(budget(tmp_path, colour_camera("achromat", "[400 nm, 1000 nm]")), backend)
+
+
 @pytest.mark.second
 def test_a_run_tells_its_light(backend: Backend, tmp_path: Path) -> None:
     told = TOLERANCE(run_tolerance(budget(tmp_path), backend))
@@ -229,21 +192,3 @@ def test_a_run_tells_its_light(backend: Backend, tmp_path: Path) -> None:
     assert told["weights"] == pytest.approx([0.25, 0.5, 0.25])
     shares = told["merits"]["wavefront"]["variance_shares"]
     assert shares["crown_abbe"] > 0.01
-
-
-ABBE = "tolerances: {{a: {{motion: {} abbe, limit: {}}}}}".format
-BAD = [
-    ("light: spectrum", {"spectrum": None}, "no spectrum", "light"),
-    (ABBE("L2", "1 percent"), {}, "does not allow abbe", "tolerances"),
-    (ABBE("L1", "20 percent"), {}, "no Abbe number is that uncertain", "tolerances"),
-    (ABBE("L1", "20 um"), {}, "percent", "tolerances"),
-]
-
-
-@pytest.mark.parametrize(("changes", "camera", "words", "key"), BAD, ids=[case[2] for case in BAD])
-def test_bad_input_is_told_with_its_key(changes, camera, words, key, backend: Backend, tmp_path: Path) -> None:
-    lens = colour_camera("achromat").model_copy(update=camera)
-    with pytest.raises(InputError) as caught:
-        ToleranceBench(budget(tmp_path, lens, **parse_yaml(changes).data), backend)
-    for part in (words, key, "budget.yaml:"):
-        assert part in str(caught.value)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +12,8 @@ from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import Motion
 from scenes.models.disturbances import state_of
-from scenes.specs.tolerance import MeritSpec, ToleranceSetup, resolve_tolerance
-from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from scenes.specs.tolerance import MeritSpec
+from tests.twin.study_bench import TEXTS, budget
 from twin.monitor.image_quality import image_quality
 from twin.monitor.information import built_noise, quantity_rows
 from twin.monitor.monitor_derivative import SMALL, STEPS
@@ -30,41 +27,14 @@ from twin.tolerance.variations import states_of
 from twin.uncertainty.monitor_limits import expected_covariance, find_limits
 
 ARCSEC = np.radians(1.0 / 3600.0)
-BUDGET: dict[str, Any] = {
-    "instrument": "gf7_pair",
-    "camera": "forward",
-    "tolerances": {
-        "despace": {"motion": "forward/M2 shift z", "limit": "20 um"},
-        "tilt": {"motion": "forward/M2 rotate x about centre", "limit": "20 arcsec"},
-        "radius": {"motion": "forward/M1 radius", "limit": "50 ppm"},
-        "prism": {"motion": "forward/monitor/left/prism_180 shift x", "limit": "2 mm"},
-    },
-    "compensators": {"focus": {"motion": "forward/focal_plane shift z", "range": "1 mm"}},
-    "merits": {
-        "wavefront": {"kind": "wavefront", "at_most": 0.06},
-        "angle": {"kind": "monitor_angle", "at_most": "0.1 arcsec"},
-        "turns": {"kind": "monitor_angle", "at_most": "1 arcsec", "reading": "d_gamma", "estimator": "derived"},
-        "f": {"kind": "monitor_focus", "at_most": "7 um"},
-        "shadow": {"kind": "obstruction", "at_most": 0.2},
-    },
-    "samples": 20,
-    "seed": 3,
-}
 NEAR = 1e-4
 """Relative difference of sigmas by their noise alone: it makes 2e-4 of the variances, and the bound of a spot's noise
 and what its fit finds, of which the pattern of the pixels cancels in part, differ by a fifth."""
 
 
-def budget(folder: Path, **changes: Any) -> ToleranceSetup:
-    """The budget with other keys at its top, read from a file."""
-    file = folder / "budget.yaml"
-    file.write_text(dump_yaml({**BUDGET, **changes}), "utf-8")
-    return resolve_tolerance(file)
-
-
 @pytest.fixture(scope="module")
 def bench(backend, tmp_path_factory: pytest.TempPathFactory) -> ToleranceBench:
-    return ToleranceBench(budget(tmp_path_factory.mktemp("monitor")), backend)
+    return ToleranceBench(budget(tmp_path_factory.mktemp("monitor"), "pair"), backend)
 
 
 def amounts(bench: ToleranceBench, *rows: dict[str, float]) -> np.ndarray:
@@ -199,9 +169,9 @@ def test_bodies_take_what_image_quality_says(bench: ToleranceBench, backend) -> 
 
 @pytest.mark.second
 def test_a_run_tells_of_the_monitor(backend, tmp_path) -> None:
-    merits = {name: BUDGET["merits"][name] for name in ("wavefront", "angle", "f")}
-    tolerances = {name: BUDGET["tolerances"][name] for name in ("despace", "radius")}
-    setup = budget(tmp_path, merits=merits, tolerances=tolerances, disturbances="launch")
+    merits = {name: TEXTS["pair"]["merits"][name] for name in ("wavefront", "angle", "f")}
+    tolerances = {name: TEXTS["pair"]["tolerances"][name] for name in ("despace", "radius")}
+    setup = budget(tmp_path, "pair", merits=merits, tolerances=tolerances, disturbances="launch")
     run = run_tolerance(setup, backend)
     numbers = TOLERANCE(run)
     angle = numbers["merits"]["angle"]
@@ -216,44 +186,3 @@ def test_which_readings_count() -> None:
     one = MeritSpec.model_validate({"kind": "monitor_angle", "at_most": "1 arcsec"})
     assert readings_of(one, ("a", "b")) == ("angle",)
     assert readings_of(one, ("a",)) == ROTATIONS
-
-
-BAD = [
-    (
-        "{instrument: gf7, camera: gf7, merits: {f: {kind: monitor_focus, at_most: 1 um}}}",
-        "gf7 has none",
-        "merits.f.kind",
-    ),
-    ("{disturbances: none}", "prior on disturbances, and there is none", "merits.angle.kind"),
-    (
-        "{merits: {f: {kind: monitor_focus, at_most: 1 um, estimator: guess}}}",
-        "no such estimator",
-        "merits.f.estimator",
-    ),
-    ("{merits: {f: {kind: monitor_focus, at_most: 1 um, reading: d_alpha}}}", "no reading", "merits.f.kind"),
-    ("{merits: {w: {kind: wavefront, at_most: 0.1, estimator: derived}}}", "no estimator", "merits.w.kind"),
-    (
-        "{disturbances: launch, merits: {w: {kind: wavefront, at_most: 0.1}}}",
-        "no merit rests on disturbances",
-        "disturbances",
-    ),
-    (
-        "{instrument: gf7, camera: gf7, merits: {s: {kind: obstruction, at_most: 0.1}}}",
-        "no body of gf7",
-        "merits.s.kind",
-    ),
-    ("{merits: {f: {kind: monitor_focus, at_most: 3.0}}}", "unit", "merits.f.at_most"),
-]
-
-
-@pytest.mark.parametrize(("text", "words", "key"), BAD, ids=[case[1] for case in BAD])
-def test_bad_input_is_told_with_its_key(text: str, words: str, key: str, backend, tmp_path) -> None:
-    changes: dict[str, Any] = dict(parse_yaml(text).data)
-    if changes.get("instrument") == "gf7":
-        changes |= {"tolerances": {"despace": {"motion": "M2 shift z", "limit": "20 um"}}}
-    if "merits" in changes:  # none that compensators could follow
-        changes |= {"compensators": {}}
-    with pytest.raises(InputError) as caught:
-        ToleranceBench(budget(tmp_path, **changes), backend)
-    for part in (words, key, "budget.yaml:"):
-        assert part in str(caught.value)

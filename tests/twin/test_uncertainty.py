@@ -1,6 +1,5 @@
 """What limits a monitor, and whether its sigmas hold in images of random states: ``python -m twin.uncertainty``."""
 
-import json
 import re
 from dataclasses import replace
 from functools import cache
@@ -21,6 +20,7 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.twin.commands import invoke
+from tests.twin.study_bench import TEXTS, refusals
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import trace_truth
 from twin.uncertainty import __main__ as command
@@ -28,29 +28,11 @@ from twin.uncertainty import coverage
 from twin.uncertainty.coverage import FALSE, HALF_WIDTHS, Coverage, run_states
 from twin.uncertainty.monitor_limits import BEST, expected_covariance, find_limits
 from twin.uncertainty.uncertainty_numbers import STATES, uncertainty_numbers
-from twin.uncertainty.uncertainty_report import limits_section, uncertainty_report
+from twin.uncertainty.uncertainty_report import uncertainty_report
 
 FRAMES = 9
-TOGETHER = """
-disturbances:
-  file: orbit
-  causes:
-    camera_mounts: {together: 0.9}
-    mirror_mounts: {together: 0.3}
-    prism_180_heat: {together: 0.6}
-    mirror_figure:
-      correlations:
-        - {between: [base/forward/M2 figure Z7, base/backward/M2 figure Z7], correlation: -0.8}
-        - {between: [base/forward/M2 figure Z7, base/forward/M2 figure Z4], correlation: 0.5}
-"""
-
-
-SHAKEN = """\
-disturbances:
-  file: launch
-  causes: {camera_mounts: {rotate: 5 arcsec}}
-"""
-"""A launch that brings one of three states' spots off their CCDs."""
+TOGETHER, SHAKEN = TEXTS["together"], TEXTS["shaken"]
+"""Correlated disturbances, and a launch that brings one of three states' spots off their CCDs."""
 
 
 @cache
@@ -116,22 +98,13 @@ def test_what_rests_on_the_stated_numbers(monkeypatch):
     assert "blurred" in uncertainty_report(run).told(numbers)["warnings"]
     height = numbers["quantities"]["ground"]["height_m"]
     sigma, first = height["after"][BEST]["sigma"], height["elasticities"][0]
-    assert (first["number"], first["stated"], first["unit"], first["bodies"]) == (
-        "mirror_figure figure Z7",
-        2.0,
-        "nm",
-        6,
-    )
+    assert (first["number"], first["stated"], first["unit"]) == ("mirror_figure figure Z7", 2.0, "nm")
     assert first["elasticity"] == pytest.approx(0.756, abs=0.01)
     # sigma with the part of one number doubled: its square grows by three times the elasticity
     assert first["doubled"] == pytest.approx(sigma * np.sqrt(1.0 + 3.0 * first["elasticity"]))
-    assert height["from_statement"] > 0.999
     tail = height["student_t"]
-    assert tail["held_68"] > sigma
-    assert tail["held_997"] > 4.0 * sigma
+    assert tail["held_997"] > 4.0 * tail["held_68"] > 4.0 * sigma
     assert 0.01 < tail["beyond_3_sigma"] < 0.1
-    texts = uncertainty_report(run).sections[1]
-    assert "mirror figure figure Z7, 2" in texts.text[0]
 
 
 @pytest.mark.second
@@ -241,22 +214,20 @@ def test_doubts_about_random_states_are_warnings():
     run = coverage.UncertaintyRun(experiment.resolved, replace(limits, outside=0.0), 1)
     assert uncertainty_report(run).warnings == ()
     assert uncertainty_report(replace(run, coverage=counted(alarms=2))).warnings == ()
-    for other, text in (
-        (
-            replace(run, limits=replace(run.limits, outside=0.3)),
-            "In 30.0% of all states that orbit allows a spot leaves",
-        ),
-        (replace(run, limits=replace(run.limits, without="no room")), "it cannot be built: no room"),
-        (replace(run, coverage=counted(doubted=1)), "in 1 of 400 random states spots are not as calibrated"),
-        (replace(run, coverage=counted(alarms=3)), "in 3 of 400 random states the shifts contradict the prior"),
-        (replace(run, coverage=counted(1.25)), "sigmas do not hold in the random states: posterior of"),
+    limits = run.limits
+    for changes, text in (
+        ({"limits": replace(limits, outside=0.3)}, "In 30.0% of all states that orbit allows a spot leaves"),
+        ({"limits": replace(limits, without="no room")}, "it cannot be built: no room"),
+        ({"coverage": counted(doubted=1)}, "in 1 of 400 random states spots are not as calibrated"),
+        ({"coverage": counted(alarms=3)}, "in 3 of 400 random states the shifts contradict the prior"),
+        ({"coverage": counted(1.25)}, "sigmas do not hold in the random states: posterior of"),
     ):
-        (said,) = uncertainty_report(other).warnings
+        (said,) = uncertainty_report(replace(run, **changes)).warnings
         assert text in said
 
 
 @pytest.mark.second
-def test_shares_add_up_to_the_variance_and_known_motions_take_theirs_away():
+def test_shares_add_up_to_the_variance():
     for disturbances in ("orbit", TOGETHER):
         _, limits = bench("gf7_pair", disturbances)
         for name, split in limits.splits.items():
@@ -265,16 +236,6 @@ def test_shares_add_up_to_the_variance_and_known_motions_take_theirs_away():
                 total = sum(share for _, share in lines) + split.noise[q] / split.sigma[q] ** 2
                 assert total == pytest.approx(1.0, rel=1e-9)
                 assert sum(share for _, share in limits.lines("", q)) == pytest.approx(1.0, rel=1e-9)
-        now = limits.splits[BEST].sigma
-        for left in limits.known.values():
-            assert np.all(left <= now * (1 + 1e-9))
-    _, limits = bench("gf7_pair", "orbit")
-    first = limits.lines(BEST, 0)[0]
-    assert first[0] == "base/forward/M2 figure Z7"
-    # without that motion at most its share goes
-    left = limits.known[first[0]][0]
-    assert limits.splits[BEST].sigma[0] * np.sqrt(1.0 - first[1]) * (1 - 1e-9) <= limits.splits[BEST].sigma[0]
-    assert left < 0.7 * limits.splits[BEST].sigma[0]
 
 
 @pytest.mark.second
@@ -325,54 +286,14 @@ def test_the_truth_on_the_ground_is_that_of_turned_rays(backend):
         assert error[k] == pytest.approx([along, across, -down], abs=1e-7)
 
 
-def run(tmp_path, *words):
-    return invoke(command.app, *words, "--out", tmp_path / "out")
-
-
-@pytest.mark.second
-def test_the_command_says_what_limits(tmp_path):
-    states = 2
-    result = run(tmp_path, "gf7_pair", "--states", str(states), "--seed", "5")
-    assert result.exit_code == 0, result.output
-    out = tmp_path / "out"
-    told = json.loads((out / "uncertainty.json").read_text())
-    assert told["disturbances"] == "orbit"
-    height = told["quantities"]["ground"]["height_m"]
-    assert height["after"]["posterior"]["sigma"] < 0.1 * height["before"]["sigma"]
-    assert len(height["after"]["posterior"]["lines"]) == 10
-    total = sum(line["share"] for line in height["after"]["posterior"]["lines"])
-    assert total + height["after"]["posterior"]["rest"] + height["after"]["posterior"]["noise"] == pytest.approx(1.0)
-    assert told["states"]["drawn"] == told["states"]["measured"] == states
-    page = (out / "report.html").read_text()
-    assert "What limits the readings" in page
-    assert "Do the sigmas hold?" in page
-    assert told["verdict"] in result.output.replace("\n", " ")
-
-
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
-        (("gf7_par",), r"no such name in instruments.*gf7_pair"),
-        (("gf7_pair", "--disturbances", "none"), r"no such name in disturbances"),
-        (("gf7_pair", "--disturbances", "orbt"), r"no such name in disturbances.*orbit"),
-        (("missing.yaml",), r"missing\.yaml"),
-        (("{job}",), r"there is no prior on disturbances.*--disturbances"),
-    ],
-)
+@pytest.mark.parametrize(("words", "found"), refusals("uncertainty"))
 def test_bad_input_is_one_message(tmp_path, words, found):
     job = tmp_path / "job.yaml"
     job.write_text("instrument: gf7_pair\ndisturbances: none\n")
-    result = run(tmp_path, *(word.format(job=job) for word in words))
+    result = invoke(command.app, *(word.format(job=job) for word in words), "--out", tmp_path / "out")
     assert result.exit_code == 2, result.output
     assert re.search(found, result.output.replace("\n", " ")), result.output
     assert not (tmp_path / "out").exists()
-
-
-def test_without_a_statement_the_section_says_how_to_make_one():
-    section = limits_section(None)
-    assert "noise" in section.text[0]
-    assert "disturbances: orbit" in section.text[0]
-    assert section.artefacts == ()
 
 
 def test_disturbances_that_change_no_camera_leave_nothing_to_measure(monkeypatch):

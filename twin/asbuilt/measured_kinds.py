@@ -427,6 +427,8 @@ class SightReadings(MeasuredKind):
         names = ("alpha", "beta", "gamma", "principal_distance")
         self.which = [names.index(name) for name in self.spec.measured]
         self.labels = self.blocks = self.spec.measured
+        if self.spec.correlation is not None and np.linalg.eigvalsh(self.spec.correlation)[0] <= 0.0:
+            raise self.wrong("errors that depend on each other altogether", "correlation", "a positive definite matrix")
 
     def predict(self, view: View) -> np.ndarray:
         """By exact chief rays."""

@@ -27,7 +27,7 @@ REACH_SECONDS = 5.0
 LOST_SECONDS = 10.0
 """How long a scheduler may be away before the command breaks off."""
 WORKER_SECONDS = 60.0
-"""How long to wait for the first worker."""
+"""How long to wait for the first worker, and for one that takes the place of the last."""
 LEAST_MEMORY = 0.5e9
 """Bytes that a worker process takes at least: interpreter, libraries, an instrument with its calibration."""
 RETRIES = 2
@@ -75,9 +75,10 @@ class Workers:
             tick: called about twice a second while waiting.
 
         Raises:
-            ClusterError: the scheduler is gone.
+            ClusterError: the scheduler is gone, or all processes of this command and none has come back.
         """
         lost: float | None = None
+        alone: float | None = None
         while True:
             try:
                 future = self._finished.get(timeout=0.5)
@@ -88,6 +89,12 @@ class Workers:
                     return future
             if self.client.status == "running":
                 lost = None
+                if self.local and not self.count:
+                    alone = time.monotonic() if alone is None else alone
+                    if time.monotonic() - alone > WORKER_SECONDS:
+                        raise ClusterError(f"no worker process has come back for {WORKER_SECONDS:.0f} s")
+                else:
+                    alone = None
                 continue
             lost = time.monotonic() if lost is None else lost
             if self.client.status in ("closing", "closed") or time.monotonic() - lost > LOST_SECONDS:

@@ -269,8 +269,7 @@ def _by_engine(
     with _journal(folder, plan.setup.fingerprint):
         store = ChunkStore(folder, plan)
         store.open()
-        for text in store.corrupt:
-            force.warn(text)
+        _warn_of(force, store.corrupt)
         progress = Progress(done=lambda done, total: advance(part, done, total), warn=force.warn)
         engine = Engine(plan, store, backend.name, progress)
         if store.missing:
@@ -280,10 +279,14 @@ def _by_engine(
                 else cluster.local_workers(_workers(plan, force))
             )
             with who as workers:
-                for text in workers.warnings:
-                    force.warn(text)
+                _warn_of(force, workers.warnings)
                 engine.run(workers, memory.largest_memory())
         return store.result()
+
+
+def _warn_of(force: Workforce, texts: Sequence[str]) -> None:
+    for text in texts:
+        force.warn(text)
 
 
 def _workers(plan: Plan, force: Workforce) -> int:

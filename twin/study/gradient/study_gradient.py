@@ -76,7 +76,7 @@ class GradientFactor:
         elif factor.kind in ("values", "table", "range", "uniform"):
             spread, spread_of = 0.5 * (max(values) - min(values)), "half of its range"
         else:
-            raise ValueError(f"a factor of kind {factor.kind!r} has no spread")
+            raise KeyError(f"a factor of kind {factor.kind!r} has no spread")
         if spread == 0.0:
             spread, spread_of = 1.0, "one unit"
         return cls(setup, name, unit, _in_base(setup, name, factor, unit), spread, spread_of)
@@ -357,7 +357,11 @@ class _Traced:
         return np.array([[self.asked[i].value(one, self.setup) for i in rows] for one in outcomes])
 
     def _state(self, chain: Chain, factor: GradientFactor, change: float) -> State:
-        return _state(chain, self._job(factor, change))
+        job = self._job(factor, change)
+        try:
+            return _state(chain, job)
+        except InputError as error:
+            raise _refused(self.setup, factor, change, error) from None
 
     def _job(self, factor: GradientFactor, change: float) -> ResolvedJob:
         try:
@@ -443,10 +447,7 @@ def _whole(
         advance(WHOLE, k, len(factors))
         step = PART * factor.spread
         runs = [Run(s, factor.values(factor.value + share * step), None) for s, share in enumerate(SHARES)]
-        try:
-            outcomes = setup.job.evaluate(setup.tree, runs, backend)
-        except InputError as error:
-            raise _refused(setup, factor, step, error) from None
+        outcomes = setup.job.evaluate(setup.tree, runs, backend)
         for outcome in outcomes:
             if isinstance(outcome, Failure):
                 text = f"the factor cannot be varied by {step:g} {factor.unit} about the base: {outcome.message}"

@@ -93,7 +93,7 @@ def _of_number(factor: Factor, values: np.ndarray, degree: int) -> tuple[np.ndar
         weights = weights * np.exp(-0.5 * (z**2 - np.min(z**2)))
         return _by_recurrence(places, weights / weights.sum(), values, degree)
     if kind not in ("values", "table"):
-        raise ValueError(f"there are no polynomials for a factor of kind {kind!r}")
+        raise KeyError(f"there are no polynomials for a factor of kind {kind!r}")
     listed = np.array(numbers, np.float64)
     return _by_recurrence(listed, np.full(len(listed), 1.0 / len(listed)), values, degree)
 

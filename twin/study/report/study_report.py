@@ -129,7 +129,7 @@ def _source(spec: FactorSpec) -> str:
         return f"normal, mean {values[0]}, σ {values[1]}, cut to {values[2]} … {values[3]}"
     if spec.kind in ("range", "uniform"):
         return f"{spec.kind}, {values[0]} … {values[1]}"
-    raise ValueError(f"a factor of kind {spec.kind!r} has no words")
+    raise KeyError(f"a factor of kind {spec.kind!r} has no words")
 
 
 def _values(factor: Factor) -> str:

@@ -307,7 +307,6 @@ class BlockResult:
         values = np.full((len(outcomes), len(responses)), np.nan)
         sigmas, noises = (np.full(values.shape, np.nan) for _ in range(2))
         messages: list[str] = []
-        doubts = []
         for k, outcome in enumerate(outcomes):
             message = outcome.message or "failed" if isinstance(outcome, Failure) else ""
             if not isinstance(outcome, Failure):
@@ -324,8 +323,11 @@ class BlockResult:
                     message = str(problem)
                     values[k] = sigmas[k] = noises[k] = np.nan
             messages.append(message)
-            doubts.append("" if isinstance(outcome, Failure) or message else _doubt(outcome))
-        return cls(values, sigmas, noises, tuple(messages), seconds, tuple(doubts))
+        doubts = tuple(
+            "" if isinstance(outcome, Failure) or message else _doubt(outcome)
+            for outcome, message in zip(outcomes, messages, strict=True)
+        )
+        return cls(values, sigmas, noises, tuple(messages), seconds, doubts)
 
     @classmethod
     def joined(cls, parts: Sequence[BlockResult]) -> BlockResult:

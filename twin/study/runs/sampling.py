@@ -63,7 +63,7 @@ def _level(factor: FactorSpec, place: np.ndarray) -> np.ndarray:
     if factor.kind in _LISTS:
         return place
     if factor.kind != "range":
-        raise ValueError(f"a factor of kind {factor.kind!r} cannot be counted")
+        raise KeyError(f"a factor of kind {factor.kind!r} cannot be counted")
     low, high = factor.numbers().values
     return np.asarray(np.linspace(low, high, factor.count or 2)[place])
 
@@ -89,7 +89,7 @@ def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
         z = -ndtri(last - u * (last - first)) if flip else ndtri(first + u * (last - first))
         return np.asarray(np.clip(mean + sigma * z, low, high))
     if factor.kind not in ("range", "uniform"):
-        raise ValueError(f"a factor of kind {factor.kind!r} has no quantiles")
+        raise KeyError(f"a factor of kind {factor.kind!r} has no quantiles")
     low, high = numbers
     return np.asarray(low + u * (high - low))
 
