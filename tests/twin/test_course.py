@@ -1,11 +1,6 @@
 """A course of temperatures: the same as single renders of its states, whole in the run folder, or not there at all."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from functools import partial
 from pathlib import Path
 
@@ -19,19 +14,17 @@ from analysis.units import ARCSEC
 from optics.thermal.heat import Temperature
 from scenes.specs.course import moment
 from scenes.specs.job import checked_nodes
-from scenes.specs.load import load_job
+from scenes.specs.load import EXAMPLES, load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.commands import invoke
-from twin.main_job.monitor_reading import stated
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.time_series import run_series, series_states
 from twin.monitor.truth import trace_truth
 
 run = partial(invoke, command.app)
-ROOT = Path(__file__).resolve().parents[2]
 LEFT = "base/forward/monitor/left/prism_180"
 JOB = f"""instrument: gf7_pair
 perturb:
@@ -143,17 +136,6 @@ def test_filter_and_smoother_stand_beside_the_readings(found, tmp_path) -> None:
             if key.endswith("_sigma"):
                 assert np.all(np.array(late) <= np.array(group["filtered"][key]) * (1.0 + 1e-9))
                 assert np.all(np.array(late) >= np.array(group["smoothed"][f"{key}_noise"]))
-    between = found["between"]
-    assert between["times_s"] == pytest.approx(
-        [90.0 * k for k in range(1, 8)] + [720.0 + 135.0 * k for k in range(1, 8)]
-    )
-    for name, camera in between["cameras"].items():
-        assert set(camera) == {"filtered", "smoothed"}
-        sigma = np.array(camera["smoothed"]["d_alpha_arcsec_sigma"])
-        ends = np.array(found["cameras"][name]["smoothed"]["d_alpha_arcsec_sigma"])
-        assert np.all(sigma[:7] > ends[:2].min())
-        assert sigma[7:].max() > sigma[:7].max()  # 18 min leave more open than 12
-    assert set(between) == {"times_s", "cameras", "intersection_angle", "ground"}
     told = found["disturbances"]
     assert told["name"] == "orbit"
     assert told["degrees_of_freedom"] == 3 * 8
@@ -173,40 +155,6 @@ def test_without_disturbances_nothing_is_smoothed(tmp_path, backend) -> None:
     assert "between" not in told
     assert "smoothed" not in told["cameras"]["forward"]
     assert "model" in told["ground"]
-
-
-@pytest.mark.second
-def test_the_time_in_detail_is_what_the_rest_of_the_run_shows(folder, found) -> None:
-    recovered = json.loads((folder / "recovered.json").read_text())
-    truth = json.loads((folder / "truth.json").read_text())
-    for name, camera in found["cameras"].items():
-        for key, values in camera["true"].items():
-            assert values[1] == pytest.approx(truth["cameras"][name][key], abs=1e-8)
-        for estimator, values in recovered["cameras"][name].items():
-            # recovered.json has the digits that a sigma lets one state, the series all of them
-            at_the_time = stated({key: camera[estimator][key][1] for key in values})
-            for key, value in values.items():
-                assert at_the_time[key] == pytest.approx(value, rel=1e-6, abs=1e-9)
-    angle = found["intersection_angle"]
-    assert angle["true"]["change_arcsec"][1] == pytest.approx(truth["intersection_angle"]["change_arcsec"], abs=1e-8)
-    single = tifffile.imread(folder / "images/forward_left_after.tiff")
-    np.testing.assert_array_equal(tifffile.imread(folder / "images/forward_left_course.tiff")[1], single[0])
-
-
-def test_small_temperatures_act_linearly(prepared) -> None:
-    """Spots of doubled and of summed temperatures, to second order."""
-    one = {LEFT: Temperature(0.1, (0.0, 0.01, 0.02)), "base/forward": Temperature(0.2)}
-    other = {"base/backward": Temperature(-0.3, (0.0, 0.0, 0.0))}
-    double = {path: field + field for path, field in one.items()}
-    states = [{}, *(prepared.thermal.state(fields) for fields in (one, double, other, one | other))]
-    rays = prepared.path.coarse.rays(states)
-    share = prepared.path.coarse.nodes.share
-    spots = np.einsum("n,bnk->bk", share, rays.position[..., :2]).reshape(4, len(states), 2) / prepared.path.pitch
-    moved = spots[:, 1:] - spots[:, :1]
-    assert np.abs(moved[:, 0]).max() > 0.05
-    # dn/dT itself changes by 1e-3 of its size per kelvin
-    np.testing.assert_allclose(moved[:, 1], 2.0 * moved[:, 0], rtol=4e-4, atol=2e-6)
-    np.testing.assert_allclose(moved[:, 3], moved[:, 0] + moved[:, 2], rtol=1e-5, atol=2e-6)
 
 
 @pytest.mark.second
@@ -232,6 +180,25 @@ def test_config_holds_the_course(folder) -> None:
     again, first = resolve(folder / "config.yaml"), resolve(folder.parent / "job.yaml")
     assert again == first
     assert again.to_yaml() == (folder / "config.yaml").read_text()
+
+
+@pytest.mark.second
+def test_an_example_is_read_within_its_sigmas(backend) -> None:
+    """At all times: no light is lost, no spot nears its edge, shifts agree with what is stated, and every change is
+    within 3.5 of its total sigmas. Errors of one course go together, so that it is one draw of nine numbers and not of
+    two hundred: false alarm 0.4 %, of a draw that the files fix.
+    """
+    resolved = resolve(EXAMPLES / "launch.yaml")
+    experiment = MonitorExperiment(resolved, backend)
+    series = run_series(experiment, resolved, series_states(experiment, resolved.job))
+    assert series.warnings == ()
+    assert series.smoothed is not None
+    assert series.smoothed.consistency.agrees
+    for row in series.readings.of("posterior"):
+        assert row.group == "ground" or np.abs(row.error / row.sigma).max() < 3.5
+    angle = series.readings.row("intersection_angle", "change_arcsec", "posterior")
+    # it is about something: what moves is many times what the noise hides
+    assert np.ptp(angle.true) > 100.0 * angle.noise.max()
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -307,33 +274,3 @@ def test_a_time_at_which_the_light_is_lost_is_named(prepared, tmp_path) -> None:
     resolved = resolve(written(tmp_path, text)).with_render(1, 1)
     with pytest.raises(InputError, match="at 1 min of the course cannot be rendered"):
         run_series(prepared, resolved, series_states(prepared, resolved.job))
-
-
-@pytest.mark.second
-def test_an_interrupt_leaves_nothing(tmp_path) -> None:
-    """Ctrl-C while the times are under way."""
-    steps = ", ".join(f"{k} s" for k in range(300))
-    warm = ", ".join(["1 K"] * 300)
-    job = written(tmp_path, COURSE.replace("0 min, 1 min", steps) + NODE + f"{{change: [{warm}]}}")
-    code = (
-        "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "runpy.run_module('twin.render', run_name='__main__', alter_sys=True)"
-    )
-    arguments = [sys.executable, "-c", code, str(job), "--out", str(tmp_path / "new/run"), "--quiet"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen(arguments, cwd=ROOT, env=environment, start_new_session=True, **pipes)
-    try:
-        deadline = time.monotonic() + 60
-        while not list(tmp_path.glob("new/.run.*.partial")):
-            assert process.poll() is None, process.stderr.read()
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        time.sleep(1.0)
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 130
-    assert "Traceback" not in errors
-    assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]

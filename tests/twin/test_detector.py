@@ -59,21 +59,6 @@ def uniform(*shape):
     return FixedPattern(np.ones(shape), np.zeros(shape))
 
 
-@pytest.mark.parametrize("mean_e", [0.3, 3.0, 9.9, 10.1, 60.0, 2500.0, 40000.0])
-def test_electrons_are_poisson(mean_e):
-    sensor = counter()
-    frames = sensor.expose(np.full((64, 64), mean_e / 0.6), uniform(64, 64), 64, 0.0, seed=11)
-    electrons = frames.ravel()
-    law = stats.poisson(mean_e)
-    edges = np.unique(law.ppf(np.linspace(0, 1, 42)[1:-1]))  # some 40 bins of equal probability, or single counts
-    observed = np.bincount(np.searchsorted(edges, electrons), minlength=edges.size + 1)
-    expected = np.diff(np.concatenate([[0.0], law.cdf(edges), [1.0]])) * electrons.size
-    keep = expected > 0
-    chi2 = np.sum((observed[keep] - expected[keep]) ** 2 / expected[keep])
-    assert observed[~keep].sum() == 0
-    assert stats.chi2.sf(chi2, keep.sum() - 1) > FALSE_ALARM
-
-
 @pytest.mark.parametrize("photons", [0.0, 500.0, 60000.0])
 def test_photon_transfer(photons):
     """Temporal mean and variance at three points of the photon transfer line, quantisation included.
@@ -89,22 +74,6 @@ def test_photon_transfer(photons):
     assert abs(frames.mean() - mean) < stats.norm.isf(FALSE_ALARM / 2) * np.sqrt(variance / count)
     ratio = np.sum((frames - mean) ** 2) / variance
     assert stats.chi2.ppf(FALSE_ALARM / 2, count) < ratio < stats.chi2.isf(FALSE_ALARM / 2, count)
-
-
-def test_fixed_pattern_survives_averaging_and_is_the_stated_one():
-    sensor = detector()
-    pattern = sensor.fixed_pattern((96, 96), 3)
-    for values, sigma in ((pattern.gain - 1, 0.01), (pattern.offset_e, 5.0)):
-        chi2 = np.sum((values / sigma) ** 2)
-        assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, values.size) < 1 - FALSE_ALARM / 2
-    frames = sensor.expose(np.full((96, 96), 50000.0), pattern, 100, 0.1, seed=9).astype(float)
-    mean = sensor.expected_dn(np.full((96, 96), 50000.0), 0.1, pattern)
-    variance = sensor.noise_model(0.1).temporal_variance_dn2(mean, 100)
-    chi2 = np.sum((frames.mean(axis=0) - mean) ** 2 / variance)
-    assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, mean.size) < 1 - FALSE_ALARM / 2
-    # without the pattern the same comparison must fail: the test above has seen the pattern
-    flat = sensor.expected_dn(np.full((96, 96), 50000.0), 0.1)
-    assert np.sum((frames.mean(axis=0) - flat) ** 2 / variance) > 10 * mean.size
 
 
 def test_the_response_differs_for_light_and_not_for_dark_current():

@@ -13,14 +13,10 @@ from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
 from optics.waves.imaging import aim_collimated
-from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import fit_wavefront, path_difference
 from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.specs.load import load_detector
-from twin.monitor.image_quality import FIELDS, PLACES, QUALITY
+from twin.monitor.image_quality import FIELDS, QUALITY
 from twin.monitor.image_quality import image_quality as quality_of
-from twin.sensors.line_ccd import LineCcd, band_wavelengths
-from twin.targets.target_path import TargetPath
 
 WAVELENGTH, ARCSEC = 650e-9, np.pi / 180 / 3600
 NODES = quadrature.disk(12)
@@ -117,23 +113,6 @@ def test_wavefront_error_against_batoid(gf7_pair, backend) -> None:
         assert rms(difference) == pytest.approx(value, abs=1e-6)
 
 
-@pytest.mark.parametrize("s", [0, 1])
-def test_mtf_is_that_of_the_path_that_images_edges(gf7_pair, backend, quality, s: int) -> None:
-    """Required: 1e-4. Nodes, wavelengths and the solution of the fit are others, 1e-6; a line in its nominal place."""
-    model = gf7_pair.cameras[CAMERA]
-    band = model.spec.bands["P"]
-    path = TargetPath(gf7_pair.assembly, CAMERA, ROOT, model, backend)
-    directions = np.array([light_of(gf7_pair, backend, STATES[s], field) for field in FIELDS])
-    pupils = path.pupils(STATES[s], directions, path.places(STATES[s], directions))
-    frequency = band.nyquist * np.eye(2)
-    detector = LineCcd.from_specs(band, load_detector(band.detector)).transfer(*frequency.T)
-    both = [polychromatic_transfer(p, frequency, *band_wavelengths(band), np.zeros(1))[0] * detector for p in pupils]
-    along, track = np.abs(both).T
-    np.testing.assert_allclose(quality.cameras[CAMERA].mtf_along_line[s], along, atol=2e-6)
-    np.testing.assert_allclose(quality.cameras[CAMERA].mtf_along_track[s], track, atol=2e-6)
-    assert np.ptp(along - track) > 1e-4 or s == 0  # the directions are not the same by chance
-
-
 def test_a_state_is_the_same_alone_and_among_others_one_of_which_is_lost(gf7_pair, backend, quality) -> None:
     several = image_quality(gf7_pair, backend, [LOST, MOVED, CUT, {}, MOVED])
     for name, camera in several.cameras.items():
@@ -182,20 +161,3 @@ def test_fields_outside_of_the_line_are_refused(gf7_pair, backend) -> None:
     for fields in ((), (0.0, 1.2)):
         with pytest.raises(ValueError, match="fields"):
             image_quality(gf7_pair, backend, [{}], fields)
-
-
-def test_files_have_each_number_under_its_key(quality) -> None:
-    """Numbers of the perturbed state, the second, at the places of the line; mean and worst over the fields."""
-    camera, fields = quality.cameras[CAMERA], quality.fields
-    told = QUALITY(quality)["cameras"][CAMERA]
-    numbers = {
-        "defocus_um": 1e6 * camera.defocus,
-        "mtf_along_line": camera.mtf_along_line,
-        "mtf_along_track": camera.mtf_along_track,
-        "light_lost": camera.light_lost,
-    }
-    for key, values in numbers.items():
-        assert told[key] == {place: values[1, fields.index(field)] for place, field in PLACES.items()}
-    assert told["wfe_rms_waves"] == camera.wfe[1].mean()
-    assert told["wfe_rms_waves_focus_removed"] == camera.wfe_refocused[1].mean()
-    assert told["wfe_worst_waves"] == camera.wfe[1].max()

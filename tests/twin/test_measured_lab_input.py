@@ -349,21 +349,3 @@ def test_series_of_unequal_length() -> None:
     # of equal numbers it is what it was for one
     assert normal_reduction(np.full(5, 10)) == normal_reduction(10)
     assert expected_rejections(np.full(41, 10)) == rejection_rate(10) * 410
-
-
-@pytest.mark.second
-def test_a_turntable_without_held_out_readings_has_its_report(folder: Path, tmp_path: Path) -> None:
-    """`held_out` may be missing; of few angles, with which the fits take a second."""
-    head_, *body = (folder / "comparisons.csv").read_text().splitlines()
-    column = head_.split(",").index("reading [deg]")
-    few = [row for row in body if float(row.split(",")[column]) < 95.2]
-    (folder / "comparisons.csv").write_text("\n".join([head_, *few]) + "\n")
-    text = (folder / "turntable.yaml").read_text()
-    lines = [line for line in text.splitlines() if not line.strip().startswith(("held_out", "folds"))]
-    (folder / "turntable.yaml").write_text("\n".join(lines) + "\n")
-    ended = CliRunner().invoke(app, ["turntable", str(folder / "turntable.yaml"), "--out", str(tmp_path / "out")])
-    assert ended.exit_code == 0, ended.stderr
-    page = (tmp_path / "out" / "report.html").read_text("utf-8")
-    assert "ranked by cross-validation: there are no held-out readings" in page
-    assert "misses held-out angles" not in page
-    assert "None" not in page

@@ -69,27 +69,6 @@ def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
     assert np.max(np.abs(steps[0] - steps[1])[:, None] / peak[0][:, None]) < ACCURACY
 
 
-def test_too_few_nodes_would_be_seen(setup) -> None:
-    """The first class is not right for the last one's spots, so that the choice matters."""
-    path = setup.path
-    state = off_middle(path, 1.0 + 0.95 * SPOT_RANGES[-1])
-    want = path.expected_photons([state], single=False)
-    few = MonitorPath(path.instrument, path.backend, path.class_beams(0).nodes).expected_photons([state], single=False)
-    assert np.max(np.abs(few - want)) > 3 * ACCURACY * want.max()
-
-
-@pytest.mark.second
-def test_a_state_has_its_class_in_any_company(setup) -> None:
-    path = setup.path
-    states = [off_middle(path, 1.0 + share) for share in (0.1, 0.4, 0.7, 0.2)]
-    together = path.expected_photons(states)
-    assert path.class_of(path.coarse_trace(states)).tolist() == [0, 1, 2, 0]
-    for state, photons in zip(states, together, strict=True):
-        alone = path.expected_photons([state])[0]
-        # the compiler may contract other products; then sums in single precision round elsewhere
-        assert np.max(np.abs(alone - photons)) < SINGLE * photons.max()
-
-
 def test_margin_counts_as_distance(setup) -> None:
     place = np.zeros((4, 1, 2))
     half = 0.5 * setup.path.shape[0]

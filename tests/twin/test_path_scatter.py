@@ -155,16 +155,3 @@ def test_a_scattering_mirror_in_a_scene(backend) -> None:
         assert abs(family.energy - expected) < 3.89 * family.error, mark
         assert family.error < 0.03 * expected
     assert abs(result.balance.error) < 0.01
-
-
-def test_specular_light_is_not_stray(backend) -> None:
-    surface, grid = screen("screen", Pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 0.4])), 0.3)
-    finish = Finish(reflectance=0.5, scatter=ABg(1e-5, 1e-4, 2.0))
-    tracer = PathTracer(backend, Scenery((*flat_mirror(finish), surface), (grid,)))
-    direction = unit(-0.1, 0.0, -1.0)
-    result = tracer.run(DiskSource.along(-0.3 * direction, direction, 0.0), 10_000)
-    kinds = {f.text: f.kind for f in result.families}
-    assert kinds["mirror"] == "ghost"
-    assert sum(f.energy for f in result.families) == pytest.approx(0.5, rel=1e-9)
-    assert result.balance.absorbed["mirror"] == pytest.approx(0.5, rel=1e-12)
-    assert abs(result.balance.error) < 1e-12

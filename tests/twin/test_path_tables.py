@@ -117,16 +117,6 @@ def test_between_two_angles_of_incidence_both_have_their_part(backend) -> None:
     assert abs(found - share) < 3.9 * np.sqrt(share * (1.0 - share) / len(r))
 
 
-def test_drawing_more_scatter_keeps_its_power(backend) -> None:
-    table = of_lobe(ABg(1e-5, 1e-4, 2.0))
-    specular = unit(0.2, 0.1, 0.9)
-    _, event, weight = scattered(backend, Finish(reflectance=0.98, table=table), specular, floor=0.4)
-    found = np.where(event == Event.SCATTER, weight, 0.0)
-    total = table.total(float(np.arccos(specular[2])))
-    assert abs(found.mean() - total) < 3.3 * found.std() / np.sqrt(N) + 2e-3 * total
-    assert abs(weight.mean() - 1.0) < 3.3 * weight.std() / np.sqrt(N)
-
-
 @pytest.mark.second
 def test_an_analytic_finish_as_a_table_gives_the_same_stray_light(backend) -> None:
     """Onto a small screen: within Monte Carlo noise, and 2e-3 for what is linear between 400 radial angles.

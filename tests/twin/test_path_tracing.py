@@ -16,10 +16,8 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.models.scenery_parts import Detector
-from tests.optics.bench import disk_points
-from tests.twin.path_bench import IDEAL, facing, flat_mirror, glass_scene, scene_beam, screen, slab
+from tests.twin.path_bench import IDEAL, facing, flat_mirror, glass_scene, screen, slab
 from twin.monitor.monitor_path import MonitorPath
-from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, trace_stray
@@ -42,49 +40,11 @@ STATE = {
 CCD = "forward/left/area_ccd"
 
 
-def without_prisms(scenery: Scenery) -> Scenery:
-    return Scenery(tuple(s for s in scenery.surfaces if s.solid is None), scenery.detectors)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("name", INSTRUMENTS)
-@pytest.mark.parametrize("state", [{}, STATE], ids=["nominal", "perturbed"])
-def test_three_mirrors_as_the_sequential_trace_has_them(backend, instrument, name: str, state: dict) -> None:
-    chosen = instrument(name)
-    scenery = without_prisms(build_scenery(chosen, state, IDEAL, whole_focal_planes=True))
-    detector = "forward/focal_plane"
-    tracer = PathTracer(backend, scenery, {detector: nominal_codes(scenery, chosen.assembly, "forward/imaging")})
-    half = chosen.cameras["forward"].spec.field.x
-    position, direction = [], []
-    for x, y in ((0.0, 0.0), (0.95 * half, 0.0015), (-0.95 * half, -0.0015)):
-        middle, heading, across = scene_beam(chosen, backend, x, y)
-        position.append(middle + disk_points(5000, 0.36) @ across)  # wider than the pupil
-        direction.append(np.broadcast_to(heading, position[-1].shape))
-    position, direction = np.concatenate(position), np.concatenate(direction)
-    systems = assemble(chosen.assembly, ["forward/imaging"], [state])
-    place, _, length, valid = (a[0] for a in trace(backend, systems, make_rays(backend, position, direction)).numpy())
-    found = tracer.run(RaySource.even(position, direction), keep=True).detections
-    own = found.kind == NOMINAL
-    # every ray that gets through the apertures there gets through here, and no other
-    np.testing.assert_array_equal(np.sort(found.path[own]), np.nonzero(valid)[0])
-    assert 0.5 < valid.mean() < 0.9
-    path = found.path[own]
-    flipped = found.place[own] * [-1.0, 1.0]  # the detector faces the light
-    np.testing.assert_allclose(flipped, place[path, :2], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found.length[own], length[path], rtol=0, atol=1e-12)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("name", INSTRUMENTS)
-@pytest.mark.parametrize("state", [{}, STATE], ids=["nominal", "perturbed"])
-def test_out_and_back_through_all_prisms_as_the_sequential_trace_has_it(
-    backend, instrument, name: str, state: dict
-) -> None:
-    chosen = instrument(name)
+def out_and_back(backend, chosen, state: dict) -> None:
+    """Places on the CCDs and path lengths of every channel's light are those of the sequential trace."""
     scenery = build_scenery(chosen, state, IDEAL)
     tracer = PathTracer(backend, scenery, monitor_families(scenery, chosen))
     aimed = MonitorPath(chosen, backend).nominal
-    checked = 0
     for number, channel in enumerate(chosen.channels):
         shift = chosen.assembly.place([state]).pose(channel.reticle_body).translation
         position = np.broadcast_to(shift, aimed.direction[number].shape)
@@ -100,8 +60,16 @@ def test_out_and_back_through_all_prisms_as_the_sequential_trace_has_it(
         np.testing.assert_array_equal(np.sort(path), np.nonzero(valid)[0])
         np.testing.assert_allclose(found.place[own], place[path, :2], rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.length[own], length[path], rtol=0, atol=1e-12)
-        checked += len(path)
-    assert checked > 2000
+        assert len(path) > 50
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("name", INSTRUMENTS)
+@pytest.mark.parametrize("state", [{}, STATE], ids=["nominal", "perturbed"])
+def test_out_and_back_through_all_prisms_as_the_sequential_trace_has_it(
+    backend, instrument, name: str, state: dict
+) -> None:
+    out_and_back(backend, instrument(name), state)
 
 
 @pytest.mark.second
@@ -151,7 +119,7 @@ def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
         (lambda: PathTracer(backend, Scenery((wavy, surface), (grid,))), "aspheric terms, found 40"),
         (lambda: Scenery((surface, surface), (grid,)), "surfaces of the same name: "),
         (lambda: Scenery((surface,), ()), "unknown detectors: far"),
-        (lambda: PathTracer(backend, alone, {"near": ()}, ways=False), "unknown detectors: near"),
+        (lambda: PathTracer(backend, alone, {"near": ()}), "unknown detectors: near; detectors of the scene: far"),
         (lambda: PathTracer(backend, Scenery(*zip(*many, strict=True))), "256 detectors: at most 255 of each"),
     ):
         with pytest.raises(ValueError, match=words):

@@ -23,7 +23,6 @@ from twin.pictures.picture import (
     Shot,
     Studio,
     colour_variant,
-    render_shot,
     staged,
     still_patches,
     without_grain,
@@ -107,21 +106,6 @@ def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
 
 
 # --- how they look ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.second
-def test_colours(backend, gf7_pair, paths):
-    """Light background, blue and orange light; a seed gives the same picture."""
-    image = render_shot(gf7_pair, paths, backend, SMALL[0], seed=3).astype(int)
-    assert image.shape == (SMALL[0].height, SMALL[0].width, 3)
-    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
-    assert border.min() > 200
-    assert np.ptp(border.mean(axis=0)) < 6  # neutral
-    assert np.array_equal(image, render_shot(gf7_pair, paths, backend, SMALL[0], seed=3))
-    red, _, blue = np.moveaxis(image, -1, 0)
-    assert (red - blue > 80).sum() > 50  # monitor
-    assert (blue - red > 80).sum() > 50  # imaging
-    assert (image.max(axis=-1) < 80).sum() > 5  # black housings
 
 
 def test_grain_is_taken_off_matt_patches_only():

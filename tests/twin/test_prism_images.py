@@ -173,34 +173,6 @@ def test_squared_facets_absorb_the_errors(imperfect) -> None:
     assert np.abs(spots(imperfect, [{}])).max() < 0.05
 
 
-@pytest.mark.second
-@pytest.mark.parametrize("prism", PRISMS)
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_an_imperfect_prism_that_turns(imperfect, instrument, backend, prism, axis) -> None:
-    """Its V turns with it: V becomes V + phi x V, 1e-9 rad for 60 arcsec; what a perfect prism does is taken off.
-
-    The facet is turned by 1e3 times as much, to stand out; its effect is linear to 1e-3. In the difference of two beams
-    that walk alike 5e-6 px are left.
-    """
-    phi, perfect = 60.0 * np.eye(3)[axis], MonitorPath(instrument("monitor_pair"), backend)
-    moved, ideal = (spots(p, [{}, on_prisms(p, prism, phi)]) for p in (imperfect, perfect))
-    got = (moved[:, 1] - moved[:, 0]) - (ideal[:, 1] - ideal[:, 0])
-    placed = perfect.instrument.assembly.place()
-    vectors = []
-    for channel in perfect.channels:
-        whole = sum(
-            seen_turn(perfect, channel, prism, face, SIGNS[face] * ARCSEC * np.array([1.0, 1.0, 0.0]))
-            for p, face in FACES
-            if p == prism
-        )
-        spin = ARCSEC * placed.pose(channel.prism_body(prism)).rotation @ phi
-        vectors.append(-1e3 * np.cross(spin, whole))
-    turned = spots(perfect, [{}, facets_turned(perfect, vectors)])
-    want = (turned[:, 1] - turned[:, 0]) / 1e3
-    assert np.abs(got - want).max() < 5e-6
-    assert np.abs(want).max() > 1e-3
-
-
 def test_a_beam_that_misses_its_prism_is_told_by_name(tmp_path):
     job = tmp_path / "job.yaml"
     prism = "base/forward/monitor/left/prism_180"

@@ -106,33 +106,6 @@ def test_the_smoothed_series_is_the_main_jobs_to_the_last_bit(course, backend):
 
 
 @pytest.mark.second
-def test_a_learnt_shape_does_for_a_series_as_well(course, backend):
-    """With the model for what moves and the shape from the frames before: shifts of the same frames agree to what one
-    shape's noise is, each sigma is that of two images, and filter and smoother know what the times share.
-    """
-    found = course.measured(backend, course.text() + "template: measured\n", "learnt.yaml")
-    for k, reading in enumerate(found.readings):
-        own, modelled = reading.recovery.shift_covariance[0], course.series.shift_covariance[k]
-        sigma = np.sqrt(np.diag(modelled))
-        np.testing.assert_array_less(np.abs(reading.recovery.shift[0] - course.series.shift[k]), 0.5 * sigma)
-        np.testing.assert_allclose(np.sqrt(np.diag(own)), sigma, rtol=0.1)
-    for one, other in zip(found.smoothed.changes, course.series.smoothed.changes, strict=True):
-        np.testing.assert_allclose(one.sigma, other.sigma, rtol=0.1)
-    assert found.smoothed.consistency.agrees
-
-
-@pytest.mark.second
-def test_only_time_differences_matter(course, backend):
-    """Stated motions are stationary: a series that begins ten hours later says the same."""
-    later = [f"{60 * 10 + minute} min" for minute in (0, 12, 30, 50)]
-    found = course.measured(backend, course.text(later))
-    for one, other in zip(found.smoothed.changes, course.series.smoothed.changes, strict=True):
-        # the law is a function of differences of times, which round at 1e-16 of ten hours
-        np.testing.assert_allclose(one.value, other.value, rtol=0, atol=1e-9 * float(np.max(other.sigma)))
-    np.testing.assert_allclose(found.smoothed.times - 36000.0, course.series.smoothed.times, atol=1e-9)
-
-
-@pytest.mark.second
 def test_the_worst_time_is_told_wherever_it_is(course, backend):
     """The frames of the second time are those of a spot that nothing stated could have moved so."""
     frames = tifffile.imread(course.folder / "forward_left_1.tiff")

@@ -7,7 +7,7 @@ import erfa
 import numpy as np
 import pyproj
 import pytest
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import solve_ivp
 
 from optics.geometry.tree import Motion
 from scenes.specs.orbit.flight import OrbitSpec
@@ -170,21 +170,6 @@ def test_aberration_against_erfa() -> None:
         np.testing.assert_allclose(aberrated(expected, -velocity), direction, rtol=0, atol=2e-15)
 
 
-@pytest.mark.parametrize("name", ["forward", "nadir", "backward"])
-def test_aberration_on_the_ground(name: str) -> None:
-    """What is seen lies forward of where it is, by v/c = 25 urad: the true ground point is behind, by 13 m at nadir."""
-    off, on = (sensor(TH1[name], e).ground(5000.0, 5999.5)[0] for e in (NO_EFFECTS, LightEffects(False, True, False)))
-    position, velocity = CIRCLE.position(0.5), CIRCLE.inertial_velocity(0.5)
-    assert np.linalg.norm(velocity) / SPEED_OF_LIGHT == pytest.approx(25.4e-6, rel=0.01)  # 5.2 arcsec
-    ray = (off - position) / np.linalg.norm(off - position)
-    normal = EARTH.ecef(*EARTH.geodetic(off)[:2], 1.0) - EARTH.ecef(*EARTH.geodetic(off)[:2], 0.0)
-    tilt = -(velocity - ray * (velocity @ ray)) / SPEED_OF_LIGHT * np.linalg.norm(off - position)
-    expected = tilt - ray * (tilt @ normal) / (ray @ normal)  # down along the ray to the level ground
-    np.testing.assert_allclose(on - off, expected, atol=1e-3)  # second order: 13 m times 25 urad, and the curved ground
-    assert (on - off) @ velocity < 0.0
-    assert 12.5 < np.linalg.norm(on - off) < 15.5
-
-
 def test_light_time_on_the_ground() -> None:
     """The Earth turned eastward under the light: the point lies east by its speed times the way."""
     off, on = (
@@ -234,21 +219,6 @@ def test_refraction_against_the_ray_equation(degrees: float) -> None:
     # the flat-layer formula, within what the sphere takes away (1/cos^2 times the scale height over the radius)
     flat = math.tan(z) / math.cos(z) ** 2 * n * scale
     assert flat * (1 - 4e-3 / math.cos(z) ** 2) < found < flat
-
-
-def test_quadrature_of_refraction() -> None:
-    """Adaptive integration of Bouguer's integral as printed: 12 Laguerre points are good to a micrometre."""
-    radius, n0, scale = 6371e3, standard_refractivity(650e-9), 8.31446 * 288.15 / (0.0289644 * 9.80665)
-    for degrees in (1.0, 30.0, 60.0, 75.0):
-        p = radius * math.sin(math.radians(degrees))
-
-        def integrand(h: float, p: float = p) -> float:
-            r, n = radius + h, 1.0 + n0 * math.exp(-h / scale)
-            return p / r * (1.0 / math.sqrt(r**2 - p**2) - 1.0 / math.sqrt((n * r) ** 2 - p**2))
-
-        expected = radius * quad(integrand, 0.0, 400e3, epsabs=1e-14, epsrel=1e-10, limit=500)[0]
-        found = refractive_shift(np.array([math.radians(degrees)]), np.zeros(1), np.array([radius]), 650e-9)[0]
-        assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
 def test_the_standard_atmosphere() -> None:

@@ -19,8 +19,7 @@ from tests.twin.path_bench import IDEAL, scene_beam, ways_and_search
 from tests.twin.test_clear_ways import same
 from twin.path_tracing.families import Event, nominal_codes
 from twin.path_tracing.path_result import PathResult
-from twin.path_tracing.sequential import WORDS, advanced
-from twin.path_tracing.source import DiskSource, random_streams
+from twin.path_tracing.source import DiskSource
 from twin.path_tracing.stray_light import monitor_families, pinhole
 from twin.path_tracing.thinning import LEAST_KEPT, Followed, Thinning, learn
 from twin.path_tracing.tracer import BALANCED, FAINT, LEAST_ALONG, PathTracer, Sampling
@@ -110,15 +109,6 @@ def test_steps_say_what_nominal_light_does(backend, gf7_pair) -> None:
     assert [step.front for step in through] == [step.body == 0 for step in through]
     assert sum(step.body > 0 for step in steps) == 2 * (4 + 3)
     assert tracer.nominal_steps(source, toward, PATHS - 1) == ()
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 51])
-def test_a_generator_jumps_over_numbers(backend, count: int) -> None:
-    rng, jumped = (random_streams(backend, backend.opaque(np.arange(8), backend.UInt), 3) for _ in range(2))
-    for _ in range(count):
-        rng.next_float64()
-    jumped.state = advanced(jumped.state, jumped.inc, count * WORDS)
-    np.testing.assert_array_equal(rng.next_float64().numpy(), jumped.next_float64().numpy())
 
 
 @pytest.fixture(scope="module")

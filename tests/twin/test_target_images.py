@@ -22,15 +22,13 @@ from optics.waves.imaging import imaging_field
 from optics.waves.pupil_stack import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.models.shadow import imaging_shadows
 from scenes.specs.camera import BandSpec
 from scenes.specs.load import load_detector
 from tests.tiers import quick
-from twin.monitor.image_quality import image_quality
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.band_light import BandPupils
 from twin.targets.target_images import ALONG, DIRECTIONS, PLACES, TRACK, BarDesign, TargetCamera, TargetLostError, View
-from twin.targets.target_measurement import CURVE, on_axis, read_bars, read_edge
+from twin.targets.target_measurement import CURVE, read_bars, read_edge
 from twin.targets.target_path import LocalMap, TargetPath
 
 PITCH, WAVELENGTH, F_NUMBER = 7e-6, 650e-9, 9.2
@@ -271,71 +269,6 @@ def test_bars(sharp, aberrated, direction):
     assert "no structure in the region" in nothing.reason
 
 
-def dense_transfer(view: View, frequency: np.ndarray, points: int = 401) -> float:
-    """MTF by the plainest sum: the pupil on a square grid, in or out of its rim and of each shadow, times itself moved.
-
-    Right to 1e-4 with 401 points across; the pupils' polynomials alone are what `View.transfer` and image quality use.
-    """
-    pupil = view.pupil
-    rim = pupil.edge.boundary(np.linspace(0.0, 2.0 * np.pi, 2001))[0]
-    order = np.argsort(np.angle(rim))
-
-    def lit(p: np.ndarray) -> np.ndarray:
-        inside = np.abs(p) < np.interp(np.angle(p), np.angle(rim)[order], np.abs(rim)[order], period=2.0 * np.pi)
-        for x, y in np.moveaxis(np.zeros((0, 3, 2)) if pupil.shadow is None else pupil.shadow.pieces[0], -1, 1):
-            cross = [
-                (b - a) * (p.imag - c) - (d - c) * (p.real - a)
-                for a, b, c, d in zip(x, np.roll(x, -1), y, np.roll(y, -1), strict=True)
-            ]
-            if np.ptp(x) > 0.0:
-                inside &= ~np.all(np.array(cross) >= 0.0, axis=0)
-        return np.asarray(inside)
-
-    side = np.linspace(-1.2, 1.2, points) + 1e-4
-    p = side + 1j * side[:, None]
-    light = float(np.sum(pupil.values(p[lit(p)])[1] ** 2))
-    wavelengths, weights = band_wavelengths(view.band)
-    total = 0j
-    for wavelength, weight in zip(wavelengths, weights / np.sum(weights), strict=True):
-        half = 0.5 * complex(pupil.normalised(*(wavelength * frequency)))
-        both = p[lit(p + half) & lit(p - half)]
-        (path, own), (behind, other) = pupil.values(both + half), pupil.values(both - half)
-        total += weight * np.sum(own * other * np.exp(2j * np.pi / wavelength * (path - behind))) / light
-    return float(np.abs(total) * view.ccd.transfer(*frequency))
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("obstructed", [False, True])
-def test_image_quality_and_bars_see_one_pupil_at_two_frequencies(gf7_pair, backend, obstructed):
-    """Bars of the panchromatic line read 0.2351 where image quality says 0.2381 with the prisms in the beam. Both are
-    right: image quality is at the Nyquist frequency along the line, bars are tilted by 7 deg, and the prisms make the
-    MTF fall between the two by 1.2%, to opposite sides at the line's ends.
-    """
-    name, model = "forward", gf7_pair.cameras["forward"]
-    ccd = LineCcd.from_specs(model.spec.bands["P"], load_detector("gf7_pan"))
-    shadows = imaging_shadows(gf7_pair, name, backend) if obstructed else None
-    path = TargetPath(gf7_pair.assembly, name, f"base/{name}", model, backend, shadows=shadows)
-    camera = TargetCamera(path, ccd, 64)
-    views = camera.views({})
-    fields = tuple(2.0 * camera.places[:, 0] / (ccd.band.pixels * ccd.band.pitch))
-    quality = image_quality(gf7_pair, backend, [{}], fields, obstruction=obstructed).cameras[name]
-    for direction, said in ((ALONG, quality.mtf_along_line[0]), (TRACK, quality.mtf_along_track[0])):
-        own = [on_axis(views[place], direction) for place in PLACES]
-        # two quadratures over the shadows
-        np.testing.assert_allclose(own, said, rtol=0.0, atol=1e-4 if obstructed else 1e-7)
-    tilted = {place: BarDesign.build(view, ALONG).seen(view) for place, view in views.items()}
-    bars = {place: float(np.abs(view.transfer(tilted[place][None]))[0]) for place, view in views.items()}
-    # what is symmetric about the middle sees the other tilt at the other end
-    mirrored = float(np.abs(views["left"].transfer((tilted["left"] * [1.0, -1.0])[None]))[0])
-    assert bars["right"] == pytest.approx(mirrored, abs=2e-4)
-    assert bars["left"] - bars["right"] == pytest.approx(0.00225 if obstructed else -0.00163, abs=2e-4)
-    if obstructed:
-        assert on_axis(views["centre"], ALONG) - bars["centre"] == pytest.approx(0.0029, abs=2e-4)
-        nyquist = np.array([0.5 / PITCH, 0.0])
-        for frequency, want in ((nyquist, on_axis(views["centre"], ALONG)), (tilted["centre"], bars["centre"])):
-            assert dense_transfer(views["centre"], frequency) == pytest.approx(want, abs=3e-4)
-
-
 def bar_readings(
     camera: TargetCamera, states: list[State], repeats: int, frames: int, places: tuple[str, ...] = tuple(PLACES)
 ) -> np.ndarray:
@@ -379,16 +312,6 @@ def test_bars_agree_with_the_traced_pupil_within_their_sigma(before_gf7):
     readings = bar_readings(before_gf7, states, 6, 9, ("left",))
     assert len(readings) == 24
     assert_no_chance_of(readings)
-
-
-@pytest.mark.second
-def test_bars_of_another_band_agree_with_the_traced_pupil(before_gf7):
-    """Sharp, aberrated, and shifted on the pixels; 54 readings of the band that is farthest from the panchromatic."""
-    spec = before_gf7.path.model.spec.bands["B1"]
-    camera = TargetCamera(before_gf7.path, LineCcd.from_specs(spec, load_detector(spec.detector)), REGION)
-    assert_no_chance_of(
-        bar_readings(camera, [{}, ABERRATED, {"base/forward": Motion(rotate=(1.1e-6, 0.7e-6, 0.0))}], 3, 9)
-    )
 
 
 def test_pinhole_and_star_lie_in_the_middle(perfect):

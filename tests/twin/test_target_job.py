@@ -11,12 +11,8 @@ import yaml
 import twin.render as command
 from analysis.mtf.slanted_edge import measure_edge
 from scenes.specs.load import LIBRARY
-from scenes.specs.resolved import resolve
-from tests.twin.commands import files, invoke
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run.reference_frames import described
+from tests.twin.commands import invoke
 from twin.targets.target_images import DIRECTIONS, PLACES
-from twin.targets.target_measurement import render_targets
 
 run = partial(invoke, command.app)
 PITCH, FRAMES, REGION = 7e-6, 4, 112
@@ -55,9 +51,6 @@ def mtf(folder):
 
 @pytest.mark.second
 def test_files(folder, mtf):
-    found = files(folder / "run")
-    assert {f"{image}.tiff" for image in IMAGES} | {f"{image}.png" for image in IMAGES} | {"mtf.json"} <= found
-    assert {"images/one_left_before.tiff", "recovered.json"} <= found  # the spots are always rendered
     pages = tifffile.imread(folder / "run" / "images" / "one_left_knife_edge_track_after.tiff")
     assert pages.dtype == np.uint16
     assert pages.shape == (FRAMES, REGION, REGION)
@@ -124,22 +117,6 @@ def test_no_two_images_share_their_noise(folder):
             for second in differences[:k]:
                 products = first * second
                 assert abs(np.sum(products)) < FAR * np.sqrt(np.sum(products**2)), names[k]
-
-
-@pytest.mark.second
-def test_config_repeats_the_run(folder, mtf, backend):
-    again = resolve(folder / "run" / "config.yaml")
-    assert again.job.render.images == ("spots", "knife_edge")
-    assert again.line_detectors["gf7"].name == "gf7_pan"
-    assert again.to_yaml() == (folder / "run" / "config.yaml").read_text()
-    experiment = MonitorExperiment(again, backend)
-    repeated = render_targets(again, experiment.instrument, backend, experiment.state(again.job), 1)
-    images = {stem: frames for stem, _, frames, _ in repeated.images()}
-    for name in IMAGES:
-        np.testing.assert_array_equal(
-            images[name.removeprefix("images/")], tifffile.imread(folder / "run" / f"{name}.tiff")
-        )
-    assert described("mtf", repeated.to_dict()) == mtf
 
 
 @pytest.mark.second
