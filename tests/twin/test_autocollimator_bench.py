@@ -181,25 +181,6 @@ def test_errors_of_the_bench_act_as_they_should(reader: Reader, backend: Backend
     assert reading[:, 0] == pytest.approx([angle, angle], abs=limit)
 
 
-def test_errors_are_drawn_as_large_as_declared() -> None:
-    e = SETUP.spec.errors
-    series = series_per_axis(SETUP.spec)[0]
-    drawn: dict[str, list[float]] = {name: [] for name in BenchErrorsSpec.model_fields}
-    for seed in range(300):
-        zero, *_, last = states_of(SETUP.spec, series, seed)
-        turn = np.array(last[axis_body("X")].rotate)
-        drawn["turntable_step"].append(float(np.linalg.norm(turn) - series.angles[-1]))
-        drawn["axis_tilt"] += (turn[1:] / turn[0]).tolist()
-        for unit in UNITS:
-            root = autocollimator_body(unit)
-            drawn["focal_length"].append(last[root].scale)
-            drawn["reading"] += [*last[root].rotate[:2], *zero[root].rotate[:2]]
-            drawn["ccd_rotation"].append(last[f"{root}/focal_plane/area_ccd"].rotate[2])
-            drawn["mirror_mount"] += last[mirror_body(unit)].rotate[:2]
-    for name, values in drawn.items():
-        assert scatter_agrees(float(np.sum((np.array(values) / getattr(e, name)) ** 2)), len(values)), name
-
-
 @pytest.mark.second
 def test_seeds(reader: Reader, backend: Backend) -> None:
     first, again, other = (

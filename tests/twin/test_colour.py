@@ -38,27 +38,6 @@ def test_a_camera_of_one_colour_is_that_of_its_wavelength(achromat, backend) -> 
         achromat.at(5e-6)
 
 
-def test_colour_of_a_thin_achromat(achromat, backend) -> None:
-    """Secondary axial colour -f (P1 - P2) / (V1 - V2), with partial dispersions and Abbe numbers for F, d and C."""
-    spec = achromat.model.spec
-    lines = np.array([486.1327e-9, 587.5618e-9, 656.2725e-9])
-    n = np.array([[spec.index_behind(face, w) for w in lines] for face in ("L1", "L3")])
-    spread = n[:, 0] - n[:, 2]
-    abbe, partial = (n[:, 1] - 1.0) / spread, (n[:, 0] - n[:, 1]) / spread
-    found = judge_colours(achromat, spec.spectrum, ((0.0, 0.0),), False)
-    focal = float(achromat.model.first_order.principal_distance[0])
-    assert found.axial is not None
-    # what is not achromatic of it is a little of what one lens has, f / V; that is taken off the blue line's focus
-    blue = found.axial[0, 0] - found.axial_reference[0]
-    primary = found.axial_primary[0]
-    assert abs(primary) < 0.02 * focal / abbe[0]
-    wanted = -focal * (partial[0] - partial[1]) / (abbe[0] - abbe[1])
-    assert blue - primary * partial[0] == pytest.approx(wanted, rel=0.03)
-    np.testing.assert_allclose(
-        found.axial_secondary, found.axial_reference - 0.5 * (found.axial[:, 0] + found.axial[:, -1])
-    )
-
-
 def test_lateral_colour_is_in_the_pupils(achromat) -> None:
     """The phase of a line's transfer function is that of where its light falls, seen from the design's chief ray."""
     lines, field, frequency = np.array([486.1327e-9, 656.2725e-9]), (1.0, 0.0), np.array([0.0, 100.0, 40e3])

@@ -3,14 +3,22 @@
 Every statistical limit is a two-sided chi-square (or normal) quantile with a false-alarm rate of 1e-6 per test.
 """
 
+from __future__ import annotations
+
+import itertools
 import re
+import time
 from contextlib import nullcontext
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from scipy import stats
+from scipy.special import gammainc, gammaincc
 
+import twin.sensors.poisson_numbers as module
+from analysis.spots.centroid import mean_frames
 from scenes.specs.camera import BandSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.job import JobSpec
@@ -20,7 +28,10 @@ from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from twin.main_job.render_job import render_job
 from twin.render import app
-from twin.sensors import area_detector, exposure_kernel, poisson_numbers
+from twin.run import frame_store
+from twin.run.data_files import FrameFacts, preview_png, tiff
+from twin.run.frame_store import frame_room, in_file, kept_bytes, largest_of, let_go, mean_of
+from twin.sensors import area_detector, exposure_kernel
 from twin.sensors.area_detector import (
     EmvaDetector,
     FixedOffsets,
@@ -29,7 +40,9 @@ from twin.sensors.area_detector import (
     coarse_warnings,
     told_of_steps,
 )
+from twin.sensors.exposure_kernel import FEWEST
 from twin.sensors.line_ccd import LineCcd
+from twin.sensors.poisson_numbers import SERIES_END, TABLE_END, poisson_numbers, poisson_quantile
 
 FALSE_ALARM = 1e-6
 SHEET = {
@@ -122,7 +135,7 @@ def test_many_frames_in_pieces_have_the_same_bits(full_well, noise, monkeypatch)
     assert ccd.frames_at_once(7, 240) == 7
     monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 500)
     monkeypatch.setattr(area_detector, "_FURTHER_PIXELS", 500)
-    monkeypatch.setattr(poisson_numbers, "_ROOM", 500)
+    monkeypatch.setattr(module, "_ROOM", 500)
     assert ccd.frames_at_once(7, 240) == 2
     np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, 5), whole)
 
@@ -325,3 +338,162 @@ def test_coarse_grey_values_are_warned_of(backend):
     assert "area CCD monitor_ccd has coarse grey values: noise of 0.092 DN" in text
     assert text in render_job(coarse, backend).warnings
     assert coarse_warnings(fine.detector) == ()
+
+
+LAST = np.uint64(2**64 - 1)
+
+
+def generator(seed: int) -> np.random.Generator:
+    return np.random.Generator(np.random.SFC64(seed))
+
+
+def words(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    return rng.integers(0, LAST, shape, dtype=np.uint64, endpoint=True)
+
+
+def is_quantile(number: np.ndarray, mean: np.ndarray, word: np.ndarray) -> np.ndarray:
+    """Whether F(n - 1) < u <= F(n), by SciPy's functions alone; the upper half of u by the upper tail."""
+    upper = word > np.uint64(2**63 - 1)
+    tail = (np.where(upper, LAST - word, word).astype(float) + 0.5) / 2.0**64
+
+    def reached(k: np.ndarray) -> np.ndarray:
+        return np.where(upper, gammainc(k + 1.0, mean) <= tail, gammaincc(k + 1.0, mean) >= tail)
+
+    return reached(number) & ((number == 0.0) | ~reached(np.maximum(number - 1.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(1e-6, 0.5), (0.5, 8.0), (8.0, TABLE_END), (TABLE_END, 300.0), (300.0, SERIES_END)]
+)
+def test_every_number_is_the_quantile(low, high) -> None:
+    """Table, interpolation and expansion never decide otherwise than the distribution function, out to u = 2^-60."""
+    rng = np.random.default_rng(3)
+    mean = np.minimum(low * (high / low) ** rng.random(20_000), np.nextafter(high, 0.0))
+    word = words(rng, (9, mean.size))
+    for k, shift in enumerate((10, 20, 30, 40)):
+        word[2 * k] >>= np.uint64(shift)
+        word[2 * k + 1] = LAST - (word[2 * k + 1] >> np.uint64(shift))
+    number = poisson_quantile(mean, word)
+    assert np.array_equal(number, np.floor(number))
+    assert is_quantile(number, mean, word).all()
+    # the check sees a number that is one off
+    assert not is_quantile(number + 1.0, mean, word).any()
+
+
+def test_edges_of_the_cells() -> None:
+    """Means on the table's own, just below and above, u at the first and last of each of its cells."""
+    steps = np.concatenate([np.arange(0, 33) / 32.0, np.arange(1, 33), [TABLE_END, 1000.0, SERIES_END - 1.0]])
+    mean = np.concatenate([steps, np.nextafter(steps, 1e9), np.nextafter(steps[1:], 0.0)])
+    edge = np.arange(1024, dtype=np.uint64) << np.uint64(54)
+    word = np.concatenate([edge, edge + np.uint64(2**54 - 1)])[:, None].repeat(mean.size, axis=1)
+    number = poisson_quantile(mean, word)
+    assert is_quantile(number, mean, word).all()
+    assert np.all(np.diff(number[np.argsort(word[:, 0], kind="stable")], axis=0) >= 0)
+    assert np.all(np.diff(number[:, np.argsort(mean, kind="stable")], axis=1) >= 0)
+    assert np.all(number[:, mean == 0.0] == 0.0)
+
+
+@pytest.mark.parametrize("kind", [np.random.SFC64, np.random.MT19937])
+def test_mixed_means_are_independent_and_each_has_its_own(kind) -> None:
+    """All ways of one call, also of a generator whose words have 32 bits: means, variances, and neighbours, frames and
+    means that do not know of each other."""
+    mean = np.array([0.0, 1e-4, 0.5, 7.0, 31.0, 33.0, 900.0, 7e4, 3e5])
+    number = poisson_numbers(mean, 200_000, np.random.Generator(kind(2)))
+    assert np.all(number[:, 0] == 0.0)
+    assert 3 <= np.count_nonzero(number[:, 1]) <= 48  # of 20: 1e-6 on either side
+    scaled = (number[:, 2:] - mean[2:]) / np.sqrt(mean[2:])
+    within = 5.0 / np.sqrt(len(scaled))  # 6e-7 for each of the 42 numbers
+    assert np.all(np.abs(scaled.mean(axis=0)) < within)
+    between = scaled.T @ scaled / len(scaled)
+    assert np.all(np.abs(np.diag(between) - 1.0) < within * np.sqrt(2.0 + 1.0 / mean[2:]))
+    assert np.all(np.abs(between - np.diag(np.diag(between))) < within)
+    later = scaled[1:].T @ scaled[:-1] / (len(scaled) - 1)
+    assert np.all(np.abs(later) < within)
+
+
+def test_the_pieces_do_not_matter(monkeypatch) -> None:
+    mean = np.random.default_rng(1).exponential(20.0, (30, 41))
+    whole = poisson_numbers(mean, 7, generator(4))
+    assert whole.shape == (7, 30, 41)
+    for room in (1, 5000):
+        monkeypatch.setattr(module, "_ROOM", room)
+        assert np.array_equal(poisson_numbers(mean, 7, generator(4)), whole)
+    # views, other layouts and a single number
+    assert np.array_equal(poisson_numbers(np.asfortranarray(mean), 7, generator(4)), whole)
+    assert poisson_numbers(np.array(3.0), 2, generator(4)).shape == (2,)
+
+
+DETECTOR = EmvaDetector(
+    quantum_efficiency=0.6,
+    full_well_e=30_000.0,
+    system_gain_dn_per_e=0.1,
+    dark_noise_e=5.0,
+    dark_current_e_per_s=20.0,
+    prnu=0.01,
+    dsnu_e=3.0,
+    offset_dn=50.0,
+    bit_depth=12,
+)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hardly anything is kept in memory."""
+    monkeypatch.setattr(frame_store, "IN_MEMORY", 1000)
+    monkeypatch.setattr(frame_store, "PART", 20_000)
+
+
+def exposed(frames: int, threads: int | None = None, images: int = 3) -> np.ndarray:
+    light = np.random.default_rng(2).uniform(0.0, 4000.0, (images, 24, 32))
+    pattern = DETECTOR.fixed_pattern((images, 24, 32), 5)
+    return DETECTOR.expose(light, pattern, frames, 0.1, 7, threads)
+
+
+def test_frames_in_a_file_are_those_in_memory(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = 2 * FEWEST // (3 * 24 * 32)
+    stored = exposed(frames)
+    monkeypatch.setattr(frame_store, "IN_MEMORY", 1 << 28)
+    kept = exposed(frames)
+    assert in_file(stored)
+    assert in_file(stored[1, 3])
+    assert not in_file(kept)
+    let_go(stored)
+    let_go(kept)
+    np.testing.assert_array_equal(stored, kept)
+    np.testing.assert_array_equal(mean_of(stored), mean_frames(kept))
+    np.testing.assert_array_equal(mean_of(stored), kept.mean(axis=-3))  # as pictures have it: all sums are exact
+    np.testing.assert_array_equal(largest_of(stored), kept.max(axis=-3))
+    np.testing.assert_array_equal(DETECTOR.saturated(stored).pixels, DETECTOR.saturated(kept).pixels)
+    facts = FrameFacts("a camera", 5e-6, 1e-3)
+    assert bytes(tiff(stored[1], facts)) == tiff(kept[1], facts)
+    assert preview_png(stored[2]) == preview_png(kept[2])
+
+
+def test_threads_do_not_change_the_frames_of_one_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several pieces of one image: a thread must not draw the next one while another draws the last."""
+    monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 32 * 24 * 32)
+    frames = 8 * FEWEST // (24 * 32)
+    first = exposed(frames, threads=1, images=1)
+    drawn, calls = exposure_kernel.words_of, itertools.count()
+
+    def slow(*arguments: Any) -> np.ndarray:
+        if next(calls) == 0:
+            time.sleep(0.2)
+        return drawn(*arguments)
+
+    monkeypatch.setattr(exposure_kernel, "words_of", slow)
+    np.testing.assert_array_equal(exposed(frames, threads=4, images=1), first)
+
+
+def test_a_full_disk_is_said_before(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(file: int, start: int, size: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(frame_store.os, "posix_fallocate", full)
+    with pytest.raises(OSError, match="GB of frames do not fit on the disk"):
+        frame_room((2, 100, 30, 30))
+
+
+def test_what_lies_in_a_file_takes_no_memory() -> None:
+    assert kept_bytes(1e6) == 1e6
+    assert kept_bytes(1e12) == kept_bytes(5e9) < 0.2e9

@@ -104,16 +104,6 @@ def test_half_the_glass_path_halves_the_error(budget):
     assert ratio == pytest.approx(0.5, abs=0.02)
 
 
-def test_the_draws_are_those_of_normal_numbers_one_trial_after_the_other(budget):
-    """Cause by cause, body by body, axis by axis, as a third of what the file says; gradients and turns alike."""
-    from_file = {"prism_0_thermal": 18.5e-3, "prism_0_rotation": 68.0 * ARCSEC}
-    amounts = budget.stated.of_causes(tuple(from_file)).draw(np.random.default_rng(11), 3)
-    plain, channels = np.random.default_rng(11), len(budget.experiment.instrument.channels)
-    for row in amounts:
-        expected = [v / 3.0 * plain.standard_normal() for v in from_file.values() for _ in range(3 * channels)]
-        np.testing.assert_allclose(row, expected, rtol=1e-15)  # one rounding
-
-
 def test_a_line_of_several_numbers_is_told_in_times_of_what_is_stated(backend, budget):
     both = make(backend, causes={"prism_0_rotation": {"shift": "3 um"}})
     assert both.input_of("prism_0_rotation") == (1.0, "times stated")

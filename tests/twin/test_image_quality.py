@@ -72,16 +72,8 @@ def rms(difference: np.ndarray) -> float:
     return float(fit_wavefront(NODES.x, NODES.y, NODES.weight, difference[1:]).rms) / WAVELENGTH
 
 
-def test_nominal_wavefront_errors(quality) -> None:
-    """The range of the reference design along its line, see tests/oracles/test_reference_cameras.py, where the field's
-    minimum lies between the fields that are looked at there.
-    """
-    for camera in quality.cameras.values():
-        assert np.all((camera.wfe[0] > 0.0140) & (camera.wfe[0] < 0.0182))
-        assert np.all(camera.wfe[0, [0, 2, 4]] > 0.0145)
-        np.testing.assert_allclose(camera.wfe[0], camera.wfe[0, ::-1], rtol=1e-6)  # the design is symmetric
-        np.testing.assert_allclose(camera.defocus[0], camera.defocus[0, ::-1], atol=1e-11)
-    # a camera that turns as a whole sees other things as well as before
+def test_a_camera_that_turns_as_a_whole_is_as_sharp(quality) -> None:
+    """It sees other things as well as before."""
     turned = quality.cameras[CAMERA]
     np.testing.assert_allclose(turned.wfe[2], turned.wfe[0], atol=1e-8)
     np.testing.assert_allclose(turned.mtf_along_line[2], turned.mtf_along_line[0], atol=1e-8)

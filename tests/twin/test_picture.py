@@ -7,12 +7,17 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import twin.main_job.render_command
 import twin.pictures.picture
 import twin.pictures.picture as picture_light
 import twin.render as command
+from optics.geometry.tree import Motion
+from scenes.models.meshes import mirror_mesh
+from scenes.specs.instrument import BASE
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
 from twin.main_job.render_job import render_job
@@ -29,7 +34,7 @@ from twin.pictures.picture import (
     write_pictures,
 )
 from twin.pictures.picture_scene import framed, looking, points_in_world
-from twin.pictures.scene_file import build_scene
+from twin.pictures.scene_file import build_scene, motions
 
 SMALL = tuple(Shot(s.name, s.width // 10, s.height // 10, 2, 2, s.shows) for s in SHOTS)
 LINE = 3.0
@@ -176,3 +181,154 @@ def test_the_command_writes_them_or_says_why_not(backend, tmp_path, monkeypatch)
     kept = {path.name for path in (tmp_path / "none").iterdir()}
     assert {"manifest.json", "truth.json", "recovered.json", "scene.glb", "report.html"} <= kept
     assert not kept & {shot.name for shot in SMALL}
+
+
+TOLERANCE = 1e-3
+"""Metres: meshes and float32 files are for looking at."""
+STATE = {
+    "base/forward/M2": Motion(shift=(0.0, 0.0, 2e-3)),  # enough to be seen in a millimetre's tolerance
+    "base/backward/focal_plane": Motion(rotate=(0.0, 0.0, 0.02)),
+    "base/backward/monitor": Motion(shift=(0.0, 2e-3, 0.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def beams(backend, gf7_pair):
+    small = {path: Motion(motion.rotate, (0.0, 0.0, 1e-5)) for path, motion in STATE.items() if "M2" in path}
+    return trace_light_paths(gf7_pair, backend, small)
+
+
+@pytest.fixture(scope="module")
+def loaded(gf7_pair, beams, tmp_path_factory):
+    """The scene of a state with large motions, written and read back."""
+    placed = gf7_pair.assembly.place([STATE])
+    scene = build_scene(gf7_pair, type(beams)(beams.beams, placed))
+    scene.metadata["motions"] = motions(gf7_pair, STATE, placed)
+    place = tmp_path_factory.mktemp("scene") / "scene.glb"
+    place.write_bytes(scene.export(file_type="glb"))
+    return trimesh.load_scene(place), placed
+
+
+def box(scene: trimesh.Scene, name: str) -> np.ndarray:
+    """Bounds of a node's mesh in the base frame, (2, 3) metres."""
+    matrix, geometry = scene.graph.get(name)
+    points = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
+    return np.array([points.min(axis=0), points.max(axis=0)])
+
+
+def test_every_body_is_a_node_where_it_stands(gf7_pair, loaded):
+    scene, placed = loaded
+    for body in gf7_pair.assembly.tree.bodies:
+        assert body.path in scene.graph.nodes
+        matrix, _ = scene.graph.get(body.path)
+        pose = placed.pose(body.path)
+        assert np.abs(matrix[:3, 3] - pose.translation).max() < 1e-6
+        assert np.abs(matrix[:3, :3] - pose.rotation).max() < 1e-6
+    assert scene.graph.transforms.parents["base/forward/M1"] == "base/forward"
+
+
+def test_boxes_of_mirrors_and_detectors(gf7_pair, loaded):
+    """Front surfaces sampled from the prescription's sag, detectors from their sizes, all in the base frame."""
+    scene, placed = loaded
+    for camera, model in gf7_pair.cameras.items():
+        for mirror in model.mirrors:
+            path = f"{BASE}/{camera}/{mirror}"
+            outline = model.apertures[mirror].outline()
+            z = model.surfaces[mirror].sag(*outline.T)
+            front = placed.pose(path).apply(np.column_stack([outline, z]))
+            found = box(scene, path)
+            # across, the mesh ends where the clear aperture does; along the axis it has its thickness as well
+            assert np.all(found[0] < front.min(axis=0) + TOLERANCE)
+            assert np.all(found[1] > front.max(axis=0) - TOLERANCE)
+            assert np.abs(found[:, 1] - [front[:, 1].min(), front[:, 1].max()]).max() < TOLERANCE
+            mesh = mirror_mesh(model.surfaces[mirror], model.apertures[mirror], 1.0)
+            inside = mesh.triangles_center[mesh.face_normals[:, 2] < -0.5]
+            assert len(inside) > 500
+            assert np.abs(inside[:, 2] - model.surfaces[mirror].sag(*inside[:, :2].T)).max() < TOLERANCE
+        line = 0.5 * model.spec.line.pixels * model.spec.line.pitch
+        body = f"{BASE}/{camera}/focal_plane/line"
+        ends = placed.pose(body).apply(np.array([[0.0, -line, 0.0], [0.0, line, 0.0]]))
+        assert np.abs(box(scene, body) - np.sort(ends, axis=0)).max() < 1.6e-3  # and it is drawn 2 mm wide
+    ccd = gf7_pair.spec.monitor.area_ccd
+    half = 0.5 * ccd.pitch * np.array([ccd.columns, ccd.rows, 0.0])
+    for channel in gf7_pair.channels:
+        world = placed.pose(channel.ccd_body).apply(half * [[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)])
+        assert np.abs(box(scene, channel.ccd_body) - [world.min(axis=0), world.max(axis=0)]).max() < TOLERANCE
+        face = box(scene, channel.face_body)
+        assert np.abs(face.mean(axis=0) - placed.pose(channel.face_body).translation)[1] < TOLERANCE
+        assert face[1, 1] - face[0, 1] == pytest.approx(gf7_pair.spec.monitor.return_face.aperture, abs=TOLERANCE)
+
+
+def drawn(told: dict, factor: float) -> np.ndarray:
+    """A body's matrix in its parent when its motion is drawn ``factor`` times as large, as a viewer works it out."""
+    nominal = np.array(told["nominal"]).reshape(4, 4).T
+    turn = Rotation.from_rotvec(factor * np.array(told["rotate"])).as_matrix()
+    pivot = np.array(told["pivot"])
+    change = np.eye(4)
+    change[:3, :3], change[:3, 3] = turn, pivot + factor * np.array(told["shift"]) - turn @ pivot
+    return nominal @ change
+
+
+def test_motions_can_be_drawn_larger(gf7_pair, loaded):
+    """As they are they give the bodies' places, not at all the nominal ones; k times they are k times the job's."""
+    scene, placed = loaded
+    told = scene.metadata["motions"]
+    assert set(told) == set(STATE)
+    nominal = gf7_pair.assembly.place()
+    for path, motion in STATE.items():
+        parent = path.rpartition("/")[0]
+        for factor, where in ((0.0, nominal), (1.0, placed)):
+            pose = where.pose(parent).inverse() @ where.pose(path)
+            matrix = drawn(told[path], factor)
+            np.testing.assert_allclose(matrix[:3, :3], pose.rotation, atol=1e-12)
+            np.testing.assert_allclose(matrix[:3, 3], pose.translation, atol=1e-12)
+        np.testing.assert_allclose(told[path]["rotate"], motion.rotate, atol=1e-12)
+        np.testing.assert_allclose(told[path]["shift"], motion.shift, atol=1e-12)
+    larger = {
+        path: Motion(tuple(7.0 * np.array(m.rotate)), tuple(7.0 * np.array(m.shift))) for path, m in STATE.items()
+    }
+    seven = gf7_pair.assembly.place([larger])
+    for path in STATE:
+        parent = path.rpartition("/")[0]
+        pose = seven.pose(parent).inverse() @ seven.pose(path)
+        np.testing.assert_allclose(drawn(told[path], 7.0)[:3, 3], pose.translation, atol=1e-12)
+
+
+def test_a_turn_about_a_pivot_leaves_it_in_place(gf7_pair):
+    """However large it is drawn; a body that only its carrier moves has no motion of its own."""
+    path = "base/backward/focal_plane"
+    state = {path: Motion(rotate=(0.0, 0.01, 0.02), pivot="rear_node"), "base/forward": Motion(shift=(0.0, 0.0, 1e-3))}
+    told = motions(gf7_pair, state, gf7_pair.assembly.place([state]))
+    assert set(told) == set(state)
+    pivot = np.array([*told[path]["pivot"], 1.0])
+    assert np.linalg.norm(pivot[:3]) > 0.1
+    for factor in (1.0, 30.0):
+        np.testing.assert_allclose(drawn(told[path], factor) @ pivot, drawn(told[path], 0.0) @ pivot, atol=1e-12)
+
+
+def test_beams_go_where_they_must(gf7_pair, beams):
+    """Imaging beams fill the stop and end on the line CCD, monitor beams on their area CCD; none leaves an aperture."""
+    for beam in beams.beams:
+        model = gf7_pair.cameras[beam.camera]
+        for (mirror, _), points in beam.footprints.items():
+            x0, x1, y0, y1 = model.apertures[mirror].bounds
+            assert np.all(points >= np.array([x0, y0]) - 1e-5)
+            assert np.all(points <= np.array([x1, y1]) + 1e-5)
+        if beam.is_monitor:
+            assert len(beam.footprints) == 2 * len(model.mirrors)
+            mine = (c for c in gf7_pair.channels if f"{c.camera}/monitor/{c.name}" == f"{beam.camera}/{beam.name}")
+            channel = next(mine)
+            ccd = beams.placed.pose(channel.ccd_body).inverse().apply(beam.vertices[:, -1])
+            assert np.abs(ccd).max() < 1e-3
+        else:
+            plane = beams.placed.pose(f"{BASE}/{beam.camera}/focal_plane").inverse().apply(beam.vertices[:, -1])
+            assert np.abs(plane[:, [0, 2]]).max() < 1e-9
+            half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
+            share = {"left edge": 1.0, "centre": 0.0, "right edge": -1.0}[beam.name.rpartition("/")[2]]
+            assert plane[:, 1] == pytest.approx(share * half, abs=1e-9)
+            stop = beam.footprints[model.spec.stop, 0]
+            radius = model.apertures[model.spec.stop].bounds[1]
+            assert np.linalg.norm(stop[1:], axis=1) == pytest.approx(radius, abs=2e-6)
+            rays = np.diff(beam.vertices[:, :2], axis=1)[:, 0]
+            angle = rays @ rays[0] / np.linalg.norm(rays, axis=1) / np.linalg.norm(rays[0])
+            assert np.all(angle > 1 - 1e-9)  # collimated toward the scene
