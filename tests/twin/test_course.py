@@ -10,7 +10,6 @@ import tifffile
 import xarray as xr
 
 import twin.render as command
-from analysis.units import ARCSEC
 from optics.thermal.heat import Temperature
 from scenes.specs.course import moment
 from scenes.specs.job import checked_nodes
@@ -110,13 +109,6 @@ def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) ->
         for estimator, p in recovery.parameters[name].items():
             for key, value in p.to_dict().items():
                 np.testing.assert_array_equal(found["cameras"][name][estimator][key], value)
-    for estimator, angle in recovery.angle.items():
-        told = (angle.change_rad, angle.sigma_rad, angle.noise_rad)
-        assert list(found["intersection_angle"][estimator].values()) == [(one / ARCSEC).tolist() for one in told]
-    assert "posterior" in recovery.angle
-    for estimator, ground in recovery.ground.items():
-        assert found["ground"][estimator]["height_m_sigma"] == ground.sigma_m[:, 2].tolist()
-        assert found["ground"][estimator]["left_plan_rms_m"] == ground.plan_rms_m.tolist()
     true = np.array([found["ground"]["true"][f"{axis}_m"] for axis in ("along", "across", "height")]).T
     np.testing.assert_allclose(true, truth.ground_error(experiment.ground), atol=1e-9)
 

@@ -435,9 +435,6 @@ def test_turntable_agrees_with_scipy(folder: Path) -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), sigma, rtol=1e-8)
 
 
-# --- more data -------------------------------------------------------------------------------------------
-
-
 # --- one model for all terms -----------------------------------------------------------------------------
 
 

@@ -29,8 +29,6 @@ from twin.pictures.picture import (
     Studio,
     colour_variant,
     staged,
-    still_patches,
-    without_grain,
     write_pictures,
 )
 from twin.pictures.picture_scene import framed, looking, points_in_world
@@ -111,21 +109,6 @@ def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
 
 
 # --- how they look ----------------------------------------------------------------------------------------------------
-
-
-def test_grain_is_taken_off_matt_patches_only():
-    noise = np.random.default_rng(2).normal(0.5, 0.1, (60, 80, 3))
-    noise[:, 40:] += 0.4
-    part, normal = np.zeros((60, 80), int), np.zeros((60, 80, 3))
-    part[:, 40:], part[:, 70:] = 1, 2
-    patches = still_patches([(part, normal)], [True, True, False])
-    smooth = without_grain(noise, patches)
-    assert np.all(patches[:, 69:] == -1)  # no matt surface
-    assert np.all(patches[:, 39:41] == -1)  # a border
-    assert np.array_equal(smooth[patches == -1], noise[patches == -1].astype(np.float32))
-    assert smooth[:, :39].std() < 0.03
-    assert smooth[:, :39].mean() == pytest.approx(0.5, abs=0.01)  # nothing comes over the border
-    assert smooth[:, 41:69].mean() == pytest.approx(0.9, abs=0.01)
 
 
 # --- Mitsuba's variants -----------------------------------------------------------------------------------------------
