@@ -294,6 +294,7 @@ def test_impossible_exposures_are_explained() -> None:
         ("area_ccd", "columns", 23, "columns: outside the limits; found 23, allowed: at least 24"),
         ("area_ccd", "pitch", "1 nm", "pitch: outside the limits; found '1 nm', allowed: at least 0.5 um"),
         ("sheet", "system_gain_dn_per_e", 1e-30, "system_gain_dn_per_e: a full well is not even one grey value"),
+        ("sheet", "noise", {"ofset": 2.0}, "noise.ofset: no such noise; did you mean 'offset'?"),
         ("sheet", "dark_current_e_per_s", 1e8, "less than 1e+07 electrons per second with the exposure of 10 ms"),
         ("band", "pitch", "1 nm", "bands.P.pitch: outside the limits"),
     ],

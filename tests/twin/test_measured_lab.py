@@ -355,6 +355,9 @@ def test_distortion_agrees_with_scipy(folder: Path) -> None:
     (folder / "distortion.yaml").write_text(text[: text.index("  turntable:")] + "  angle_sigma: 0.05 arcsec\n")
     run_ = distortion_of(folder)
     fit = run_.compensated.fit
+    (folder / "distortion.yaml").write_text((folder / "distortion.yaml").read_text().replace("zero: 102", "zero: 2"))
+    with pytest.raises(InputError, match=r"spots.csv:\d+: reading.*an angle beyond any field"):
+        distortion_of(folder)
     head, *body = rows_of(folder / "spots.csv")
     table = np.array(body, float)
     points, sets = int(table[:, 0].max()), int(table[:, 1].max())

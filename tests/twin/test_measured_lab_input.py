@@ -3,6 +3,7 @@ tables of a million rows.
 """
 
 import csv
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -88,6 +89,13 @@ def scaled(name: str, factor: float) -> Callable[[list[list[str]]], None]:
     return change
 
 
+def crowded(rows: list[list[str]]) -> None:
+    """Points without numbers, in one set, each a little beside the last."""
+    rows[:] = [[cell for j, cell in enumerate(row) if rows[0][j] not in ("point", "set")] for row in rows[:2]]
+    k = rows[0].index("reading [deg]")
+    rows[2:] = [[*rows[1][:k], repr(float(rows[1][k]) + 1e-4 * n), *rows[1][k + 1 :]] for n in range(1, 3001)]
+
+
 TABLES = [
     ("turntable", head("reading [deg]", "reading"), ":1: reading: a head without a unit; allowed: 'reading [arcsec]'"),
     ("turntable", head("reading [deg]", "reding [deg]"), "no such column; did you mean 'reading [arcsec]'?"),
@@ -128,6 +136,7 @@ TABLES = [
     ),
     ("distortion", scaled("along [mm]", -1.0), "angles and spot positions count in opposite senses"),
     ("distortion", only(30), "too few points; found 3, allowed: 5 or more, over the whole field"),
+    ("distortion", crowded, "too many points; found 3001, allowed: at most 3000"),
     ("distortion", cell(4, "point", "77"), ":4: point: one spot only of this point in a test of several sets"),
     ("distortion", cell(3, "point", "x"), ":3: point: not a number"),
     ("distortion", only(2), "2 rows below the heads"),
@@ -286,6 +295,18 @@ def more(*columns: tuple[str, str]) -> Callable[[Path], None]:
     return lambda place: edited(place / "images.csv", change)
 
 
+def noisy(band: str, saturation: float) -> Callable[[Path], object]:
+    """The noise of a band's detector in the test's file, and a column of bands."""
+    noise = f"{{gain_dn_per_e: 0.06, dark_noise_e: 4, offset_dn: 100, saturation_dn: {saturation}}}"
+
+    def change(place: Path) -> None:
+        more(("band", "P"))(place)
+        file = place / "focus.yaml"
+        file.write_text(file.read_text().replace("moved: image", f"moved: image\n  noise: {{{band}: {noise}}}"))
+
+    return change
+
+
 REGION = ("row", "0"), ("column", "0"), ("height", "90"), ("width", "90")
 IMAGES = [
     (lambda place: (place / "0_along_3.tiff").unlink(), "there is no image"),
@@ -297,6 +318,8 @@ IMAGES = [
     (more(("page", "-1")), "page: out of range"),
     (more(("per shift", "1")), "moved: target"),
     (more(*REGION), "does not lie in the image"),
+    (noisy("Q", 4095), "no image is of this band; found 'Q', allowed: "),
+    (noisy("P", 50), "saturation_dn 50.0 must lie above the dark level"),
     (lambda place: edited(place / "images.csv", without("file")), "no column 'file'"),
     (lambda place: edited(place / "images.csv", cell(4, "file", "")), ":4: file: an empty cell"),
     (lambda place: edited(place / "images.csv", cell(4, "file", "..")), "is a folder, not an image"),
@@ -312,7 +335,7 @@ def test_bad_images(stack: Path, tmp_path: Path, spoil: Callable[[Path], object]
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     assert done.exit_code == 2, text
     assert told in text, text
-    assert "images.csv:" in text, text
+    assert re.search(r"(images\.csv|focus\.yaml):\d+: ", text), text
 
 
 @pytest.mark.second

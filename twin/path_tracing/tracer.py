@@ -56,7 +56,7 @@ def build_scene(mi: Any, scenery: Scenery) -> Any:
         scenery: the surfaces; their triangles are moved to the world in float64 and rounded once.
 
     Raises:
-        RuntimeError: Mitsuba has put the shapes in another order.
+        AssertionError: Mitsuba has put the shapes in another order.
     """
     names = [f"surface{i:05d}" for i in range(len(scenery.surfaces))]
     # robust: rays do not slip through between two triangles
@@ -72,7 +72,7 @@ def build_scene(mi: Any, scenery: Scenery) -> Any:
     # the parser's optimisations would merge meshes of the same material
     scene = mi.load_dict(description, optimize=False)
     if [shape.id() for shape in scene.shapes()] != names:
-        raise RuntimeError("mitsuba has put the shapes of a scene in another order")
+        raise AssertionError("mitsuba has put the shapes of a scene in another order")
     return scene
 
 

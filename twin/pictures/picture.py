@@ -292,9 +292,7 @@ def write_pictures(
 
 
 def _save(image: np.ndarray, place: Path) -> None:
-    ok, encoded = cv2.imencode(".png", image[..., ::-1])
-    if not ok:
-        raise PictureError(f"{place.name} cannot be encoded as PNG")
+    _, encoded = cv2.imencode(".png", image[..., ::-1])
     place.write_bytes(encoded.tobytes())
 
 
