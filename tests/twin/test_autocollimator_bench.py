@@ -131,25 +131,6 @@ def test_the_images_noise_is_as_stated(reader: Reader, backend: Backend) -> None
 
 
 @pytest.mark.second
-def test_unrest_and_steps_scatter_as_declared(reader: Reader, backend: Backend) -> None:
-    series = Series("X", math.radians(15), math.radians(0.002), 100)
-    setup = with_errors(reading=0.5 * ARCSEC, turntable_step=0.8 * ARCSEC)
-    result = run_autocollimator_test(setup, backend, [series], 11, reader=reader)["X"]
-    off = result.from_exact[:, 1:, 0]
-    noise = np.mean(result.sigma**2) / 2
-    # the table's position is common to both mirrors, the unrest is not
-    difference = (off[0] - off[1]) - np.mean(off[0] - off[1])
-    assert scatter_agrees(float(np.sum(difference**2) / (2 * (0.5 * ARCSEC) ** 2 + 2 * noise)), 99)
-    common = 0.5 * (off[0] + off[1])
-    common = common - common.mean()
-    assert scatter_agrees(float(np.sum(common**2) / ((0.8 * ARCSEC) ** 2 + 0.5 * (0.5 * ARCSEC) ** 2)), 99)
-    # across it is the unrest alone
-    cross = result.from_exact[:, 1:, 1]
-    cross = cross - cross.mean(axis=1, keepdims=True)
-    assert scatter_agrees(float(np.sum(cross**2) / ((0.5 * ARCSEC) ** 2 + noise)), 198)
-
-
-@pytest.mark.second
 def test_errors_of_the_bench_act_as_they_should(reader: Reader, backend: Backend) -> None:
     series = series_per_axis(SETUP.spec)[0]
     angle = series.angles[-1]

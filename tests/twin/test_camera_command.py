@@ -19,7 +19,7 @@ from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_run import find_focus, kind_of, run_camera
-from twin.camera.field_maps import distortion, field_curves, through_focus
+from twin.camera.field_maps import distortion
 
 
 @pytest.fixture(scope="module")
@@ -40,27 +40,6 @@ def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
     assert found.rms < found.largest < 1e-3
     away = (found.places - found.ideal).reshape(-1, 2)
     np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=1e-12)
-
-
-def test_focus_along_the_line_and_through_focus(backend, gf7_alone) -> None:
-    """The best focus of curves is where the error through focus is least, and both fans stand about it."""
-    curves = field_curves(gf7_alone, sharp=True, count=3)
-    near = through_focus(gf7_alone, ((0.0, 0.0), (1.0, 0.0)), sharp=True)
-    for k, share in enumerate((1, 2)):
-        least = np.polyfit(near.defocus, near.error[k] ** 2, 2)
-        assert -least[1] / (2.0 * least[0]) == pytest.approx(curves.focus[share], abs=0.3e-6)
-        # the beam is 2 % elliptic: its best focus is nearer to one of the fans
-        line, track = curves.focus_line[share], curves.focus_track[share]
-        assert 0.5 * (line + track) == pytest.approx(curves.focus[share], abs=0.05 * abs(line - track))
-    middle = len(near.defocus) // 2
-    np.testing.assert_allclose(near.mtf[0, :, middle], gf7_alone.mtf().at(gf7_alone.nyquist), atol=1e-3)
-    np.testing.assert_allclose(curves.mtf[1], near.mtf[0, :, middle], atol=1e-6)
-    # astigmatism parts the fans: where one is sharpest its MTF is
-    best = near.defocus[np.argmax(near.mtf[1], axis=1)]
-    assert (best[0] - best[1]) * (curves.focus_line[2] - curves.focus_track[2]) > 0.0
-    assert near.error[0, middle] == pytest.approx(gf7_alone.wavefront().rms, rel=1e-4)
-    assert np.all(curves.vignetted == 0.0)
-    assert np.all(np.abs(curves.illumination - 1.0) < 5e-3)
 
 
 def test_kinds_of_aberration() -> None:

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
-import xarray as xr
 
 import twin.render as command
 from optics.thermal.heat import Temperature
@@ -19,9 +17,7 @@ from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.time_series import run_series, series_states
-from twin.monitor.truth import trace_truth
 
 run = partial(invoke, command.app)
 LEFT = "base/forward/monitor/left/prism_180"
@@ -78,39 +74,6 @@ def test_temperatures_of_a_time_add_to_the_perturbation(tmp_path) -> None:
     assert job.fields() == {LEFT: Temperature(0.5)}
     assert job.fields(2) == {LEFT: Temperature(0.7, (0.0, 0.02, 0.0)), "base/forward": Temperature(-0.2)}
     assert [moment(t) for t in job.course.times] == ["0 min", "12 min", "30 min"]
-
-
-@pytest.mark.second
-def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) -> None:
-    """Truth, images and readings, bit for bit, from jobs that each describe the state of one time."""
-    experiment, states = prepared, []
-    for k in range(3):
-        own = f"{{temperature: {{change: {(0.5, 0.6, 0.7)[k]} K, gradient: [0 K/m, {10 * k} mK/m, 0 K/m]}}}}"
-        text = JOB[: JOB.index("course:")].replace("{temperature: 0.5 K}", own)
-        text += f"  base/forward: {{temperature: {(0.0, 0.1, -0.2)[k]} K}}\n"
-        states.append(experiment.state(load_job(written(tmp_path, text))))
-    truth = trace_truth(experiment.instrument, experiment.backend, states)
-    photons = experiment.path.expected_photons(states)
-    after = experiment.frames_after(photons, 2, 7)
-    recovery = next(observe(experiment, states, Observing(one_detector(experiment, 2, 7)))).recovery
-    with xr.open_dataset(folder / "course.nc", engine="h5netcdf", decode_timedelta=False) as data:
-        assert data.photons.dims == ("time", "channel", "row", "column")
-        assert list(data.time.values) == [0.0, 720.0, 1800.0]
-        assert data.time.attrs["units"] == "s"
-        np.testing.assert_array_equal(data.photons.values, photons.astype(np.float32))
-    for i, channel in enumerate(experiment.path.channels):
-        image = tifffile.imread(folder / f"images/{channel.camera}_{channel.name}_course.tiff")
-        assert image.dtype == np.uint16
-        np.testing.assert_array_equal(image, after[:, i, 0])
-    for name, change in truth.cameras.items():
-        true = found["cameras"][name]["true"]
-        np.testing.assert_allclose(true["d_alpha_arcsec"], np.degrees(change.d_alpha) * 3600, rtol=1e-12, atol=1e-15)
-        np.testing.assert_allclose(true["d_f_um"], 1e6 * change.d_f, rtol=1e-12, atol=1e-12)
-        for estimator, p in recovery.parameters[name].items():
-            for key, value in p.to_dict().items():
-                np.testing.assert_array_equal(found["cameras"][name][estimator][key], value)
-    true = np.array([found["ground"]["true"][f"{axis}_m"] for axis in ("along", "across", "height")]).T
-    np.testing.assert_allclose(true, truth.ground_error(experiment.ground), atol=1e-9)
 
 
 @pytest.mark.second

@@ -25,16 +25,13 @@ from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from twin.laboratory.distortion_bench import DistortionBench
-from twin.laboratory.distortion_numbers import DISTORTION
 from twin.laboratory.distortion_run import CLOSED_FORMS, SimulatedDistortion, measure, reduce
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import rms, run_turntable
 from twin.run.procedure import BenchError
-from twin.validation.checks.group import load_printed
 
 UM, NM = 1e-6, 1e-9
 FALSE_ALARM = 1e-4
-ACCURACY_UM = load_printed("004").number("distortion.accuracy_um")
 
 
 @cache
@@ -109,25 +106,6 @@ def test_noise_of_the_spots_is_as_stated():
     rest = means - np.polyval(np.polyfit(b.turn, means, 3), b.turn)
     low, high = stats.chi2.ppf([FALSE_ALARM, 1 - FALSE_ALARM], 51) / 51
     assert low < np.var(rest) * 55 / 51 / np.mean(spots.fixed**2 + spots.temporal**2 / 10) < high
-
-
-@pytest.mark.second
-def test_result_agrees_with_the_truth():
-    data = DISTORTION(run())
-    truth = data["truth"]
-    assert len(data["points"]) == load_printed("004").whole("distortion.points")
-    assert truth["error_rms_compensated_um"] < ACCURACY_UM
-    assert truth["error_rms_compensated_um"] < truth["error_rms_raw_um"]
-    error = data["principal_distance_mm"] - truth["principal_distance_mm"]
-    assert abs(error) < 2 * data["principal_distance_mm_sigma"]
-    assert data["principal_distance_mm_sigma"] < 0.03
-    error = data["principal_point_mm"] - truth["principal_point_mm"]
-    assert abs(error) < 3 * data["principal_point_mm_sigma"]
-    # +-1.17 deg and 0.1 arcsec: tan^2 W is 4e-4, so that half a micrometre is a millimetre of p
-    assert not data["principal_point_observable"]
-    assert "not observable" in data["principal_point_statement"]
-    # conventions: the principal distance of gf7's line, whose whole length is a little longer than the points
-    assert truth["principal_distance_mm"] == pytest.approx(5512.0, abs=0.1)
 
 
 @pytest.mark.second
@@ -293,24 +271,6 @@ def test_held_out_residuals_and_sigmas() -> None:
     assert low < squares < high
     # each table has one constant of the subdivision's phase with half of the variance: 4 sigma of the mean of 40
     assert np.mean(ratio) == pytest.approx(1.0, abs=4.0 * np.std(ratio) / math.sqrt(40.0))
-
-
-def test_without_errors_the_truth_comes_out() -> None:
-    zero = SPEC.dividing_error.model_copy(
-        update={
-            "repeatability": 0.0,
-            "subdivision": SPEC.dividing_error.subdivision.model_copy(update={"rms": 0.0}),
-            # waves of 6 deg and longer, which the spline follows
-            "graduation": SPEC.dividing_error.graduation.model_copy(update={"last": 60}),
-        }
-    )
-    reference = SPEC.reference.model_copy(update={"calibration": 0.0, "noise": 0.0, "gross_probability": 0.0})
-    spec = SPEC.model_copy(update={"dividing_error": zero, "reference": reference})
-    done = run_turntable(spec, 1, names=("cubic_spline",))
-    inside = slice(400, -400)
-    left = done.fits["cubic_spline"](done.truth_readings) - done.true_error
-    # fourth order of the step, 0.005 (2 pi 0.5 / 6)^4 of 0.5 arcsec, is 2e-4
-    assert np.max(np.abs(left[inside])) < 1e-3 * ARCSEC
 
 
 @pytest.mark.parametrize(
