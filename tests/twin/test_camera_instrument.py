@@ -207,6 +207,17 @@ def test_what_only_a_monitor_gives_is_refused(says: dict, problem: str, backend)
     assert f"{RC} has none" in str(error.value)
 
 
+@pytest.mark.second
+def test_light_that_a_perturbation_loses_is_told(backend) -> None:
+    turned = {"perturb": [f"{RC} rotate x 20 arcmin"], "render": {"images": ["knife_edge"]}}
+    for says, problem in (
+        ({"perturb": ["M1 rotate x 3 deg"]}, "the perturbed instrument cannot be rendered"),
+        (turned, "moves by .* mm along the line, beyond its end"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            render_job(resolve_job(job(**says)), backend)
+
+
 # --- where users meet it ---------------------------------------------------------------------------------
 
 

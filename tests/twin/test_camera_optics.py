@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion
+from optics.numerics.physical_error import UnphysicalError
 from scenes.models.camera_model import field_direction
 from scenes.models.camera_sharpness import FieldBeams
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.cut_wavefront import RAYS_ACCURACY
 from twin.camera.field_maps import through_focus
+from twin.camera.varied_beams import VariedBeams
 from twin.monitor.image_quality import image_quality
 from twin.sensors.line_ccd import band_factors, band_wavelengths
 
@@ -93,6 +95,16 @@ def test_where_the_camera_stands_changes_nothing(backend, gf7_pair, gf7_alone) -
         for one, two in zip(gf7_alone.wavefronts(FIELDS), other.wavefronts(FIELDS), strict=True):
             # paths of some metres to 1e-15 each, in waves
             np.testing.assert_allclose(two.map, one.map, atol=2e-8)
+
+
+@pytest.mark.second
+def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera) -> None:
+    beams = VariedBeams(CameraOptics.alone(camera("ritchey_chretien"), backend), [(0.0, 0.0)], None, None)
+    assert beams.zernike_rows(11).shape[1] == 11
+    with pytest.raises(UnphysicalError, match="a surface's edge stops light of a field"):
+        beams.light([{"camera/M2": Motion(shift=(0.05, 0.0, 0.0))}])
+    with pytest.raises(UnphysicalError, match="400 Zernike terms are not independent"):
+        beams.zernike_rows(400)
 
 
 def test_fields_are_shares_of_the_half_field(gf7, gf7_alone) -> None:

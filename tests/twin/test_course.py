@@ -3,6 +3,7 @@
 import json
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.time_series import run_series, series_states
+from twin.monitor.time_series import TimeSeries, _warnings, run_series, series_states
 
 run = partial(invoke, command.app)
 LEFT = "base/forward/monitor/left/prism_180"
@@ -223,9 +224,30 @@ def test_the_cold_of_the_perturbation_is_told_there(prepared, tmp_path) -> None:
 
 
 def test_a_time_at_which_the_light_is_lost_is_named(prepared, tmp_path) -> None:
-    """Also when it is not the time that is shown in full."""
+    """Also when it is not the time that is shown in full; and at which a spot is too near the edge of its CCD."""
     gradients = "[[0 K/m, 0 K/m, 0 K/m], [0 K/m, 30 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m]]"
-    text = COURSE.replace("1 min", "1 min, 2 min") + f"    {LEFT}: {{gradient: {gradients}}}"
-    resolved = resolve(written(tmp_path, text)).with_render(1, 1)
-    with pytest.raises(InputError, match="at 1 min of the course cannot be rendered"):
-        run_series(prepared, resolved, series_states(prepared, resolved.job))
+    aside = COURSE.replace("temperature", "motion")
+    aside += "    base/forward/focal_plane: {shift: [0 0 0 um, 550 0 0 um, 0 0 0 um]}"
+    for text, reason in (
+        (COURSE + f"    {LEFT}: {{gradient: {gradients}}}", ""),
+        (aside, r"the spot forward/left cannot be measured \("),
+    ):
+        resolved = resolve(written(tmp_path, text.replace("1 min", "1 min, 2 min"))).with_render(1, 1)
+        with pytest.raises(InputError, match=f"at 1 min of the course cannot be rendered: {reason}"):
+            run_series(prepared, resolved, series_states(prepared, resolved.job))
+
+
+def test_what_is_wrong_with_a_course_is_told_at_its_first_time(prepared) -> None:
+    course, saturated, share = SimpleNamespace(times=(0.0, 60.0, 120.0)), np.zeros((3, 4), bool), np.ones((3, 4))
+    assert _warnings(prepared, course, saturated, share) == ()
+    saturated[1:, 0], share[2, 3] = True, 0.49
+    full, dim = _warnings(prepared, course, saturated, share)
+    assert "saturated pixels in the spot forward/left at 2 times, first at 1 min" in full
+    assert "backward/right at 2 min: only 49% of the nominal light" in dim
+    bent = SimpleNamespace(holds=np.array([True, True, False]), beyond=np.array([False, True, True]))
+    evidence = SimpleNamespace(course_doubt=lambda times, spots: f"{spots[0]} at {times[1]}")
+    parts = {"smoothed": None, "times": np.array(course.times), "curvature": {"model": bent}, "evidence": evidence}
+    first, lost, again = TimeSeries.doubts(SimpleNamespace(**parts), ["a"])
+    assert first == "course a at 1 min"
+    assert "σ does not hold at 1 times, first at 2 min: the motions that the model reads" in lost
+    assert "at 1 times, first at 1 min, the motions that the model reads are not small" in again

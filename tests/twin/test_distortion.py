@@ -165,6 +165,18 @@ def test_test_that_cannot_be_measured(changes, key, text):
 
 
 @pytest.mark.second
+def test_a_narrow_collimator_and_a_coarse_calibration():
+    collimator = altered().test.collimator.model_copy(update={"aperture": 0.3})
+    with pytest.raises(BenchError, match="beam cannot be traced: ") as error:
+        DistortionBench.build(altered(collimator=collimator), backend())
+    assert error.value.key == ("collimator",)
+    coarse = altered().turntable.calibration.model_copy(update={"step": np.radians(10.0)})
+    with pytest.raises(BenchError, match="too few angles") as error:
+        measure(within(altered(table={"calibration": coarse})), 1)
+    assert error.value.key == ("turntable",)
+
+
+@pytest.mark.second
 def test_fewer_points_than_unknowns():
     b = bench()
     few = [0, 27, 54]

@@ -96,6 +96,24 @@ def crowded(rows: list[list[str]]) -> None:
     rows[2:] = [[*rows[1][:k], repr(float(rows[1][k]) + 1e-4 * n), *rows[1][k + 1 :]] for n in range(1, 3001)]
 
 
+def countless(rows: list[list[str]]) -> None:
+    """As many repeats of one reading as there are readings."""
+    rows[1:] = [[f"{92 + 1e-3 * k}", "0", "0.1"] for k in range(5600)] + [["92", f"{k}", "0.1"] for k in range(1, 5600)]
+
+
+def misplaced(rows: list[list[str]]) -> None:
+    """Positions of ten repeats each, and one repeat that stands at the next."""
+    rows[0].insert(0, "position")
+    for k, row in enumerate(rows[1:]):
+        row.insert(0, str(k // 10))
+    rows[3][0], rows[3][rows[0].index("repeat")] = "1", "77"
+
+
+def spread_out(rows: list[list[str]]) -> None:
+    k = rows[0].index("x [mm]")
+    rows[2:] = [[*rows[1][:k], str(n), *rows[1][k + 1 :]] for n in range(3000)]
+
+
 TABLES = [
     ("turntable", head("reading [deg]", "reading"), ":1: reading: a head without a unit; allowed: 'reading [arcsec]'"),
     ("turntable", head("reading [deg]", "reding [deg]"), "no such column; did you mean 'reading [arcsec]'?"),
@@ -109,6 +127,8 @@ TABLES = [
     ("turntable", cell(5, "repeat", "1.5"), ":5: repeat: not a whole number"),
     ("turntable", copied(12), ":412: repeat: the same repeat twice, first in line 12"),
     ("turntable", numbered, ":7: position: two positions with the same readings, the other in line 2; found 1,"),
+    ("turntable", countless, ":2: too many to hold; found 5600 angles with up to 5600 repeats each"),
+    ("turntable", misplaced, ":4: reading [deg]: a reading that is nearer to those of another position"),
     ("turntable", only(20), ":2: reading [deg]: too few different readings; found 2, allowed: 4 or more"),
     ("turntable", only(0), "0 rows below the heads"),
     ("turntable", scaled("difference [arcsec]", 3600.0), "the difference from the reference changes by"),
@@ -123,6 +143,7 @@ TABLES = [
         ],
         "allowed: line: {pitch: 7 um, middle: 6143.5}",
     ),
+    ("distortion", head("along [mm]", "column"), "a sigma in lengths of places in pixels; allowed: 'column sigma'"),
     ("distortion", head("sigma [um]", "column sigma"), "a sigma in pixels of places in lengths; allowed: 'sigma [um]'"),
     ("distortion", without("point"), "sets of points that have no number; allowed: a column 'point' as well"),
     ("distortion", cell(4, "sigma [um]", "-0.1"), ":4: sigma [um]: out of range; found '-0.1', allowed: at least 0"),
@@ -149,6 +170,7 @@ TABLES = [
     ("focus", cell(2, "x [mm]", "3"), "no row of the edge 'track', which other places have"),
     ("focus", cell(5, "band", ""), ":5: band: an empty cell"),
     ("focus", scaled("x [mm]", 0.0), "all places lie on X' = constant (the line CCD alone), so slope_x cannot be told"),
+    ("focus", spread_out, ":2: x [mm]: too many places; found 3001, allowed: at most 3000 places"),
     ("focus", only(9), "3 places cannot tell|1 places cannot tell"),
     ("focus", scaled("shift [um]", 0.0), "no best focus of"),
     ("focus", lambda rows: rows.__delitem__(slice(3, 9)), "no best focus of P"),
@@ -318,7 +340,7 @@ IMAGES = [
     (more(("page", "-1")), "page: out of range"),
     (more(("per shift", "1")), "moved: target"),
     (more(*REGION), "does not lie in the image"),
-    (noisy("Q", 4095), "no image is of this band; found 'Q', allowed: "),
+    (noisy("Q", 4095), "noise.Q: no image is of this band; allowed: P"),
     (noisy("P", 50), "saturation_dn 50.0 must lie above the dark level"),
     (lambda place: edited(place / "images.csv", without("file")), "no column 'file'"),
     (lambda place: edited(place / "images.csv", cell(4, "file", "")), ":4: file: an empty cell"),

@@ -1,6 +1,7 @@
 """Without noise: what the images say about the motions that paper 001 is derived for, against the exact trace."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from analysis.spots.likelihood import cramer_rao_bound
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.instrument import BASE
+from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from twin.monitor.crosstalk import crosstalk
-from twin.monitor.truth import trace_truth
+from twin.monitor.truth import ground_geometry, trace_truth
 
 SHIFT, TURN, SCALE = 50e-6, 20 * ARCSEC, 20e-6  # the largest motions that are claimed
 ALONE = [tuple(sign * (i == k) for i in range(4)) for k in range(4) for sign in (1, -1)]
@@ -63,6 +65,15 @@ def test_model_recovers_the_family(measured):
         assert np.max(np.abs(true), axis=0) == pytest.approx([1.5, 1.5, 20, 150], rel=0.3)  # not a test of nothing
     assert len(signs) == 24
     assert np.all(worst < MODEL_LIMIT), worst
+
+
+def test_cameras_that_look_the_same_way_locate_no_point(gf7_pair):
+    spec, distance = gf7_pair.spec, dict.fromkeys(gf7_pair.cameras, 5.5)
+    assert ground_geometry(gf7_pair, distance).altitude_m == spec.altitude
+    sites = {name: site.model_copy(update={"look": 0.4}) for name, site in spec.cameras.items()}
+    same = replace(gf7_pair, spec=spec.model_copy(update={"cameras": sites}))
+    with pytest.raises(InputError, match="altitude: points on the ground cannot be located by these cameras"):
+        ground_geometry(same, distance)
 
 
 def test_derived_formulas_are_good_to_one_percent(measured):

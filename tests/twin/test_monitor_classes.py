@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from optics.raytrace.aim import aim
 from optics.waves.diffraction import image
 from scenes.specs.instrument import BASE
 from twin.monitor import monitor_beams
-from twin.monitor.image_sampling import SPOT_RANGES
+from twin.monitor.image_sampling import SPOT_RANGES, UncertainImageError
 from twin.monitor.monitor_path import MonitorPath
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,6 +68,12 @@ def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
         for one in (path.class_beams(number), path.class_beams(number + 1))
     ]
     assert np.max(np.abs(steps[0] - steps[1])[:, None] / peak[0][:, None]) < ACCURACY
+
+
+def test_beams_that_are_too_wide_for_the_pixels_are_refused(setup) -> None:
+    wide = SimpleNamespace(aperture=np.array([10.0 * setup.path.numerical_aperture]))
+    with pytest.raises(UncertainImageError, match="beams have 10 times the aperture as designed: "):
+        setup.path._response_of(wide)
 
 
 def test_margin_counts_as_distance(setup) -> None:

@@ -243,3 +243,5 @@ def test_another_pivot_than_the_states_is_refused(coarse) -> None:
     about = {body: Motion(rotate=(1e-6, 0.0, 0.0), pivot="centre")}
     with pytest.raises(ValueError, match=r"base/forward/M1 moves about 'centre'"):
         spot_gradient(coarse, [ElementaryMotion(body, "rotate", 0)], about)
+    with pytest.raises(ValueError, match="a rotate, shift, scale or figure, not a 'bend'"):
+        ElementaryMotion(body, "bend").state(1e-6)

@@ -106,6 +106,8 @@ def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
             assert np.all(found <= where.max(axis=0) + LINE), body
             checked += 1
     assert checked > 50
+    with pytest.raises(ValueError, match="the prisms or the focal plane, not 'moon'"):
+        staged(gf7_pair, paths, Shot("moon.png", 10, 10, 2, 2, "moon"))
 
 
 # --- how they look ----------------------------------------------------------------------------------------------------
@@ -135,6 +137,10 @@ def test_a_variant_that_is_not_there_is_an_error(backend, monkeypatch):
     with pytest.raises(PictureError, match="llvm_ad_teal"), colour_variant(backend):
         pytest.fail("no other variant may be taken")
     assert mi.variant() == before
+    monkeypatch.setitem(picture_light.VARIANTS, "llvm", "scalar_rgb")
+    monkeypatch.setattr(mi, "set_variant", lambda *_: None)
+    with pytest.raises(PictureError, match="where scalar_rgb is needed"), colour_variant(backend):
+        pytest.fail("no other variant may be taken")
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
 """python -m twin.recover: the closed loop through files, other kinds of files, series, geometry, refusals."""
 
 import shutil
+import struct
+import zlib
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -217,6 +219,13 @@ def burnt(frames):
     return np.clip(level, 0, 16100).astype(np.uint16)
 
 
+def holed(frames):
+    """The middle of the spot does not respond."""
+    row, column = np.unravel_index(np.argmax(frames.mean(axis=0)), frames.shape[1:])
+    frames[:, row - 3 : row + 4, column - 3 : column + 4] = 100
+    return frames
+
+
 @pytest.mark.parametrize(
     ("change", "problem", "remedy"),
     quick(
@@ -226,6 +235,7 @@ def burnt(frames):
             (at_the_edge, "too near the edge", "10 pixels or more inside"),
             (half_dark, "6 of 9 frames hold less than half of the light", "with the light on"),
             (burnt, "too much of the spot is missing (saturation", "less light"),
+            (holed, "too much of the spot is missing (bad pixels", "fewer bad pixels at the spot"),
             (lambda f: f[:, :20], "frames of 20 x 96 pixels", "24 rows and columns or more"),
             (
                 lambda f: np.pad(f, ((0, 0), (0, 9), (0, 0))),
@@ -253,6 +263,17 @@ def test_frames_that_cannot_be_used_are_refused_by_name(run, images, backend, tm
     assert remedy in told
     assert "backward_right_after.tiff" in told
     assert "measurement.yaml:3: frames.backward/right.after" in told
+
+
+def test_dark_and_flat_frames_that_cannot_be_used(run, images, backend, tmp_path):
+    for name, size in (("small", 20), ("even", 96)):
+        tifffile.imwrite(tmp_path / f"{name}.tif", np.full((2, size, size), 100, np.uint16), photometric="minisblack")
+    for more, problem in (
+        ("dark: small.tif", "dark.all: .*small.tif has frames of 20 x 20 pixels"),
+        ("dark: even.tif\nflat: even.tif", "flat: the flat frames are only 0 DN brighter than the dark ones"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            measured(tmp_path, f"{HEAD}frames: {images}\n{more}\n", backend, run)
 
 
 def test_copies_are_refused_with_the_frames_that_they_are_of(run, images, backend, tmp_path):
@@ -409,11 +430,19 @@ def test_files_that_are_no_raw_frames_are_refused(tmp_path):
     for name, size in (("a", 30), ("b", 32)):
         tifffile.imwrite(tmp_path / f"{name}.tif", np.zeros((size, 30), np.uint16), photometric="minisblack")
     Image.fromarray(np.full((24, 24), 7, np.uint16)).save(tmp_path / "turned.tif", tiffinfo={274: 3})
+    cv2.imwrite(str(tmp_path / "coded.png"), np.full((24, 24), 7, np.uint16))
+    data = (tmp_path / "coded.png").read_bytes()
+    chunk = b"sRGB\0"
+    tone = struct.pack(">I", 1) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    (tmp_path / "coded.png").write_bytes(data[:33] + tone + data[33:])
+    (tmp_path / "unreadable.fits").symlink_to("/proc/self/mem")
     test = SimpleNamespace(error=lambda text, key, allowed=None: InputError(Issue(text, allowed=allowed)))
     for names, told in (
         (("a.tif", "b.tif"), "have frames of different sizes, 30 x 30 and 32 x 30"),
         (("turned.tif",), "is stored turned or mirrored"),
         (("none.tif",), "there is no image"),
+        (("coded.png",), "it says sRGB, which is not linear in light"),
+        (("unreadable.fits",), "unreadable.fits: "),
     ):
         with pytest.raises(InputError, match=told):
             measured_frames._stacked(test, tuple(str(tmp_path / name) for name in names), ("frames",))

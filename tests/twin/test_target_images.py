@@ -15,6 +15,7 @@ from analysis.mtf.rice import rice_bias
 from analysis.mtf.slanted_edge import measure_edge
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
+from optics.numerics.physical_error import UnphysicalError
 from optics.raytrace.system import assemble
 from optics.targets.target_shapes import pinhole_target, star_target
 from optics.waves.diffraction import Grid, image
@@ -352,6 +353,17 @@ def test_an_image_beyond_the_end_of_the_line(before_gf7):
         before_gf7.views({"base/forward": Motion(rotate=(1.5e-3, 0.0, 0.0))})
     with pytest.raises(TargetLostError, match="camera forward"):
         before_gf7.views({"base/forward/M2": Motion(shift=(0.05, 0.0, 0.0))})
+
+
+def test_outlines_that_are_wrong_about_the_light_are_refused(backend, camera, monkeypatch):
+    """Of a telescope with edges; they are right about nearly all, so the limit is lowered."""
+    model = camera("ritchey_chretien")
+    path = TargetPath(camera_alone(model), ROOT, ROOT, model, backend)
+    middle = np.zeros((1, 2))
+    assert path.pupils({}, path.directions(middle), middle)[0].light < 0.9
+    monkeypatch.setattr("twin.targets.target_path.WORST_PLACED", -1.0)
+    with pytest.raises(UnphysicalError, match="outlines of its edges are wrong about"):
+        path.pupils({}, path.directions(middle), middle)
 
 
 def test_a_line_too_short_for_the_windows(before_gf7):

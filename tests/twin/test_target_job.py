@@ -1,6 +1,7 @@
 """Test targets in the main job: files, mtf.json, the report, and errors that say what to change."""
 
 import json
+import re
 from functools import partial
 
 import numpy as np
@@ -148,10 +149,14 @@ def test_what_cannot_be_measured_is_said(folder, tmp_path):
         ("render: {images: [knife_edge], targets: {region: 8}}", "render.targets.region"),
         ("render: {images: [bars], targets: {frames: 10000, region: 512}}", "do not fit into memory"),
         ("render: {images: [bars], frames: 9000}", "render.targets.frames"),
+        ("render: {images: [bars], targets: {region: 200}}", "region: the images of targets do not fit the line CCD"),
     ],
 )
 def test_bad_input(tmp_path, text, says):
-    (tmp_path / "job.yaml").write_text(f"instrument: gf7_pair\n{text}\n")
+    short = re.sub(r"pixels: \d+", "pixels: 200", (LIBRARY / "cameras" / "gf7.yaml").read_text())
+    (tmp_path / "short.yaml").write_text(short)
+    instrument = "{camera: short.yaml}" if "region: 200" in text else "gf7_pair"
+    (tmp_path / "job.yaml").write_text(f"instrument: {instrument}\n{text}\n")
     done = run(tmp_path / "job.yaml", "--out", tmp_path / "run")
     assert done.exit_code == 2
     assert says in done.output
