@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from tests.twin.commands import invoke
 from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_plots import distortion_figure
 from twin.camera.camera_run import find_focus, kind_of, run_camera
 from twin.camera.field_maps import distortion
 
@@ -40,6 +42,11 @@ def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
     assert found.rms < found.largest < 1e-3
     away = (found.places - found.ideal).reshape(-1, 2)
     np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=1e-12)
+    # as drawn: a grid whose departures stay within half of its spacing, and the line's in millimetres and micrometres
+    left, right, *_ = distortion_figure(SimpleNamespace(distortion=found)).axes
+    reach = np.abs(np.concatenate([line.get_xydata() for line in left.lines])).max(axis=0)
+    np.testing.assert_allclose(reach, 1e3 * np.abs(found.ideal).max(axis=(0, 1)), rtol=0.3)
+    np.testing.assert_allclose(right.lines[0].get_xydata(), np.stack([1e3 * found.position, 1e6 * found.residual], -1))
 
 
 def test_kinds_of_aberration() -> None:

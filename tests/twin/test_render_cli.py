@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from rich.console import Console
 
 import twin.main_job.render_command
 import twin.main_job.render_drawings
@@ -129,6 +130,12 @@ def test_what_cannot_be_drawn_costs_nothing_else(ready, tmp_path, monkeypatch):
     assert (done.exit_code, told in " ".join(done.stderr.split())) == (1, True)
     assert {"truth.json", "recovered.json", "report.html"} <= files(tmp_path / "run")
     assert told in json.loads((tmp_path / "run" / "manifest.json").read_text())["warnings"]
+
+
+def test_brackets_of_a_prior_are_printed(computed, monkeypatch, capsys):
+    monkeypatch.setattr(twin.main_job.render_command, "assumed", lambda _: "the prior [draft]")
+    twin.main_job.render_command._print_result(computed[3], Console(width=200))
+    assert "the prior [draft]." in capsys.readouterr().out
 
 
 # --- a run that works -------------------------------------------------------------------------------------------------
