@@ -227,7 +227,7 @@ def test_a_time_at_which_the_light_is_lost_is_named(prepared, tmp_path) -> None:
     """Also when it is not the time that is shown in full; and at which a spot is too near the edge of its CCD."""
     gradients = "[[0 K/m, 0 K/m, 0 K/m], [0 K/m, 30 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m]]"
     aside = COURSE.replace("temperature", "motion")
-    aside += "    base/forward/focal_plane: {shift: [0 0 0 um, 550 0 0 um, 0 0 0 um]}"
+    aside += "    base/forward/focal_plane: {shift: [0 0 0 um, 270 0 0 um, 0 0 0 um]}"
     for text, reason in (
         (COURSE + f"    {LEFT}: {{gradient: {gradients}}}", ""),
         (aside, r"the spot forward/left cannot be measured \("),

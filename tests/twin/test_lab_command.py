@@ -58,12 +58,6 @@ BAD = {
         ["on one line", "span a plane"],
     ),
     "clearance": ({"clearance: 1 mm": "clearance: 1 um"}, "mount.clearance", ["slide hole_", "more clearance"]),
-    "light lost": (
-        {"  M3: {figure": "  M2: {shift: [0 mm, 400 mm, 0 mm]}\n  M3: {figure"},
-        "as_built",
-        ["whole beam gets through"],
-    ),
-    "too little light": ({"white: 60 percent": "white: 0.01 percent"}, "edge", ["anywhere", "region or light"]),
     "short scan": (
         {"reach: 1.4 mm": "reach: 0.04 mm", "step: 0.08 mm": "step: 0.015 mm"},
         "scan.reach",

@@ -260,7 +260,7 @@ def test_output_that_exists(tmp_path):
 
 TOO_MUCH = {
     "beam off the mirrors": "base/forward/M1: {rotate: [3 deg, 0 deg, 0 deg], pivot: centre}",
-    "spot at the edge of the CCD": "base/forward/focal_plane: {shift: [0.55 mm, 0 um, 0 um]}",
+    "spot at the edge of the CCD": "base/forward/focal_plane: {shift: [0.27 mm, 0 um, 0 um]}",
     "spot off the CCD": "base/forward/focal_plane: {shift: [0.6 mm, 0 um, 0 um]}",
 }
 
