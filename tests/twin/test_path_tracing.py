@@ -112,7 +112,7 @@ def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
     alone = Scenery((surface,), (grid,))
     empty = PathTracer(backend, alone).run(replace(source, centre=np.array([0.0, 0.0, 1.0])), 10)
     glass, (mirror,) = glass_scene(slab(0.3, 0.02), 1.5).surfaces[:6], flat_mirror(IDEAL.mirror)
-    wavy = replace(mirror, surface=Surface(0.1, 0.0, (1e-9,) * 40))
+    wavy = replace(mirror, surface=Surface(0.1, 0.0, (1e-9,) * 4))
     rays = RaySource.even(np.zeros((2, 3)), np.tile([0.0, 0.0, 1.0], (2, 1)))
     many = tuple(screen(f"s{k}", facing(0.5 + k), 1.0) for k in range(256))
     for make, words in (
@@ -122,7 +122,7 @@ def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
         (lambda: PathTracer(backend, alone).run(source, 0), "how many paths to trace, at least 1; found 0"),
         (lambda: PathTracer(backend, alone).run(rays, 3), "a list of rays is traced as a whole"),
         (lambda: PathTracer(backend, Scenery((*glass[:3], surface, *glass[3:]), (grid,))), "do not follow each other"),
-        (lambda: PathTracer(backend, Scenery((wavy, surface), (grid,))), "aspheric terms, found 40"),
+        (lambda: PathTracer(backend, Scenery((wavy, surface), (grid,))), "takes 3 aspheric terms, found 4"),
         (lambda: Scenery((surface, surface), (grid,)), "surfaces of the same name: "),
         (lambda: Scenery((surface,), ()), "unknown detectors: far"),
         (lambda: PathTracer(backend, alone, {"near": ()}), "unknown detectors: near; detectors of the scene: far"),
