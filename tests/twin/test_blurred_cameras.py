@@ -108,30 +108,6 @@ def test_just_beyond_the_limit(backend, tmp_path) -> None:
     assert [len(text) for text in texts] == [0, 1]
 
 
-def test_the_best_plane_is_best(backend, tmp_path) -> None:
-    """Neither a shift nor a turn makes the mean square error less, also where it starts from a plane that is turned."""
-    camera = load_camera(gf7_with(tmp_path, "-2.03 m"))
-    image = camera.image.model_copy(update={"tilt": 0.02})
-    camera = camera.model_copy(update={"image": image})
-    beams = FieldBeams.trace(derive_camera(camera, backend), backend, FIELDS, 5)
-    middle = float(np.mean(beams.position[:, 0, 1]))
-
-    def merit(plane: FocalPlane) -> float:
-        return float(np.mean(beams.errors(plane) ** 2))
-
-    straight, turned = beams.best_plane(), beams.best_plane(tilt=True)
-    assert straight.tilt == 0.02
-    assert abs(turned.tilt) < 0.002
-    assert merit(turned) < 0.9 * merit(straight)
-    for dz in (-2e-5, 2e-5):
-        assert merit(FocalPlane(straight.z + dz, straight.tilt)) > merit(straight)
-        assert merit(FocalPlane(turned.z + dz, turned.tilt)) > merit(turned)
-    for turn in (-1e-4, 1e-4):
-        tilt = turned.tilt + turn
-        z = turned.z + middle * (np.tan(turned.tilt) - np.tan(tilt))
-        assert merit(FocalPlane(z, tilt)) > merit(turned)
-
-
 def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     """All but the design, whose start is there to be improved, and tests without a camera's prescription."""
     blurred = load_camera(gf7_with(tmp_path, "-2.02 m"))

@@ -87,16 +87,6 @@ def test_what_prisms_take_is_missing_in_every_table(backend, gf7_pair) -> None:
     assert whole.wavefront((1.0, 0.0)).rms > 1.04 * rms[1]
 
 
-def test_where_the_camera_stands_changes_nothing(backend, gf7_pair, gf7_alone) -> None:
-    """Neither the look angle nor a motion of the whole camera."""
-    turned = {"base/forward": Motion(rotate=(0.01, -0.02, 0.03), shift=(0.1, 0.0, 0.2))}
-    for state in ({}, turned):
-        other = CameraOptics.within(gf7_pair, "forward", backend, state, obstruction=False)
-        for one, two in zip(gf7_alone.wavefronts(FIELDS), other.wavefronts(FIELDS), strict=True):
-            # paths of some metres to 1e-15 each, in waves
-            np.testing.assert_allclose(two.map, one.map, atol=2e-8)
-
-
 @pytest.mark.second
 def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera) -> None:
     beams = VariedBeams(CameraOptics.alone(camera("ritchey_chretien"), backend), [(0.0, 0.0)], None, None)

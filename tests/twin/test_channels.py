@@ -62,33 +62,6 @@ def test_a_pair_that_is_written_out_is_the_plain_pair(backend, tmp_path) -> None
 
 
 @pytest.mark.second
-def test_more_channels_leave_the_others_as_they_are(two, backend, tmp_path) -> None:
-    """The first pair alone has the same spots: its parts do not know of the others, and light is traced ray by ray.
-
-    Rays are aimed for all channels together, until the worst is good enough: up to the tolerance of aiming.
-    """
-    data = monitor_layouts.two_beams()
-    for site in data["cameras"].values():
-        site["channels"] = {name: site["channels"][name] for name in ("left", "right")}
-    # a block as wide as that of the two pairs
-    alone = experiment(data, tmp_path, backend)
-    names = [c.key for c in two.instrument.channels]
-    assert names == [f"{c}/{s}" for c in ("forward", "backward") for s in ("left", "right", "left_2", "right_2")]
-    own = [names.index(c.key) for c in alone.instrument.channels]
-    placed = [e.instrument.assembly.place() for e in (alone, two)]
-    for channel in alone.instrument.channels:
-        for body in (channel.prism_body("prism_180"), channel.prism_body("prism_0"), channel.face_body):
-            found, wanted = (p.pose(body) for p in placed)
-            # facets are squared to rays that are aimed to 1e-9 m or better
-            np.testing.assert_allclose(found.translation, wanted.translation, rtol=0, atol=1e-12)
-            np.testing.assert_allclose(found.rotation, wanted.rotation, rtol=0, atol=1e-10)
-    few, many = alone.path.coarse_trace(STATES).place, two.path.coarse_trace(STATES).place[own]
-    np.testing.assert_allclose(few, many, rtol=0, atol=1e-6)
-    before, after = alone.path.expected_photons(STATES), two.path.expected_photons(STATES)[:, own]
-    np.testing.assert_allclose(after, before, rtol=0, atol=1e-5 * before.max())
-
-
-@pytest.mark.second
 def test_the_printed_formulas_are_about_the_pair(two, backend, tmp_path) -> None:
     """Their L and field are those of left and right, not those of the channels that stand farthest out."""
     plain = experiment(monitor_layouts.pair(), tmp_path, backend)

@@ -78,29 +78,6 @@ def test_temperatures_of_a_time_add_to_the_perturbation(tmp_path) -> None:
 
 
 @pytest.mark.second
-def test_filter_and_smoother_stand_beside_the_readings(found, tmp_path) -> None:
-    """The first time knows its own measurement alone, which is the posterior; the last knows all, filtered or smoothed.
-    The prisms' half kelvin of this job is seven times what `orbit` states; chi-square says so."""
-    groups = [*found["cameras"].values(), found["intersection_angle"], found["ground"]]
-    for group in groups:
-        for key, first in group["filtered"].items():
-            # the pattern's covariance is kept in single precision
-            assert first[0] == pytest.approx(group["posterior"][key][0], rel=1e-5, abs=1e-9)
-            if not key.startswith("left"):
-                assert group["smoothed"][key][-1] == pytest.approx(first[-1], rel=1e-9)
-        for key, late in group["smoothed"].items():
-            if key.endswith("_sigma"):
-                assert np.all(np.array(late) <= np.array(group["filtered"][key]) * (1.0 + 1e-9))
-                assert np.all(np.array(late) >= np.array(group["smoothed"][f"{key}_noise"]))
-    told = found["disturbances"]
-    assert told["name"] == "orbit"
-    assert told["degrees_of_freedom"] == 3 * 8
-    assert sum(told["innovations"]["chi_square"]) == pytest.approx(told["chi_square"])
-    assert not told["agrees"]
-    assert told["chi_square"] > told["limit"]
-
-
-@pytest.mark.second
 def test_without_disturbances_nothing_is_smoothed(tmp_path, backend) -> None:
     resolved = resolve(written(tmp_path, JOB.replace("course:", "disturbances: none\ncourse:")))
     experiment = MonitorExperiment(resolved, backend)
@@ -129,13 +106,6 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
     monkeypatch.setattr("twin.monitor.time_series.LARGEST_SERIES", 50_000)
     with pytest.raises(InputError, match="do not fit into memory; found '3 times', allowed: at most 1 "):
         run_series(experiment, resolved, states)
-
-
-@pytest.mark.second
-def test_config_holds_the_course(folder) -> None:
-    again, first = resolve(folder / "config.yaml"), resolve(folder.parent / "job.yaml")
-    assert again == first
-    assert again.to_yaml() == (folder / "config.yaml").read_text()
 
 
 @pytest.mark.second

@@ -27,7 +27,7 @@ from tests.tiers import quick
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import CLOSED_FORMS, SimulatedDistortion, measure, reduce
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_run import rms, run_turntable
+from twin.laboratory.turntable_run import run_turntable
 from twin.run.procedure import BenchError
 
 UM, NM = 1e-6, 1e-9
@@ -106,25 +106,6 @@ def test_noise_of_the_spots_is_as_stated():
     rest = means - np.polyval(np.polyfit(b.turn, means, 3), b.turn)
     low, high = stats.chi2.ppf([FALSE_ALARM, 1 - FALSE_ALARM], 51) / 51
     assert low < np.var(rest) * 55 / 51 / np.mean(spots.fixed**2 + spots.temporal**2 / 10) < high
-
-
-@pytest.mark.second
-def test_error_of_the_zero_spoils_the_printed_equations_and_not_the_constant():
-    """An operator's 2 arcsec: (3) leaves f d in every point, (2) turns it into p; theory of the module's docstring."""
-    b = within(altered(zero=2.0 * ARCSEC))
-    r = measure(b, 3)
-    d, f = r.truth.zero, 5.512
-    assert abs(d) > 0.5 * ARCSEC
-    # the compensation's own error at the middle is within 0.1 arcsec
-    assert r.compensated.zero == pytest.approx(d, abs=0.1 * ARCSEC)
-    error = {name: rms(one.distortion - r.true_estimates[name].distortion) for name, one in r.estimates.items()}
-    assert error["constant"] < 1.0 * UM
-    assert error["eq2_zero_from_constant"] < 1.0 * UM
-    assert error["eq3"] == pytest.approx(f * abs(d), rel=0.1)
-    widest = np.tan(b.turn[-1])
-    expected = f * d * (1.0 + 5.0 / (3.0 * widest**2))
-    # even points of a finite number, 55, make 5/3 a little smaller
-    assert r.estimates["eq2"].p - r.estimates["constant"].p == pytest.approx(expected, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -129,16 +129,6 @@ def test_a_state_is_the_same_alone_and_among_others_one_of_which_is_lost(gf7_pai
     json.dumps(QUALITY(several), allow_nan=False)
 
 
-def test_a_line_that_moves_in_its_focal_plane(gf7_pair, backend) -> None:
-    """The line CCD is a body of its own, here moved by 50 um downstream: all of it is defocus."""
-    shift = Motion(shift=(0.0, 0.0, 50e-6))
-    states = [{}, {f"{ROOT}/focal_plane/line": shift}, {f"{ROOT}/focal_plane": shift}]
-    found = image_quality(gf7_pair, backend, states).cameras[CAMERA]
-    np.testing.assert_allclose(found.defocus[1] - found.defocus[0], -50e-6, atol=1e-8)
-    np.testing.assert_allclose(found.wfe[1], found.wfe[2], atol=1e-9)
-    np.testing.assert_allclose(found.mtf_along_line[1], found.mtf_along_line[2], atol=1e-9)
-
-
 @pytest.mark.second
 def test_too_rough_a_wavefront_has_no_mtf_but_an_error(gf7_pair, backend) -> None:
     rough = {f"{ROOT}/M1": Motion(figure={60: 1e-6})}

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, State
-from optics.raytrace import derivatives, trace
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_derivative import every_motion, photon_derivative, spot_gradient, spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
@@ -60,24 +59,6 @@ def test_centroid_of_the_image_moves_as_the_rays_do(path):
     for m in range(len(MOTIONS)):
         scale = np.abs(rays[m]).max()
         assert np.abs(moved[m] - rays[m]).max() < 0.03 * scale + 1e-9
-
-
-@pytest.mark.second
-def test_a_trace_in_sections_is_the_same(path, monkeypatch):
-    """Where one kernel ends and the next begins changes no ray, and derivatives by rounding only."""
-    whole, some = {}, MOTIONS[:6]
-    monkeypatch.setattr(trace, "FEW", 0)
-    for section in (1000, 6, 1):
-        for module in (trace, derivatives):
-            monkeypatch.setattr(module, "SECTION", section)
-        rays = path.coarse.rays([motion.state(STEP[motion.kind]) for motion in some])
-        whole[section] = (rays.position, rays.direction, rays.path), spot_jacobian(path, some)
-    for section in (6, 1):
-        for one, other in zip(whole[section][0], whole[1000][0], strict=True):
-            np.testing.assert_array_equal(one, other)
-        one, other = whole[section][1], whole[1000][1]
-        # 25 surfaces, each of which rounds
-        assert np.abs(one - other).max() < 1e-13 * np.abs(other).max()
 
 
 def kernels(path, motions):
@@ -183,21 +164,6 @@ def test_it_is_what_the_spots_do(coarse, motions, gradient) -> None:
     """Every third motion of all parts: three of the seven kinds of each, others for the next part."""
     own = range(0, len(motions), 3)
     assert check_differences(coarse, [motions[k] for k in own], gradient[..., own]) > 60
-
-
-@pytest.mark.second
-def test_what_no_spot_sees(motions, gradient) -> None:
-    """Zero, and zero up to rounding by a cancellation of terms of 1e6 px/rad and 1e5 px/m."""
-    size = dict(zip((m.step for m in motions), np.abs(gradient).max(axis=(0, 1)), strict=True))
-    for name in CAMERAS:
-        plane = f"{BASE}/{name}/focal_plane"
-        blind = [(f"{plane}/line", kind, axis) for kind in ("shift", "rotate") for axis in range(3)]
-        blind += [(f"{plane}/left/reticle", "rotate", axis) for axis in range(3)]
-        assert max(size[step] for step in blind) == 0.0
-        # the instrument as a whole moves nothing in itself; a mirror of revolution may turn about its own axis
-        assert size[f"{BASE}/{name}/M2", "rotate", 2] < 1e-8
-        assert size[f"{BASE}/{name}/M1", "rotate", 2] > 1.0  # its pivot is off its axis
-    assert max(size[BASE, kind, axis] for kind in ("shift", "rotate") for axis in range(3)) < 1e-8
 
 
 @pytest.mark.second

@@ -179,23 +179,6 @@ def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, p
 
 
 @pytest.mark.second
-def test_spots_that_are_taken_to_be_alike_are(bench: LayoutBench, path: MonitorPath) -> None:
-    # left and right of one camera are mirror images but for tilts of the prisms; one of them has less light
-    start = path.instrument
-    channels = tuple(replace(c, photons=0.25 * c.photons) if c.name == "left" else c for c in start.channels)
-    uneven = MonitorPath(replace(start, channels=channels), path.backend)
-    taken, own = (np.diag(spot_noise(uneven, bench.detector(), alike)[0]) for alike in (True, False))
-    assert taken == pytest.approx(own, rel=0.02)
-    assert own[0] > 1.5 * own[2]
-
-
-def test_bodies_of_one_channel_are_told_from_shared_ones() -> None:
-    own = ("base/forward/monitor/left_2/prism_0", "base/central_prism/forward_left", "base/a/focal_plane/right/reticle")
-    assert all(is_own(body) for body in own)
-    assert not any(is_own(body) for body in ("base/forward/M1", "base/central_prism", "base/forward/focal_plane"))
-
-
-@pytest.mark.second
 def test_beams_that_stand_in_each_other_are_not_combined(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
     assert not touching(facts[0], facts[1])
     # CCDs of 1.152 mm at 5.51 m and fields near 1.22 deg have room from 0.0120 deg on

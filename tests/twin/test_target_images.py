@@ -405,16 +405,6 @@ def test_sense_of_the_axes(path) -> None:
     assert place[:, 0] @ axes[:, 0] > 0.99
 
 
-def test_first_order_of_the_map(path) -> None:
-    """Derivative of the chief rays' map in the middle against forward-mode derivatives of the trace at the stop's
-    centre; upright in the target's coordinates.
-    """
-    local = path.local_map({}, path.directions(PLACES[:1])[0], 0.5e-3)
-    scale = path.model.first_order.scale[0]
-    np.testing.assert_allclose(np.diag(local.jacobian) * LONG, np.abs(np.diag(scale)), rtol=1e-9)
-    np.testing.assert_allclose(local.jacobian[[0, 1], [1, 0]] * LONG, 0.0, atol=1e-8)
-
-
 @pytest.mark.parametrize("number", range(len(PLACES)))
 def test_local_map_between_its_points(path, number: int) -> None:
     """Chief rays of 40 random directions inside the map's reach, in a bent camera."""
@@ -433,25 +423,6 @@ def test_local_map_between_its_points(path, number: int) -> None:
     places = path.places(state, np.concatenate([direction[None], turned]))
     np.testing.assert_allclose(local(points), places[1:] - places[0], rtol=0.0, atol=1e-9)
     assert local.residual < 1e-9
-
-
-def test_a_focal_plane_that_moves_sideways(path) -> None:
-    """Places are on the focal plane, which has moved: they go the other way, and the pupils do not change."""
-    shift = (0.2e-3, -0.3e-3, 0.0)
-    directions = path.directions(PLACES)
-    moved = path.places({FOCAL_PLANE: Motion(shift=shift)}, directions)
-    np.testing.assert_allclose(moved - PLACES, [[-shift[1], -shift[0]]] * len(PLACES), rtol=0.0, atol=1e-12)
-
-
-def test_a_focal_plane_that_moves_downstream(path) -> None:
-    """Places follow the chief rays' slope, which is below 1e-3 in this nearly telecentric camera."""
-    directions = path.directions(PLACES)
-    moved = path.places({FOCAL_PLANE: Motion(shift=(0.0, 0.0, 1e-3))}, directions)
-    slope = (moved - PLACES) / 1e-3
-    centres = np.array([pupil.centre for pupil in path.pupils({}, directions, PLACES)])
-    # coma moves the pupil's middle off the chief ray, here by 3e-5, which is 0.06% of its radius
-    np.testing.assert_allclose(slope, centres, rtol=0.0, atol=5e-5)
-    assert np.all(np.abs(slope) < 2e-3)
 
 
 def target_camera(backend, spectrum: list[str]) -> tuple[TargetCamera, CameraOptics]:
