@@ -77,6 +77,7 @@ def test_a_camera_that_turns_as_a_whole_is_as_sharp(quality) -> None:
     turned = quality.cameras[CAMERA]
     np.testing.assert_allclose(turned.wfe[2], turned.wfe[0], atol=1e-8)
     np.testing.assert_allclose(turned.mtf_along_line[2], turned.mtf_along_line[0], atol=1e-8)
+    assert [len(outlines) for outlines in turned.pupils] == [len(FIELDS)] * len(STATES)
 
 
 @pytest.mark.second
