@@ -22,10 +22,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, library_names, load_camera
 from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import resolve_job
-from scenes.yaml.spec import validate
-from scenes.yaml.yaml_file import YamlFile
 from tests.oracles.test_reference_cameras import bundle, wavefront_error
-from twin.camera.camera_optics import CameraOptics
 
 GF7 = (LIBRARY / "cameras" / "gf7.yaml").read_text("utf-8")
 M2 = "z: -2.01593047747168 m"
@@ -123,25 +120,3 @@ def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     assert not cameras_of(PROCEDURES["orbit calibrate"].resolve("calibrate"))
     assert not cameras_of(PROCEDURES["orbit angle"].resolve("angle"))  # a payload's lines have no mirrors
     assert not PROCEDURES["design camera"].judged
-
-
-@pytest.mark.second
-def test_a_tilted_image_plane(backend) -> None:
-    """The focal plane of a camera with a tilt is the plane that ``FocalPlane`` says, and its middle is on it."""
-    camera = load_camera("gf7")
-    plane = FocalPlane(camera.image.z + 1e-3, 0.02)
-    image = camera.image.model_copy(update={"z": plane.z, "tilt": plane.tilt})
-    tilted = camera.model_copy(update={"image": image})
-    model = derive_camera(tilted, backend)
-    _, y, z = model.focal_plane.translation
-    assert z == pytest.approx(plane.z + np.tan(plane.tilt) * y, abs=1e-12)
-    np.testing.assert_allclose(model.focal_plane.rotation[:, 2], [0.0, np.sin(0.02), -np.cos(0.02)], atol=1e-15)
-    beams = [FieldBeams.trace(m, backend, FIELDS, 3) for m in (derive_camera(camera, backend), model)]
-    # the chief ray's image moves, and with it the sphere: by some 1e-8 waves of the rms
-    np.testing.assert_allclose(beams[0].errors(plane), beams[1].errors(FocalPlane.of(tilted)), rtol=1e-4)
-    # and as the camera itself sees it, whose rays end on its own plane
-    own = [wave.rms for wave in CameraOptics.alone(model, backend).wavefronts(FIELDS)]
-    np.testing.assert_allclose(beams[1].errors(FocalPlane.of(tilted)), own, rtol=1e-3)
-    assert max(own) > 1.03 * min(own)
-    assert validate(CameraSpec, YamlFile("", tilted.plain(), {})) == tilted
-    assert "tilt" not in camera.plain()["image"]

@@ -12,7 +12,7 @@ import twin.render as command
 from optics.thermal.heat import Temperature
 from scenes.specs.course import moment
 from scenes.specs.job import checked_nodes
-from scenes.specs.load import EXAMPLES, load_job
+from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
@@ -106,25 +106,6 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
     monkeypatch.setattr("twin.monitor.time_series.LARGEST_SERIES", 50_000)
     with pytest.raises(InputError, match="do not fit into memory; found '3 times', allowed: at most 1 "):
         run_series(experiment, resolved, states)
-
-
-@pytest.mark.second
-def test_an_example_is_read_within_its_sigmas(backend) -> None:
-    """At all times: no light is lost, no spot nears its edge, shifts agree with what is stated, and every change is
-    within 3.5 of its total sigmas. Errors of one course go together, so that it is one draw of nine numbers and not of
-    two hundred: false alarm 0.4 %, of a draw that the files fix.
-    """
-    resolved = resolve(EXAMPLES / "launch.yaml")
-    experiment = MonitorExperiment(resolved, backend)
-    series = run_series(experiment, resolved, series_states(experiment, resolved.job))
-    assert series.warnings == ()
-    assert series.smoothed is not None
-    assert series.smoothed.consistency.agrees
-    for row in series.readings.of("posterior"):
-        assert row.group == "ground" or np.abs(row.error / row.sigma).max() < 3.5
-    angle = series.readings.row("intersection_angle", "change_arcsec", "posterior")
-    # it is about something: what moves is many times what the noise hides
-    assert np.ptp(angle.true) > 100.0 * angle.noise.max()
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
