@@ -1,4 +1,6 @@
-"""A camera by itself as an instrument: perturbed in the words of every command, traced, judged by its images."""
+"""A camera by itself as an instrument: perturbed in the words of every command, traced, judged by its images; and its
+derivatives by motions of its parts, against formulas of the first order.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The detector against the EMVA 1288 model that it claims to be.
+"""The detector against the EMVA 1288 model that it claims to be, its Poisson numbers, and frames that lie in a file.
 
 Every statistical limit is a two-sided chi-square (or normal) quantile with a false-alarm rate of 1e-6 per test.
 """

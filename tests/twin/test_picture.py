@@ -1,4 +1,4 @@
-"""Pictures of the instrument: everything is where the prescription puts it, the same again, and nothing is lost."""
+"""Pictures and scene.glb: everything is where the perturbed instrument has it, the same again, and nothing is lost."""
 
 import json
 import re

@@ -1,4 +1,7 @@
-"""python -m twin.recover: the closed loop through files, other kinds of files, series, geometry, refusals."""
+"""python -m twin.recover: the closed loop through files, other kinds of files, series, geometry, refusals.
+
+Filter and smoother of a series are those of the main job's course.
+"""
 
 import shutil
 import struct
