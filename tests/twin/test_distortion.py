@@ -1,5 +1,5 @@
-"""The distortion test of paper 004: from exposures of a pinhole to f, p and distortion, against exact chief rays; and the
-simulated turntable test that it rests on.
+"""The distortion test of paper 004: from exposures of a pinhole to f, p and distortion, against exact chief rays; and
+the simulated turntable test that it rests on.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What the images say: without noise against the exact trace and the crosstalk table, with noise against the stated sigmas."""
+"""What images say: without noise against the exact trace and the crosstalk table, with noise against stated sigmas."""
 
 import itertools
 from dataclasses import replace

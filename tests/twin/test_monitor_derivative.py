@@ -1,5 +1,5 @@
-"""Derivatives from a body's motion to the pixels, by AD through tree, trace and diffraction, against differences; and the
-gradient of the spots by reverse mode, against forward mode and differences of exact traces.
+"""Derivatives from a body's motion to the pixels, by AD through tree, trace and diffraction, against differences; and
+the gradient of the spots by reverse mode, against forward mode and differences of exact traces.
 """
 
 from collections.abc import Callable, Sequence
