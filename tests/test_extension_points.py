@@ -59,7 +59,7 @@ from scenes.yaml.file_kind import FileKind
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
-from tests.twin import test_path_figure as path_figure
+from tests.twin import test_path_tracing as path_figure
 from tests.twin import test_prism_images
 from tests.twin.commands import invoke
 from tests.twin.path_bench import IDEAL

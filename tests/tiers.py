@@ -31,7 +31,7 @@ def shuffled(items: list[pytest.Item], seed: int) -> list[pytest.Item]:
 
 LONGEST = (
     "test_wheel.py",
-    "twin/test_spot_gradient.py",
+    "twin/test_monitor_derivative.py",
     "twin/test_orbit_calibration.py",
     "validation/test_mutations_001.py",
     "test_extension_points.py",

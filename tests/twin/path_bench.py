@@ -17,8 +17,7 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from scenes.models.camera_axis import LINE_AXIS
 from scenes.models.camera_model import collimated, field_direction
-from scenes.models.instrument_model import Instrument
-from scenes.models.scenery import BOARD, FACING_THE_LIGHT, Scenery, _reach
+from scenes.models.scenery import Scenery
 from scenes.models.scenery_parts import (
     Detector,
     Finishes,
@@ -27,7 +26,6 @@ from scenes.models.scenery_parts import (
     mirror_surface,
     solid_surfaces,
 )
-from scenes.specs.baffle import Plate, box
 
 if TYPE_CHECKING:
     from twin.path_tracing.path_result import PathResult
@@ -63,21 +61,6 @@ def slab(half: float, thickness: float, sides: Coating = Coating.GROUND) -> Soli
     for k, (x, y) in enumerate([(1, 0), (-1, 0), (0, 1), (0, -1)]):
         faces.append(Face(f"side{k}", "glass", sides, frame((x, y, 0), (half * x, half * y, 0))))
     return Solid("glass", "N-BK7", tuple(faces))
-
-
-def right_angle_prism(half: float) -> Solid:
-    """Light enters along +z at z = -half, is turned to +x by total reflection and leaves at x = half."""
-    return Solid(
-        "glass",
-        "N-BK7",
-        (
-            Face("entry", "glass", Coating.TRANSMITTING, frame((0, 0, -1), (0, 0, -half))),
-            Face("hypotenuse", "glass", Coating.TOTAL, frame((-1, 0, 1), (0, 0, 0))),
-            Face("exit", "glass", Coating.TRANSMITTING, frame((1, 0, 0), (half, 0, 0))),
-            Face("side_a", "glass", Coating.GROUND, frame((0, 1, 0), (0, half, 0))),
-            Face("side_b", "glass", Coating.GROUND, frame((0, -1, 0), (0, -half, 0))),
-        ),
-    )
 
 
 def screen(name: str, pose: Pose, half: float, pixels: int = 10) -> tuple[SceneSurface, Detector]:
@@ -127,14 +110,6 @@ def scene_beam(instrument, backend, x: float = 0.0, y: float = 0.0) -> tuple[np.
     first = to_world.rotation @ (LINE_AXIS - (LINE_AXIS @ direction) * direction)
     first /= np.linalg.norm(first)
     return to_world.apply(middle), heading, np.stack([first, np.cross(heading, first)])
-
-
-def focal_plane_housing(instrument: Instrument, camera: str) -> tuple[Plate, ...]:
-    """A black box around the detectors of a camera, open to the light; its walls stand out 30 mm before them."""
-    reach_x, reach_y = _reach(instrument, camera)
-    pose = FACING_THE_LIGHT @ Pose(np.eye(3), np.array([0.0, 0.0, -2.0 * BOARD]))
-    size = (2.0 * reach_x, 2.0 * reach_y, 2.0 * BOARD + 0.03)
-    return box(f"{camera}/housing", f"base/{camera}/focal_plane", pose, size)
 
 
 class Compared(NamedTuple):

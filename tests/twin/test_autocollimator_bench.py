@@ -19,7 +19,6 @@ from scenes.specs.autocollimators import AutocollimatorSetup, BenchErrorsSpec
 from scenes.specs.load import load_autocollimator_test
 from twin.laboratory.autocollimator_bench import (
     Reader,
-    ReadingTable,
     Series,
     declared_spread,
     run_autocollimator_test,
@@ -27,8 +26,6 @@ from twin.laboratory.autocollimator_bench import (
     states_of,
 )
 from twin.laboratory.autocollimator_images import window_pattern
-from twin.validation.paper_001 import table2
-from twin.validation.paper_001.table2 import bench_png
 
 ARCSEC = math.pi / 648000
 SETUP = load_autocollimator_test()
@@ -38,12 +35,6 @@ FALSE_ALARM = 1e-4
 @pytest.fixture(scope="module")
 def reader(backend: Backend) -> Reader:
     return Reader(SETUP, backend)
-
-
-@pytest.fixture(scope="module")
-def benches(reader: Reader, backend: Backend) -> list[ReadingTable]:
-    """Table 2 on five benches with all errors."""
-    return [run_autocollimator_test(SETUP, backend, seed=seed, reader=reader) for seed in range(100, 105)]
 
 
 def with_errors(**sigmas: float) -> AutocollimatorSetup:
@@ -140,25 +131,6 @@ def test_the_images_noise_is_as_stated(reader: Reader, backend: Backend) -> None
 
 
 @pytest.mark.second
-def test_unrest_and_steps_scatter_as_declared(reader: Reader, backend: Backend) -> None:
-    series = Series("X", math.radians(15), math.radians(0.002), 100)
-    setup = with_errors(reading=0.5 * ARCSEC, turntable_step=0.8 * ARCSEC)
-    result = run_autocollimator_test(setup, backend, [series], 11, reader=reader)["X"]
-    off = result.from_exact[:, 1:, 0]
-    noise = np.mean(result.sigma**2) / 2
-    # the table's position is common to both mirrors, the unrest is not
-    difference = (off[0] - off[1]) - np.mean(off[0] - off[1])
-    assert scatter_agrees(float(np.sum(difference**2) / (2 * (0.5 * ARCSEC) ** 2 + 2 * noise)), 99)
-    common = 0.5 * (off[0] + off[1])
-    common = common - common.mean()
-    assert scatter_agrees(float(np.sum(common**2) / ((0.8 * ARCSEC) ** 2 + 0.5 * (0.5 * ARCSEC) ** 2)), 99)
-    # across it is the unrest alone
-    cross = result.from_exact[:, 1:, 1]
-    cross = cross - cross.mean(axis=1, keepdims=True)
-    assert scatter_agrees(float(np.sum(cross**2) / ((0.5 * ARCSEC) ** 2 + noise)), 198)
-
-
-@pytest.mark.second
 def test_errors_of_the_bench_act_as_they_should(reader: Reader, backend: Backend) -> None:
     series = series_per_axis(SETUP.spec)[0]
     angle = series.angles[-1]
@@ -190,25 +162,6 @@ def test_errors_of_the_bench_act_as_they_should(reader: Reader, backend: Backend
     assert reading[:, 0] == pytest.approx([angle, angle], abs=limit)
 
 
-def test_errors_are_drawn_as_large_as_declared() -> None:
-    e = SETUP.spec.errors
-    series = series_per_axis(SETUP.spec)[0]
-    drawn: dict[str, list[float]] = {name: [] for name in BenchErrorsSpec.model_fields}
-    for seed in range(300):
-        zero, *_, last = states_of(SETUP.spec, series, seed)
-        turn = np.array(last[axis_body("X")].rotate)
-        drawn["turntable_step"].append(float(np.linalg.norm(turn) - series.angles[-1]))
-        drawn["axis_tilt"] += (turn[1:] / turn[0]).tolist()
-        for unit in UNITS:
-            root = autocollimator_body(unit)
-            drawn["focal_length"].append(last[root].scale)
-            drawn["reading"] += [*last[root].rotate[:2], *zero[root].rotate[:2]]
-            drawn["ccd_rotation"].append(last[f"{root}/focal_plane/area_ccd"].rotate[2])
-            drawn["mirror_mount"] += last[mirror_body(unit)].rotate[:2]
-    for name, values in drawn.items():
-        assert scatter_agrees(float(np.sum((np.array(values) / getattr(e, name)) ** 2)), len(values)), name
-
-
 @pytest.mark.second
 def test_seeds(reader: Reader, backend: Backend) -> None:
     first, again, other = (
@@ -235,32 +188,6 @@ def test_too_large_a_turn_is_told(reader: Reader, backend: Backend) -> None:
         )
 
 
-def test_mean_differences(reader: Reader, benches: list[ReadingTable], backend: Backend) -> None:
-    ideal = run_autocollimator_test(SETUP, backend, ideal=True, reader=reader)
-    found = table2.mean_differences(SETUP.spec, ideal, benches[:1])
-    assert list(found) == ["X", "Y", "Z"]
-    for axis, one in found.items():
-        assert table2.MEAN_DIFFERENCE[axis] == pytest.approx(table2.printed_mean_difference(axis), abs=6e-7)
-        assert 0.05 < one.value < 1.5
-        assert 0.05 < one.sigma < 0.4
-
-
-def test_the_printed_columns_about_z_are_one() -> None:
-    (row,) = (check for check in table2.GROUP.checks if check.id == "001.table2.z_columns")
-    one, two = (np.array(mirror["Z"]) for mirror in (table2.MIRROR_1, table2.MIRROR_2))
-    assert row.printed == pytest.approx(np.max(np.abs(2 / math.sqrt(3) * one - two)), abs=5e-10)
-    assert row.printed < 5e-7  # half of the last printed digit
-
-
-def test_declared_spread_is_that_of_rendered_benches(benches: list[ReadingTable]) -> None:
-    # mean differences against the distribution without images: their mean within 4 sigma, none absurd
-    for series in series_per_axis(SETUP.spec):
-        spread = declared_spread(SETUP.spec, series, 0.011 * ARCSEC / math.sqrt(2))
-        found = np.array([table[series.axis].mean_difference for table in benches])
-        assert abs(found.mean() - spread.mean()) < 4 * spread.std() / math.sqrt(len(found))
-        assert np.all((found > 0) & (found < np.quantile(spread, 0.9999) * 1.2))
-
-
 @pytest.mark.parametrize(
     ("error", "sigma", "x", "z"),
     [
@@ -275,17 +202,3 @@ def test_declared_spread_of_single_errors(error: str, sigma: float, x: float, z:
     for series, wanted in zip(series_per_axis(spec)[::2], (x, z), strict=True):
         mean = declared_spread(spec, series, 0.0).mean() / ARCSEC
         assert mean == pytest.approx(math.sqrt(2 / math.pi) * wanted, rel=0.05, abs=1e-3)
-
-
-def test_columns_follow_the_table_and_the_picture_is_drawn(reader: Reader, benches: list[ReadingTable]) -> None:
-    table = benches[0]
-    assert [r.series.axis for r in table.results] == ["X", "Y", "Z"]
-    assert [r.scale for r in table.results] == pytest.approx([1, 2 / math.sqrt(3), 2 / math.sqrt(3)])
-    for result in table.results:
-        assert result.series.angles / ARCSEC == pytest.approx(table2.ANGLES)
-        first, second = (column / ARCSEC for column in result.columns)
-        assert second == pytest.approx(table2.ANGLES, abs=3)
-        assert first == pytest.approx(np.zeros(11) if result.series.axis == "Z" else table2.ANGLES, abs=3)
-    with pytest.raises(KeyError):
-        table["W"]
-    assert bench_png(reader, benches).startswith(b"\x89PNG")

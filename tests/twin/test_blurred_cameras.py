@@ -22,10 +22,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, library_names, load_camera
 from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import resolve_job
-from scenes.yaml.spec import validate
-from scenes.yaml.yaml_file import YamlFile
 from tests.oracles.test_reference_cameras import bundle, wavefront_error
-from twin.camera.camera_optics import CameraOptics
 
 GF7 = (LIBRARY / "cameras" / "gf7.yaml").read_text("utf-8")
 M2 = "z: -2.01593047747168 m"
@@ -108,30 +105,6 @@ def test_just_beyond_the_limit(backend, tmp_path) -> None:
     assert [len(text) for text in texts] == [0, 1]
 
 
-def test_the_best_plane_is_best(backend, tmp_path) -> None:
-    """Neither a shift nor a turn makes the mean square error less, also where it starts from a plane that is turned."""
-    camera = load_camera(gf7_with(tmp_path, "-2.03 m"))
-    image = camera.image.model_copy(update={"tilt": 0.02})
-    camera = camera.model_copy(update={"image": image})
-    beams = FieldBeams.trace(derive_camera(camera, backend), backend, FIELDS, 5)
-    middle = float(np.mean(beams.position[:, 0, 1]))
-
-    def merit(plane: FocalPlane) -> float:
-        return float(np.mean(beams.errors(plane) ** 2))
-
-    straight, turned = beams.best_plane(), beams.best_plane(tilt=True)
-    assert straight.tilt == 0.02
-    assert abs(turned.tilt) < 0.002
-    assert merit(turned) < 0.9 * merit(straight)
-    for dz in (-2e-5, 2e-5):
-        assert merit(FocalPlane(straight.z + dz, straight.tilt)) > merit(straight)
-        assert merit(FocalPlane(turned.z + dz, turned.tilt)) > merit(turned)
-    for turn in (-1e-4, 1e-4):
-        tilt = turned.tilt + turn
-        z = turned.z + middle * (np.tan(turned.tilt) - np.tan(tilt))
-        assert merit(FocalPlane(z, tilt)) > merit(turned)
-
-
 def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     """All but the design, whose start is there to be improved, and tests without a camera's prescription."""
     blurred = load_camera(gf7_with(tmp_path, "-2.02 m"))
@@ -147,25 +120,3 @@ def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     assert not cameras_of(PROCEDURES["orbit calibrate"].resolve("calibrate"))
     assert not cameras_of(PROCEDURES["orbit angle"].resolve("angle"))  # a payload's lines have no mirrors
     assert not PROCEDURES["design camera"].judged
-
-
-@pytest.mark.second
-def test_a_tilted_image_plane(backend) -> None:
-    """The focal plane of a camera with a tilt is the plane that ``FocalPlane`` says, and its middle is on it."""
-    camera = load_camera("gf7")
-    plane = FocalPlane(camera.image.z + 1e-3, 0.02)
-    image = camera.image.model_copy(update={"z": plane.z, "tilt": plane.tilt})
-    tilted = camera.model_copy(update={"image": image})
-    model = derive_camera(tilted, backend)
-    _, y, z = model.focal_plane.translation
-    assert z == pytest.approx(plane.z + np.tan(plane.tilt) * y, abs=1e-12)
-    np.testing.assert_allclose(model.focal_plane.rotation[:, 2], [0.0, np.sin(0.02), -np.cos(0.02)], atol=1e-15)
-    beams = [FieldBeams.trace(m, backend, FIELDS, 3) for m in (derive_camera(camera, backend), model)]
-    # the chief ray's image moves, and with it the sphere: by some 1e-8 waves of the rms
-    np.testing.assert_allclose(beams[0].errors(plane), beams[1].errors(FocalPlane.of(tilted)), rtol=1e-4)
-    # and as the camera itself sees it, whose rays end on its own plane
-    own = [wave.rms for wave in CameraOptics.alone(model, backend).wavefronts(FIELDS)]
-    np.testing.assert_allclose(beams[1].errors(FocalPlane.of(tilted)), own, rtol=1e-3)
-    assert max(own) > 1.03 * min(own)
-    assert validate(CameraSpec, YamlFile("", tilted.plain(), {})) == tilted
-    assert "tilt" not in camera.plain()["image"]

@@ -9,21 +9,12 @@ import pytest
 from optics.geometry.tree import Motion, State
 from optics.materials.material import material
 from optics.numerics.backend import Backend
-from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
 from optics.thermal.heat import Temperature
-from scenes.models.scenery import build_scenery
 from scenes.specs.resolved import resolve
 from tests.scenes import monitor_layouts
 from tests.tiers import quick
-from tests.twin.path_bench import IDEAL
+from tests.twin.test_path_tracing import out_and_back
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.sinks import NOMINAL
-from twin.path_tracing.source import RaySource
-from twin.path_tracing.stray_light import monitor_families
-from twin.path_tracing.tracer import PathTracer
-from twin.pictures.light_paths import trace_light_paths
-from twin.pictures.scene_file import build_scene
 
 ARCSEC = np.pi / 648000.0
 STATES: list[State] = [
@@ -68,47 +59,6 @@ def test_a_pair_that_is_written_out_is_the_plain_pair(backend, tmp_path) -> None
         np.testing.assert_array_equal(getattr(a.assembly.place(), what), getattr(b.assembly.place(), what))
     assert dict(a.assembly.sequences) == dict(b.assembly.sequences)
     np.testing.assert_array_equal(plain.path.expected_photons(STATES), written.path.expected_photons(STATES))
-
-
-@pytest.mark.second
-def test_more_channels_leave_the_others_as_they_are(two, backend, tmp_path) -> None:
-    """The first pair alone has the same spots: its parts do not know of the others, and light is traced ray by ray.
-
-    Rays are aimed for all channels together, until the worst is good enough: up to the tolerance of aiming.
-    """
-    data = monitor_layouts.two_beams()
-    for site in data["cameras"].values():
-        site["channels"] = {name: site["channels"][name] for name in ("left", "right")}
-    # a block as wide as that of the two pairs
-    alone = experiment(data, tmp_path, backend)
-    names = [c.key for c in two.instrument.channels]
-    assert names == [f"{c}/{s}" for c in ("forward", "backward") for s in ("left", "right", "left_2", "right_2")]
-    own = [names.index(c.key) for c in alone.instrument.channels]
-    placed = [e.instrument.assembly.place() for e in (alone, two)]
-    for channel in alone.instrument.channels:
-        for body in (channel.prism_body("prism_180"), channel.prism_body("prism_0"), channel.face_body):
-            found, wanted = (p.pose(body) for p in placed)
-            # facets are squared to rays that are aimed to 1e-9 m or better
-            np.testing.assert_allclose(found.translation, wanted.translation, rtol=0, atol=1e-12)
-            np.testing.assert_allclose(found.rotation, wanted.rotation, rtol=0, atol=1e-10)
-    few, many = alone.path.coarse_trace(STATES).place, two.path.coarse_trace(STATES).place[own]
-    np.testing.assert_allclose(few, many, rtol=0, atol=1e-6)
-    before, after = alone.path.expected_photons(STATES), two.path.expected_photons(STATES)[:, own]
-    np.testing.assert_allclose(after, before, rtol=0, atol=1e-5 * before.max())
-
-
-@pytest.mark.second
-def test_the_order_of_channels_is_that_of_the_results(two, backend, tmp_path) -> None:
-    data = monitor_layouts.two_beams()
-    order = ("right_2", "left", "left_2", "right")
-    for site in data["cameras"].values():
-        site["channels"] = {name: site["channels"][name] for name in order}
-    shuffled = experiment(data, tmp_path, backend)
-    keys = [c.key for c in two.instrument.channels]
-    own = [keys.index(c.key) for c in shuffled.instrument.channels]
-    assert [c.name for c in shuffled.instrument.channels[:4]] == list(order)
-    a, b = two.path.coarse_trace(STATES).place[own], shuffled.path.coarse_trace(STATES).place
-    np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
 
 @pytest.mark.second
@@ -225,44 +175,7 @@ def test_frames_keep_what_glass_turns(backend, tmp_path) -> None:
 @pytest.mark.second
 @pytest.mark.parametrize("layout", quick(1, ["two", "hollow"]))
 def test_the_path_tracers_nominal_light_is_the_traced_light(layout, request, backend) -> None:
-    """For every channel, with a reflector turned: places on the CCD and path lengths."""
-    own = request.getfixturevalue(layout)
-    instrument = own.instrument
+    """With a reflector turned."""
+    instrument = request.getfixturevalue(layout).instrument
     turned = instrument.channels[-1].prism_body("prism_0") + "/mirror_a"
-    state = {turned: Motion(rotate=(0.0, 2.0 * ARCSEC, 0.0))}
-    scenery = build_scenery(instrument, state, IDEAL)
-    tracer = PathTracer(backend, scenery, monitor_families(scenery, instrument))
-    placed, aimed = instrument.assembly.place([state]), own.path.coarse.nominal
-    for number, channel in enumerate(instrument.channels):
-        direction = aimed.direction[number]
-        position = np.broadcast_to(placed.pose(channel.reticle_body).translation, direction.shape)
-        systems = assemble(instrument.assembly, [f"{channel.key}/monitor"], [state])
-        place, _, length, valid = (
-            a[0] for a in trace(backend, systems, make_rays(backend, position, direction)).numpy()
-        )
-        run = tracer.run(RaySource.even(position, direction), keep=True)
-        found = run.detections
-        ccd = [d.name for d in scenery.detectors].index(f"{channel.key}/area_ccd")
-        mine = (found.kind == NOMINAL) & (found.detector == ccd)
-        path = found.path[mine]
-        np.testing.assert_array_equal(np.sort(path), np.nonzero(valid)[0])
-        assert valid.sum() > 50
-        np.testing.assert_allclose(found.place[mine], place[path, :2], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(found.length[mine], length[path], rtol=0, atol=1e-12)
-
-
-@pytest.mark.second
-def test_drawings_show_every_channel(two, hollow, backend) -> None:
-    for own in (two, hollow):
-        paths = trace_light_paths(own.instrument, backend, {})
-        names = {(b.camera, b.name) for b in paths.beams if b.is_monitor}
-        assert names == {(c.camera, f"monitor/{c.name}") for c in own.instrument.channels}
-        scene = build_scene(own.instrument, paths)
-        assert {s.path for s in own.instrument.solids} <= set(scene.graph.nodes_geometry)
-        reach = max(
-            one.prism_180.distance
-            for c in own.instrument.cameras
-            for one in own.instrument.spec.channels_of(c).values()
-        )
-        beam = paths.of("forward", monitor=False)[1].vertices[0]
-        assert np.linalg.norm(beam[0] - beam[1]) == pytest.approx(reach, rel=1e-9)
+    out_and_back(backend, instrument, {turned: Motion(rotate=(0.0, 2.0 * ARCSEC, 0.0))})

@@ -11,7 +11,7 @@ from optics.waves.transfer import polychromatic_transfer
 from scenes.specs.spectrum import SpectrumSpec
 from tests.scenes.lens.colour_cameras import colour_camera
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.colour import axial_colour, judge_colours, lateral_colour, spectral_mtfs, spectral_psfs
+from twin.camera.colour import axial_colour, lateral_colour, spectral_mtfs
 from twin.targets import band_light
 
 FIELDS = [(0.0, 0.0), (1.0, 1.0)]
@@ -36,27 +36,6 @@ def test_a_camera_of_one_colour_is_that_of_its_wavelength(achromat, backend) -> 
     assert achromat.at(achromat.wavelength).wavefront().rms == achromat.wavefront().rms
     with pytest.raises(ValueError, match="outside the range"):
         achromat.at(5e-6)
-
-
-def test_colour_of_a_thin_achromat(achromat, backend) -> None:
-    """Secondary axial colour -f (P1 - P2) / (V1 - V2), with partial dispersions and Abbe numbers for F, d and C."""
-    spec = achromat.model.spec
-    lines = np.array([486.1327e-9, 587.5618e-9, 656.2725e-9])
-    n = np.array([[spec.index_behind(face, w) for w in lines] for face in ("L1", "L3")])
-    spread = n[:, 0] - n[:, 2]
-    abbe, partial = (n[:, 1] - 1.0) / spread, (n[:, 0] - n[:, 1]) / spread
-    found = judge_colours(achromat, spec.spectrum, ((0.0, 0.0),), False)
-    focal = float(achromat.model.first_order.principal_distance[0])
-    assert found.axial is not None
-    # what is not achromatic of it is a little of what one lens has, f / V; that is taken off the blue line's focus
-    blue = found.axial[0, 0] - found.axial_reference[0]
-    primary = found.axial_primary[0]
-    assert abs(primary) < 0.02 * focal / abbe[0]
-    wanted = -focal * (partial[0] - partial[1]) / (abbe[0] - abbe[1])
-    assert blue - primary * partial[0] == pytest.approx(wanted, rel=0.03)
-    np.testing.assert_allclose(
-        found.axial_secondary, found.axial_reference - 0.5 * (found.axial[:, 0] + found.axial[:, -1])
-    )
 
 
 def test_lateral_colour_is_in_the_pupils(achromat) -> None:
@@ -89,32 +68,6 @@ def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) 
     monkeypatch.setattr(band_light, "WORST_CHANGE", 1e-9)
     with pytest.raises(UnphysicalError, match="still changes by"):
         spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
-
-
-@pytest.mark.second
-def test_a_camera_of_mirrors_over_its_band(backend, gf7) -> None:
-    """One pupil serves all wavelengths; a point's image has the MTF that the transfer function says."""
-    optics = CameraOptics.alone(gf7, backend)
-    light, field = gf7.spec.light, (1.0, 1.0)
-    assert light is not None
-    found = judge_colours(optics, light, (field,), False)
-    assert found.lateral is None
-    assert found.axial_secondary is None
-    wavelengths, weights = light.rule(9)
-    (psf,) = spectral_psfs(optics, [field], wavelengths, weights)
-    frequency = np.array([0.0, 20e3, 50e3])
-    (mtf,) = optics.mtfs([field], frequency, wavelengths, weights)
-    step = psf.place[1] - psf.place[0]
-    for k in range(2):
-        line = np.sum(psf.values, axis=k) * step**2
-        turned = np.abs(np.exp(-2j * np.pi * frequency[:, None] * psf.place) @ line)
-        # 1 % of the light is beyond the window, spread so wide that it adds to no frequency but the lowest
-        np.testing.assert_allclose(turned[1:], mtf.values[k, 1:], atol=4e-3)
-        assert 0.985 < turned[0] < 1.0
-    assert 0.8 < psf.strehl < 1.0
-    # of one wavelength the Strehl ratio is what the wavefront says
-    (alone,) = spectral_psfs(optics, [field], np.array([650e-9]), np.ones(1))
-    assert alone.strehl == pytest.approx(optics.wavefront(field).strehl, abs=2e-3)
 
 
 def test_axial_colour_is_that_of_the_state(achromat, backend) -> None:

@@ -1,21 +1,14 @@
 """A course of temperatures: the same as single renders of its states, whole in the run folder, or not there at all."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import tifffile
-import xarray as xr
 
 import twin.render as command
-from analysis.units import ARCSEC
 from optics.thermal.heat import Temperature
 from scenes.specs.course import moment
 from scenes.specs.job import checked_nodes
@@ -24,14 +17,10 @@ from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.commands import invoke
-from twin.main_job.monitor_reading import stated
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import Observing, observe, one_detector
-from twin.monitor.time_series import run_series, series_states
-from twin.monitor.truth import trace_truth
+from twin.monitor.time_series import TimeSeries, _warnings, run_series, series_states
 
 run = partial(invoke, command.app)
-ROOT = Path(__file__).resolve().parents[2]
 LEFT = "base/forward/monitor/left/prism_180"
 JOB = f"""instrument: gf7_pair
 perturb:
@@ -89,80 +78,6 @@ def test_temperatures_of_a_time_add_to_the_perturbation(tmp_path) -> None:
 
 
 @pytest.mark.second
-def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) -> None:
-    """Truth, images and readings, bit for bit, from jobs that each describe the state of one time."""
-    experiment, states = prepared, []
-    for k in range(3):
-        own = f"{{temperature: {{change: {(0.5, 0.6, 0.7)[k]} K, gradient: [0 K/m, {10 * k} mK/m, 0 K/m]}}}}"
-        text = JOB[: JOB.index("course:")].replace("{temperature: 0.5 K}", own)
-        text += f"  base/forward: {{temperature: {(0.0, 0.1, -0.2)[k]} K}}\n"
-        states.append(experiment.state(load_job(written(tmp_path, text))))
-    truth = trace_truth(experiment.instrument, experiment.backend, states)
-    photons = experiment.path.expected_photons(states)
-    after = experiment.frames_after(photons, 2, 7)
-    recovery = next(observe(experiment, states, Observing(one_detector(experiment, 2, 7)))).recovery
-    with xr.open_dataset(folder / "course.nc", engine="h5netcdf", decode_timedelta=False) as data:
-        assert data.photons.dims == ("time", "channel", "row", "column")
-        assert list(data.time.values) == [0.0, 720.0, 1800.0]
-        assert data.time.attrs["units"] == "s"
-        np.testing.assert_array_equal(data.photons.values, photons.astype(np.float32))
-    for i, channel in enumerate(experiment.path.channels):
-        image = tifffile.imread(folder / f"images/{channel.camera}_{channel.name}_course.tiff")
-        assert image.dtype == np.uint16
-        np.testing.assert_array_equal(image, after[:, i, 0])
-    for name, change in truth.cameras.items():
-        true = found["cameras"][name]["true"]
-        np.testing.assert_allclose(true["d_alpha_arcsec"], np.degrees(change.d_alpha) * 3600, rtol=1e-12, atol=1e-15)
-        np.testing.assert_allclose(true["d_f_um"], 1e6 * change.d_f, rtol=1e-12, atol=1e-12)
-        for estimator, p in recovery.parameters[name].items():
-            for key, value in p.to_dict().items():
-                np.testing.assert_array_equal(found["cameras"][name][estimator][key], value)
-    for estimator, angle in recovery.angle.items():
-        told = (angle.change_rad, angle.sigma_rad, angle.noise_rad)
-        assert list(found["intersection_angle"][estimator].values()) == [(one / ARCSEC).tolist() for one in told]
-    assert "posterior" in recovery.angle
-    for estimator, ground in recovery.ground.items():
-        assert found["ground"][estimator]["height_m_sigma"] == ground.sigma_m[:, 2].tolist()
-        assert found["ground"][estimator]["left_plan_rms_m"] == ground.plan_rms_m.tolist()
-    true = np.array([found["ground"]["true"][f"{axis}_m"] for axis in ("along", "across", "height")]).T
-    np.testing.assert_allclose(true, truth.ground_error(experiment.ground), atol=1e-9)
-
-
-@pytest.mark.second
-def test_filter_and_smoother_stand_beside_the_readings(found, tmp_path) -> None:
-    """The first time knows its own measurement alone, which is the posterior; the last knows all, filtered or smoothed.
-    The prisms' half kelvin of this job is seven times what `orbit` states; chi-square says so."""
-    groups = [*found["cameras"].values(), found["intersection_angle"], found["ground"]]
-    for group in groups:
-        for key, first in group["filtered"].items():
-            # the pattern's covariance is kept in single precision
-            assert first[0] == pytest.approx(group["posterior"][key][0], rel=1e-5, abs=1e-9)
-            if not key.startswith("left"):
-                assert group["smoothed"][key][-1] == pytest.approx(first[-1], rel=1e-9)
-        for key, late in group["smoothed"].items():
-            if key.endswith("_sigma"):
-                assert np.all(np.array(late) <= np.array(group["filtered"][key]) * (1.0 + 1e-9))
-                assert np.all(np.array(late) >= np.array(group["smoothed"][f"{key}_noise"]))
-    between = found["between"]
-    assert between["times_s"] == pytest.approx(
-        [90.0 * k for k in range(1, 8)] + [720.0 + 135.0 * k for k in range(1, 8)]
-    )
-    for name, camera in between["cameras"].items():
-        assert set(camera) == {"filtered", "smoothed"}
-        sigma = np.array(camera["smoothed"]["d_alpha_arcsec_sigma"])
-        ends = np.array(found["cameras"][name]["smoothed"]["d_alpha_arcsec_sigma"])
-        assert np.all(sigma[:7] > ends[:2].min())
-        assert sigma[7:].max() > sigma[:7].max()  # 18 min leave more open than 12
-    assert set(between) == {"times_s", "cameras", "intersection_angle", "ground"}
-    told = found["disturbances"]
-    assert told["name"] == "orbit"
-    assert told["degrees_of_freedom"] == 3 * 8
-    assert sum(told["innovations"]["chi_square"]) == pytest.approx(told["chi_square"])
-    assert not told["agrees"]
-    assert told["chi_square"] > told["limit"]
-
-
-@pytest.mark.second
 def test_without_disturbances_nothing_is_smoothed(tmp_path, backend) -> None:
     resolved = resolve(written(tmp_path, JOB.replace("course:", "disturbances: none\ncourse:")))
     experiment = MonitorExperiment(resolved, backend)
@@ -173,40 +88,6 @@ def test_without_disturbances_nothing_is_smoothed(tmp_path, backend) -> None:
     assert "between" not in told
     assert "smoothed" not in told["cameras"]["forward"]
     assert "model" in told["ground"]
-
-
-@pytest.mark.second
-def test_the_time_in_detail_is_what_the_rest_of_the_run_shows(folder, found) -> None:
-    recovered = json.loads((folder / "recovered.json").read_text())
-    truth = json.loads((folder / "truth.json").read_text())
-    for name, camera in found["cameras"].items():
-        for key, values in camera["true"].items():
-            assert values[1] == pytest.approx(truth["cameras"][name][key], abs=1e-8)
-        for estimator, values in recovered["cameras"][name].items():
-            # recovered.json has the digits that a sigma lets one state, the series all of them
-            at_the_time = stated({key: camera[estimator][key][1] for key in values})
-            for key, value in values.items():
-                assert at_the_time[key] == pytest.approx(value, rel=1e-6, abs=1e-9)
-    angle = found["intersection_angle"]
-    assert angle["true"]["change_arcsec"][1] == pytest.approx(truth["intersection_angle"]["change_arcsec"], abs=1e-8)
-    single = tifffile.imread(folder / "images/forward_left_after.tiff")
-    np.testing.assert_array_equal(tifffile.imread(folder / "images/forward_left_course.tiff")[1], single[0])
-
-
-def test_small_temperatures_act_linearly(prepared) -> None:
-    """Spots of doubled and of summed temperatures, to second order."""
-    one = {LEFT: Temperature(0.1, (0.0, 0.01, 0.02)), "base/forward": Temperature(0.2)}
-    other = {"base/backward": Temperature(-0.3, (0.0, 0.0, 0.0))}
-    double = {path: field + field for path, field in one.items()}
-    states = [{}, *(prepared.thermal.state(fields) for fields in (one, double, other, one | other))]
-    rays = prepared.path.coarse.rays(states)
-    share = prepared.path.coarse.nodes.share
-    spots = np.einsum("n,bnk->bk", share, rays.position[..., :2]).reshape(4, len(states), 2) / prepared.path.pitch
-    moved = spots[:, 1:] - spots[:, :1]
-    assert np.abs(moved[:, 0]).max() > 0.05
-    # dn/dT itself changes by 1e-3 of its size per kelvin
-    np.testing.assert_allclose(moved[:, 1], 2.0 * moved[:, 0], rtol=4e-4, atol=2e-6)
-    np.testing.assert_allclose(moved[:, 3], moved[:, 0] + moved[:, 2], rtol=1e-5, atol=2e-6)
 
 
 @pytest.mark.second
@@ -225,13 +106,6 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
     monkeypatch.setattr("twin.monitor.time_series.LARGEST_SERIES", 50_000)
     with pytest.raises(InputError, match="do not fit into memory; found '3 times', allowed: at most 1 "):
         run_series(experiment, resolved, states)
-
-
-@pytest.mark.second
-def test_config_holds_the_course(folder) -> None:
-    again, first = resolve(folder / "config.yaml"), resolve(folder.parent / "job.yaml")
-    assert again == first
-    assert again.to_yaml() == (folder / "config.yaml").read_text()
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -301,39 +175,30 @@ def test_the_cold_of_the_perturbation_is_told_there(prepared, tmp_path) -> None:
 
 
 def test_a_time_at_which_the_light_is_lost_is_named(prepared, tmp_path) -> None:
-    """Also when it is not the time that is shown in full."""
+    """Also when it is not the time that is shown in full; and at which a spot is too near the edge of its CCD."""
     gradients = "[[0 K/m, 0 K/m, 0 K/m], [0 K/m, 30 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m]]"
-    text = COURSE.replace("1 min", "1 min, 2 min") + f"    {LEFT}: {{gradient: {gradients}}}"
-    resolved = resolve(written(tmp_path, text)).with_render(1, 1)
-    with pytest.raises(InputError, match="at 1 min of the course cannot be rendered"):
-        run_series(prepared, resolved, series_states(prepared, resolved.job))
+    aside = COURSE.replace("temperature", "motion")
+    aside += "    base/forward/focal_plane: {shift: [0 0 0 um, 270 0 0 um, 0 0 0 um]}"
+    for text, reason in (
+        (COURSE + f"    {LEFT}: {{gradient: {gradients}}}", ""),
+        (aside, r"the spot forward/left cannot be measured \("),
+    ):
+        resolved = resolve(written(tmp_path, text.replace("1 min", "1 min, 2 min"))).with_render(1, 1)
+        with pytest.raises(InputError, match=f"at 1 min of the course cannot be rendered: {reason}"):
+            run_series(prepared, resolved, series_states(prepared, resolved.job))
 
 
-@pytest.mark.second
-def test_an_interrupt_leaves_nothing(tmp_path) -> None:
-    """Ctrl-C while the times are under way."""
-    steps = ", ".join(f"{k} s" for k in range(300))
-    warm = ", ".join(["1 K"] * 300)
-    job = written(tmp_path, COURSE.replace("0 min, 1 min", steps) + NODE + f"{{change: [{warm}]}}")
-    code = (
-        "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "runpy.run_module('twin.render', run_name='__main__', alter_sys=True)"
-    )
-    arguments = [sys.executable, "-c", code, str(job), "--out", str(tmp_path / "new/run"), "--quiet"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen(arguments, cwd=ROOT, env=environment, start_new_session=True, **pipes)
-    try:
-        deadline = time.monotonic() + 60
-        while not list(tmp_path.glob("new/.run.*.partial")):
-            assert process.poll() is None, process.stderr.read()
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        time.sleep(1.0)
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 130
-    assert "Traceback" not in errors
-    assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]
+def test_what_is_wrong_with_a_course_is_told_at_its_first_time(prepared) -> None:
+    course, saturated, share = SimpleNamespace(times=(0.0, 60.0, 120.0)), np.zeros((3, 4), bool), np.ones((3, 4))
+    assert _warnings(prepared, course, saturated, share) == ()
+    saturated[1:, 0], share[2, 3] = True, 0.49
+    full, dim = _warnings(prepared, course, saturated, share)
+    assert "saturated pixels in the spot forward/left at 2 times, first at 1 min" in full
+    assert "backward/right at 2 min: only 49% of the nominal light" in dim
+    bent = SimpleNamespace(holds=np.array([True, True, False]), beyond=np.array([False, True, True]))
+    evidence = SimpleNamespace(course_doubt=lambda times, spots: f"{spots[0]} at {times[1]}")
+    parts = {"smoothed": None, "times": np.array(course.times), "curvature": {"model": bent}, "evidence": evidence}
+    first, lost, again = TimeSeries.doubts(SimpleNamespace(**parts), ["a"])
+    assert first == "course a at 1 min"
+    assert "σ does not hold at 1 times, first at 2 min: the motions that the model reads" in lost
+    assert "at 1 times, first at 1 min, the motions that the model reads are not small" in again

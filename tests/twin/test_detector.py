@@ -1,16 +1,24 @@
-"""The detector against the EMVA 1288 model that it claims to be.
+"""The detector against the EMVA 1288 model that it claims to be, its Poisson numbers, and frames that lie in a file.
 
 Every statistical limit is a two-sided chi-square (or normal) quantile with a false-alarm rate of 1e-6 per test.
 """
 
+from __future__ import annotations
+
+import itertools
 import re
+import time
 from contextlib import nullcontext
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from scipy import stats
+from scipy.special import gammainc, gammaincc
 
+import twin.sensors.poisson_numbers as module
+from analysis.spots.centroid import mean_frames
 from scenes.specs.camera import BandSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.job import JobSpec
@@ -20,7 +28,10 @@ from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from twin.main_job.render_job import render_job
 from twin.render import app
-from twin.sensors import area_detector, exposure_kernel, poisson_numbers
+from twin.run import frame_store
+from twin.run.data_files import FrameFacts, preview_png, tiff
+from twin.run.frame_store import frame_room, in_file, kept_bytes, largest_of, let_go, mean_of
+from twin.sensors import area_detector, exposure_kernel
 from twin.sensors.area_detector import (
     EmvaDetector,
     FixedOffsets,
@@ -29,7 +40,10 @@ from twin.sensors.area_detector import (
     coarse_warnings,
     told_of_steps,
 )
+from twin.sensors.charge_transfer import Collection, Motion
+from twin.sensors.exposure_kernel import FEWEST
 from twin.sensors.line_ccd import LineCcd
+from twin.sensors.poisson_numbers import SERIES_END, TABLE_END, poisson_numbers, poisson_quantile
 
 FALSE_ALARM = 1e-6
 SHEET = {
@@ -59,21 +73,6 @@ def uniform(*shape):
     return FixedPattern(np.ones(shape), np.zeros(shape))
 
 
-@pytest.mark.parametrize("mean_e", [0.3, 3.0, 9.9, 10.1, 60.0, 2500.0, 40000.0])
-def test_electrons_are_poisson(mean_e):
-    sensor = counter()
-    frames = sensor.expose(np.full((64, 64), mean_e / 0.6), uniform(64, 64), 64, 0.0, seed=11)
-    electrons = frames.ravel()
-    law = stats.poisson(mean_e)
-    edges = np.unique(law.ppf(np.linspace(0, 1, 42)[1:-1]))  # some 40 bins of equal probability, or single counts
-    observed = np.bincount(np.searchsorted(edges, electrons), minlength=edges.size + 1)
-    expected = np.diff(np.concatenate([[0.0], law.cdf(edges), [1.0]])) * electrons.size
-    keep = expected > 0
-    chi2 = np.sum((observed[keep] - expected[keep]) ** 2 / expected[keep])
-    assert observed[~keep].sum() == 0
-    assert stats.chi2.sf(chi2, keep.sum() - 1) > FALSE_ALARM
-
-
 @pytest.mark.parametrize("photons", [0.0, 500.0, 60000.0])
 def test_photon_transfer(photons):
     """Temporal mean and variance at three points of the photon transfer line, quantisation included.
@@ -89,22 +88,6 @@ def test_photon_transfer(photons):
     assert abs(frames.mean() - mean) < stats.norm.isf(FALSE_ALARM / 2) * np.sqrt(variance / count)
     ratio = np.sum((frames - mean) ** 2) / variance
     assert stats.chi2.ppf(FALSE_ALARM / 2, count) < ratio < stats.chi2.isf(FALSE_ALARM / 2, count)
-
-
-def test_fixed_pattern_survives_averaging_and_is_the_stated_one():
-    sensor = detector()
-    pattern = sensor.fixed_pattern((96, 96), 3)
-    for values, sigma in ((pattern.gain - 1, 0.01), (pattern.offset_e, 5.0)):
-        chi2 = np.sum((values / sigma) ** 2)
-        assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, values.size) < 1 - FALSE_ALARM / 2
-    frames = sensor.expose(np.full((96, 96), 50000.0), pattern, 100, 0.1, seed=9).astype(float)
-    mean = sensor.expected_dn(np.full((96, 96), 50000.0), 0.1, pattern)
-    variance = sensor.noise_model(0.1).temporal_variance_dn2(mean, 100)
-    chi2 = np.sum((frames.mean(axis=0) - mean) ** 2 / variance)
-    assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, mean.size) < 1 - FALSE_ALARM / 2
-    # without the pattern the same comparison must fail: the test above has seen the pattern
-    flat = sensor.expected_dn(np.full((96, 96), 50000.0), 0.1)
-    assert np.sum((frames.mean(axis=0) - flat) ** 2 / variance) > 10 * mean.size
 
 
 def test_the_response_differs_for_light_and_not_for_dark_current():
@@ -153,7 +136,7 @@ def test_many_frames_in_pieces_have_the_same_bits(full_well, noise, monkeypatch)
     assert ccd.frames_at_once(7, 240) == 7
     monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 500)
     monkeypatch.setattr(area_detector, "_FURTHER_PIXELS", 500)
-    monkeypatch.setattr(poisson_numbers, "_ROOM", 500)
+    monkeypatch.setattr(module, "_ROOM", 500)
     assert ccd.frames_at_once(7, 240) == 2
     np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, 5), whole)
 
@@ -280,21 +263,28 @@ def test_detector_and_data_sheet_saturate_at_one_level(full_well, first):
             dark.check_exposure(0.1)
 
 
-@pytest.mark.parametrize(
-    ("photons", "frames", "exposure", "seed", "words"),
-    [
-        (np.full((4, 4), -1.0), 1, 0.1, 1, "photons"),
-        (np.full((4, 4), np.nan), 1, 0.1, 1, "photons"),
-        (np.full((4, 4), 1e13), 1, 0.1, 1, "photons"),
-        (np.zeros((5, 4)), 1, 0.1, 1, "fixed pattern"),
-        (np.zeros((4, 4)), 0, 0.1, 1, "frames"),
-        (np.zeros((4, 4)), 1, -0.1, 1, "exposure_s"),
-        (np.zeros((4, 4)), 1, 0.1, -1, "seed"),
-    ],
-)
-def test_impossible_exposures_are_explained(photons, frames, exposure, seed, words):
-    with pytest.raises(ValueError, match=words):
-        detector().expose(photons, uniform(4, 4), frames, exposure, seed)
+def test_impossible_exposures_are_explained() -> None:
+    dark, even, sensor = np.zeros((4, 4)), uniform(4, 4), detector()
+    for call, words in (
+        (lambda: sensor.expose(dark - 1.0, even, 1, 0.1, 1), "photons"),
+        (lambda: sensor.expose(np.full((4, 4), np.nan), even, 1, 0.1, 1), "photons"),
+        (lambda: sensor.expose(np.full((4, 4), 1e13), even, 1, 0.1, 1), "photons"),
+        (lambda: sensor.expose(np.zeros(4), even, 1, 0.1, 1), r"photons must be \(..., H, W\)"),
+        (lambda: sensor.expose(np.zeros((5, 4)), even, 1, 0.1, 1), r"fixed pattern \(4, 4\) does not fit"),
+        (lambda: sensor.expose(dark, even, 0, 0.1, 1), "frames must be an integer >= 1"),
+        (lambda: sensor.expose(dark, even, 1, -0.1, 1), "exposure_s"),
+        (lambda: sensor.expose(dark, even, 1, 0.1, -1), "seed must be an integer >= 0"),
+        (lambda: sensor.expose(dark, even, 1, 0.1, 1, threads=0), "threads must be >= 1"),
+        (lambda: sensor.saturated(np.zeros((4, 4), np.uint16)), r"frames must be \(..., frames, H, W\)"),
+        (lambda: sensor.fixed_pattern((4,), 1), "shape must be"),
+        (lambda: FixedPattern(np.ones((2, 2)), np.zeros((2, 3))), "must have one shape"),
+        (lambda: FixedPattern(-np.ones((2, 2)), np.zeros((2, 2))), "gain must be finite and >= 0"),
+        (lambda: Collection(0, 1e-3), "a collection has a step or more"),
+        (lambda: Motion.of([(0.0, 1.0)]), "oscillations have frequencies above zero"),
+        (lambda: Motion.of(bands=[(2.0, 1.0, 1.0)]), "bands reach from a frequency to a higher one"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()
 
 
 @pytest.mark.parametrize(
@@ -304,6 +294,7 @@ def test_impossible_exposures_are_explained(photons, frames, exposure, seed, wor
         ("area_ccd", "columns", 23, "columns: outside the limits; found 23, allowed: at least 24"),
         ("area_ccd", "pitch", "1 nm", "pitch: outside the limits; found '1 nm', allowed: at least 0.5 um"),
         ("sheet", "system_gain_dn_per_e", 1e-30, "system_gain_dn_per_e: a full well is not even one grey value"),
+        ("sheet", "noise", {"ofset": 2.0}, "noise.ofset: no such noise; did you mean 'offset'?"),
         ("sheet", "dark_current_e_per_s", 1e8, "less than 1e+07 electrons per second with the exposure of 10 ms"),
         ("band", "pitch", "1 nm", "bands.P.pitch: outside the limits"),
     ],
@@ -337,7 +328,10 @@ def test_a_line_ccd_knows_its_exposure():
     assert spec.exposure == pytest.approx(11.2e-3)
     room = min(60000.0, (4095.0 - 64.0) / 0.06)
     sheet = DetectorSpec.model_validate({"name": "any", **SHEET, "dark_current_e_per_s": 0.99 * room / 11.2e-3})
-    assert LineCcd.from_specs(spec, sheet).noise.dark_signal_e == pytest.approx(0.99 * room)
+    ccd, seed = LineCcd.from_specs(spec, sheet), np.random.SeedSequence(1)
+    assert ccd.noise.dark_signal_e == pytest.approx(0.99 * room)
+    with pytest.raises(ValueError, match="columns 60 to 67 are not all on a line of 64 pixels"):
+        ccd.expose(np.zeros((1, 8)), 60, ccd.pattern(seed), 1, seed)
     full = DetectorSpec.model_validate({"name": "any", **SHEET, "dark_current_e_per_s": 1.01 * room / 11.2e-3})
     with pytest.raises(InputError, match="dark current alone saturates"):
         LineCcd.from_specs(spec, full)
@@ -356,3 +350,162 @@ def test_coarse_grey_values_are_warned_of(backend):
     assert "area CCD monitor_ccd has coarse grey values: noise of 0.092 DN" in text
     assert text in render_job(coarse, backend).warnings
     assert coarse_warnings(fine.detector) == ()
+
+
+LAST = np.uint64(2**64 - 1)
+
+
+def generator(seed: int) -> np.random.Generator:
+    return np.random.Generator(np.random.SFC64(seed))
+
+
+def words(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    return rng.integers(0, LAST, shape, dtype=np.uint64, endpoint=True)
+
+
+def is_quantile(number: np.ndarray, mean: np.ndarray, word: np.ndarray) -> np.ndarray:
+    """Whether F(n - 1) < u <= F(n), by SciPy's functions alone; the upper half of u by the upper tail."""
+    upper = word > np.uint64(2**63 - 1)
+    tail = (np.where(upper, LAST - word, word).astype(float) + 0.5) / 2.0**64
+
+    def reached(k: np.ndarray) -> np.ndarray:
+        return np.where(upper, gammainc(k + 1.0, mean) <= tail, gammaincc(k + 1.0, mean) >= tail)
+
+    return reached(number) & ((number == 0.0) | ~reached(np.maximum(number - 1.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(1e-6, 0.5), (0.5, 8.0), (8.0, TABLE_END), (TABLE_END, 300.0), (300.0, SERIES_END)]
+)
+def test_every_number_is_the_quantile(low, high) -> None:
+    """Table, interpolation and expansion never decide otherwise than the distribution function, out to u = 2^-60."""
+    rng = np.random.default_rng(3)
+    mean = np.minimum(low * (high / low) ** rng.random(20_000), np.nextafter(high, 0.0))
+    word = words(rng, (9, mean.size))
+    for k, shift in enumerate((10, 20, 30, 40)):
+        word[2 * k] >>= np.uint64(shift)
+        word[2 * k + 1] = LAST - (word[2 * k + 1] >> np.uint64(shift))
+    number = poisson_quantile(mean, word)
+    assert np.array_equal(number, np.floor(number))
+    assert is_quantile(number, mean, word).all()
+    # the check sees a number that is one off
+    assert not is_quantile(number + 1.0, mean, word).any()
+
+
+def test_edges_of_the_cells() -> None:
+    """Means on the table's own, just below and above, u at the first and last of each of its cells."""
+    steps = np.concatenate([np.arange(0, 33) / 32.0, np.arange(1, 33), [TABLE_END, 1000.0, SERIES_END - 1.0]])
+    mean = np.concatenate([steps, np.nextafter(steps, 1e9), np.nextafter(steps[1:], 0.0)])
+    edge = np.arange(1024, dtype=np.uint64) << np.uint64(54)
+    word = np.concatenate([edge, edge + np.uint64(2**54 - 1)])[:, None].repeat(mean.size, axis=1)
+    number = poisson_quantile(mean, word)
+    assert is_quantile(number, mean, word).all()
+    assert np.all(np.diff(number[np.argsort(word[:, 0], kind="stable")], axis=0) >= 0)
+    assert np.all(np.diff(number[:, np.argsort(mean, kind="stable")], axis=1) >= 0)
+    assert np.all(number[:, mean == 0.0] == 0.0)
+
+
+@pytest.mark.parametrize("kind", [np.random.SFC64, np.random.MT19937])
+def test_mixed_means_are_independent_and_each_has_its_own(kind) -> None:
+    """All ways of one call, also of a generator whose words have 32 bits: means, variances, and neighbours, frames and
+    means that do not know of each other."""
+    mean = np.array([0.0, 1e-4, 0.5, 7.0, 31.0, 33.0, 900.0, 7e4, 3e5])
+    number = poisson_numbers(mean, 200_000, np.random.Generator(kind(2)))
+    assert np.all(number[:, 0] == 0.0)
+    assert 3 <= np.count_nonzero(number[:, 1]) <= 48  # of 20: 1e-6 on either side
+    scaled = (number[:, 2:] - mean[2:]) / np.sqrt(mean[2:])
+    within = 5.0 / np.sqrt(len(scaled))  # 6e-7 for each of the 42 numbers
+    assert np.all(np.abs(scaled.mean(axis=0)) < within)
+    between = scaled.T @ scaled / len(scaled)
+    assert np.all(np.abs(np.diag(between) - 1.0) < within * np.sqrt(2.0 + 1.0 / mean[2:]))
+    assert np.all(np.abs(between - np.diag(np.diag(between))) < within)
+    later = scaled[1:].T @ scaled[:-1] / (len(scaled) - 1)
+    assert np.all(np.abs(later) < within)
+
+
+def test_the_pieces_do_not_matter(monkeypatch) -> None:
+    mean = np.random.default_rng(1).exponential(20.0, (30, 41))
+    whole = poisson_numbers(mean, 7, generator(4))
+    assert whole.shape == (7, 30, 41)
+    for room in (1, 5000):
+        monkeypatch.setattr(module, "_ROOM", room)
+        assert np.array_equal(poisson_numbers(mean, 7, generator(4)), whole)
+    # views, other layouts and a single number
+    assert np.array_equal(poisson_numbers(np.asfortranarray(mean), 7, generator(4)), whole)
+    assert poisson_numbers(np.array(3.0), 2, generator(4)).shape == (2,)
+
+
+DETECTOR = EmvaDetector(
+    quantum_efficiency=0.6,
+    full_well_e=30_000.0,
+    system_gain_dn_per_e=0.1,
+    dark_noise_e=5.0,
+    dark_current_e_per_s=20.0,
+    prnu=0.01,
+    dsnu_e=3.0,
+    offset_dn=50.0,
+    bit_depth=12,
+)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hardly anything is kept in memory."""
+    monkeypatch.setattr(frame_store, "IN_MEMORY", 1000)
+    monkeypatch.setattr(frame_store, "PART", 20_000)
+
+
+def exposed(frames: int, threads: int | None = None, images: int = 3) -> np.ndarray:
+    light = np.random.default_rng(2).uniform(0.0, 4000.0, (images, 24, 32))
+    pattern = DETECTOR.fixed_pattern((images, 24, 32), 5)
+    return DETECTOR.expose(light, pattern, frames, 0.1, 7, threads)
+
+
+def test_frames_in_a_file_are_those_in_memory(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = 2 * FEWEST // (3 * 24 * 32)
+    stored = exposed(frames)
+    monkeypatch.setattr(frame_store, "IN_MEMORY", 1 << 28)
+    kept = exposed(frames)
+    assert in_file(stored)
+    assert in_file(stored[1, 3])
+    assert not in_file(kept)
+    let_go(stored)
+    let_go(kept)
+    np.testing.assert_array_equal(stored, kept)
+    np.testing.assert_array_equal(mean_of(stored), mean_frames(kept))
+    np.testing.assert_array_equal(mean_of(stored), kept.mean(axis=-3))  # as pictures have it: all sums are exact
+    np.testing.assert_array_equal(largest_of(stored), kept.max(axis=-3))
+    np.testing.assert_array_equal(DETECTOR.saturated(stored).pixels, DETECTOR.saturated(kept).pixels)
+    facts = FrameFacts("a camera", 5e-6, 1e-3)
+    assert bytes(tiff(stored[1], facts)) == tiff(kept[1], facts)
+    assert preview_png(stored[2]) == preview_png(kept[2])
+
+
+def test_threads_do_not_change_the_frames_of_one_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several pieces of one image: a thread must not draw the next one while another draws the last."""
+    monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 32 * 24 * 32)
+    frames = 8 * FEWEST // (24 * 32)
+    first = exposed(frames, threads=1, images=1)
+    drawn, calls = exposure_kernel.words_of, itertools.count()
+
+    def slow(*arguments: Any) -> np.ndarray:
+        if next(calls) == 0:
+            time.sleep(0.2)
+        return drawn(*arguments)
+
+    monkeypatch.setattr(exposure_kernel, "words_of", slow)
+    np.testing.assert_array_equal(exposed(frames, threads=4, images=1), first)
+
+
+def test_a_full_disk_is_said_before(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(file: int, start: int, size: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(frame_store.os, "posix_fallocate", full)
+    with pytest.raises(OSError, match="GB of frames do not fit on the disk"):
+        frame_room((2, 100, 30, 30))
+
+
+def test_what_lies_in_a_file_takes_no_memory() -> None:
+    assert kept_bytes(1e6) == 1e6
+    assert kept_bytes(1e12) == kept_bytes(5e9) < 0.2e9

@@ -1,17 +1,15 @@
 """What real frames hold beside the spot is found and corrected, and sigmas hold; clean frames are left as they are."""
 
 import re
-from contextlib import suppress
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.spots import static_defects
 from analysis.spots.frame_screening import noise_ratio, screen_frames
 from analysis.spots.photon_transfer import pixel_correction
-from analysis.spots.screened_fit import fit_screened, one_shape
-from analysis.spots.spot_positions import SpotError, difference_covariance
+from analysis.spots.screened_fit import one_shape
+from analysis.spots.spot_positions import SpotError
 from analysis.spots.static_defects import examine, lone_pixels
 from optics.numerics.threads import one_blas_thread
 from scenes.models.disturbances import state_of
@@ -81,21 +79,6 @@ def test_dirt_is_found_and_corrected(bench, kind):
         # with all together light and well may leave nothing saturated
         for one in kinds:
             assert set(TOLD[one]) <= names or (kind == "all" and one == "saturation")
-
-
-@pytest.mark.second
-def test_without_the_corrections_dirt_does_harm(bench):
-    """The test above could fail: the same frames taken as they are."""
-    template, detector, noise = bench
-    for kind in ("background", "reflection", "movement"):
-        drawn = draw(template, detector, (kind,), 1000)
-        work = measurement(drawn, template, noise, corrections="none")
-        assert work.search() == []
-        assert work.measure() == []
-        first, second = work.positions
-        error = (second.position - first.position)[0] - drawn.shift
-        square = float(error @ np.linalg.solve(difference_covariance(first, second, noise)[0], error))
-        assert square > chi2.isf(1e-6, 2)
 
 
 def test_clean_frames_are_not_touched(bench):
@@ -202,32 +185,6 @@ def test_findings_tell_places_on_the_ccd(bench):
         assert "(30, 21)" in texts["bad pixels"]
         assert texts["bad columns"].startswith("62 ")
         assert "at row 60.3, column 37.6" in texts["second light"]
-
-
-class Gaussian:
-    """A spot of another shape than the calibrated one, with as much light."""
-
-    def __init__(self, template, width: float) -> None:
-        self.shape, self.width = template.shape, width
-        self.light = float(np.sum(template.evaluate(47.0, 48.0)[0][0]))
-
-    def evaluate(self, row: float, column: float):
-        r, c = np.indices(self.shape)
-        peak = self.light / (2.0 * np.pi * self.width**2)
-        return [[peak * np.exp(-((r - row) ** 2 + (c - column) ** 2) / (2.0 * self.width**2))]]
-
-
-@pytest.mark.parametrize("width", quick(1, [0.9, 4.0]))
-def test_the_search_ends_where_the_spot_has_another_shape(bench, width, monkeypatch):
-    """A Gaussian in place of the diffraction image takes some dozen fits, not one for each place along the edges."""
-    template, detector, noise = bench
-    fits, rng = [], np.random.default_rng(8)
-    monkeypatch.setattr(static_defects, "fit_screened", lambda *a, **k: fits.append(1) or fit_screened(*a, **k))
-    pattern = detector.fixed_pattern(template.shape, 3)
-    frames = record(clean_scene((47.0, 48.0), template.shape), Gaussian(template, width), detector, pattern, rng)
-    with suppress(SpotError), one_blas_thread():
-        examine(screen_frames(frames, noise), noise, template)
-    assert 0 < len(fits) <= 150
 
 
 @pytest.mark.parametrize("seed", quick(0, [18, 139, 154]))

@@ -13,14 +13,10 @@ from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
 from optics.waves.imaging import aim_collimated
-from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import fit_wavefront, path_difference
 from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.specs.load import load_detector
-from twin.monitor.image_quality import FIELDS, PLACES, QUALITY
+from twin.monitor.image_quality import FIELDS, QUALITY
 from twin.monitor.image_quality import image_quality as quality_of
-from twin.sensors.line_ccd import LineCcd, band_wavelengths
-from twin.targets.target_path import TargetPath
 
 WAVELENGTH, ARCSEC = 650e-9, np.pi / 180 / 3600
 NODES = quadrature.disk(12)
@@ -76,19 +72,12 @@ def rms(difference: np.ndarray) -> float:
     return float(fit_wavefront(NODES.x, NODES.y, NODES.weight, difference[1:]).rms) / WAVELENGTH
 
 
-def test_nominal_wavefront_errors(quality) -> None:
-    """The range of the reference design along its line, see tests/oracles/test_reference_cameras.py, where the field's
-    minimum lies between the fields that are looked at there.
-    """
-    for camera in quality.cameras.values():
-        assert np.all((camera.wfe[0] > 0.0140) & (camera.wfe[0] < 0.0182))
-        assert np.all(camera.wfe[0, [0, 2, 4]] > 0.0145)
-        np.testing.assert_allclose(camera.wfe[0], camera.wfe[0, ::-1], rtol=1e-6)  # the design is symmetric
-        np.testing.assert_allclose(camera.defocus[0], camera.defocus[0, ::-1], atol=1e-11)
-    # a camera that turns as a whole sees other things as well as before
+def test_a_camera_that_turns_as_a_whole_is_as_sharp(quality) -> None:
+    """It sees other things as well as before."""
     turned = quality.cameras[CAMERA]
     np.testing.assert_allclose(turned.wfe[2], turned.wfe[0], atol=1e-8)
     np.testing.assert_allclose(turned.mtf_along_line[2], turned.mtf_along_line[0], atol=1e-8)
+    assert [len(outlines) for outlines in turned.pupils] == [len(FIELDS)] * len(STATES)
 
 
 @pytest.mark.second
@@ -117,23 +106,6 @@ def test_wavefront_error_against_batoid(gf7_pair, backend) -> None:
         assert rms(difference) == pytest.approx(value, abs=1e-6)
 
 
-@pytest.mark.parametrize("s", [0, 1])
-def test_mtf_is_that_of_the_path_that_images_edges(gf7_pair, backend, quality, s: int) -> None:
-    """Required: 1e-4. Nodes, wavelengths and the solution of the fit are others, 1e-6; a line in its nominal place."""
-    model = gf7_pair.cameras[CAMERA]
-    band = model.spec.bands["P"]
-    path = TargetPath(gf7_pair.assembly, CAMERA, ROOT, model, backend)
-    directions = np.array([light_of(gf7_pair, backend, STATES[s], field) for field in FIELDS])
-    pupils = path.pupils(STATES[s], directions, path.places(STATES[s], directions))
-    frequency = band.nyquist * np.eye(2)
-    detector = LineCcd.from_specs(band, load_detector(band.detector)).transfer(*frequency.T)
-    both = [polychromatic_transfer(p, frequency, *band_wavelengths(band), np.zeros(1))[0] * detector for p in pupils]
-    along, track = np.abs(both).T
-    np.testing.assert_allclose(quality.cameras[CAMERA].mtf_along_line[s], along, atol=2e-6)
-    np.testing.assert_allclose(quality.cameras[CAMERA].mtf_along_track[s], track, atol=2e-6)
-    assert np.ptp(along - track) > 1e-4 or s == 0  # the directions are not the same by chance
-
-
 def test_a_state_is_the_same_alone_and_among_others_one_of_which_is_lost(gf7_pair, backend, quality) -> None:
     several = image_quality(gf7_pair, backend, [LOST, MOVED, CUT, {}, MOVED])
     for name, camera in several.cameras.items():
@@ -158,16 +130,6 @@ def test_a_state_is_the_same_alone_and_among_others_one_of_which_is_lost(gf7_pai
     json.dumps(QUALITY(several), allow_nan=False)
 
 
-def test_a_line_that_moves_in_its_focal_plane(gf7_pair, backend) -> None:
-    """The line CCD is a body of its own, here moved by 50 um downstream: all of it is defocus."""
-    shift = Motion(shift=(0.0, 0.0, 50e-6))
-    states = [{}, {f"{ROOT}/focal_plane/line": shift}, {f"{ROOT}/focal_plane": shift}]
-    found = image_quality(gf7_pair, backend, states).cameras[CAMERA]
-    np.testing.assert_allclose(found.defocus[1] - found.defocus[0], -50e-6, atol=1e-8)
-    np.testing.assert_allclose(found.wfe[1], found.wfe[2], atol=1e-9)
-    np.testing.assert_allclose(found.mtf_along_line[1], found.mtf_along_line[2], atol=1e-9)
-
-
 @pytest.mark.second
 def test_too_rough_a_wavefront_has_no_mtf_but_an_error(gf7_pair, backend) -> None:
     rough = {f"{ROOT}/M1": Motion(figure={60: 1e-6})}
@@ -182,20 +144,3 @@ def test_fields_outside_of_the_line_are_refused(gf7_pair, backend) -> None:
     for fields in ((), (0.0, 1.2)):
         with pytest.raises(ValueError, match="fields"):
             image_quality(gf7_pair, backend, [{}], fields)
-
-
-def test_files_have_each_number_under_its_key(quality) -> None:
-    """Numbers of the perturbed state, the second, at the places of the line; mean and worst over the fields."""
-    camera, fields = quality.cameras[CAMERA], quality.fields
-    told = QUALITY(quality)["cameras"][CAMERA]
-    numbers = {
-        "defocus_um": 1e6 * camera.defocus,
-        "mtf_along_line": camera.mtf_along_line,
-        "mtf_along_track": camera.mtf_along_track,
-        "light_lost": camera.light_lost,
-    }
-    for key, values in numbers.items():
-        assert told[key] == {place: values[1, fields.index(field)] for place, field in PLACES.items()}
-    assert told["wfe_rms_waves"] == camera.wfe[1].mean()
-    assert told["wfe_rms_waves_focus_removed"] == camera.wfe_refocused[1].mean()
-    assert told["wfe_worst_waves"] == camera.wfe[1].max()

@@ -11,7 +11,7 @@ import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.spots.likelihood import EDGE_PX
-from optics.numerics.backend import Backend, load_backend
+from optics.numerics.backend import Backend
 from scenes.models.monitor_layout import (
     CONTINUOUS,
     Beam,
@@ -58,11 +58,6 @@ goal: {angle: 0.05 arcsec, d_f: 2 um}
 FIRST = Beam(0.22, 0.0, 0.034, np.radians(1.22), 2.4, 0.5, 0.15, 0.06, 0.05)
 SECOND = Beam(0.13, 0.0, 0.034, np.radians(1.25), 2.65, 0.65, 0.1, 0.06, 0.11)
 STATED_NAME = "mirrors.yaml"
-
-
-@pytest.fixture(scope="module")
-def backend() -> Backend:
-    return load_backend("llvm")
 
 
 @pytest.fixture(scope="module")

@@ -355,7 +355,14 @@ def test_distortion_agrees_with_scipy(folder: Path) -> None:
     (folder / "distortion.yaml").write_text(text[: text.index("  turntable:")] + "  angle_sigma: 0.05 arcsec\n")
     run_ = distortion_of(folder)
     fit = run_.compensated.fit
+    (folder / "distortion.yaml").write_text((folder / "distortion.yaml").read_text().replace("zero: 102", "zero: 2"))
+    with pytest.raises(InputError, match=r"spots.csv:\d+: reading.*an angle beyond any field"):
+        distortion_of(folder)
     head, *body = rows_of(folder / "spots.csv")
+    write(folder / "spots.csv", [head, *(row for row in body if row[1] == body[0][1])])
+    in_unit(folder / "spots.csv", "sigma [um]", "sigma [um]", 0.0)
+    with pytest.raises(InputError, match=r"spots.csv:\d+: sigma .*one set of points without sigmas"):
+        distortion_of(folder)
     table = np.array(body, float)
     points, sets = int(table[:, 0].max()), int(table[:, 1].max())
     keep = run_.means.keep
@@ -433,9 +440,6 @@ def test_turntable_agrees_with_scipy(folder: Path) -> None:
     assert np.all(np.abs(at @ found.x - fit(series.angle) / ARCSEC) < 1e-5 * sigma)
     covariance = at @ np.linalg.inv(design.T @ design) @ at.T
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), sigma, rtol=1e-8)
-
-
-# --- more data -------------------------------------------------------------------------------------------
 
 
 # --- one model for all terms -----------------------------------------------------------------------------

@@ -1,17 +1,23 @@
-"""Without noise: what the images say about the motions that paper 001 is derived for, against the exact trace."""
+"""What images say: without noise against the exact trace and the crosstalk table, with noise against stated sigmas."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from analysis.monitor import model_fit, monitoring
 from analysis.monitor.monitoring import PER_SI
-from analysis.monitor.recovery import measure_spots
+from analysis.monitor.recovery import measure_spots, recover
+from analysis.spots.likelihood import cramer_rao_bound
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.instrument import BASE
-from twin.monitor.truth import trace_truth
+from scenes.yaml.errors import InputError
+from tests.tiers import quick
+from twin.monitor.crosstalk import crosstalk
+from twin.monitor.truth import ground_geometry, trace_truth
 
 SHIFT, TURN, SCALE = 50e-6, 20 * ARCSEC, 20e-6  # the largest motions that are claimed
 ALONE = [tuple(sign * (i == k) for i in range(4)) for k in range(4) for sign in (1, -1)]
@@ -61,6 +67,15 @@ def test_model_recovers_the_family(measured):
     assert np.all(worst < MODEL_LIMIT), worst
 
 
+def test_cameras_that_look_the_same_way_locate_no_point(gf7_pair):
+    spec, distance = gf7_pair.spec, dict.fromkeys(gf7_pair.cameras, 5.5)
+    assert ground_geometry(gf7_pair, distance).altitude_m == spec.altitude
+    sites = {name: site.model_copy(update={"look": 0.4}) for name, site in spec.cameras.items()}
+    same = replace(gf7_pair, spec=spec.model_copy(update={"cameras": sites}))
+    with pytest.raises(InputError, match="altitude: points on the ground cannot be located by these cameras"):
+        ground_geometry(same, distance)
+
+
 def test_derived_formulas_are_good_to_one_percent(measured):
     signs, cameras = measured
     checked = 0
@@ -73,22 +88,150 @@ def test_derived_formulas_are_good_to_one_percent(measured):
     assert checked == 2 * (8 + 16 * 4)
 
 
-def test_printed_formulas_miss_by_their_factors(measured):
-    """The line's turn and the scale, alone, against the paper's own model: 2.000 and 1/2; the cos^2 is 1 - sin^2 W."""
-    signs, cameras = measured
-    turn, scale, along = (signs[:, k] * (np.abs(signs).sum(axis=1) == 1) for k in (2, 3, 1))
-    for _, shift, calibration in cameras.values():
-        geometry = calibration.geometry
-        single = shift @ monitoring.coefficients("paper_single", geometry).T
-        joint = shift @ monitoring.coefficients("paper_joint", geometry).T
-        rows = np.flatnonzero(turn)
-        assert single[rows, 2] / (turn[rows] * TURN) == pytest.approx(2.0, abs=2e-3)
-        assert joint[rows, 2] / (turn[rows] * TURN) == pytest.approx(2.0, abs=2e-3)
-        rows = np.flatnonzero(scale)
-        f = geometry.principal_distance_m
-        # both ends read 3e-3 too much at the largest field: the calibrated line is not quite the chord of the monitors
-        assert single[rows, 3] / (scale[rows] * SCALE * f) == pytest.approx(1.0, abs=4e-3)
-        assert joint[rows, 3] / (scale[rows] * SCALE * f) == pytest.approx(0.5, abs=2e-3)
-        rows = np.flatnonzero(along)
-        without = single[rows, 1] / np.cos(geometry.field_beta_rad) ** 2
-        assert np.all(np.abs(without / (along[rows] * SHIFT / f) - 1.0) < 2e-3)
+PIXEL_NOISE = (1e-3) ** 2 * np.eye(8)  # px^2, weighs all coordinates alike
+
+
+@pytest.fixture(scope="module", params=quick(1, ["gf7_pair", "monitor_pair"]))
+def table(request, experiment):
+    setup = experiment(request.param)
+    return setup, crosstalk(setup, PIXEL_NOISE)
+
+
+def row(cameras, camera, label):
+    found = cameras[camera]
+    return found, [m.label for m in found.motions].index(label)
+
+
+@pytest.mark.second
+def test_table_is_what_the_images_say(table, backend):
+    """Every motion rendered at a size that moves a spot by some 5 px: spots and truth within 1% of the table."""
+    setup, cameras = table
+    calibration = setup.calibration
+    first = measure_spots(setup.expected_frames(setup.nominal_photons), 9, calibration).position
+    for k, (name, found) in enumerate(cameras.items()):
+        strongest = np.max(np.abs(found.spot_shift), axis=0)
+        units = np.clip(5.0 / np.maximum(strongest, 1e-9), 0.0, 50.0)
+        states = [m.state(n * m.unit_size) for m, n in zip(found.motions, units, strict=True)]
+        photons = setup.path.expected_photons(states)
+        images = setup.expected_frames(photons).reshape(-1, *photons.shape[2:])
+        position = measure_spots(images, 9, calibration, threads=2).position.reshape(len(states), -1, 2)
+        shift = (position - first)[:, 2 * k : 2 * k + 2].reshape(-1, 4).T / units
+        change = trace_truth(setup.instrument, backend, states).cameras[name]
+        true = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f]) * PER_SI[:, None] / units
+        assert len(states) == 49
+        # second order of a motion: 1% of its own effect; 2e-5 px: interpolation of the template, over the units. Coma
+        # in the monitor's aperture changes the spot's shape, and a fit of the calibrated shape is not the mean ray: 3%
+        share = np.array([0.03 if m.kind == "figure" else 0.01 for m in found.motions])
+        assert np.all(np.abs(shift - found.spot_shift) < share * strongest + 2e-5 / units)
+        camera = setup.calibration.cameras[name]
+        per_pixel = np.abs(camera.parameter_jacobian @ np.linalg.inv(camera.spot_jacobian)).sum(axis=1) * PER_SI
+        floor = 0.01 * per_pixel[:, None] * strongest + 2e-8  # um or arcsec: rounding of the differenced truth
+        assert np.all(np.abs(true - found.true) < 0.01 * np.abs(found.true) + floor)
+
+
+@pytest.mark.second
+def test_reference_rotation_cannot_be_told_from_the_cameras(table):
+    """A turn of the central prism reads as an opposite turn of the camera; the report has to name it."""
+    _, cameras = table
+    for name in cameras:
+        found, k = row(cameras, name, "central prism about Y")
+        assert np.all(np.abs(found.true[:, k]) < 1e-6)
+        assert found.readings["model"][0, k] == pytest.approx(-1.0, rel=0.02)
+        assert found.observability.rank == 4
+        statements = found.principal_distance_statements()
+        assert any("whole camera scaled" in s and "the spots see it." in s for s in statements)
+        assert any("(piston)" in s and "the spots see it wrongly" in s for s in statements)
+        assert any(
+            s.startswith("central prism about Y") and "not separable" in s for s in found.observability.statements
+        )
+
+
+SEEDS = 40
+FRAMES = 9
+FALSE_ALARM = 1e-4  # per quantity, both sides; 8 parameters and 1 angle: 9e-4 in all
+STATE = {
+    f"{BASE}/backward/focal_plane": Motion(rotate=(0.0, 0.0, 10 * ARCSEC), shift=(20e-6, -30e-6, 0.0)),
+    f"{BASE}/forward": Motion(scale=10e-6),
+    f"{BASE}/forward/focal_plane": Motion(shift=(-15e-6, 25e-6, 0.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def runs(experiment):
+    """Recovery of every seed (pattern, before and after all new) and of the noise-free images."""
+    setup = experiment("gf7_pair")
+    photons = setup.path.expected_photons([STATE])
+    recovered = []
+    for seed in range(SEEDS):
+        before = setup.frames_before(FRAMES, seed)
+        recovered.append(recover(before, setup.frames_after(photons, FRAMES, seed), setup.calibration))
+    clean_before = measure_spots(setup.expected_frames(setup.nominal_photons), FRAMES, setup.calibration)
+    clean_after = measure_spots(setup.expected_frames(photons[0]), FRAMES, setup.calibration)
+    return setup, photons, recovered, clean_before, clean_after
+
+
+def assert_chi_square(values, sigma, expected):
+    """Sum of squares of normalised deviations from the noise-free reading is chi-square with one degree a seed."""
+    total = float(np.sum(((values - expected) / sigma) ** 2))
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], len(values))
+    assert low < total < high, (total / len(values), low / len(values), high / len(values))
+
+
+@pytest.mark.second
+def test_scatter_of_parameters_agrees_with_sigma(runs):
+    setup, _, recovered, clean_before, clean_after = runs
+    for k, (camera, calibration) in enumerate(setup.calibration.cameras.items()):
+        shift = (clean_after.position - clean_before.position)[2 * k : 2 * k + 2].reshape(4)
+        expected = calibration.parameter_jacobian @ np.linalg.inv(calibration.spot_jacobian) @ shift
+        values = np.array([r.parameters[camera]["model"].vector[0] for r in recovered])
+        sigma = np.array([r.parameters[camera]["model"].sigma[0] for r in recovered])
+        assert np.all(np.std(values, axis=0) > 0)
+        for parameter in range(4):
+            assert_chi_square(values[:, parameter], sigma[:, parameter], expected[parameter])
+
+
+@pytest.mark.second
+def test_scatter_of_the_intersection_angle_agrees_with_sigma(runs):
+    _, _, recovered, *_ = runs
+    values = np.array([r.angle["model"].change_rad[0] for r in recovered])
+    sigma = np.array([r.angle["model"].sigma_rad[0] for r in recovered])
+    total = float(np.sum(((values - values.mean()) / sigma) ** 2))
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], SEEDS - 1)
+    assert low < total < high
+
+
+@pytest.mark.second
+def test_maximum_likelihood_reaches_the_cramer_rao_bound(runs):
+    """Pooled over 16 coordinates: 640 deviations, standard error of the ratio 2.8 %; four of them, and 3 % above."""
+    setup, _, recovered, clean_before, clean_after = runs
+    ratios = []
+    for clean, pick in ((clean_before, "before"), (clean_after, "after")):
+        bound = cramer_rao_bound(
+            setup.calibration.template, clean.row, clean.column, clean.flux, clean.background,
+            setup.calibration.noise, FRAMES,
+        )  # fmt: skip
+        sigma = np.sqrt(np.diagonal(bound, axis1=1, axis2=2))
+        measured = np.stack([getattr(r, pick)[0] for r in recovered])
+        ratios.append((measured - clean.position) / sigma)
+    spread = float(np.sqrt(np.mean(np.square(ratios))))
+    assert np.size(ratios) == 16 * SEEDS
+    assert 0.89 < spread < 1.14, spread
+
+
+def test_frames_before_and_after_have_noise_of_their_own(experiment):
+    """Of one seed and of one state, so that nothing but the noise differs. Differences of frames hold no pattern."""
+    setup = experiment("gf7_pair")
+    before = setup.frames_before(2, 3)
+    after = setup.frames_after(np.stack([setup.nominal_photons] * 3), 2, 3)
+    again = setup.frames_after(setup.nominal_photons[None], 2, 4)
+    differences = [(frames[:, 1].astype(float) - frames[:, 0]).ravel() for frames in (before, *after, *again)]
+    limit = stats.norm.isf(FALSE_ALARM / 2 / 10)
+    for k, first in enumerate(differences):
+        for second in differences[:k]:
+            products = first * second
+            assert abs(np.sum(products)) < limit * np.sqrt(np.sum(products**2))
+    # and the channels of one exposure
+    for channels in (before, after[0]):
+        each = [(frames[1].astype(float) - frames[0]).ravel() for frames in channels]
+        for k, first in enumerate(each):
+            assert all(abs(np.sum(first * s)) < limit * np.sqrt(np.sum((first * s) ** 2)) for s in each[:k])

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from optics.raytrace.aim import aim
 from optics.waves.diffraction import image
 from scenes.specs.instrument import BASE
 from twin.monitor import monitor_beams
-from twin.monitor.image_sampling import SPOT_RANGES
+from twin.monitor.image_sampling import SPOT_RANGES, UncertainImageError
 from twin.monitor.monitor_path import MonitorPath
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,25 +70,10 @@ def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
     assert np.max(np.abs(steps[0] - steps[1])[:, None] / peak[0][:, None]) < ACCURACY
 
 
-def test_too_few_nodes_would_be_seen(setup) -> None:
-    """The first class is not right for the last one's spots, so that the choice matters."""
-    path = setup.path
-    state = off_middle(path, 1.0 + 0.95 * SPOT_RANGES[-1])
-    want = path.expected_photons([state], single=False)
-    few = MonitorPath(path.instrument, path.backend, path.class_beams(0).nodes).expected_photons([state], single=False)
-    assert np.max(np.abs(few - want)) > 3 * ACCURACY * want.max()
-
-
-@pytest.mark.second
-def test_a_state_has_its_class_in_any_company(setup) -> None:
-    path = setup.path
-    states = [off_middle(path, 1.0 + share) for share in (0.1, 0.4, 0.7, 0.2)]
-    together = path.expected_photons(states)
-    assert path.class_of(path.coarse_trace(states)).tolist() == [0, 1, 2, 0]
-    for state, photons in zip(states, together, strict=True):
-        alone = path.expected_photons([state])[0]
-        # the compiler may contract other products; then sums in single precision round elsewhere
-        assert np.max(np.abs(alone - photons)) < SINGLE * photons.max()
+def test_beams_that_are_too_wide_for_the_pixels_are_refused(setup) -> None:
+    wide = SimpleNamespace(aperture=np.array([10.0 * setup.path.numerical_aperture]))
+    with pytest.raises(UncertainImageError, match="beams have 10 times the aperture as designed: "):
+        setup.path._response_of(wide)
 
 
 def test_margin_counts_as_distance(setup) -> None:

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from analysis.monitor.parameters import ANGLE_GROUP
-from optics.numerics.backend import Backend, load_backend
+from optics.numerics.backend import Backend
 from scenes.models.monitor_layout import (
     Beam,
     ImagingBeams,
@@ -22,14 +22,11 @@ from scenes.models.monitor_layout import (
     prism_mass,
     pupil_share,
     resolve_monitor_design,
-    start_beams,
 )
 from scenes.specs.job import JobSpec
-from scenes.specs.load import load_instrument
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
-from twin.design import monitor_design, monitor_report
 from twin.design.__main__ import app
 from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
 from twin.design.monitor_design import LAYOUTS, MonitorDesignRun, run_monitor_design
@@ -37,8 +34,6 @@ from twin.design.search_workers import Journal
 from twin.monitor.information import Information, spot_noise
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
-from twin.path_tracing.stray_light import Ghost
-from twin.run.procedure import BenchError
 from twin.run.run_folder import RunFolderError
 from twin.uncertainty.monitor_limits import expected_covariance, find_limits
 
@@ -78,11 +73,6 @@ def written(folder: Path, design: str = DESIGN) -> Path:
 
 
 @pytest.fixture(scope="module")
-def backend() -> Backend:
-    return load_backend("llvm")
-
-
-@pytest.fixture(scope="module")
 def setup(tmp_path_factory: pytest.TempPathFactory) -> MonitorDesignSetup:
     return resolve_monitor_design(written(tmp_path_factory.mktemp("design")))
 
@@ -97,14 +87,6 @@ def facts(bench: LayoutBench) -> tuple[BeamFacts, ...]:
     tried = tuple(bench.try_beam(beam) for beam in (FIRST, SECOND, THIRD))
     assert [one.refused for one in tried] == ["", "", ""]
     return tried
-
-
-def test_the_start_is_a_layout_of_one_beam(setup: MonitorDesignSetup) -> None:
-    (beam,) = start_beams(setup)
-    assert (beam.pupil_x, beam.pupil_y, beam.width) == (0.22, 0.0, 0.05)
-    spec = layout_spec(setup, (beam,))
-    for camera in spec.cameras:
-        assert spec.channels_of(camera) == setup.instrument.channels_of(camera)
 
 
 def test_a_further_beam_never_raises_a_sigma(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
@@ -197,23 +179,6 @@ def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, p
 
 
 @pytest.mark.second
-def test_spots_that_are_taken_to_be_alike_are(bench: LayoutBench, path: MonitorPath) -> None:
-    # left and right of one camera are mirror images but for tilts of the prisms; one of them has less light
-    start = path.instrument
-    channels = tuple(replace(c, photons=0.25 * c.photons) if c.name == "left" else c for c in start.channels)
-    uneven = MonitorPath(replace(start, channels=channels), path.backend)
-    taken, own = (np.diag(spot_noise(uneven, bench.detector(), alike)[0]) for alike in (True, False))
-    assert taken == pytest.approx(own, rel=0.02)
-    assert own[0] > 1.5 * own[2]
-
-
-def test_bodies_of_one_channel_are_told_from_shared_ones() -> None:
-    own = ("base/forward/monitor/left_2/prism_0", "base/central_prism/forward_left", "base/a/focal_plane/right/reticle")
-    assert all(is_own(body) for body in own)
-    assert not any(is_own(body) for body in ("base/forward/M1", "base/central_prism", "base/forward/focal_plane"))
-
-
-@pytest.mark.second
 def test_beams_that_stand_in_each_other_are_not_combined(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
     assert not touching(facts[0], facts[1])
     # CCDs of 1.152 mm at 5.51 m and fields near 1.22 deg have room from 0.0120 deg on
@@ -258,20 +223,6 @@ def test_a_short_search_finds_a_better_layout(whole: MonitorDesignRun, tmp_path:
     best = whole.points[0]
     assert whole.merit(best.facts) < whole.merit(whole.found.start)
     assert best.facts.pupil_share <= 0.2
-    file = tmp_path / f"{best.name}.yaml"
-    file.write_text(best.text, "utf-8")
-    again = load_instrument(file)
-    assert again.channels_of("forward") == layout_spec(whole.setup, best.facts.beams).channels_of("forward")
-    numbers = LAYOUTS(whole)
-    assert numbers["search"]["beams_tried"] == 6
-    assert list(numbers["ends"]) == ["gf7_pair", "start 1"]
-    assert sorted(name for group in numbers["optima"] for name in group) == ["gf7_pair", "start 1"]
-    first, second = whole.found.ends
-    # a start of its own draws other beams
-    assert not {b for f in first.layouts for b in f.beams} & {b for f in second.layouts for b in f.beams}
-    text = monitor_report.starts_text(whole)
-    assert ("same goal" in text) == (len(numbers["optima"]) == 1)
-    assert next(iter(numbers["layouts"])) == "better"
 
 
 def test_a_journal_keeps_every_bit_and_is_of_one_search(facts: tuple[BeamFacts, ...], tmp_path: Path) -> None:
@@ -313,33 +264,6 @@ def test_a_search_that_is_broken_off_goes_on_to_the_same_end(
     again = run_monitor_design(setup, backend, 1, journal=journal)
     assert journal.exists()  # the command removes it, when the run folder stands
     assert LAYOUTS(again) == LAYOUTS(whole)
-
-
-@pytest.mark.second
-def test_layouts_with_ghosts_are_left_out(whole: MonitorDesignRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The path tracer is not run: what it says of the layouts is what is tested elsewhere."""
-    limits = whole.setup.test.limits.model_copy(update={"ghost_paths": 20_000})
-    setup = whole.setup.model_copy(update={"test": whole.setup.test.model_copy(update={"limits": limits})})
-    asked: list[int] = []
-
-    def traced(experiment: object, state: object, paths: int, seed: int) -> str:
-        asked.append(paths)
-        return "light"
-
-    monkeypatch.setattr(monitor_design, "stray_light", traced)
-    ghost = Ghost(whole.bench.start.channels[0], "forward/left", "base/forward/monitor/left/prism_0", "a ghost")
-    # the start has none
-    found = {whole.setup.instrument.name: ()}
-    monkeypatch.setattr(
-        monitor_design, "ghosts", lambda experiment, light: found.get(experiment.resolved.instrument.name, (ghost,))
-    )
-    monkeypatch.setattr(monitor_design.Search, "run", lambda self: whole.found)
-    with pytest.raises(BenchError, match="ghosts"):
-        run_monitor_design(setup, whole.bench.backend)
-    assert set(asked) == {20_000}
-    monkeypatch.setattr(monitor_design, "ghosts", lambda experiment, light: ())
-    again = run_monitor_design(setup, whole.bench.backend)
-    assert [point.name for point in again.points] == [point.name for point in whole.points]
 
 
 @pytest.mark.second
@@ -394,14 +318,6 @@ def test_bad_input_is_told_with_its_line(tmp_path: Path, change: str, to: str, t
     issue = error.value.issues[0]
     assert issue.line is not None
     assert file.read_text("utf-8").splitlines()[issue.line - 1].split(":")[0].strip() in to
-
-
-def test_the_file_says_which_design_it_is(tmp_path: Path) -> None:
-    file = written(tmp_path, DESIGN.replace("goal: {angle: 0.05 arcsec, d_f: 2 um}", "goal: {}"))
-    for words in ([str(file)], ["monitor", str(file)]):
-        result = CliRunner().invoke(app, words)
-        assert result.exit_code == 2
-        assert "what is the layout to reach?" in " ".join(result.output.split())
 
 
 @pytest.mark.second

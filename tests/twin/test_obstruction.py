@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optics.geometry import zernike
 from optics.geometry.aperture import Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.solid import solid_mesh
@@ -14,11 +13,10 @@ from optics.numerics import quadrature
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import imaging_rays
 from optics.waves.transfer import polychromatic_transfer
-from optics.waves.wavefront import path_to_sphere
 from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams
 from scenes.specs.baffle import Plate
 from scenes.specs.load import load_band_detectors
-from twin.monitor.image_quality import _CameraBench, image_quality
+from twin.monitor.image_quality import image_quality
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
 
@@ -149,44 +147,6 @@ def test_batch_and_single_pupils_agree(gf7_pair, backend) -> None:
     assert np.all(free.light_lost == 0.0)
     assert not free.bodies
     assert np.all(free.mtf_along_track - quality.mtf_along_track > 0.01)
-
-
-@pytest.mark.second
-def test_wavefront_error_is_that_of_the_free_part(gf7_pair, backend) -> None:
-    """Against a mean over points of a spiral that are in no shadow."""
-    path = path_of(gf7_pair, backend)
-    state = {**MOVED, f"{ROOT}/M3": Motion(figure={7: 30e-9, 5: 20e-9})}
-    quality = image_quality(gf7_pair, backend, [state], (0.0,)).cameras[CAMERA]
-    free = image_quality(gf7_pair, backend, [state], (0.0,), obstruction=False).cameras[CAMERA]
-    found = {}
-    for name, camera in (("cut", quality), ("free", free)):
-        found[name] = camera.wfe[0, 0]
-    assert abs(found["cut"] / found["free"] - 1.0) > 0.005
-    bench_rays, position = pixel_rays(gf7_pair, backend, state)
-    error = path_to_sphere(
-        bench_rays.position, bench_rays.direction, bench_rays.path, position,
-        float(path.model.first_order.exit_pupil_distance[0]),
-    )[0]  # fmt: skip
-    nodes = spiral()
-    placed = gf7_pair.assembly.place([state])
-    taken = np.zeros(SPIRAL, bool)
-    heading = np.cross(bench_rays.axes[0, 0], bench_rays.axes[0, 1])
-    for solid in gf7_pair.solids:
-        own = solid_mesh(solid, gf7_pair.assembly.place()).mesh
-        triangles = placed.pose(solid.path).apply(own.vertices[own.faces].reshape(-1, 3)).reshape(-1, 3, 3)
-        taken |= meets(triangles, bench_rays.launched[0], heading)
-    tilts = zernike.basis(3, nodes.x, nodes.y)
-    for name, kept in (("free", np.ones(SPIRAL, bool)), ("cut", ~taken)):
-        rest = error[kept] - tilts[kept] @ np.linalg.lstsq(tilts[kept], error[kept], rcond=None)[0]
-        # the spiral's mean of squares is right to some 1e-4
-        assert np.sqrt(np.mean(rest**2)) / 650e-9 == pytest.approx(found[name], rel=3e-4)
-
-
-def pixel_rays(instrument, backend, state):
-    """Dense rays to the middle of the line CCD, as ``image_quality`` has them."""
-    bench = _CameraBench(instrument, CAMERA, backend, (0.0,), 650e-9, None)
-    bench.nodes = spiral()
-    return bench._trace([state]).rays, bench.points[:, None]
 
 
 def with_plate(instrument, plate: Plate):

@@ -19,13 +19,11 @@ from optics.geometry.tree import Body, RigidTree
 from optics.materials.finish import ABSORBER, BARE, Finish, reflectance
 from optics.materials.scatter import ABg
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
 from scenes.models.scenery import Scenery
 from scenes.models.scenery_parts import Finishes, solid_surfaces
 from tests.optics.bench import unit
-from tests.twin.path_bench import facing, frame, glass_scene, right_angle_prism, screen, slab
-from twin.path_tracing.families import Event, decode, nominal_codes
+from tests.twin.path_bench import facing, frame, glass_scene, screen, slab
+from twin.path_tracing.families import Event, decode
 from twin.path_tracing.path_result import Family, PathResult
 from twin.path_tracing.sinks import GHOST, STRAY
 from twin.path_tracing.source import DiskSource, RaySource
@@ -81,52 +79,6 @@ def test_ghosts_of_a_plane_parallel_plate(backend, angle: float, coated: Finish)
         found = sum(f.energy for f in result.families if f.detector == detector)
         error = np.sqrt(sum(f.error**2 for f in result.families if f.detector == detector))
         assert abs(found - total) < Z_LIMIT * error
-
-
-def hand_made_prism(backend, coated: Finish) -> tuple[Assembly, Scenery, str]:
-    """A turned right-angle prism whose faces carry elements, a screen behind it, and the sequence's name."""
-    solid = right_angle_prism(0.03)
-    body = Pose(rotation_matrix(np.array([0.02, -0.03, 0.05])), np.array([0.01, 0.02, 2.0]))
-    faces, bodies, elements = [], [Body("glass", body)], {}
-    kinds = {"entry": Interaction.REFRACT, "hypotenuse": Interaction.TOTAL, "exit": Interaction.REFRACT}
-    for face in solid.faces:
-        if face.name in kinds:
-            path = f"glass/{face.name}"
-            bodies.append(Body(path, face.pose))
-            faces.append(Face(face.name, path, face.coating))
-            elements[face.name] = Element(face.name, path, plane(), kinds[face.name], solid="glass")
-        else:
-            faces.append(face)
-    bodies.append(Body("screen", Pose(rotation_matrix([0.0, -0.5 * np.pi + 0.1, 0.0]), np.array([1.5, 0.0, 2.0]))))
-    elements["screen"] = Element("screen", "screen", plane(), Interaction.PASS)
-    made = Solid("glass", "N-BK7", tuple(faces))
-    names = {"through": ("entry", "hypotenuse", "exit", "screen")}
-    assembly = Assembly(RigidTree(tuple(bodies)), elements, names, {"glass": INDEX})
-    placed = assembly.place()
-    finishes = Finishes(coated=coated, ground=ABSORBER)
-    surface, grid = screen("screen", placed.pose("screen"), 0.5)
-    scenery = Scenery((*solid_surfaces(made, assembly, placed, {}, finishes), surface), (grid,))
-    return assembly, scenery, "through"
-
-
-def test_a_prism_as_the_sequential_trace_has_it(backend) -> None:
-    assembly, scenery, name = hand_made_prism(backend, Finish(transmission=1.0))
-    rng = np.random.default_rng(4)
-    n = 5000
-    position = np.column_stack([rng.uniform(-0.01, 0.03, n), rng.uniform(0.0, 0.04, n), np.zeros(n)])
-    tilt = rng.uniform(-0.005, 0.005, (n, 2))
-    direction = np.column_stack([tilt, np.sqrt(1.0 - np.sum(tilt**2, axis=1))])
-    traced = trace(backend, assemble(assembly, [name]), make_rays(backend, position, direction))
-    place, _, length, valid = (a[0] for a in traced.numpy())
-    codes = nominal_codes(scenery, assembly, name)
-    tracer = PathTracer(backend, scenery, {"screen": codes})
-    found = tracer.run(RaySource.even(position, direction), keep=True).detections
-    own = found.kind == 0
-    assert own.sum() > 0.5 * n
-    path = found.path[own]
-    assert valid[path].all()
-    np.testing.assert_allclose(found.place[own], place[path, :2], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found.length[own], length[path], rtol=0, atol=1e-12)
 
 
 def near_edges(rng: np.random.Generator, half: float, n: int) -> RaySource:

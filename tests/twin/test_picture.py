@@ -1,4 +1,4 @@
-"""Pictures of the instrument: everything is where the prescription puts it, the same again, and nothing is lost."""
+"""Pictures and scene.glb: everything is where the perturbed instrument has it, the same again, and nothing is lost."""
 
 import json
 import re
@@ -7,12 +7,16 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import twin.main_job.render_command
 import twin.pictures.picture
 import twin.pictures.picture as picture_light
 import twin.render as command
+from optics.geometry.tree import Motion
+from scenes.specs.instrument import BASE
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
 from twin.main_job.render_job import render_job
@@ -23,14 +27,11 @@ from twin.pictures.picture import (
     Shot,
     Studio,
     colour_variant,
-    render_shot,
     staged,
-    still_patches,
-    without_grain,
     write_pictures,
 )
 from twin.pictures.picture_scene import framed, looking, points_in_world
-from twin.pictures.scene_file import build_scene
+from twin.pictures.scene_file import build_scene, motions
 
 SMALL = tuple(Shot(s.name, s.width // 10, s.height // 10, 2, 2, s.shows) for s in SHOTS)
 LINE = 3.0
@@ -104,39 +105,11 @@ def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
             assert np.all(found <= where.max(axis=0) + LINE), body
             checked += 1
     assert checked > 50
+    with pytest.raises(ValueError, match="the prisms or the focal plane, not 'moon'"):
+        staged(gf7_pair, paths, Shot("moon.png", 10, 10, 2, 2, "moon"))
 
 
 # --- how they look ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.second
-def test_colours(backend, gf7_pair, paths):
-    """Light background, blue and orange light; a seed gives the same picture."""
-    image = render_shot(gf7_pair, paths, backend, SMALL[0], seed=3).astype(int)
-    assert image.shape == (SMALL[0].height, SMALL[0].width, 3)
-    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
-    assert border.min() > 200
-    assert np.ptp(border.mean(axis=0)) < 6  # neutral
-    assert np.array_equal(image, render_shot(gf7_pair, paths, backend, SMALL[0], seed=3))
-    red, _, blue = np.moveaxis(image, -1, 0)
-    assert (red - blue > 80).sum() > 50  # monitor
-    assert (blue - red > 80).sum() > 50  # imaging
-    assert (image.max(axis=-1) < 80).sum() > 5  # black housings
-
-
-def test_grain_is_taken_off_matt_patches_only():
-    noise = np.random.default_rng(2).normal(0.5, 0.1, (60, 80, 3))
-    noise[:, 40:] += 0.4
-    part, normal = np.zeros((60, 80), int), np.zeros((60, 80, 3))
-    part[:, 40:], part[:, 70:] = 1, 2
-    patches = still_patches([(part, normal)], [True, True, False])
-    smooth = without_grain(noise, patches)
-    assert np.all(patches[:, 69:] == -1)  # no matt surface
-    assert np.all(patches[:, 39:41] == -1)  # a border
-    assert np.array_equal(smooth[patches == -1], noise[patches == -1].astype(np.float32))
-    assert smooth[:, :39].std() < 0.03
-    assert smooth[:, :39].mean() == pytest.approx(0.5, abs=0.01)  # nothing comes over the border
-    assert smooth[:, 41:69].mean() == pytest.approx(0.9, abs=0.01)
 
 
 # --- Mitsuba's variants -----------------------------------------------------------------------------------------------
@@ -163,6 +136,10 @@ def test_a_variant_that_is_not_there_is_an_error(backend, monkeypatch):
     with pytest.raises(PictureError, match="llvm_ad_teal"), colour_variant(backend):
         pytest.fail("no other variant may be taken")
     assert mi.variant() == before
+    monkeypatch.setitem(picture_light.VARIANTS, "llvm", "scalar_rgb")
+    monkeypatch.setattr(mi, "set_variant", lambda *_: None)
+    with pytest.raises(PictureError, match="where scalar_rgb is needed"), colour_variant(backend):
+        pytest.fail("no other variant may be taken")
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -192,3 +169,101 @@ def test_the_command_writes_them_or_says_why_not(backend, tmp_path, monkeypatch)
     kept = {path.name for path in (tmp_path / "none").iterdir()}
     assert {"manifest.json", "truth.json", "recovered.json", "scene.glb", "report.html"} <= kept
     assert not kept & {shot.name for shot in SMALL}
+
+
+STATE = {
+    "base/forward/M2": Motion(shift=(0.0, 0.0, 2e-3)),  # enough to be seen in a millimetre's tolerance
+    "base/backward/focal_plane": Motion(rotate=(0.0, 0.0, 0.02)),
+    "base/backward/monitor": Motion(shift=(0.0, 2e-3, 0.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def beams(backend, gf7_pair):
+    small = {path: Motion(motion.rotate, (0.0, 0.0, 1e-5)) for path, motion in STATE.items() if "M2" in path}
+    return trace_light_paths(gf7_pair, backend, small)
+
+
+@pytest.fixture(scope="module")
+def loaded(gf7_pair, beams, tmp_path_factory):
+    """The scene of a state with large motions, written and read back."""
+    placed = gf7_pair.assembly.place([STATE])
+    scene = build_scene(gf7_pair, type(beams)(beams.beams, placed))
+    scene.metadata["motions"] = motions(gf7_pair, STATE, placed)
+    place = tmp_path_factory.mktemp("scene") / "scene.glb"
+    place.write_bytes(scene.export(file_type="glb"))
+    return trimesh.load_scene(place), placed
+
+
+def test_every_body_is_a_node_where_it_stands(gf7_pair, loaded):
+    scene, placed = loaded
+    for body in gf7_pair.assembly.tree.bodies:
+        assert body.path in scene.graph.nodes
+        matrix, _ = scene.graph.get(body.path)
+        pose = placed.pose(body.path)
+        assert np.abs(matrix[:3, 3] - pose.translation).max() < 1e-6
+        assert np.abs(matrix[:3, :3] - pose.rotation).max() < 1e-6
+    assert scene.graph.transforms.parents["base/forward/M1"] == "base/forward"
+
+
+def drawn(told: dict, factor: float) -> np.ndarray:
+    """A body's matrix in its parent when its motion is drawn ``factor`` times as large, as a viewer works it out."""
+    nominal = np.array(told["nominal"]).reshape(4, 4).T
+    turn = Rotation.from_rotvec(factor * np.array(told["rotate"])).as_matrix()
+    pivot = np.array(told["pivot"])
+    change = np.eye(4)
+    change[:3, :3], change[:3, 3] = turn, pivot + factor * np.array(told["shift"]) - turn @ pivot
+    return nominal @ change
+
+
+def test_motions_can_be_drawn_larger(gf7_pair, loaded):
+    """As they are they give the bodies' places, not at all the nominal ones; k times they are k times the job's."""
+    scene, placed = loaded
+    told = scene.metadata["motions"]
+    assert set(told) == set(STATE)
+    nominal = gf7_pair.assembly.place()
+    for path, motion in STATE.items():
+        parent = path.rpartition("/")[0]
+        for factor, where in ((0.0, nominal), (1.0, placed)):
+            pose = where.pose(parent).inverse() @ where.pose(path)
+            matrix = drawn(told[path], factor)
+            np.testing.assert_allclose(matrix[:3, :3], pose.rotation, atol=1e-12)
+            np.testing.assert_allclose(matrix[:3, 3], pose.translation, atol=1e-12)
+        np.testing.assert_allclose(told[path]["rotate"], motion.rotate, atol=1e-12)
+        np.testing.assert_allclose(told[path]["shift"], motion.shift, atol=1e-12)
+    larger = {
+        path: Motion(tuple(7.0 * np.array(m.rotate)), tuple(7.0 * np.array(m.shift))) for path, m in STATE.items()
+    }
+    seven = gf7_pair.assembly.place([larger])
+    for path in STATE:
+        parent = path.rpartition("/")[0]
+        pose = seven.pose(parent).inverse() @ seven.pose(path)
+        np.testing.assert_allclose(drawn(told[path], 7.0)[:3, 3], pose.translation, atol=1e-12)
+
+
+def test_beams_go_where_they_must(gf7_pair, beams):
+    """Imaging beams fill the stop and end on the line CCD, monitor beams on their area CCD; none leaves an aperture."""
+    for beam in beams.beams:
+        model = gf7_pair.cameras[beam.camera]
+        for (mirror, _), points in beam.footprints.items():
+            x0, x1, y0, y1 = model.apertures[mirror].bounds
+            assert np.all(points >= np.array([x0, y0]) - 1e-5)
+            assert np.all(points <= np.array([x1, y1]) + 1e-5)
+        if beam.is_monitor:
+            assert len(beam.footprints) == 2 * len(model.mirrors)
+            mine = (c for c in gf7_pair.channels if f"{c.camera}/monitor/{c.name}" == f"{beam.camera}/{beam.name}")
+            channel = next(mine)
+            ccd = beams.placed.pose(channel.ccd_body).inverse().apply(beam.vertices[:, -1])
+            assert np.abs(ccd).max() < 1e-3
+        else:
+            plane = beams.placed.pose(f"{BASE}/{beam.camera}/focal_plane").inverse().apply(beam.vertices[:, -1])
+            assert np.abs(plane[:, [0, 2]]).max() < 1e-9
+            half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
+            share = {"left edge": 1.0, "centre": 0.0, "right edge": -1.0}[beam.name.rpartition("/")[2]]
+            assert plane[:, 1] == pytest.approx(share * half, abs=1e-9)
+            stop = beam.footprints[model.spec.stop, 0]
+            radius = model.apertures[model.spec.stop].bounds[1]
+            assert np.linalg.norm(stop[1:], axis=1) == pytest.approx(radius, abs=2e-6)
+            rays = np.diff(beam.vertices[:, :2], axis=1)[:, 0]
+            angle = rays @ rays[0] / np.linalg.norm(rays, axis=1) / np.linalg.norm(rays[0])
+            assert np.all(angle > 1 - 1e-9)  # collimated toward the scene

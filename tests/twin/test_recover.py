@@ -1,9 +1,15 @@
-"""python -m twin.recover: the closed loop through files, other kinds of files, series, geometry, refusals."""
+"""python -m twin.recover: the closed loop through files, other kinds of files, series, geometry, refusals.
+
+Filter and smoother of a series are those of the main job's course.
+"""
 
 import shutil
-from dataclasses import replace
+import struct
+import zlib
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -15,19 +21,23 @@ from PIL import Image
 
 from analysis.images.image_file import recorded
 from analysis.spots.noise import NoiseModel
+from optics.geometry.tree import State
+from scenes.specs.job import JobSpec
 from scenes.specs.measured.monitor_frames import resolve_measurement
-from scenes.specs.resolved import resolve
+from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue
 from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.time_series import TimeSeries, run_series, series_states
 from twin.recover import measured_frames
 from twin.recover.__main__ import app
 from twin.recover.measured_frames import ChannelFrames, StateFrames, order_warnings
 from twin.recover.recover_report import recover_numbers, recover_report
-from twin.recover.recover_run import run_recover
+from twin.recover.recover_run import RecoverRun, run_recover
 from twin.run.data_files import FrameFacts, tiff
 
 JOB = ROOT / "scenes/examples/perturb.yaml"
@@ -250,6 +260,17 @@ def test_frames_that_cannot_be_used_are_refused_by_name(run, images, backend, tm
     assert "measurement.yaml:3: frames.backward/right.after" in told
 
 
+def test_dark_and_flat_frames_that_cannot_be_used(run, images, backend, tmp_path):
+    for name, size in (("small", 20), ("even", 96)):
+        tifffile.imwrite(tmp_path / f"{name}.tif", np.full((2, size, size), 100, np.uint16), photometric="minisblack")
+    for more, problem in (
+        ("dark: small.tif", "dark.all: .*small.tif has frames of 20 x 20 pixels"),
+        ("dark: even.tif\nflat: even.tif", "flat: the flat frames are only 0 DN brighter than the dark ones"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            measured(tmp_path, f"{HEAD}frames: {images}\n{more}\n", backend, run)
+
+
 def test_copies_are_refused_with_the_frames_that_they_are_of(run, images, backend, tmp_path):
     """The frames before as those after, in a file of another type, too, gave 0 +- sigma without a word; so does a frame
     that stands twice in one state, whose noise would count as two.
@@ -259,14 +280,9 @@ def test_copies_are_refused_with_the_frames_that_they_are_of(run, images, backen
     shutil.copytree(images, folder)
     (folder / "backward_right_after.tiff").unlink()
     fits.PrimaryHDU(before[3:].astype(np.float32)).writeto(folder / "backward_right_after.fits")
-    with pytest.raises(InputError) as error:
+    words = r"yaml:3: frames.backward/right.after: frame 1 of \S+ in \S+after.fits is frame 4 of \S+before.tiff"
+    with pytest.raises(InputError, match=words):
         measured(tmp_path, HEAD + "frames: images\n", backend, run)
-    assert len(error.value.issues) == 1
-    told = str(error.value)
-    assert "measurement.yaml:3: frames.backward/right.after: frame 1 of backward/right in" in told
-    assert "backward_right_after.fits is frame 4 of" in told
-    assert "backward_right_before.tiff, to the last pixel" in told
-    assert "recorded one by one" in told
     spoilt(tmp_path / "twice", images, "forward_left_before.tiff", lambda f: np.concatenate([f, f[4:5]]))
     with pytest.raises(InputError, match=r"frame 10 of forward/left in \S+ is frame 5 of"):
         measured(tmp_path / "twice", HEAD + "frames: images\n", backend, run)
@@ -308,24 +324,14 @@ def test_one_file_without_a_time_says_nothing(tmp_path):
     channel = states(tmp_path, ["2026-03-02T00:10:00", "2026-03-01T23:50:00"])
     silent = replace(channel.before, origin=(*channel.before.origin, (None, "")))
     assert order_warnings([replace(channel, before=silent)], None) == ()
+    # files of the main job say which they are
+    late, early = (replace(channel.before, origin=((None, note),)) for note in ("perturbed", "nominal"))
+    (warning,) = order_warnings([replace(channel, before=late, after=(early,))], None)
+    assert "before and after seem to be exchanged" in warning
+    assert order_warnings([replace(channel, before=early, after=(late,))], None) == ()
     # two keywords of older files
     dated = states(tmp_path, ["2026-03-02", "2026-03-01"], **{"TIME-OBS": "08:00:00"})
     assert len(order_warnings([dated], None)) == 1
-
-
-@pytest.mark.second
-def test_files_of_the_main_job_say_which_they_are(run, images, backend, tmp_path):
-    """In their note; as they are there is nothing to be said."""
-    folder = tmp_path / "images"
-    folder.mkdir()
-    for number, path in enumerate(sorted(images.glob("*.tiff"))):
-        when = path.stem.rpartition("_")[2]
-        other = path.stem.replace("before", "X").replace("after", "before").replace("X", "after")
-        facts = FrameFacts(note="nominal" if when == "before" else "perturbed")
-        (folder / f"{other}.tiff").write_bytes(tiff(tifffile.imread(path), facts))
-        assert recorded(folder / f"{other}.tiff") == (None, facts.note), number
-    found = measured(tmp_path, HEAD + "frames: images\n", backend, run)
-    assert sum("before and after seem to be exchanged" in text for text in found.warnings) == 1
 
 
 def test_a_tiff_says_when_it_was_recorded_in_exif(tmp_path):
@@ -336,6 +342,8 @@ def test_a_tiff_says_when_it_was_recorded_in_exif(tmp_path):
     assert recorded(path) == (None, "")
     image.save(path, tiffinfo={34665: {36867: "2026:03:01 10:00:07", 37521: "25"}})
     assert recorded(path)[0] == datetime(2026, 3, 1, 10, 0, 7, 250000, tzinfo=UTC)
+    path.write_bytes(tiff(np.full((2, 24, 24), 7, np.uint16), FrameFacts(note="nominal")))
+    assert recorded(path) == (None, "nominal")
 
 
 call = partial(invoke, app, terminal_width=200)
@@ -417,11 +425,132 @@ def test_files_that_are_no_raw_frames_are_refused(tmp_path):
     for name, size in (("a", 30), ("b", 32)):
         tifffile.imwrite(tmp_path / f"{name}.tif", np.zeros((size, 30), np.uint16), photometric="minisblack")
     Image.fromarray(np.full((24, 24), 7, np.uint16)).save(tmp_path / "turned.tif", tiffinfo={274: 3})
+    cv2.imwrite(str(tmp_path / "coded.png"), np.full((24, 24), 7, np.uint16))
+    data = (tmp_path / "coded.png").read_bytes()
+    chunk = b"sRGB\0"
+    tone = struct.pack(">I", 1) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    (tmp_path / "coded.png").write_bytes(data[:33] + tone + data[33:])
     test = SimpleNamespace(error=lambda text, key, allowed=None: InputError(Issue(text, allowed=allowed)))
     for names, told in (
         (("a.tif", "b.tif"), "have frames of different sizes, 30 x 30 and 32 x 30"),
         (("turned.tif",), "is stored turned or mirrored"),
         (("none.tif",), "there is no image"),
+        (("coded.png",), "it says sRGB, which is not linear in light"),
     ):
         with pytest.raises(InputError, match=told):
             measured_frames._stacked(test, tuple(str(tmp_path / name) for name in names), ("frames",))
+
+
+TIMES = ("0 min", "12 min", "0.5 h", "50 min")
+FRAMES, SEED = 3, 7
+COURSE = {
+    "instrument": "gf7_pair",
+    "disturbances": "orbit",
+    "course": {
+        "times": list(TIMES),
+        "detail": "12 min",
+        "temperature": {"base/forward": {"change": ["0 K", "0.08 K", "0.15 K", "0.05 K"]}},
+        "motion": {
+            "base/forward/M2": {
+                "shift": [[f"{x} um", "0 um", f"{z} um"] for x, z in ((0, 0), (0.1, 0.2), (0.2, 0.3), (0.1, 0))]
+            }
+        },
+    },
+    "render": {"frames": FRAMES, "seed": SEED},
+}
+
+
+@dataclass
+class Course:
+    """The main job's course, and the frames that it was measured in as files."""
+
+    job: ResolvedJob
+    experiment: MonitorExperiment
+    series: TimeSeries
+    states: list[State]
+    folder: Path
+
+    def measured(self, backend, text: str, name: str = "series.yaml") -> RecoverRun:
+        file = self.folder / name
+        file.write_text(text)
+        return run_recover(resolve_measurement(file), backend, experiment=self.experiment)
+
+    def text(self, times=TIMES, which=None, **other: str) -> str:
+        """A measurement's file; other: channel -> file in place of that of the second time."""
+        out = f"instrument: gf7_pair\ndisturbances: orbit\ntimes: [{', '.join(times)}]\nframes:\n"
+        for channel in self.experiment.path.channels:
+            stem = f"{channel.camera}_{channel.name}"
+            files = [f"{stem}_{k}.tiff" for k in (range(len(times)) if which is None else which)]
+            if stem in other:
+                files[1] = other[stem]
+            out += f"  {channel.key}: {{before: {stem}_before.tiff, after: [{', '.join(files)}]}}\n"
+        return out
+
+
+@pytest.fixture(scope="module")
+def course(experiment, tmp_path_factory) -> Course:
+    job = resolve_job(JobSpec.model_validate(COURSE))
+    pair = experiment("gf7_pair").stating(job)
+    states = series_states(pair, job.job)
+    series = run_series(pair, job, states)
+    folder = tmp_path_factory.mktemp("series")
+    before = pair.frames_before(FRAMES, SEED)
+    after = pair.frames_after(pair.path.expected_photons(states), FRAMES, SEED)
+    for i, channel in enumerate(pair.path.channels):
+        stem = f"{channel.camera}_{channel.name}"
+        for name, frames in (("before", before[i]), *((k, after[k, i]) for k in range(len(states)))):
+            tifffile.imwrite(folder / f"{stem}_{name}.tiff", frames, photometric="minisblack", compression="lzw")
+    return Course(job, pair, series, states, folder)
+
+
+def dicts(run_or_series) -> tuple:
+    """All that the smoother says."""
+    found = run_or_series.smoothed
+    return found.changes.groups(), found.between_dict(), found.to_dict()
+
+
+@pytest.mark.second
+def test_the_smoothed_series_is_the_main_jobs_to_the_last_bit(course, backend):
+    found = course.measured(backend, course.text())
+    assert dicts(found) == dicts(course.series)
+    for k, reading in enumerate(found.readings):
+        np.testing.assert_array_equal(reading.recovery.shift[0], course.series.shift[k])
+        np.testing.assert_array_equal(reading.recovery.shift_covariance[0], course.series.shift_covariance[k])
+    numbers = recover_numbers(found)
+    written = course.series.to_dict()
+    for name, every in numbers["smoothed"]["cameras"].items():
+        for estimator in ("filtered", "smoothed"):
+            assert every[estimator] == written["cameras"][name][estimator]
+    assert numbers["smoothed"]["between"] == written["between"]
+    assert numbers["smoothed"]["disturbances"] == written["disturbances"]
+    # from the last time on nothing comes, so that both are one
+    filtered, smoothed = (found.smoothed.changes.of(name)[:4] for name in ("filtered", "smoothed"))
+    assert [row.value[-1] for row in filtered] == pytest.approx([row.value[-1] for row in smoothed], rel=1e-9)
+    assert all(b.sigma[0] <= a.sigma[0] * (1.0 + 1e-9) for a, b in zip(filtered, smoothed, strict=True))
+    assert recover_report(found).warnings == ()
+
+
+@pytest.mark.second
+def test_the_worst_time_is_told_wherever_it_is(course, backend):
+    """The frames of the second time are those of a spot that nothing stated could have moved so."""
+    frames = tifffile.imread(course.folder / "forward_left_1.tiff")
+    tifffile.imwrite(course.folder / "moved.tiff", np.roll(frames, 14, axis=1), photometric="minisblack")
+    found = course.measured(backend, course.text(forward_left="moved.tiff"))
+    assert found.last.consistency.agrees
+    assert found.worst[0] == 1
+    told = " ".join(recover_report(found).warnings)
+    assert "orbit at 12 min, the worst of 4 times" in told
+    assert "for the series" in told
+    assert not found.smoothed.consistency.agrees
+
+
+@pytest.mark.second
+def test_a_single_time_and_one_without_statements_are_not_smoothed(course, backend):
+    alone = course.measured(backend, course.text(TIMES[:1]))
+    assert alone.smoothed is None
+    assert "smoothed" not in recover_numbers(alone)
+    text = course.text().replace("disturbances: orbit", "disturbances: none")
+    (course.folder / "none.yaml").write_text(text)
+    plain = run_recover(resolve_measurement(course.folder / "none.yaml"), backend)
+    assert plain.smoothed is None
+    assert recover_report(plain).sections[0].text == ()

@@ -7,9 +7,8 @@ import erfa
 import numpy as np
 import pyproj
 import pytest
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import solve_ivp
 
-from optics.geometry.tree import Motion
 from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
@@ -94,20 +93,6 @@ def test_round_trip_with_an_unsteady_attitude() -> None:
     np.testing.assert_allclose(back, [line, pixel], rtol=0, atol=1e-6)
 
 
-def test_ground_sample_and_swath_of_th1(trajectory) -> None:
-    """5 m and 60 km at 500 km; half a percent for the height of the orbit over the pass and the curved ground."""
-    model = sensor(TH1["nadir"], ALL, trajectory)
-    middle = model.ground(5000.0, np.array([5999.0, 6000.0]))
-    assert np.linalg.norm(middle[1] - middle[0]) == pytest.approx(5.0, rel=5e-3)
-    lon, lat, _ = np.degrees(EARTH.geodetic(model.ground(5000.0, np.array([-0.5, 11999.5]))))
-    _, _, swath = pyproj.Geod(ellps="WGS84").inv(lon[0], lat[0], lon[1], lat[1])
-    assert swath == pytest.approx(60e3, rel=5e-3)
-    # descending: the first pixel sees to the right of the flight, west, and later lines lie south
-    assert lon[0] < lon[1]
-    below = np.degrees(EARTH.geodetic(model.ground(np.array([0.0, 9999.0]), 6000.0)))
-    assert below[1, 0] > below[1, 1]
-
-
 @pytest.mark.parametrize("name", ["th1/backward", "gf7_pair/forward"])
 def test_ground_by_bisection(cameras, trajectory, name: str) -> None:
     """The look is followed until PROJ's geodetic height, nothing else, is the wanted one."""
@@ -170,34 +155,6 @@ def test_aberration_against_erfa() -> None:
         np.testing.assert_allclose(aberrated(expected, -velocity), direction, rtol=0, atol=2e-15)
 
 
-@pytest.mark.parametrize("name", ["forward", "nadir", "backward"])
-def test_aberration_on_the_ground(name: str) -> None:
-    """What is seen lies forward of where it is, by v/c = 25 urad: the true ground point is behind, by 13 m at nadir."""
-    off, on = (sensor(TH1[name], e).ground(5000.0, 5999.5)[0] for e in (NO_EFFECTS, LightEffects(False, True, False)))
-    position, velocity = CIRCLE.position(0.5), CIRCLE.inertial_velocity(0.5)
-    assert np.linalg.norm(velocity) / SPEED_OF_LIGHT == pytest.approx(25.4e-6, rel=0.01)  # 5.2 arcsec
-    ray = (off - position) / np.linalg.norm(off - position)
-    normal = EARTH.ecef(*EARTH.geodetic(off)[:2], 1.0) - EARTH.ecef(*EARTH.geodetic(off)[:2], 0.0)
-    tilt = -(velocity - ray * (velocity @ ray)) / SPEED_OF_LIGHT * np.linalg.norm(off - position)
-    expected = tilt - ray * (tilt @ normal) / (ray @ normal)  # down along the ray to the level ground
-    np.testing.assert_allclose(on - off, expected, atol=1e-3)  # second order: 13 m times 25 urad, and the curved ground
-    assert (on - off) @ velocity < 0.0
-    assert 12.5 < np.linalg.norm(on - off) < 15.5
-
-
-def test_light_time_on_the_ground() -> None:
-    """The Earth turned eastward under the light: the point lies east by its speed times the way."""
-    off, on = (
-        sensor(TH1["nadir"], e).ground(5000.0, 5999.5)[0] for e in (NO_EFFECTS, LightEffects(True, False, False))
-    )
-    _, lat, _ = EARTH.geodetic(off)
-    east = np.array([-off[1], off[0], 0.0]) / math.hypot(off[0], off[1])
-    way = np.linalg.norm(off - CIRCLE.position(0.5)) / SPEED_OF_LIGHT
-    expected = RATE * math.hypot(off[0], off[1]) * way
-    assert 0.5 < expected < 0.8 * math.cos(lat) + 0.05  # 465 m/s for 1.7 ms at the equator
-    np.testing.assert_allclose(on - off, expected * east, rtol=0, atol=2e-7)  # second order: expected times 1.2e-7 rad
-
-
 def bent_shift(zenith: float, radius: float, refractivity: float, scale: float) -> float:
     """Shift of the ground point by the ray equation d/ds (n dr/ds) = grad n in a spherical exponential atmosphere, from
     200 km down; plane polar geometry only at the end.
@@ -236,21 +193,6 @@ def test_refraction_against_the_ray_equation(degrees: float) -> None:
     assert flat * (1 - 4e-3 / math.cos(z) ** 2) < found < flat
 
 
-def test_quadrature_of_refraction() -> None:
-    """Adaptive integration of Bouguer's integral as printed: 12 Laguerre points are good to a micrometre."""
-    radius, n0, scale = 6371e3, standard_refractivity(650e-9), 8.31446 * 288.15 / (0.0289644 * 9.80665)
-    for degrees in (1.0, 30.0, 60.0, 75.0):
-        p = radius * math.sin(math.radians(degrees))
-
-        def integrand(h: float, p: float = p) -> float:
-            r, n = radius + h, 1.0 + n0 * math.exp(-h / scale)
-            return p / r * (1.0 / math.sqrt(r**2 - p**2) - 1.0 / math.sqrt((n * r) ** 2 - p**2))
-
-        expected = radius * quad(integrand, 0.0, 400e3, epsabs=1e-14, epsrel=1e-10, limit=500)[0]
-        found = refractive_shift(np.array([math.radians(degrees)]), np.zeros(1), np.array([radius]), 650e-9)[0]
-        assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
-
-
 def test_the_standard_atmosphere() -> None:
     # NIST's Engineering Metrology Toolbox, Ciddor's equation: 633 nm, 20 degC, 101325 Pa, dry; an ideal gas to 15 degC
     assert standard_refractivity(633e-9) == pytest.approx(2.71800e-4 * 293.15 / 288.15, rel=1e-4)
@@ -278,23 +220,6 @@ def test_refraction_on_the_ground(name: str) -> None:
     station = CIRCLE.position(np.array([0.5]))
     assert np.linalg.norm(refracted(off[None], station, EARTH, 650e-9) - on) < 1e-8
     assert np.linalg.norm(unrefracted(on[None], station, EARTH, 650e-9) - off) < 1e-8
-
-
-def test_a_turned_mirror_camera_moves_its_image_on_the_ground(gf7_pair, backend, trajectory) -> None:
-    """One arcsec about the camera's Y moves the ground point of a 26 degree look forward by distance/cos(incidence)."""
-    state = {"base/forward": Motion(rotate=(0.0, ARCSEC, 0.0))}
-    before, after = (
-        sensor(traced_line_cameras(gf7_pair, backend, s)["forward"], NO_EFFECTS, trajectory).ground(5000.0, 16383.5)[0]
-        for s in ({}, state)
-    )
-    t = -3.0 + 5000.0 * 0.1e-3
-    ray = before - trajectory.position(t)
-    distance = np.linalg.norm(ray)
-    lon, lat, _ = EARTH.geodetic(before)
-    incidence = math.acos(-ray @ (EARTH.ecef(lon, lat, 1.0) - before) / distance)
-    moved = after - before
-    assert np.linalg.norm(moved) == pytest.approx(ARCSEC * distance / math.cos(incidence), rel=1e-4)
-    assert moved @ trajectory.velocity(t) > 0.0
 
 
 def test_what_the_image_does_not_hold_is_nan(trajectory) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -58,22 +57,7 @@ def test_trajectory_says_which_velocity_it_has(folder: Path) -> None:
     assert np.linalg.norm(inertial - fixed, axis=1).min() > 300.0
 
 
-def test_files(folder: Path) -> None:
-    data = read(folder / "simulate.json")
-    for name in LINES:
-        said = data["lines"][name]
-        (image,) = np.atleast_3d(tifffile.imread(folder / "images" / f"{name}.tiff")).reshape(1, 64, 80)
-        assert image.dtype == np.uint16
-        assert (said["lines"], said["pixels"]) == (64, 80)
-        assert said["mean_dn"] == pytest.approx(image.mean(), rel=1e-12)
-        assert said["saturated_pixels"] == 0
-        assert said["geometry_error_px"] < 0.002
-        assert 100.0 < image.mean() < 500.0
-        assert 4.9 < said["sample_along_track_m"] < 5.1
-    times = [data["lines"][k]["first_line_time_s"] for k in LINES]
-    assert times[0] == pytest.approx(-33.0, abs=1.0)
-    assert times[2] == pytest.approx(33.0, abs=1.0)
-    assert tifffile.imread(folder / "images" / "dem.tiff").shape[-2:] == (data["dem"]["rows"], data["dem"]["columns"])
+def test_only_the_truth_knows_the_true_camera(folder: Path) -> None:
     # nothing that only the truth knows
     known = "".join((folder / "artefacts" / f"{n}.json").read_text("utf-8") for n in ("camera", "trajectory"))
     assert "0.65009" not in known

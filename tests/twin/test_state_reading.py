@@ -8,8 +8,6 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
-from tests.benchmarks.monitor_speed import random_states
-from twin.main_job.render_job import render_job
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import StateReader
 
@@ -22,25 +20,6 @@ def job():
 @pytest.fixture(scope="module")
 def reader(job, backend) -> StateReader:
     return StateReader(MonitorExperiment(job, backend), 2, 5)
-
-
-@pytest.mark.second
-def test_a_reading_is_the_main_jobs_whatever_was_read_before(job, reader, backend) -> None:
-    state = reader.experiment.state(job.job)
-    for other in random_states(2, 1):
-        reader.read(other)
-    found = reader.read(state)
-    run = render_job(job, backend, 2, 5)
-    assert np.array_equal(found.light.photons[0], run.photons_after)
-    assert np.array_equal(reader.before, run.before)
-    assert np.array_equal(found.after[0], run.after)
-    for name, change in run.truth.cameras.items():
-        assert np.array_equal(found.truth.cameras[name].d_alpha, change.d_alpha)
-        assert np.array_equal(found.truth.cameras[name].d_f, change.d_f)
-        for estimator, parameters in run.recovery.parameters[name].items():
-            own = found.recovery.parameters[name][estimator]
-            assert own.to_dict() == parameters.to_dict()
-    assert np.array_equal(found.recovery.shift_covariance, run.recovery.shift_covariance)
 
 
 @pytest.mark.second

@@ -367,8 +367,6 @@ def _locate(bench: DistortionBench, record: DistortionRecord) -> measurement.Spo
     except SpotError as error:
         reason = next(iter(error.reasons.values()))
         problem = f"{len(error.reasons)} of {record.column.size} spots cannot be measured; the first: {reason}"
-        if "edge" in reason:
-            raise BenchError(problem, ("window",), "a larger window") from error
         remedy = "less light: 30 to 80 percent is good" if "saturated" in reason else "more light or more frames"
         raise BenchError(problem, ("light",), remedy) from error
 

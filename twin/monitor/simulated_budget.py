@@ -97,8 +97,8 @@ class ErrorBudget:
         self.resolved = resolved.model_copy(update={"instrument": spec.applied_to(resolved.instrument)})
         self.experiment = MonitorExperiment(self.resolved, backend)
         stated = self.experiment.stated
-        if stated is None or self.resolved.disturbances is None:
-            raise ValueError("error budget: the job states no disturbances")
+        assert stated is not None  # resolve_budget refuses a budget without them
+        assert self.resolved.disturbances is not None
         self.stated = stated
         if _CENTROID in self.causes:
             text = f"{_CENTROID} is the line of the centroid's own noise"

@@ -303,8 +303,7 @@ def too_large(job: JobSpec, k: int, reason: str) -> InputError:
 
 
 def _course(job: JobSpec) -> CourseSpec:
-    if job.course is None:
-        raise ValueError("the job has no course")
+    assert job.course is not None
     return job.course
 
 

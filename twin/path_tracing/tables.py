@@ -379,9 +379,6 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways:
     bodies = glass_bodies(surfaces)
     if len(bodies) > MOST_BODIES or len(detectors) > MOST_DETECTORS:
         raise ValueError(f"{len(bodies)} glass bodies, {len(detectors)} detectors: at most {MOST_BODIES} of each")
-    unknown = sorted(set(nominal) - {d.name for d in detectors})
-    if unknown:
-        raise ValueError(f"nominal paths are given for unknown detectors: {', '.join(unknown)}")
     rows = np.zeros((len(surfaces), ROW))
     planes = np.zeros((len(surfaces), BLOCK))
     kind = np.zeros(len(surfaces), np.uint32)

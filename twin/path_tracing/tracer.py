@@ -56,7 +56,7 @@ def build_scene(mi: Any, scenery: Scenery) -> Any:
         scenery: the surfaces; their triangles are moved to the world in float64 and rounded once.
 
     Raises:
-        RuntimeError: Mitsuba has put the shapes in another order.
+        AssertionError: Mitsuba has put the shapes in another order.
     """
     names = [f"surface{i:05d}" for i in range(len(scenery.surfaces))]
     # robust: rays do not slip through between two triangles
@@ -72,7 +72,7 @@ def build_scene(mi: Any, scenery: Scenery) -> Any:
     # the parser's optimisations would merge meshes of the same material
     scene = mi.load_dict(description, optimize=False)
     if [shape.id() for shape in scene.shapes()] != names:
-        raise RuntimeError("mitsuba has put the shapes of a scene in another order")
+        raise AssertionError("mitsuba has put the shapes of a scene in another order")
     return scene
 
 
@@ -251,6 +251,9 @@ class PathTracer:
         nominal: detector -> codes of the events of its nominal family.
         sampling: how paths are drawn.
         ways: paths take clear ways; without, every flight is a search. The paths are the same.
+
+    Raises:
+        ValueError: a nominal family of a detector that the scenery does not have.
     """
 
     def __init__(
@@ -264,6 +267,10 @@ class PathTracer:
         self.backend = backend
         self.scenery = scenery
         self.nominal = dict(nominal or {})
+        known = [d.name for d in scenery.detectors]
+        if unknown := sorted(set(self.nominal) - set(known)):
+            there = ", ".join(known)
+            raise ValueError(f"families of unknown detectors: {', '.join(unknown)}; detectors of the scene: {there}")
         self.sampling = sampling
         self.integrator = make_integrator(backend, sampling)
         mi = load_mitsuba(backend)
@@ -271,7 +278,7 @@ class PathTracer:
         self._clear = ClearWays(scenery, self.nominal if ways else {})
         tables = upload(backend, scenery, signatures, self._clear.ways)
         self.prepared = PreparedScene(backend, mi, build_scene(mi, scenery), tables)
-        self._signatures = [signatures.get(d.name, 0) for d in scenery.detectors]
+        self._signatures = [signatures.get(name, 0) for name in known]
 
     def features(self, keep_nominal: bool = False, log: bool = False) -> Features:
         """What the kernel must be able to do for this scene."""

@@ -290,7 +290,7 @@ def load_studio(mi: Any, parts: list[Part], view: View) -> Any:
         description[name] = _mesh(mi, name, part)
     scene = mi.load_dict(description, optimize=False)
     if [shape.id() for shape in scene.shapes()] != names:
-        raise RuntimeError("mitsuba has put the shapes of a scene in another order")
+        raise AssertionError("mitsuba has put the shapes of a scene in another order")
     return scene
 
 
