@@ -85,6 +85,24 @@ def test_the_table_has_every_quantity_with_its_requirement(overview):
     assert list(table.bands.values()) == ["forward", "backward", "angle between the cameras", "ground"]
 
 
+def test_motions_are_those_of_most_sigmas_with_all_causes_together(history, overview):
+    made = daily_report(history, overview, end_of_day(None, overview.time))
+    (section,) = (one for one in made.sections if one.name == "motions")
+    rows, days = section.artefacts[0].rows, (overview.time - START) / DAY
+    assert len(rows) == 12
+    best: dict[str, list[float]] = {}
+    for k, one in enumerate(overview.operation.experiment.stated.components):
+        own = best.setdefault(f"{one.name} [{one.unit}]", [0.0, 0.0])
+        size = one.sigma / one.unit_size
+        own[0] += 0.1 * days * size * (0.1 if k % 3 else 1.0)
+        own[1] = np.hypot(own[1], np.sqrt(0.3) * size)
+    for name, mean, sigma, ratio in rows:
+        assert (float(mean), float(sigma)) == pytest.approx(best[name], rel=1e-9)
+        assert float(ratio) == pytest.approx(best[name][0] / best[name][1])
+    assert [float(row[3]) for row in rows] == sorted((float(row[3]) for row in rows), reverse=True)
+    assert not any("temperature" in str(row[0]) for row in rows)
+
+
 def test_the_page_needs_nothing_else_and_runs_nothing_that_a_text_brings(page):
     assert breaches(page) == []
     assert EVIL not in page
