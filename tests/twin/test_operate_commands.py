@@ -8,13 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from optics.numerics.backend import load_backend
 from scenes.specs.operation import OperationSpec, RequirementSpec
 from tests.twin.commands import invoke
-from tests.twin.operation_records import START, given, life_of, monitor_entry, plan_of, record_of, temperature_entry
+from tests.twin.operation_records import START, entries_of, given, life_of, plan_of, record_of
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.alarms import AGAIN, alarms_of, raise_alarms
@@ -45,18 +44,14 @@ def life(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert stated is not None
     slip = stated.labels.index(f"{BODY} shift x")
     drawn = life_of(stated, DAYS, EVERY, 3, {SLIPPED: {slip: 60.0}})
-    entries = [monitor_entry(experiment, stated, drawn, k, 3) for k in range(len(drawn.times))]
-    rng = np.random.default_rng(1)
+
+    def sensor(body: str, k: int, kelvin: float) -> float:
+        return 292.0 if k > 15 and body == "base/backward" else round(kelvin, 2)
+
+    entries = entries_of((plan, experiment, stated), drawn, 3, sensor=sensor)
+    entries.append(Entry("event", "safe_mode", START + 30 * DAY + DAY // 2, {}))
+    entries.sort(key=lambda one: one.time)
     with record_of(folder / "record", plan) as history:
-        for k, label in enumerate(stated.labels):
-            if not label.endswith("temperature"):
-                continue
-            own = stated.sigmas[k] * drawn.motions[:, k] + 0.05 * rng.standard_normal(len(drawn.times))
-            for n, (time, value) in enumerate(zip(drawn.times.tolist(), own.tolist(), strict=True)):
-                kelvin = 292.0 if n > 15 and stated.bodies[k] == "base/backward" else history.temperature + value
-                entries.append(temperature_entry(stated.bodies[k], time - 600 * MICRO, round(kelvin, 2)))
-        entries.append(Entry("event", "safe_mode", START + 30 * DAY + DAY // 2, {}))
-        entries.sort(key=lambda one: one.time)
         assert not history.take(given("all", entries)).refused
     return folder
 
