@@ -27,7 +27,6 @@ from twin.operate.record.entries import Alarm, Entry, Given, digest_of_job, inst
 from twin.operate.record.history import History, content_of, initialised
 from twin.operate.record.place import FILE, NotARecord
 from twin.operate.record.record_tables import tables
-from twin.operate.record.run_readings import run_entries
 from twin.operate.record.sources import time_of_name
 
 
@@ -195,26 +194,6 @@ def test_results_that_are_none_are_refused(record: Path, tmp_path: Path) -> None
         done = run("ingest", record, folder, "--time", "2026-03-05T03:05:00Z")
         assert (done.exit_code, words in done.stdout, "0 taken" in done.stdout) == (2, True, True), done.stdout
     assert status(record)["entries"] == 0
-
-
-def test_a_series_is_a_reading_for_each_time(record: Path, tmp_path: Path) -> None:
-    folder = run_folder(tmp_path / "run")
-    data = json.loads((folder / "recovered.json").read_text())
-    rewritten(folder, {"times_s": [0.0, 60.0], "series": [{"cameras": data["cameras"]}, {"cameras": data["cameras"]}]})
-    with History(str(record)) as history:
-        taken = history.take(run_entries(folder, "", START, history, stated=False))
-        assert (taken.new, taken.refused) == (2, ())
-        assert [row["time_us"] for row in history.entries()] == [START, START + MINUTE]
-
-
-def test_later_tables_are_found_and_old_rows_are_known(record: Path, tmp_path: Path) -> None:
-    """A table that grows, as telemetry does: each row is taken once."""
-    file = written(tmp_path, TELEMETRY, {"t_1.csv": table(0, 3)})
-    assert json.loads(run("ingest", record, file, "--json").stdout)["new"] == 3
-    (tmp_path / "t_1.csv").write_text(table(0, 5))
-    (tmp_path / "t_2.csv").write_text(table(5, 2))
-    found = json.loads(run("ingest", record, tmp_path, "--json").stdout)
-    assert [(one["new"], one["known"]) for one in found["files"]] == [(2, 3), (2, 0)]
 
 
 def watched(record: Path, what: Path, steps: list, monkeypatch: pytest.MonkeyPatch) -> list[dict]:
