@@ -10,7 +10,6 @@ import re
 import signal
 import subprocess
 import sys
-import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -61,23 +60,6 @@ def _keep(answer: str | bytes, place: Path) -> None:
     xr.Dataset({"pixels": ("pixel", pixels)}).to_netcdf(place.with_suffix(".nc"), engine="h5netcdf")
 
 
-def operated(address: str, cookie: str, out: Path) -> None:
-    """Keep what the page of an instrument in operation asks for."""
-
-    def ask(path: str) -> Any:
-        request = urllib.request.Request(f"{address}/{path}", headers={"Cookie": cookie})
-        with urllib.request.urlopen(request, timeout=120) as answer:
-            return json.loads(answer.read())
-
-    state = ask("state")
-    times = sorted(map(int, re.findall(r"\b\d{15}\b", json.dumps(state))))
-    begin, end = times[0], times[-1]
-    found = {"state": state, "trend": ask(f"trend?from={begin}&to={end + 1}"), "reading": ask(f"reading?time={end}")}
-    found["motions"] = ask(f"motions?time={end}")
-    for name, told in found.items():
-        (out / f"{name}.json").write_text(json.dumps(told), "utf-8")
-
-
 def main(out: Path, module: str, *words: str) -> int:
     """Visit the page of a command; its exit code."""
     out.mkdir(parents=True, exist_ok=True)
@@ -87,7 +69,7 @@ def main(out: Path, module: str, *words: str) -> int:
         try:
             found = next(filter(None, (re.search(PLACE, line) for line in process.stdout)))
             cookie = f"space_camera_twin_{found[2]}={found[3]}"
-            (live if module == "twin.live" else operated)(found[1], cookie, out)
+            live(found[1], cookie, out)
         finally:
             process.send_signal(signal.SIGINT)
     return process.returncode

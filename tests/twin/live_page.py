@@ -60,21 +60,6 @@ class Command:
         assert found is not None
         return int(found[1]), found[2]
 
-    def memory(self) -> int:
-        """Bytes that the server and the process that computes hold."""
-        pids = [self.process.pid, *self._children(self.process.pid)]
-        return sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in pids) * os.sysconf("SC_PAGE_SIZE")
-
-    def _children(self, pid: int) -> list[int]:
-        # of every thread: the process that computes is started again from another one than at first
-        lists = [place.read_text() for place in Path(f"/proc/{pid}/task").glob("*/children")]
-        return [int(child) for text in lists for child in text.split()]
-
-    def computer(self) -> int:
-        """The process that computes: the one that holds the most memory."""
-        held = {pid: int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in self._children(self.process.pid)}
-        return max(held, key=held.__getitem__)
-
     def end(self) -> int:
         """Ctrl-C; the exit code."""
         self.process.send_signal(signal.SIGINT)

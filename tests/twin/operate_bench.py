@@ -17,7 +17,7 @@ from tests.twin.operation_records import life_of, plan_of, record_of
 from tests.twin.operation_records import monitor_entry as own_entry
 from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.estimate.following import Break, Course, Following, FoundJump, SensorState
+from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState
 from twin.operate.estimate.plans import keep_plan
 from twin.operate.estimate.standing import Scores
 from twin.operate.record.entries import MICRO, Alarm, Entry
@@ -162,17 +162,13 @@ class StandIn:
     def forecast(self, times: Any) -> Course:
         return self._course(times)
 
-    def states(self, times: Any) -> tuple[Course, np.ndarray, dict[str, Any]]:
+    def motions(self, time: int) -> Motions:
         """Every third motion grows to two of its standard deviations, the others to a tenth of that."""
         stated = self.experiment.stated.components
         size = np.array([one.sigma / one.unit_size for one in stated])
-        days = (np.asarray(times) - START) / DAY
-        mean = 0.1 * days[:, None] * size * np.where(np.arange(len(size)) % 3 == 0, 1.0, 0.1)
-        together = {}
-        for name in dict.fromkeys(one.name for one in stated):
-            own = np.array([one.name == name for one in stated])
-            together[name] = mean[:, own].sum(axis=1), np.full(len(mean), np.sqrt(0.3 * np.sum(size[own] ** 2)))
-        return self._course(times), mean, together
+        mean = 0.1 * (time - START) / DAY * size * np.where(np.arange(len(size)) % 3 == 0, 1.0, 0.1)
+        labels, units = zip(*((one.name, one.unit) for one in stated), strict=True)
+        return Motions(time, labels, units, mean, 0.3 * np.diag(size**2))
 
 
 def lived(folder: Path, days: float = 80.0) -> tuple[Path, Path]:

@@ -102,6 +102,32 @@ def temperature_entry(body: str, time: int, kelvin: float, sigma: float = 0.05) 
     return Entry("temperature", body, time, {"values": [kelvin], "sigma": sigma, "unit": "K"}, None)
 
 
+def entries_of(
+    known: tuple, life: Life, seed: int, factor: float = 1.0, sensor=lambda body, k, kelvin: kelvin
+) -> list[Entry]:
+    """All that the instrument sends down.
+
+    Args:
+        known: plan, its experiment and what is stated to move.
+        life: of the instrument.
+        seed: of the noise.
+        factor: of what heat really does over the computed: sensors read as much less.
+        sensor: what a sensor says of what it should say; None for nothing.
+    """
+    _, experiment, stated = known
+    rng = np.random.default_rng([seed, 7])
+    out = []
+    for k, time in enumerate(life.times.tolist()):
+        for m, label in enumerate(stated.labels):
+            if label.endswith(" temperature"):
+                body = stated.bodies[m]
+                kelvin = 293.15 + life.motions[k, m] / factor + 0.05 * rng.normal()
+                told = sensor(body, k, kelvin)
+                out += [] if told is None else [temperature_entry(body, time, told)]
+        out.append(monitor_entry(experiment, stated, life, k, seed))
+    return out
+
+
 def given(name: str, entries: list[Entry]) -> Given:
     return Given(name, digest_of_data(name), digest_of_data([name, "m"]), entries, {})
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -141,26 +138,11 @@ def test_record_and_repeat(page, backend, tmp_path):
     assert run.series.readings.row("forward", "d_f_um", "model").true[-1] == pytest.approx(shown, abs=1e-7)
 
 
-def studied(folder: Path) -> Path:
-    """A study's folder, as it is from the study's beginning."""
-    with RunFolder(folder / "study") as made:
+def test_a_run_of_a_study_and_a_study_are_opened(browser, tmp_path):
+    with RunFolder(tmp_path / "study") as made:
         made.write_text("config.yaml", resolve_study("scenes/examples/study_aperture.yaml").to_yaml())
         write_manifest(made, "twin.study", 0.0, 1.0)
-    return folder / "study"
-
-
-def test_a_run_folder_and_a_study_are_opened(browser, tmp_path):
-    render = [sys.executable, "-m", "twin.render", "scenes/examples/perturb.yaml", "--out", str(tmp_path / "run")]
-    assert subprocess.run(render, check=False, capture_output=True).returncode == 0
-    with running(str(tmp_path / "run"), "--port", "0") as command:
-        page = Page(browser, command.address)
-        page.ready()
-        assert page.page.inner_text("#opened") == "run"
-        told = page.page.evaluate("liveTwin.last.readings")
-        file = json.loads((tmp_path / "run" / "recovered.json").read_text())
-        assert told == {key: file[key] for key in told}
-        page.close()
-    with running(str(studied(tmp_path)), "--run", "1234", "--port", "0") as command:
+    with running(str(tmp_path / "study"), "--run", "1234", "--port", "0") as command:
         page = Page(browser, command.address)
         page.ready()
         plan = Plan.of(resolve_study(tmp_path / "study" / "config.yaml"))

@@ -1,59 +1,69 @@
-"""The process that computes is stopped and killed under a page: what is told when, and what stays."""
+"""The process that computes is killed while it starts and while it answers: what is told, and what stays."""
 
 from __future__ import annotations
 
+import asyncio
 import json
-import os
-import signal
-import time
+import threading
+from contextlib import contextmanager, suppress
 
 import pytest
 
-pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
-pytest.importorskip("websockets.sync.client", reason="the extra `live` is not installed")
+from twin.live.computer import CannotStart, Computer, ComputerLost
+from twin.live.messages import AskedState
 
-from tests.twin.live_client import connect, numbered, state
-from tests.twin.live_page import running
-
-
-def reading(message: bytes) -> dict:
-    told = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
-    return {key: told[key] for key in ("readings", "truth")}
+pytestmark = pytest.mark.second
+ASKED = AskedState(n=1), None
 
 
-def told(ws, wanted: str, seconds: float) -> str:
-    """Wait until the page is told this of the process; what it is told."""
-    last = time.monotonic() + seconds
-    while True:
-        said = ws.recv(max(0.0, last - time.monotonic()))
-        if isinstance(said, str) and json.loads(said).get("state") == wanted:
-            return json.loads(said)["problem"]
+@contextmanager
+def computer(what: str):
+    """A process that is not started yet."""
+    made = Computer(what, "llvm")
+    try:
+        yield made
+    finally:
+        made.stop()
 
 
-def answer(ws, n: int, seconds: float = 120.0) -> dict:
-    """Wait for the answer to a state."""
-    last = time.monotonic() + seconds
-    while True:
-        said = ws.recv(max(0.0, last - time.monotonic()))
-        if isinstance(said, bytes) and numbered(said) == n:
-            return reading(said)
+def test_values_of_a_studys_factors_stay_when_the_process_is_started_again() -> None:
+    async def session(process: Computer) -> None:
+        async def readings() -> list[object]:
+            said = await process.ask("state", ASKED)
+            head = json.loads(said[4 : 4 + int.from_bytes(said[:4], "little")])
+            return [head["readings"], head["truth"]]
+
+        first = await readings()
+        (factor, *_) = process.opened.greeting["factors"]
+        await process.ask("factors", {factor["name"]: 0.9 * factor["now"]})
+        expected = await readings()
+        assert expected != first
+        process.kill()
+        with pytest.raises(ComputerLost, match="killed by SIGKILL"):
+            await process.ask("state", ASKED)
+        await process.start_again()
+        assert process.opened.greeting["factors"][0]["now"] == pytest.approx(0.9 * factor["now"])
+        assert await readings() == expected
+
+    with computer("scenes/examples/study_aperture.yaml") as process:
+        process.start()
+        asyncio.run(session(process))
 
 
-@pytest.mark.second
-def test_values_of_a_studys_factors_stay_when_the_process_is_started_again():
-    with running("scenes/examples/study_aperture.yaml", "--port", "0", "--stay") as command:
-        with connect(*command.place) as ws:
-            greeting = json.loads(ws.recv(5))
-            name, first = greeting["factors"][0]["name"], greeting["factors"][0]["now"]
-            ws.send(json.dumps({"type": "factors", "values": {name: 0.9 * first}}))
-            hello = {}
-            while hello.get("type") != "hello":
-                hello = json.loads(ws.recv(60))
-            assert hello["factors"][0]["now"] == pytest.approx(0.9 * first)
-            ws.send(state(1))
-            expected = answer(ws, 1)
-            os.kill(command.computer(), signal.SIGKILL)
-            told(ws, "runs", 240.0)
-            ws.send(state(2))
-            assert answer(ws, 2) == expected
-        assert command.end() == 0
+def test_a_process_that_cannot_start_says_why() -> None:
+    with computer("nowhere.yaml") as process, pytest.raises(CannotStart, match=r"nowhere\.yaml"):
+        process.start()
+    ended = threading.Event()
+    with computer("gf7_pair") as process:
+
+        def kill() -> None:
+            while not ended.wait(0.1):
+                with suppress(AttributeError):  # it has not begun
+                    process.kill()
+
+        with pytest.raises(CannotStart, match="killed by SIGKILL"):
+            process.start(lambda part: process.kill())
+        threading.Thread(target=kill, daemon=True).start()
+        with pytest.raises(CannotStart, match="3 times when it was started again"):
+            asyncio.run(process.start_again())
+        ended.set()

@@ -1,5 +1,6 @@
 """What commands tell of an estimate, and the alarms that they raise: once each."""
 
+import html
 import json
 import shutil
 from collections.abc import Iterator
@@ -7,13 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from optics.numerics.backend import load_backend
 from scenes.specs.operation import OperationSpec, RequirementSpec
 from tests.twin.commands import invoke
-from tests.twin.operation_records import START, given, life_of, monitor_entry, plan_of, record_of, temperature_entry
+from tests.twin.operation_records import START, entries_of, given, life_of, plan_of, record_of
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.alarms import AGAIN, alarms_of, raise_alarms
@@ -44,18 +44,14 @@ def life(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert stated is not None
     slip = stated.labels.index(f"{BODY} shift x")
     drawn = life_of(stated, DAYS, EVERY, 3, {SLIPPED: {slip: 60.0}})
-    entries = [monitor_entry(experiment, stated, drawn, k, 3) for k in range(len(drawn.times))]
-    rng = np.random.default_rng(1)
+
+    def sensor(body: str, k: int, kelvin: float) -> float:
+        return 292.0 if k > 15 and body == "base/backward" else round(kelvin, 2)
+
+    entries = entries_of((plan, experiment, stated), drawn, 3, sensor=sensor)
+    entries.append(Entry("event", "safe_mode", START + 30 * DAY + DAY // 2, {}))
+    entries.sort(key=lambda one: one.time)
     with record_of(folder / "record", plan) as history:
-        for k, label in enumerate(stated.labels):
-            if not label.endswith("temperature"):
-                continue
-            own = stated.sigmas[k] * drawn.motions[:, k] + 0.05 * rng.standard_normal(len(drawn.times))
-            for n, (time, value) in enumerate(zip(drawn.times.tolist(), own.tolist(), strict=True)):
-                kelvin = 292.0 if n > 15 and stated.bodies[k] == "base/backward" else history.temperature + value
-                entries.append(temperature_entry(stated.bodies[k], time - 600 * MICRO, round(kelvin, 2)))
-        entries.append(Entry("event", "safe_mode", START + 30 * DAY + DAY // 2, {}))
-        entries.sort(key=lambda one: one.time)
         assert not history.take(given("all", entries)).refused
     return folder
 
@@ -88,9 +84,10 @@ def following(life: Path, tmp_path_factory: pytest.TempPathFactory) -> Following
 @pytest.mark.second
 def test_without_a_plan_there_is_no_estimate(record: Path, life: Path) -> None:
     assert said("status", record)["estimate"] is None
-    done = run("forecast", record)
-    assert done.exit_code == 2
-    assert "keeps no plan of operation" in done.stderr
+    for words in (("forecast", record), ("ingest", record, life / "plan.yaml", "--report", life / "r.html")):
+        done = run(*words)
+        assert done.exit_code == 2
+        assert "keeps no plan of operation" in done.stderr
     # one that is named counts for this command alone
     told = said("status", record, life / "plan.yaml")
     assert told["estimate"]["readings"] == DAYS // EVERY
@@ -102,9 +99,13 @@ def test_a_record_without_a_reading_of_the_monitor(life: Path, tmp_path: Path) -
     with record_of(tmp_path / "record", plan) as history:
         keep_plan(plan, life / "plan.yaml", history)
     assert said("status", tmp_path / "record")["estimate"] is None
-    done = run("forecast", tmp_path / "record")
-    assert done.exit_code == 2
-    assert "no reading of the monitor is in the record" in done.stderr
+    (tmp_path / "tm.yaml").write_text(TABLE)
+    (tmp_path / "t.csv").write_text("UTC,T\n2026-06-25T06:00:00Z,293.1\n")
+    ingest = ("ingest", tmp_path / "record", tmp_path / "tm.yaml", "--report", tmp_path / "r.html")
+    for words, code in ((("forecast", tmp_path / "record"), 2), (ingest, 0)):
+        done = run(*words)
+        assert done.exit_code == code
+        assert "no reading of the monitor is in the record" in done.stderr
 
 
 def test_status_tells_how_the_instrument_stands(record: Path, life: Path) -> None:
@@ -167,15 +168,21 @@ def test_ingest_raises_alarms_once(record: Path, life: Path, tmp_path: Path) -> 
     run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
     (tmp_path / "tm.yaml").write_text(TABLE)
     (tmp_path / "t.csv").write_text("time,T\n2026-06-25T06:00:00Z,293.1\n".replace("time", "UTC"))
-    first = said("ingest", record, tmp_path / "tm.yaml")
+    first = said("ingest", record, tmp_path / "tm.yaml", "--report", tmp_path / "r.html")
     assert first["new"] == 1
+    page = (tmp_path / "r.html").read_text("utf-8")
+    assert all(html.escape(one.removeprefix("alarm: ")) in page for one in first["alarms"])
     assert len(first["alarms"]) == 2
     assert any(f"{BODY} jumped between" in one for one in first["alarms"])
     (tmp_path / "t.csv").write_text("UTC,T\n2026-06-25T12:00:00Z,293.1\n")
     done = run("ingest", record, tmp_path / "tm.yaml")
     assert "alarm: " not in done.stdout
     assert len(said("alarms", record)["alarms"]) == 2
-    assert said("ingest", record, tmp_path / "tm.yaml")["alarms"] == []
+    before = (tmp_path / "r.html").stat().st_mtime_ns
+    assert said("ingest", record, tmp_path / "tm.yaml", "--report", tmp_path / "r.html")["alarms"] == []
+    assert (tmp_path / "r.html").stat().st_mtime_ns > before
+    done = run("ingest", record, tmp_path / "tm.yaml", "--report", tmp_path / "no" / "r.html")
+    assert (done.exit_code, "r.html cannot be written" in done.stderr) == (1, True), done.stderr
 
 
 def test_an_estimate_that_fails_does_not_hide_what_was_taken(record: Path, life: Path, tmp_path: Path) -> None:

@@ -31,7 +31,6 @@ from tests.twin.line_scanner_model import LineScannerModel
 from tests.twin.products_bench import StandIn
 from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import StateReader
 from twin.operate.__main__ import app as operate
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.plans import keep_plan
@@ -45,10 +44,11 @@ from twin.operate.validity import Mark, validity
 from twin.orbit.export.export_run import ExportSource, read_source
 from twin.orbit.flight.corrected_lines import corrected_line
 from twin.orbit.flight.line_camera import traced_line_cameras
-from twin.render import app as render
 
 SCENE = SCENES / ORBIT / "angle_gf7.yaml"
 NOISE = 0.005**2 * np.eye(8)
+KNOWN = ("stated", "instrument", "thermal", "cameras", "ground")
+"""Of an experiment, what products ask for beside its disturbances."""
 
 
 @cache
@@ -106,11 +106,8 @@ class Walk:
 
     def __call__(self, times):
         away = (np.array(times, float) - START)[:, None] / MICRO
-        return replace_course(self, self.slope * away, np.sqrt(1.0 + self.rate * np.abs(away)))
-
-
-def replace_course(walk: Walk, values: np.ndarray, sigmas: np.ndarray) -> SimpleNamespace:
-    return SimpleNamespace(quantities=walk.quantities, values=values, sigmas=sigmas)
+        sigmas = np.sqrt(1.0 + self.rate * np.abs(away))
+        return SimpleNamespace(quantities=self.quantities, values=self.slope * away, sigmas=sigmas)
 
 
 FIRST, LAST = Mark(START - 10**12, "first"), Mark(START + 10**13, "last")
@@ -171,32 +168,6 @@ def test_the_job_of_a_state_is_that_state(tmp_path: Path) -> None:
         read, meant = truth.vector(camera)
         # texts of quantities read back to the same bits, and the rest is the same trace
         np.testing.assert_allclose(read, meant, rtol=1e-9, atol=1e-15)
-
-
-@pytest.mark.second
-def test_spots_of_the_rendered_state_are_those_that_were_measured(history: History, tmp_path: Path) -> None:
-    """A state is drawn and its frames are read; twin.render of the product's job gives the spots of that reading."""
-    state = state_of(drawn(7)[0], experiment().stated.components, experiment().thermal)
-    read = StateReader(experiment(), 9, 5).read(state, number=1).recovery
-    operation = StandIn(experiment(), np.array([START]), read.shift, read.shift_covariance[0])
-    (tmp_path / "state.yaml").write_text(products_of(operation, history, START, None, load_backend()).state, "utf-8")
-    result = invoke(render, tmp_path / "state.yaml", "--out", tmp_path / "run", "--quiet")
-    assert result.exit_code == 0, result.stderr
-    rendered, sigma = shifts_of(tmp_path / "run")
-    away = rendered - read.shift[0]
-    # five sigma of both noises, and a thousandth of the shift for what is not linear in the motions
-    limit = 5.0 * np.sqrt(sigma**2 + np.diagonal(read.shift_covariance[0])) + 1e-3 * np.abs(read.shift[0])
-    assert np.all(np.abs(away) < limit)
-    assert np.abs(read.shift).max() > 100.0 * sigma.max()
-
-
-def shifts_of(run: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Shifts that a run measured, row and column of one spot after the other, px, and their sigmas."""
-    found = json.loads((run / "recovered.json").read_text("utf-8"))["spots"]
-    spots = [(spot, axis) for camera in found.values() for spot in camera.values() for axis in ("row", "column")]
-    shifts = [spot["after"][axis] - spot["before"][axis] for spot, axis in spots]
-    sigmas = [np.hypot(spot["after"][f"{axis}_sigma"], spot["before"][f"{axis}_sigma"]) for spot, axis in spots]
-    return np.array(shifts), np.array(sigmas)
 
 
 def test_what_a_job_cannot_say_is_told() -> None:
@@ -292,19 +263,15 @@ def problem(history: History, time: int, source: ExportSource | None = None) -> 
     return told.value
 
 
-def test_times_of_which_nothing_is_known_are_refused(history: History) -> None:
-    early = problem(history, START - 1)
+def test_times_of_which_nothing_is_known_are_refused(history: History, tmp_path: Path) -> None:
+    end = START + 30 * 86400 * MICRO
+    early, late, none = problem(history, START - 1), problem(history, end + 1), problem(made(tmp_path / "none"), START)
     assert "before the first reading" in early.problem
-    assert early.allowed == f"a time from {utc_text(START)} to {utc_text(START + 30 * 86400 * MICRO)}"
-    late = problem(history, START + 30 * 86400 * MICRO + 1)
+    assert early.allowed == f"a time from {utc_text(START)} to {utc_text(end)}"
     assert "forecast does not go so far" in late.problem
     assert "a longer horizon in the plan" in (late.allowed or "")
-
-
-def test_a_record_without_readings_has_no_products(tmp_path: Path) -> None:
-    told = problem(made(tmp_path / "record"), START)
-    assert "no reading of the monitor" in told.problem
-    assert "twin.operate ingest" in (told.allowed or "")
+    assert "no reading of the monitor" in none.problem
+    assert "twin.operate ingest" in (none.allowed or "")
 
 
 @pytest.mark.parametrize(
@@ -315,12 +282,8 @@ def test_a_scene_of_another_instrument_is_refused(history: History, tmp_path: Pa
     if change is None:
         source = read_source(SCENES / ORBIT / "angle.yaml")
     else:
-        library = SCENES / "library" / "instruments" / "gf7_pair.yaml"
-        other = (
-            library.read_text("utf-8")
-            .replace("name: gf7_pair", "name: zy3_pair")
-            .replace("look: 26 deg", "look: 25 deg")
-        )
+        other = (SCENES / "library" / "instruments" / "gf7_pair.yaml").read_text("utf-8")
+        other = other.replace("name: gf7_pair", "name: zy3_pair").replace("look: 26 deg", "look: 25 deg")
         (tmp_path / "zy3_pair.yaml").write_text(other, "utf-8")
         (tmp_path / "angle.yaml").write_text(text.replace("camera: gf7_pair ", "camera: ./zy3_pair.yaml "), "utf-8")
         source = read_source(tmp_path / "angle.yaml")
@@ -346,9 +309,7 @@ def test_the_version_goes_with_the_record_and_the_plan(tmp_path: Path) -> None:
 @pytest.mark.second
 def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
     """With motions that do not go on in time nothing else does."""
-    told = SimpleNamespace(
-        **{name: getattr(experiment(), name) for name in ("stated", "instrument", "thermal", "cameras", "ground")}
-    )
+    told = SimpleNamespace(**{name: getattr(experiment(), name) for name in KNOWN})
     told.disturbances = replace(experiment().disturbances, laws=(TimeLaw(),) * len(experiment().stated.components))
     hour = 3600 * MICRO
     quantity = "ground height_m"
@@ -446,14 +407,7 @@ def test_what_is_white_in_time_is_err_rand_and_not_applied(history: History) -> 
         for law, c in zip(base.stated.laws, base.stated.causes, strict=True)
     )
     stated = replace(base.stated, laws=laws)
-    told = SimpleNamespace(
-        disturbances=stated,
-        stated=experiment().stated,
-        instrument=experiment().instrument,
-        thermal=experiment().thermal,
-        cameras=experiment().cameras,
-        ground=experiment().ground,
-    )
+    told = SimpleNamespace(disturbances=stated, **{name: getattr(experiment(), name) for name in KNOWN})
     white = [law.white for law in laws]
     rows = stated.parameters[:4] * white
     at_once, beside = (
@@ -666,6 +620,7 @@ def test_a_state_has_the_temperatures_that_do_what_was_found(tmp_path: Path) -> 
         (("--time", "2026-03-03T00:00:00Z", "--scene", SCENES / ORBIT / "angle.yaml"), "the record's instrument"),
         (("--time", "2026-03-03T00:00:00Z", "--scene", SCENES / ORBIT / "monitor.yaml"), "does not read this"),
         (("--time", "2026-03-03T00:00:00Z", "--scene", "no.yaml"), "no.yaml"),
+        (("--scene", SCENES / ORBIT / "simulate.yaml"), "--scene: not a scene of an instrument"),
     ],
 )
 def test_what_the_command_refuses(followed: Followed, tmp_path: Path, words, said: str) -> None:
@@ -675,20 +630,23 @@ def test_what_the_command_refuses(followed: Followed, tmp_path: Path, words, sai
     assert not (tmp_path / "products").exists()
 
 
+def test_a_scene_that_cannot_be_flown_names_its_key(followed: Followed, tmp_path: Path) -> None:
+    text = SCENE.read_text("utf-8").replace("[20 arcsec, -35 arcsec, 15 arcsec]", "[80 deg, 0 deg, 0 deg]")
+    (tmp_path / "past.yaml").write_text(text, "utf-8")
+    when = ("--time", utc_text(followed.time))
+    result = command(followed.place, *when, "--scene", tmp_path / "past.yaml", "--out", tmp_path / "p")
+    assert (result.exit_code, "past.yaml:" in result.stderr) == (2, True), result.stderr
+
+
 def test_products_that_cannot_be_written_are_told(followed: Followed) -> None:
     result = command(followed.place, "--time", utc_text(followed.time), "--out", followed.place / "record.sqlite" / "x")
-    assert (result.exit_code, "what is there is not all of the products" in " ".join(result.stderr.split())) == (
-        1,
-        True,
-    )
+    said = " ".join(result.stderr.split())
+    assert (result.exit_code, "what is there is not all of the products" in said) == (1, True), said
 
 
 def test_a_record_without_a_plan_says_how_to_keep_one(tmp_path: Path) -> None:
     made(tmp_path / "record").close()
-    result = command(tmp_path / "record", "--time", "2026-03-03T00:00:00Z", "--out", tmp_path / "products")
-    assert result.exit_code == 2
-    assert "init RECORD gf7_pair --plan FILE" in result.stderr
     (tmp_path / "there").mkdir()
-    result = command(tmp_path / "record", "--time", "2026-03-03T00:00:00Z", "--out", tmp_path / "there")
-    assert result.exit_code == 2
-    assert "is there already" in result.stderr
+    for out, words in (("products", "init RECORD gf7_pair --plan FILE"), ("there", "is there already")):
+        result = command(tmp_path / "record", "--time", "2026-03-03T00:00:00Z", "--out", tmp_path / out)
+        assert (result.exit_code, words in result.stderr) == (2, True), result.stderr

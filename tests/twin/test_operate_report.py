@@ -16,7 +16,7 @@ from scenes.yaml.errors import Problem
 from tests.twin.commands import invoke
 from tests.twin.operate_bench import COUNT, DAY, EVIL, HOUR, StandIn, filled, lived, monitor_entry
 from tests.twin.policed_page import breaches
-from tests.twin.record_bench import START, given
+from tests.twin.record_bench import START, given, made
 from twin.operate.__main__ import app
 from twin.operate.daily_report import _warnings, daily_report, end_of_day, report_html, state_table
 from twin.operate.estimate.alarms import percent
@@ -85,6 +85,24 @@ def test_the_table_has_every_quantity_with_its_requirement(overview):
     assert list(table.bands.values()) == ["forward", "backward", "angle between the cameras", "ground"]
 
 
+def test_motions_are_those_of_most_sigmas_with_all_causes_together(history, overview):
+    made = daily_report(history, overview, end_of_day(None, overview.time))
+    (section,) = (one for one in made.sections if one.name == "motions")
+    rows, days = section.artefacts[0].rows, (overview.time - START) / DAY
+    assert len(rows) == 12
+    best: dict[str, list[float]] = {}
+    for k, one in enumerate(overview.operation.experiment.stated.components):
+        own = best.setdefault(f"{one.name} [{one.unit}]", [0.0, 0.0])
+        size = one.sigma / one.unit_size
+        own[0] += 0.1 * days * size * (0.1 if k % 3 else 1.0)
+        own[1] = np.hypot(own[1], np.sqrt(0.3) * size)
+    for name, mean, sigma, ratio in rows:
+        assert (float(mean), float(sigma)) == pytest.approx(best[name], rel=1e-9)
+        assert float(ratio) == pytest.approx(best[name][0] / best[name][1])
+    assert [float(row[3]) for row in rows] == sorted((float(row[3]) for row in rows), reverse=True)
+    assert not any("temperature" in str(row[0]) for row in rows)
+
+
 def test_the_page_needs_nothing_else_and_runs_nothing_that_a_text_brings(page):
     assert breaches(page) == []
     assert EVIL not in page
@@ -111,20 +129,14 @@ def test_what_a_reader_has_to_know_is_told_and_nothing_else() -> None:
     assert said(0, 3, "")[1] == "3 alarms wait for an acknowledgement; the newest: alarm 0"
 
 
-@pytest.mark.parametrize(("within", "count"), [(0, 10), (10, 10), (800, 1272), (1, 3)])
+@pytest.mark.parametrize(("within", "count"), [(0, 10), (10, 10), (800, 1272), (1, 3), (0, 0)])
 def test_intervals_are_the_exact_binomial_ones(within, count):
     found = coverage(1, within, count)
-    exact = binomtest(within, count).proportion_ci(0.95, "exact")
-    assert found.low == pytest.approx(exact.low, abs=1e-12)
-    assert found.high == pytest.approx(exact.high, abs=1e-12)
+    exact = binomtest(within, count).proportion_ci(0.95, "exact") if count else SimpleNamespace(low=0.0, high=1.0)
+    assert (found.low, found.high) == pytest.approx((exact.low, exact.high), abs=1e-12)
+    assert np.isnan(found.share) == (count == 0)
     assert found.expected == pytest.approx(0.682689492, abs=1e-9)
     assert found.holds == (found.low <= found.expected <= found.high)
-
-
-def test_nothing_predicted_is_no_failure():
-    found = coverage(2, 0, 0)
-    assert np.isnan(found.share)
-    assert found.holds
 
 
 @pytest.mark.parametrize(
@@ -272,3 +284,6 @@ def test_a_place_that_cannot_be_written_and_a_record_without_a_plan_are_told(lif
     told = run(Path(history.url.removeprefix("sqlite:///")).parent)
     assert told.exit_code == 2
     assert "keeps no plan" in told.stderr
+    made(tmp_path / "empty").close()
+    told = run(tmp_path / "empty")
+    assert (told.exit_code, "no reading of the monitor; ingest takes some" in told.stderr) == (2, True), told.stderr

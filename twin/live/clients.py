@@ -35,7 +35,7 @@ STOPPED = 10.0
 """Seconds for which it may be stopped by a signal; then it is started again."""
 PATIENCE = 20.0
 """Seconds that a page may take to receive one answer."""
-POLICY_VIOLATION, TOO_BIG, TRY_AGAIN = 1008, 1009, 1013
+POLICY_VIOLATION, TRY_AGAIN = 1008, 1013
 """Codes with which a WebSocket is closed."""
 
 

@@ -11,7 +11,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
-from twin.live.clients import POLICY_VIOLATION, TOO_BIG, Client, Desk, Goodbye
+from twin.live.clients import POLICY_VIOLATION, Client, Desk, Goodbye
 from twin.live.computer import Computer
 from twin.live.messages import LARGEST_MESSAGE
 from twin.serving.guard import Guard
@@ -96,8 +96,6 @@ class LiveServer(PageServer):
             text = said.get("text")
             if text is None:
                 raise Goodbye(POLICY_VIOLATION, "a page sends texts")
-            if len(text.encode()) > LARGEST_MESSAGE:
-                raise Goodbye(TOO_BIG, "the message is too long")
             client.take(text)
             if client.busy:
                 self.desk.wake()

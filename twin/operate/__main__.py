@@ -26,10 +26,10 @@ from twin.operate.estimate_commands import (
     show_estimate,
     show_power,
 )
-from twin.operate.followed import PlanFile
+from twin.operate.followed import PlanFile, planned
 from twin.operate.life_commands import judge, simulate
 from twin.operate.products_command import products
-from twin.operate.shown_commands import report, serve
+from twin.operate.report_command import report, write_report
 from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run import durable
 from twin.run.cli import (
@@ -142,6 +142,15 @@ def ingest(
     watch: Annotated[
         bool, typer.Option("--watch", help="Go on looking for new tables and run folders, until Ctrl-C.")
     ] = False,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            "--report",
+            metavar="FILE.html",
+            readable=False,
+            help="Write the daily report to this file, and anew whenever something was taken.",
+        ),
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -150,12 +159,14 @@ def ingest(
 
     A file is taken in one step. What is in the record already is told and not doubled. What cannot be true is refused
     with its reason, which `status` shows: another instrument, a clock that runs backwards, a unit that does not fit, an
-    unknown event. A refusal counts once, also where the file is read again after it has grown.
+    unknown event. A refusal counts once, also where the file is read again after it has grown. With --watch and
+    --report the daily report, which a browser shows, is never older than the record.
 
     For example:
 
         python -m twin.operate ingest record scenes/examples/telemetry.yaml
         python -m twin.operate ingest record runs/recover-001 --time 2026-03-05T03:05:00Z
+        python -m twin.operate ingest record downlink --watch --report report.html
 
     Exit codes: 0 success, 2 bad input or something was refused (all else is taken), 1 anything else.
     """
@@ -165,9 +176,12 @@ def ingest(
 
     with told() as errors, durable.exit_on_terminate(), History(record) as history:
         start = None if moment is None else moment_said("--time", moment)
+        if page is not None:
+            planned(history, None)
         sources = Sources(files, start, _is_stated(instrument, history), watch)
         totals, files_told, first = Counter({"new": 0, "known": 0, "refused": 0, "refused_before": 0}), [], ""
         raised: list[str] = []
+        stale = page is not None
         try:
             while True:
                 before = totals["new"]
@@ -180,8 +194,9 @@ def ingest(
                         tell(errors, as_json, quiet, _taken(taken), partial(line, text=_line(taken)))
                     else:
                         files_told.append(_taken(taken))
-                if totals["new"] > before:
-                    new = _new_alarms(errors, history, quiet or as_json)
+                if totals["new"] > before or stale:
+                    new = _new_alarms(errors, history, record, page, quiet or as_json)
+                    stale = False
                     raised += new
                     if new and (watch or not as_json):
                         tell(errors, as_json, quiet, {"alarms": new}, partial(line, text="\n".join(new)))
@@ -206,16 +221,26 @@ def ingest(
             raise typer.Exit(BAD_INPUT)
 
 
-def _new_alarms(errors: Console, history: History, quiet: bool) -> list[str]:
-    """Alarms that the estimate under the record's plan raises with what was taken; what keeps it from being worked out
-    is told, and is no fault of what was taken.
+def _new_alarms(errors: Console, history: History, record: str, page: Path | None, quiet: bool) -> list[str]:
+    """Return the alarms that the estimate under the record's plan raises with what was taken, after the report is
+    written. What keeps it from being worked out is printed, and is no fault of what was taken.
     """
+    from twin.operate.shown_readings import last_time
+
     try:
         found = estimate_of(errors, history, None, quiet)
     except (InputErrorText, InputError) as error:
         print_error(errors, f"what was taken is in the record, and the estimate cannot be worked out: {error}")
         return []
-    return [] if found is None else [f"alarm: {one.text}" for one in found[2]]
+    if found is None:
+        if page is not None:
+            print_error(errors, "no report: no reading of the monitor is in the record")
+        return []
+    if page is not None and (newest := last_time(history)) is not None:
+        from twin.operate.daily_report import end_of_day
+
+        write_report(history, found[0], end_of_day(None, newest), [record], page, errors)
+    return [f"alarm: {one.text}" for one in found[2]]
 
 
 def _is_stated(instrument: str | None, history: History) -> bool:
@@ -375,7 +400,6 @@ app.command("products")(products)
 app.command("simulate")(simulate)
 app.command("judge")(judge)
 app.command("report")(report)
-app.command("serve")(serve)
 
 
 if __name__ == "__main__":

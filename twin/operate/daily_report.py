@@ -7,9 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
+from scenes.models.disturbances import HEAT
 from scenes.yaml.errors import Problem
 from twin.operate.daily_plots import courses_svg, innovations_svg
 from twin.operate.estimate.alarms import name_of, percent
@@ -39,6 +42,8 @@ RECENT = 30 * DAY
 """Before the newest reading, of the second figure of courses."""
 MOST_EXPLAINED = 4
 """Quantities of which the lead says how much of their scatter temperatures explain."""
+MOST_MOTIONS = 12
+"""Motions of bodies that are listed."""
 MOST_SHOWN = 40
 """Rows of a table in which the newest are shown; CSV has them all."""
 _NOT = "\N{EM DASH}"
@@ -65,6 +70,7 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
     sections = (
         _changed_section(overview, begin, end),
         _trend_section(history, overview, last),
+        _motion_section(overview),
         _prediction_section(overview),
         _jump_section(overview),
         _sensor_section(overview),
@@ -190,6 +196,29 @@ def _trend_section(history: History, overview: Overview, last: int) -> Section:
 
 def _figure(name: str, title: str, svg: str) -> SvgFigure:
     return SvgFigure(name, title, "", svg, within="")
+
+
+def _motion_section(overview: Overview) -> Section | None:
+    """Return the motions of bodies that are known best, all causes of a motion together; None without any."""
+    found, stated = overview.operation.motions(overview.time), overview.operation.experiment.stated
+    moving = () if stated is None else [one for one in stated.components if one.kind not in HEAT]
+    rows: list[tuple[float, list[Cell]]] = []
+    for name, unit in {one.name: one.unit for one in moving}.items():
+        own = np.array([label == name for label in found.labels], np.float64)
+        mean, sigma = float(own @ found.mean), math.sqrt(max(float(own @ found.covariance @ own), 0.0))
+        places = decimals_for(sigma)
+        ratio = abs(mean) / sigma if sigma else 0.0
+        cells = [f"{name} [{unit}]", OwnDecimals(mean, places), OwnDecimals(sigma, places), OwnDecimals(ratio, 1)]
+        rows.append((ratio, cells))
+    if not rows:
+        return None
+    best = [cells for _, cells in sorted(rows, key=lambda row: -row[0])[:MOST_MOTIONS]]
+    caption = (
+        f"The {len(best)} motions of most sigmas of {len(rows)}, at {minute_text(overview.time)} UTC, with all "
+        "readings until then; twin.operate products writes all of them with their covariance."
+    )
+    heads = ("motion", "now", "σ", "sigmas")
+    return Section("Motions of bodies", (), (Table("motions", "", caption, heads, best, within=""),), name="motions")
 
 
 def _prediction_section(overview: Overview) -> Section:

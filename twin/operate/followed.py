@@ -42,13 +42,18 @@ def operation_of(history: History, plan: Path | None, errors: Console, quiet: bo
         InputError: the plan cannot be read, or is of another instrument.
         InputErrorText: there is no plan, or no reading of the monitor.
     """
+    return followed(history, planned(history, plan), errors, quiet)
+
+
+def planned(history: History, plan: Path | None) -> OperationSetup:
+    """Return the plan in a file, or that of the record. Raises InputErrorText: the record keeps none."""
     setup = plan_of(history, plan)
     if setup is None:
         raise InputErrorText(
             f"the record keeps no plan of operation; name one, or keep one: python -m twin.operate init RECORD "
             f"{history.name} --plan FILE"
         )
-    return followed(history, setup, errors, quiet)
+    return setup
 
 
 def followed(history: History, setup: OperationSetup, errors: Console, quiet: bool = False) -> Operation:

@@ -1,4 +1,4 @@
-"""What readers are told of an instrument in operation, for the daily report and for the served page alike.
+"""What readers are told of an instrument in operation, for the daily report.
 
 An overview takes the estimate as `twin.operate.estimate.operation` gives it, with the alarms of the record, and says
 in words and rows what holds, what changed and whether predictions came true. Nothing is estimated here.

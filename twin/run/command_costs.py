@@ -34,7 +34,6 @@ BRIEF: Mapping[str, Brief] = {
             "alarms",
             "products",
             "report",
-            "serve",
             "exclude",
         )
     },

@@ -30,7 +30,7 @@ PROGRAMS = {
     "asbuilt": ("twin.asbuilt", "one instrument as built: its state by all that was measured"),
     "operate": (
         "twin.operate",
-        "init, ingest, status, forecast, alarms, exclude, products, report, serve, export, simulate, judge",
+        "init, ingest, status, forecast, alarms, exclude, products, report, export, simulate, judge",
     ),
     "camera": ("twin.camera", "wavefront, spots, MTF, distortion of a camera; refocus it"),
     "lens": ("scenes.lens", "read and write prescriptions of Zemax, CODE V and batoid"),

@@ -5,9 +5,6 @@ no script can read and no other site can send, and is led to the page without it
 before it is accepted, needs the cookie, a Host that is the server's own (a page elsewhere may have its name resolve to
 127.0.0.1) and, where the browser tells it, an Origin that is the page's own.
 
-A server whose pages may also change something has a second token for that. It comes in the same way, as a cookie of its
-own, or from a program as ``Authorization: Bearer``; who has only the first one can read.
-
 uvicorn's own limits turn against the user here: ``limit_concurrency`` counts connections that say nothing, so that
 whoever opens enough of them locks everybody out, and ``timeout_keep_alive`` begins with the first answer. So a
 connection that has not yet shown the token is a **stranger** until it does, which a browser does within its first
@@ -82,22 +79,20 @@ class Guard:
         token: the secret.
         hosts: names under which the server is called, with their port.
         port: it listens on.
-        write: the second secret, with which something may be changed; empty where nothing may.
     """
 
     token: str
     hosts: tuple[str, ...]
     port: int
-    write: str = ""
 
     @classmethod
-    def of(cls, token: str, host: str, port: int, write: str = "") -> Guard:
+    def of(cls, token: str, host: str, port: int) -> Guard:
         """The guard of a server that listens on a host and a port."""
         named = f"[{host}]" if ":" in host else host.lower()
         names = LOOPBACK if host in ("127.0.0.1", "localhost", "::1") else (named, *LOOPBACK)
         if host in EVERYWHERE:
             names = (*names, *(name.lower() for name in names_of_this_machine()))
-        return cls(token, tuple(_called(name, port) for name in names), port, write)
+        return cls(token, tuple(_called(name, port) for name in names), port)
 
     @property
     def cookie_name(self) -> str:
@@ -109,29 +104,9 @@ class Guard:
         """What sets the cookie; the token is renewed with every server, so that it needs no date."""
         return f"{self.cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
-    @property
-    def write_cookie(self) -> str:
-        """What sets the cookie with the second token."""
-        return f"{self.cookie_name}_write={self.write}; HttpOnly; SameSite=Strict; Path=/"
-
     def knows(self, token: str) -> bool:
         """Whether it is the token; takes as long whatever is wrong with it."""
         return secrets.compare_digest(token.encode(), self.token.encode())
-
-    def knows_write(self, token: str) -> bool:
-        """Whether it is the second token; where there is none, nothing is."""
-        return bool(self.write) and secrets.compare_digest(token.encode(), self.write.encode())
-
-    def may_write(self, headers: Mapping[str, str]) -> bool:
-        """Whether a request brings the second token, as its cookie or as ``Authorization: Bearer``.
-
-        Args:
-            headers: of the request, names in small letters.
-        """
-        scheme, _, told = headers.get("authorization", "").partition(" ")
-        if scheme.lower() == "bearer" and self.knows_write(told.strip()):
-            return True
-        return any(map(self.knows_write, _cookies(headers.get("cookie", ""), f"{self.cookie_name}_write")))
 
     def knows_cookie(self, headers: Mapping[str, str]) -> bool:
         """Whether a request brings the token as its cookie.

@@ -39,7 +39,6 @@ TYPES = {
     "js": "text/javascript",
     "svg": "image/svg+xml",
     "glb": "model/gltf-binary",
-    "png": "image/png",
 }
 _ROOM = Path(__file__).parents[1]
 SHARED: Mapping[str, Traversable] = {
@@ -60,7 +59,6 @@ class PageServer:
         parts: everything that can be asked for by name, ``index.html`` among them; no path of a request is ever one of
             the file system.
         routes: what else is answered; they stand before the parts.
-        posts: paths of these to which something may be posted; all else only shows.
         tasks: that run as long as the server does. If one of them fails, the server ends.
         leave: called when it ends.
         largest: bytes of a message of a WebSocket.
@@ -71,7 +69,6 @@ class PageServer:
         guard: Guard,
         parts: Mapping[str, Traversable],
         routes: Sequence[BaseRoute] = (),
-        posts: frozenset[str] = frozenset(),
         tasks: Sequence[Callable[[], Coroutine[Any, Any, None]]] = (),
         leave: Callable[[], None] = lambda: None,
         largest: int = 1 << 16,
@@ -83,7 +80,7 @@ class PageServer:
         self._failed: BaseException | None = None
         self.app = Starlette(
             routes=[Route("/", self._index), *routes, Route("/{name}", self._part)],
-            middleware=[Middleware(Gate, guard=guard, posts=posts)],
+            middleware=[Middleware(Gate, guard=guard)],
             lifespan=self._lifespan,
         )
 
@@ -153,23 +150,15 @@ class PageServer:
     async def _index(self, request: Request) -> Response:
         if "token" not in request.query_params:
             return self.part("index.html")
-        answer = RedirectResponse("/", 303, headers={"set-cookie": self.guard.cookie})
-        if self.guard.knows_write(request.query_params.get("write", "")):
-            answer.headers.append("set-cookie", self.guard.write_cookie)
-        return answer
+        return RedirectResponse("/", 303, headers={"set-cookie": self.guard.cookie})
 
     async def _part(self, request: Request) -> Response:
         name = request.path_params["name"]
-        return self.part(name) if name in self.parts else nothing()
+        return self.part(name) if name in self.parts else PlainTextResponse("nothing is here\n", 404)
 
     def part(self, name: str) -> Response:
         """A part of the page."""
         return Response(self.parts[name].read_bytes(), media_type=TYPES[name.rpartition(".")[2]])
-
-
-def nothing(why: str = "nothing is here") -> Response:
-    """The answer where there is nothing to show."""
-    return PlainTextResponse(f"{why}\n", 404)
 
 
 class Gate:
@@ -178,11 +167,10 @@ class Gate:
     Args:
         app: behind it.
         guard: who may pass.
-        posts: paths to which who has the second token may post.
     """
 
-    def __init__(self, app: ASGIApp, guard: Guard, posts: frozenset[str] = frozenset()) -> None:
-        self.app, self.guard, self.posts = app, guard, posts
+    def __init__(self, app: ASGIApp, guard: Guard) -> None:
+        self.app, self.guard = app, guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request, or one WebSocket that is asked for."""
@@ -203,27 +191,12 @@ class Gate:
             return
         status = 403
         if not why and not socket_wanted and scope["method"] not in ("GET", "HEAD"):
-            if scope["method"] == "POST" and scope["path"] in self.posts:
-                why = self._refuses_post(headers)
-            else:
-                status, why = 405, "this server only shows"
+            status, why = 405, "this server only shows"
         if why:
             answer = PlainTextResponse(f"refused: {why}\n", status, headers={"connection": "close"})
             await answer(scope, receive, _with_headers(send))
             return
         await self.app(scope, receive, send if socket_wanted else _with_headers(send))
-
-    def _refuses_post(self, headers: Mapping[str, str]) -> str:
-        """Why nothing may be changed; empty if it may. A browser always tells whose page posts, and a form of another
-        page cannot send JSON without asking first.
-        """
-        if not self.guard.may_write(headers):
-            return "this page only shows; open the address for writing that the command printed"
-        if "origin" not in headers and "authorization" not in headers:
-            return "no origin"
-        if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-            return "what is posted is JSON"
-        return ""
 
     def _brings_token(self, scope: Scope) -> bool:
         if scope["path"] != "/":

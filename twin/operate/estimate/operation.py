@@ -418,38 +418,6 @@ class Operation:
         spread = spread * self._widened_at(np.array([time_us], np.int64))[0] ** 2
         return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
 
-    def states(self, times_us: NDArray[np.int64]) -> tuple[Course, Array, dict[str, tuple[Array, Array]]]:
-        """What `smoothed` and `motions` say of times, with the work of one look at the past.
-
-        Args:
-            times_us: (T,) as of `smoothed`.
-
-        Returns:
-            The course; (T, M) means of every stated motion; and by name the motions of several causes together, (T,)
-            means and standard deviations.
-
-        Raises:
-            Problem: a time before it.
-        """
-        times, stated, own = times_us, self.model.how.stated, self._taking.how
-        how = replace(own, steps=(*own.steps, *self._steps(self._standing)))
-        since, names = self._taking.seconds(self.epoch), list(dict.fromkeys(stated.labels))
-        group, size = np.array([names.index(label) for label in stated.labels]), stated.sigmas
-        first, second = np.nonzero(group[:, None] == group)  # pairs of one name, whose errors go together
-
-        def each(mean: Array, covariance: Array, time: float) -> Any:
-            moved, spread = how.motions_of(mean, covariance, time, since)
-            shares = size[first] * spread[first, second] * size[second]
-            variance = np.bincount(group[first], shares, len(names))
-            return own.parameters_of(mean, covariance, time), size * moved, np.sqrt(np.maximum(variance, 0.0))
-
-        found: Any = self._past(times, each)
-        wide = self._widened_at(times)
-        moved = np.array([one for _, one, _ in found]).reshape(len(times), len(group))
-        sigmas = np.array([one for _, _, one in found]).reshape(len(times), len(names)) * wide[:, None]
-        together = {name: (moved[:, group == k].sum(axis=1), sigmas[:, k]) for k, name in enumerate(names)}
-        return self._course(times, [one for one, _, _ in found], wide), moved, together
-
     @staticmethod
     def _steps(standing: Standing, told_after: int | None = None) -> tuple[Step, ...]:
         own = (one for one in standing.jumps if told_after is None or one.time > told_after)

@@ -5,6 +5,7 @@ const FIRST = 1e5;
 const SLOW = 12; // ms of a drawing from which it is slow
 const REST = 300; // ms without a change after which a slow one is made
 const LATEST = 2000; // ms after which it is made all the same
+const DISTANCE = 0.86; // of the eye, in sizes of the instrument, from where all of it is seen
 const TURN = 0.12; // radians an arrow key turns the view by
 
 // none, or what draws: a graphics card, or the processor in its place
@@ -22,10 +23,8 @@ const graphics = () => {
 };
 
 export class Scene {
-  // distance: of the eye, in sizes of the instrument, from where all of it is seen
-  constructor(root, distance = 0.86) {
+  constructor(root) {
     this.root = root;
-    this.distance = distance;
     this.nodes = new Map();
     this.motions = {};
     this.ready = null;
@@ -106,7 +105,7 @@ export class Scene {
   home() {
     if (!this.model) return;
     const wide = Math.max(1, 1.25 / this.camera.aspect);
-    this.camera.position.copy(this.middle).add(new THREE.Vector3(0.35, -1.15, 0.55).multiplyScalar(this.distance * this.size * wide));
+    this.camera.position.copy(this.middle).add(new THREE.Vector3(0.35, -1.15, 0.55).multiplyScalar(DISTANCE * this.size * wide));
     this.controls.target.copy(this.middle);
     this.controls.update();
     this.draw();
@@ -153,13 +152,11 @@ export class Scene {
         node.matrix.copy(nominal);
         node.matrixWorldNeedsUpdate = true;
       }
-      node.userData.moved = Boolean(motion);
-      // a motion that is not sure is drawn without its colour
-      const tinted = Boolean(motion) && motion.sure !== false;
-      if (tinted !== Boolean(node.userData.tinted)) {
-        node.userData.tinted = tinted;
-        node.traverse((part) => { if (part.isMesh && !this.beams.includes(part) && part.userData.name === name) this.tint(part, tinted); });
-        if (node.isMesh) this.tint(node, tinted);
+      const moved = Boolean(motion);
+      if (moved !== Boolean(node.userData.moved)) {
+        node.userData.moved = moved;
+        node.traverse((part) => { if (part.isMesh && !this.beams.includes(part) && part.userData.name === name) this.tint(part, moved); });
+        if (node.isMesh) this.tint(node, moved);
       }
     }
     this.draw();
