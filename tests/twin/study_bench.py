@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from scenes.specs.load import INSTRUMENTS, LIBRARY
-from tests.twin.commands import replaced
 from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
 from scenes.yaml.yaml_file import dump_yaml
+from tests.twin.commands import replaced
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).parent
