@@ -208,8 +208,8 @@ def _motion_section(overview: Overview) -> Section | None:
         mean, sigma = float(own @ found.mean), math.sqrt(max(float(own @ found.covariance @ own), 0.0))
         places = decimals_for(sigma)
         ratio = abs(mean) / sigma if sigma else 0.0
-        cells = [f"{name} [{unit}]", OwnDecimals(mean, places), OwnDecimals(sigma, places), OwnDecimals(ratio, 1)]
-        rows.append((ratio, cells))
+        numbers = OwnDecimals(mean, places), OwnDecimals(sigma, places), OwnDecimals(ratio, 1)
+        rows.append((ratio, [f"{name} [{unit}]", *numbers]))
     if not rows:
         return None
     best = [cells for _, cells in sorted(rows, key=lambda row: -row[0])[:MOST_MOTIONS]]
