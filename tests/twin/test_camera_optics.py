@@ -13,10 +13,8 @@ from twin.camera.cut_wavefront import RAYS_ACCURACY
 from twin.camera.field_maps import through_focus
 from twin.camera.varied_beams import VariedBeams
 from twin.monitor.image_quality import image_quality
-from twin.sensors.line_ccd import band_factors, band_wavelengths
 
 FIELDS = [(0.0, 0.0), (1.0, 0.0), (0.3, -1.0)]
-MOVED = {"base/forward/M2": Motion(shift=(20e-6, -10e-6, 30e-6), rotate=(0.0, 2e-5, 0.0))}
 
 
 @pytest.fixture(scope="module")
@@ -48,23 +46,6 @@ def test_a_defocused_focal_plane_is_the_term_of_defocus(gf7_alone) -> None:
     assert change[3] == pytest.approx(size, rel=0.01)  # the beam is 2 % elliptic
     assert np.max(np.abs(np.delete(change, 3))) < 0.05 * size
     assert downstream.spot().rms == pytest.approx(gf7_alone.spot(defocus=dz).rms, rel=1e-9)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("obstruction", [False, True])
-def test_the_same_as_image_quality_says_in_an_instrument(backend, gf7_pair, obstruction: bool) -> None:
-    """It looks at the pixel, this at the direction, whose image has moved by some micrometres."""
-    quality = image_quality(gf7_pair, backend, [MOVED], fields=(0.0,), obstruction=obstruction).cameras["forward"]
-    view = CameraOptics.within(gf7_pair, "forward", backend, MOVED, obstruction)
-    # both over what bodies leave of the stop: 10 000 rays here, their outlines there
-    assert view.wavefront().rms == pytest.approx(quality.wfe[0, 0], rel=2e-3 if obstruction else 1e-4)
-    band = view.model.spec.bands["P"]
-    frequency = np.array([0.0, view.nyquist])
-    mtf = view.mtfs([(0.0, 0.0)], frequency, *band_wavelengths(band))[0].values[:, 1]
-    for k, pair in enumerate(((view.nyquist, 0.0), (0.0, view.nyquist))):
-        factor = np.prod(list(band_factors(band, *map(np.array, pair)).values()))
-        wanted = (quality.mtf_along_line, quality.mtf_along_track)[k][0, 0]
-        assert mtf[k] * factor == pytest.approx(wanted, abs=2e-4)
 
 
 @pytest.mark.second

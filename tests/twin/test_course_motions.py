@@ -1,4 +1,4 @@
-"""Motions of a course, also from a CSV file: at each time they are what the same motion under perturb is."""
+"""Motions of a course, also from a CSV file."""
 
 from pathlib import Path
 
@@ -12,7 +12,6 @@ from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import run_series, series_states
-from twin.monitor.truth import trace_truth
 from twin.render import app
 
 FOCAL, MIRROR, CAMERA = "base/backward/focal_plane", "base/forward/M2", "base/forward"
@@ -34,12 +33,6 @@ course:
   motion: {{{FOCAL}: {{pivot: rear_node}}}}
 render: {{frames: 1, seed: 3}}
 """
-SAME = f"""instrument: gf7_pair
-perturb:
-  {MIRROR}: {{shift: [0 um, 0 um, 3 um]}}
-  {FOCAL}: {{rotate: [2 arcsec, 0 arcsec, 10 arcsec], pivot: rear_node}}
-  {CAMERA}: {{scale: 0.5 ppm, temperature: 0.1 K}}
-"""
 
 
 def written(folder: Path, job: str = JOB, table: str = TABLE) -> Path:
@@ -52,22 +45,6 @@ def written(folder: Path, job: str = JOB, table: str = TABLE) -> Path:
 @pytest.fixture(scope="module")
 def experiment(backend, tmp_path_factory) -> MonitorExperiment:
     return MonitorExperiment(resolve(written(tmp_path_factory.mktemp("job"))), backend)
-
-
-def test_a_table_at_one_time_is_the_same_motion_under_perturb(experiment, tmp_path) -> None:
-    job = load_job(written(tmp_path))
-    assert job.course is not None
-    assert (job.course.times, job.course.shown) == ((0.0, 720.0, 1800.0), 1)
-    states = series_states(experiment, job)
-    (tmp_path / "same.yaml").write_text(SAME, "utf-8")
-    alone = experiment.state(load_job(tmp_path / "same.yaml"))
-    assert dict(states[1]) == dict(alone)
-    # and it does something, at each time something else
-    truth = trace_truth(experiment.instrument, experiment.backend, [*states, alone])
-    for change in truth.cameras.values():
-        assert change.d_f[1] == change.d_f[3]
-        assert len({*change.d_f[:3]}) == 3
-    assert abs(truth.cameras["forward"].d_f[1]) > 1e-6
 
 
 def test_a_table_is_the_same_course_written_out(tmp_path) -> None:

@@ -191,14 +191,6 @@ def test_exposures_of_one_seed_share_what_is_drawn_and_not_their_light(dark_nois
     np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, seeds), alone)
 
 
-def test_images_are_independent():
-    """Neighbouring images of one call: correlation of their noise within 5 sigma of zero (false alarm 6e-7)."""
-    sensor = counter()
-    frames = sensor.expose(np.full((2, 100, 100), 100.0), uniform(100, 100), 4, 0.0, seed=1).astype(float) - 60.0
-    correlation = np.mean(frames[0] * frames[1]) / 60.0
-    assert abs(correlation) < 5 / np.sqrt(frames[0].size)
-
-
 def test_well_and_converter_clip():
     full = counter(full_well_e=1000.0)
     frames = full.expose(np.full((32, 32), 1e5), uniform(32, 32), 2, 0.0, seed=1)
@@ -423,29 +415,7 @@ def test_mixed_means_are_independent_and_each_has_its_own(kind) -> None:
     assert np.all(np.abs(later) < within)
 
 
-def test_the_pieces_do_not_matter(monkeypatch) -> None:
-    mean = np.random.default_rng(1).exponential(20.0, (30, 41))
-    whole = poisson_numbers(mean, 7, generator(4))
-    assert whole.shape == (7, 30, 41)
-    for room in (1, 5000):
-        monkeypatch.setattr(module, "_ROOM", room)
-        assert np.array_equal(poisson_numbers(mean, 7, generator(4)), whole)
-    # views, other layouts and a single number
-    assert np.array_equal(poisson_numbers(np.asfortranarray(mean), 7, generator(4)), whole)
-    assert poisson_numbers(np.array(3.0), 2, generator(4)).shape == (2,)
-
-
-DETECTOR = EmvaDetector(
-    quantum_efficiency=0.6,
-    full_well_e=30_000.0,
-    system_gain_dn_per_e=0.1,
-    dark_noise_e=5.0,
-    dark_current_e_per_s=20.0,
-    prnu=0.01,
-    dsnu_e=3.0,
-    offset_dn=50.0,
-    bit_depth=12,
-)
+SENSOR = detector()
 
 
 @pytest.fixture
@@ -457,8 +427,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def exposed(frames: int, threads: int | None = None, images: int = 3) -> np.ndarray:
     light = np.random.default_rng(2).uniform(0.0, 4000.0, (images, 24, 32))
-    pattern = DETECTOR.fixed_pattern((images, 24, 32), 5)
-    return DETECTOR.expose(light, pattern, frames, 0.1, 7, threads)
+    pattern = SENSOR.fixed_pattern((images, 24, 32), 5)
+    return SENSOR.expose(light, pattern, frames, 0.1, 7, threads)
 
 
 def test_frames_in_a_file_are_those_in_memory(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -475,7 +445,7 @@ def test_frames_in_a_file_are_those_in_memory(small: None, monkeypatch: pytest.M
     np.testing.assert_array_equal(mean_of(stored), mean_frames(kept))
     np.testing.assert_array_equal(mean_of(stored), kept.mean(axis=-3))  # as pictures have it: all sums are exact
     np.testing.assert_array_equal(largest_of(stored), kept.max(axis=-3))
-    np.testing.assert_array_equal(DETECTOR.saturated(stored).pixels, DETECTOR.saturated(kept).pixels)
+    np.testing.assert_array_equal(SENSOR.saturated(stored).pixels, SENSOR.saturated(kept).pixels)
     facts = FrameFacts("a camera", 5e-6, 1e-3)
     assert bytes(tiff(stored[1], facts)) == tiff(kept[1], facts)
     assert preview_png(stored[2]) == preview_png(kept[2])

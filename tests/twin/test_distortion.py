@@ -233,17 +233,6 @@ def test_sign_and_inverse() -> None:
     assert np.std(scatter) == pytest.approx(SPEC.dividing_error.repeatability, rel=0.1)
 
 
-def test_calibration_cannot_see_the_subdivision_error() -> None:
-    """Every step is 50 periods: one value at all calibrated readings, all phases at the held-out ones."""
-    model = TurntableModel(SPEC, 3)
-    subdivision = model.error.parts["subdivision"]
-    period = SPEC.dividing_error.subdivision.period
-    reading = np.radians(np.linspace(92.0, 92.5, 333))
-    np.testing.assert_allclose(subdivision(reading + period), subdivision(reading), rtol=0.0, atol=1e-9 * ARCSEC)
-    assert np.ptp(subdivision(model.calibrate().angle)) < 1e-9 * ARCSEC
-    assert np.std(subdivision(model.held_out().angle)) > 0.5 * subdivision.rms
-
-
 @pytest.mark.second
 def test_held_out_residuals_and_sigmas() -> None:
     """40 tables with two quick fits: below the paper's 0.2 arcsec at angles that no fit saw, and what is left after

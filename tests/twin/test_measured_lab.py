@@ -204,22 +204,6 @@ def test_order_of_rows_columns_and_stops_changes_no_bit(folder: Path) -> None:
 
 
 @pytest.mark.second
-def test_units_change_nothing_but_rounding(folder: Path) -> None:
-    turntable, distortion, focus = turntable_of(folder), distortion_of(folder), focus_of(folder)
-    in_unit(folder / "comparisons.csv", "difference [arcsec]", "difference [urad]", ARCSEC * 1e6)
-    in_unit(folder / "comparisons.csv", "reading [deg]", "reading [arcmin]", 60.0)
-    in_unit(folder / "spots.csv", "along [mm]", "along [um]", 1e3)
-    in_unit(folder / "mtf.csv", "shift [um]", "shift [mm]", 1e-3)
-    in_unit(folder / "mtf.csv", "x [mm]", "x [m]", 1e-3)
-    np.testing.assert_allclose(turntable_of(folder).series.mean, turntable.series.mean, atol=ROUNDING * ARCSEC * 0.01)
-    fit, again = distortion.compensated.fit, distortion_of(folder).compensated.fit
-    assert np.all(np.abs(again.values - fit.values) < ROUNDING * np.sqrt(np.diag(fit.covariance)))
-    assert np.all(
-        np.abs(focus_of(folder).states[0].defocus - focus.states[0].defocus) < ROUNDING * focus.states[0].defocus_sigma
-    )
-
-
-@pytest.mark.second
 def test_columns_in_pixels_and_readings_that_fall(folder: Path) -> None:
     fit = distortion_of(folder).compensated.fit
     in_unit(folder / "spots.csv", "along [mm]", "column", 1e3 / 7.0)

@@ -185,18 +185,3 @@ def test_channels_left_alone_are_rendered_once_and_alike(setup) -> None:
         kept = path.photons_of(state)
         np.testing.assert_array_equal(kept, path.expected_photons([state], single=False)[0])
         kept[:] = 0.0  # the caller's own
-
-
-@pytest.mark.second
-def test_a_state_is_the_same_alone_and_among_others(setup) -> None:
-    """More states never change one: photons and lines of sight are the same to the bit."""
-    names = list(setup.instrument.cameras)
-    rng = np.random.default_rng(3)
-    states: list[State] = []
-    for name, body in zip(names * 2, ("M2", "focal_plane", "M1", "M3"), strict=False):
-        motion = Motion(rotate=tuple(3e-6 * rng.normal(size=3)), shift=tuple(2e-6 * rng.normal(size=3)))
-        states.append({f"{BASE}/{name}/{body}": motion})
-    together = setup.path.expected_photons(states, single=False), setup.sight.trace(states)
-    for s in (0, len(states) - 1):
-        np.testing.assert_array_equal(setup.path.expected_photons(states[s : s + 1], single=False)[0], together[0][s])
-        np.testing.assert_array_equal(setup.sight.trace(states[s : s + 1])[:, 0], together[1][:, s])

@@ -162,18 +162,6 @@ def test_a_calibration_is_of_the_instrument_that_is_said(record: Path, tmp_path:
         assert (found.name, found.column("kind").plain) == ("run", ["calibration"])
 
 
-def test_tables_name_run_folders(record: Path, tmp_path: Path) -> None:
-    for k in range(2):
-        run_folder(tmp_path / f"run{k}", angle=float(k), frame=bytes([k]))
-    text = "instrument: gf7_pair\nreadings: [{kind: monitor, files: passes.csv, name: run}]\n"
-    rows = "time,run\n2026-03-05T03:05:00Z,run0\n2026-03-05T04:35:00Z,run1\n2026-03-05T06:05:00Z,run2\n"
-    result = run("ingest", record, written(tmp_path, text, {"passes.csv": rows}), "--json")
-    assert result.exit_code == 2
-    (file,) = json.loads(result.stdout)["files"]
-    assert file["new"] == 2
-    assert [(one["line"], "no reading in" in one["reason"]) for one in file["refused"]] == [(4, True)]
-
-
 def rewritten(folder: Path, data: object) -> Path:
     """Another content of a run's results, as if it had written that."""
     (folder / "recovered.json").write_text(json.dumps(data))

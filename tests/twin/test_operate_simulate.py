@@ -215,23 +215,6 @@ def test_a_life_is_a_record_as_any_other(made: tuple[Path, Path, Mapping]) -> No
     assert {Path(one["file"]).name for one in found} == {"events.csv", "temperatures.csv", "passes.csv"}
 
 
-def test_readings_lie_about_the_truth(made: tuple[Path, Path, Mapping]) -> None:
-    record, truth, _ = made
-    true = json.loads(truth.read_text("utf-8"))
-    off = []
-    for k, one in enumerate(row for row in entries(record) if row["kind"] == "monitor"):
-        numbers = content_of(one)["numbers"]
-        assert true["times_us"][k] == one["time_us"]
-        for camera, own in numbers["cameras"].items():
-            for key, value in true["cameras"][camera].items():
-                off.append((own["posterior"][key] - value[k]) / own["posterior"][f"{key}_sigma"])
-    assert len(off) == 24
-    # a prior of single readings: of 24 numbers that go together none is beyond five sigmas
-    assert np.max(np.abs(off)) < 5.0
-    step = true["steps"][-1] if len(true["steps"]) == 1 else next(s for s in true["steps"] if s["event"])
-    assert step["time_utc"] == "2027-01-08T12:00:00Z"
-
-
 def test_the_files_of_a_life_make_its_record_again(made: tuple[Path, Path, Mapping], tmp_path: Path) -> None:
     """The readings are those of its files; a second record that takes these holds the same."""
     record, _, told = made

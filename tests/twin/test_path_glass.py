@@ -5,11 +5,8 @@ Statistical tests use fixed seeds; a deviation of Z_LIMIT standard errors has a 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.pose import Pose, rotation_matrix
@@ -17,7 +14,6 @@ from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
 from optics.materials.finish import ABSORBER, BARE, Finish, reflectance
-from optics.materials.scatter import ABg
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.scenery import Scenery
 from scenes.models.scenery_parts import Finishes, solid_surfaces
@@ -25,9 +21,8 @@ from tests.optics.bench import unit
 from tests.twin.path_bench import facing, frame, glass_scene, screen, slab
 from twin.path_tracing.families import Event, decode
 from twin.path_tracing.path_result import Family, PathResult
-from twin.path_tracing.sinks import GHOST, STRAY
 from twin.path_tracing.source import DiskSource, RaySource
-from twin.path_tracing.tracer import BALANCED, FAINT, PathTracer, Sampling
+from twin.path_tracing.tracer import PathTracer, Sampling
 
 Z_LIMIT = 3.89
 INDEX = 1.5
@@ -148,56 +143,6 @@ def test_more_detections_than_expected_are_all_kept(backend) -> None:
     assert result.detections.path.size == 0
     kept = tracer.run(source, 70_000, chunk=60_000, keep=True).detections
     np.testing.assert_array_equal(kept.path, np.arange(70_000))
-
-
-RINGS = np.array([0.0, 0.01, 0.02, 0.04, 0.08])
-"""Metres about the beam behind the plate; half a metre on, the lobe's scale of 0.03 is 15 mm."""
-
-
-def scattered_in_rings(run: PathResult) -> np.ndarray:
-    """Scattered light behind the plate in rings about the other light there, and its variance, (2, rings)."""
-    found = run.detections
-    here = found.detector == 0
-    stray = here & (found.kind == STRAY)
-    place, weight = found.place, found.weight
-    middle = np.median(place[here & (found.kind == GHOST)], axis=0)
-    away = np.linalg.norm(place[stray] - middle, axis=-1)
-    sums = [np.histogram(away, RINGS, weights=weight[stray] ** power)[0] for power in (1, 2)]
-    assert np.all(np.histogram(away, RINGS)[0] > 50)
-    return np.array(sums)
-
-
-@pytest.mark.second
-def test_paths_that_are_drawn_for_faint_light_find_what_plain_ones_find(backend) -> None:
-    """Energies of all families of a scattering plate, and of its scattered light in rings about the beam, drawn for
-    faint light and as the power goes: chi-square with a false-alarm rate of 1e-3. Floors, what they are after a weak
-    way, and roulette change what a family has; distances drawn near the specular direction change what a ring has.
-    """
-    coated = Finish(reflectance=0.06, transmission=0.9, diffuse=0.01, scatter=ABg(2e-4, 1e-3, 2.0))
-    scenery = glass_scene(slab(0.3, THICKNESS), INDEX, coated)
-    direction = unit(np.sin(0.3), 0.0, np.cos(0.3))
-    source = DiskSource.along(-0.2 * direction / direction[2], direction, 1e-3)
-    runs = [
-        PathTracer(backend, scenery, sampling=sampling).run(source, 2 * PATHS, seed, keep=True)
-        for sampling, seed in ((FAINT, 3), (replace(FAINT, roulette=0.5), 5), (BALANCED, 4))
-    ]
-    faint, weak, plain = ({(f.detector, f.text): f for f in run.families} for run in runs)
-    rings = [scattered_in_rings(run) for run in runs]
-    for drawn, own in ((faint, rings[0]), (weak, rings[1])):
-        squares = []
-        for key, found in drawn.items():
-            other = plain.get(key)
-            if other is not None and min(found.count, other.count) > 50:
-                squares.append((found.energy - other.energy) ** 2 / (found.error**2 + other.error**2))
-        assert len(squares) > 10
-        assert sum(squares) < chi2.ppf(0.999, len(squares))
-        energy, variance = own - rings[2] * [[1.0], [-1.0]]
-        assert np.sum(energy**2 / variance) < chi2.ppf(0.999, len(energy))
-    assert {"ghost", "stray"} == {f.kind for f in faint.values()}
-    assert sum(squares) < chi2.ppf(0.999, len(squares))
-    # the same number of paths tells the faint ones better
-    twice = way("entry>", "exit", "entry", "exit>")
-    assert faint["behind", twice].error < 0.5 * plain["behind", twice].error
 
 
 def test_too_many_and_turned_apertures_of_a_face_are_refused() -> None:

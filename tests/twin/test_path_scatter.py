@@ -129,10 +129,19 @@ def test_diffused_directions_follow_lambert(backend) -> None:
 
 
 @pytest.mark.second
-def test_a_scattering_mirror_in_a_scene(backend) -> None:
-    """Share and pattern of the light that a mirror scatters onto a small screen, against the BSDF's integral."""
+@pytest.mark.parametrize(
+    "finish",
+    [
+        Finish(reflectance=0.5, diffuse=0.2, scatter=ABg(2e-2, 3e-2, 2.0)),
+        Finish(reflectance=0.5, diffuse=0.2, table=of_lobe(ABg(1e-2, 3e-2, 2.0))),
+    ],
+    ids=["analytic", "table"],
+)
+def test_a_scattering_mirror_in_a_scene(backend, finish: Finish) -> None:
+    """Share and pattern of the light that a mirror scatters onto a small screen, against the BSDF's integral. The
+    analytic lobe is per power of the specular beam, a table per incident power.
+    """
     scatter = ABg(2e-2, 3e-2, 2.0)
-    finish = Finish(reflectance=0.5, diffuse=0.2, scatter=scatter)
     half, distance = 0.05, 0.4
     aside = np.array([0.15, 0.0, distance])
     surface, grid = screen("screen", Pose(np.diag([-1.0, 1.0, -1.0]), aside), half, 4)
@@ -247,30 +256,6 @@ def test_between_two_angles_of_incidence_both_have_their_part(backend) -> None:
     found = np.mean(r < np.radians(9.0))
     share = inner / (inner + outer)
     assert abs(found - share) < 3.9 * np.sqrt(share * (1.0 - share) / len(r))
-
-
-@pytest.mark.second
-def test_an_analytic_finish_as_a_table_gives_the_same_stray_light(backend) -> None:
-    """Onto a small screen: within Monte Carlo noise, and 2e-3 for what is linear between 400 radial angles.
-
-    The analytic lobe is per power of the specular beam, a table per incident power.
-    """
-    analytic = Finish(reflectance=0.5, scatter=ABg(2e-2, 3e-2, 2.0))
-    tabled = Finish(reflectance=0.5, table=of_lobe(ABg(1e-2, 3e-2, 2.0)))
-    pose, direction = Pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.15, 0.0, 0.4])), unit(-0.3, 0.1, -1.0)
-    found = []
-    for finish in (analytic, tabled):
-        surface, grid = screen("screen", pose, 0.05, 4)
-        sampling = Sampling(floor=0.3, scatter_floor=0.4)
-        tracer = PathTracer(backend, Scenery((*flat_mirror(finish), surface), (grid,)), sampling=sampling)
-        result = tracer.run(DiskSource.along(-0.3 * direction, direction, 0.0), N, 7)
-        (family,) = (f for f in result.families if f.kind == "stray")
-        found.append((family.energy, family.error))
-        # weights of what is drawn more often than it is are right on average
-        assert abs(result.balance.error) < 0.01
-    (one, noise), (two, other) = found
-    assert abs(one - two) < 3.89 * np.hypot(noise, other) + 2e-3 * one
-    assert other < 0.03 * two
 
 
 @pytest.mark.second

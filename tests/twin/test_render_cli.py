@@ -172,18 +172,6 @@ def test_config_repeats_the_run_bit_for_bit(computed, tmp_path, monkeypatch):
         assert np.mean(other != tifffile.imread(image)) > 0.8
 
 
-@pytest.mark.second
-def test_force_replaces_a_run(ready, tmp_path):
-    assert run(EXAMPLE, "--out", tmp_path / "run", "--quiet").exit_code == 0
-    whole = files(tmp_path / "run")
-    (tmp_path / "run/note.txt").touch()
-    complains(run(EXAMPLE, "--out", tmp_path / "run", "--quiet", "--force"), "did not write: note.txt", "--out")
-    assert files(tmp_path / "run") == {*whole, "note.txt"}
-    (tmp_path / "run/note.txt").unlink()
-    assert run(EXAMPLE, "--out", tmp_path / "run", "--quiet", "--force").exit_code == 0
-    assert files(tmp_path / "run") == whole
-
-
 # --- bad input --------------------------------------------------------------------------------------------------------
 
 HEAD = "instrument: gf7_pair\nperturb:\n"

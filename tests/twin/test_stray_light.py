@@ -13,7 +13,6 @@ from scipy.stats import chi2, norm, t
 
 from optics.geometry.tree import Motion
 from optics.materials.finish import MIRROR, Finish
-from optics.materials.scatter import total_scatter
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.scenery import build_scenery
 from scenes.models.scenery_parts import Finishes
@@ -24,8 +23,6 @@ from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.families import Event
-from twin.path_tracing.path_result import Family
 from twin.path_tracing.sinks import GHOST, NOMINAL, STRAY
 from twin.path_tracing.stray_light import (
     REACH,
@@ -86,43 +83,6 @@ def test_families_scatter_as_their_sigma_says(backend, gf7_pair) -> None:
             degrees += 15
     assert degrees >= 60
     assert chi2.ppf(1e-6, degrees) < total < chi2.isf(1e-6, degrees)
-
-
-def share_of(family: Family, finishes: Finishes) -> float:
-    """What reflections and transmissions leave of a family that no edge cuts."""
-    assert finishes.mirror.scatter is not None
-    mirror = finishes.mirror.reflectance * (1.0 - total_scatter(finishes.mirror.scatter))
-    share = 1.0
-    for touch in family.touches:
-        face = touch.part.rpartition("/")[2]
-        if touch.event is Event.TRANSMIT:
-            share *= finishes.coated.transmission
-        elif face in ("window", "entry", "exit"):
-            share *= finishes.coated.reflectance
-        elif not face.startswith(("roof", "mirror_")):  # these reflect totally
-            share *= mirror
-    return share
-
-
-@pytest.mark.second
-def test_ghosts_name_what_the_light_met_and_have_its_losses(backend, gf7_pair) -> None:
-    """The prisms are tilted: on the CCD are left pairs of residual reflections, each R^2 of the nominal spot."""
-    run = trace_stray(gf7_pair, backend, {}, 400_000, 1, channels=gf7_pair.channels[:1]).runs["forward/left"]
-    nominal = run.nominal(CCD)
-    sequence = gf7_pair.assembly.sequences["forward/left/monitor"][:-1]
-    assert len(nominal.touches) == len(sequence) == 25
-    assert [touch.part.split("/")[-1] for touch in nominal.touches[:4]] == ["M3", "M2", "M1", "window"]
-    strong = [f for f in run.of(CCD, "ghost") if f.count > 100]
-    assert len(strong) >= 3
-    for family in strong:
-        assert len(family.touches) > 25
-        assert not any(touch.outside for touch in family.touches)
-        expected = share_of(family, Finishes()) / share_of(nominal, Finishes())
-        assert expected < 1e-5
-        # false alarm 1e-4
-        assert abs(family.energy / nominal.energy - expected) < 3.89 * family.error / nominal.energy
-    for family in run.families:
-        assert (family.kind == "stray") == any(touch.event >= Event.DIFFUSE for touch in family.touches)
 
 
 def test_stray_light_in_photons(backend, gf7_pair) -> None:
