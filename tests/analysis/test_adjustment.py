@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.block.reweighting import LARGEST_FACTOR, REJECT, robust_weights
+from analysis.block.reweighting import LARGEST_FACTOR, REJECT, robust_weights, standardised_packets
 from analysis.calibration.adjustment import adjust
 from analysis.calibration.stepwise import stepwise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Prior, Unknowns
@@ -227,3 +227,16 @@ def test_bad_input_is_told():
     assert not stepwise([field], LABORATORY, NOISE, rounds=3).converged
     refuses(CalibrationError, "rate must be", Unknowns, rate="fields")
     refuses(ValueError, "huber, igg or accept", robust_weights, np.zeros((2, 2)), "tukey")
+
+
+def test_standardised_residuals_do_not_depend_on_the_own_weight():
+    """Of a dense model one packet of two rows gets any weight, the others keep theirs."""
+    rng, found = np.random.default_rng(31), []
+    design, seen_values = rng.standard_normal((12, 4)), rng.standard_normal(12)
+    for own in (1.0, 0.5, 0.03, 0.0):
+        weight = np.where(np.arange(12) < 2, own, 1.0)
+        spread = np.linalg.inv(design.T * weight @ design)
+        left = (seen_values - design @ spread @ design.T @ (weight * seen_values))[:2]
+        cofactor = design[:2] @ spread @ design[:2].T
+        found.append(standardised_packets(left[None], cofactor[None], np.array([own]), 1.0)[0])
+    assert np.array(found) == pytest.approx(np.tile(found[-1], (4, 1)), rel=1e-9)
