@@ -90,20 +90,6 @@ def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpnes
     assert np.abs(error.mean(axis=0)).max() < 0.001
 
 
-@pytest.mark.second
-def test_covariance_with_noise(clean, templates):
-    """Shot noise and 20 electrons of read noise on contrast 120; spline errors are a tenth of the sigma."""
-    fits = least_squares(detected(clean, 21), templates, started())
-    assert np.all(fits.reason == Reason.ACCEPTED)
-    low, high = limits(2 * len(PLACES))
-    error, noise, whole = fits.place - PLACES, fits.spread.covariance(fits.reason == 0), fits.covariance()
-    assert low < chi_square(error, noise) < high
-    # relief that these points cannot exclude, a fifth of the variance at one sigma, makes sigmas larger, never smaller
-    assert low / 1.4 < chi_square(error, whole) < high
-    assert 1.1 < np.median(whole[:, 0, 0] / noise[:, 0, 0]) < 1.3
-    assert fits.sigma.mean() == pytest.approx(np.sqrt(800 + 400), rel=0.02)
-
-
 def test_scatter_reaches_the_bound(texture, clean, templates):
     """Cramer-Rao bound for place, affine change, offset, gain and sharpness from the texture's exact derivatives and
     the known noise of each pixel. Equal weights lose a per cent to it; the noise's estimate has 4 per cent a point.
@@ -129,6 +115,7 @@ def test_scatter_reaches_the_bound(texture, clean, templates):
     noise = fits.spread.covariance(fits.reason == Reason.ACCEPTED)
     claimed = np.trace(noise, axis1=1, axis2=2) / np.trace(bound, axis1=1, axis2=2)
     assert 0.95 < claimed.mean() < 1.07
+    assert fits.sigma.mean() == pytest.approx(np.sqrt(800 + 400), rel=0.02)
 
 
 def test_spline_and_its_derivatives_follow_the_texture():

@@ -40,37 +40,6 @@ def noisy(rng, count, kernel):
     return found.reshape(count, -1)
 
 
-# neighbours along one diagonal alike, along the other not
-DIAGONAL = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-def test_white_noise_has_no_correlation_after_the_fit_took_its_part():
-    """Residuals of four unknowns on 225 pixels are correlated by some per cent; freed of that the mean of 3000 windows
-    is zero to five of its standard deviations, one in 30 000 of 24 lags."""
-    rng = np.random.default_rng(1)
-    design = designs(rng, 3000)
-    _, residual = fitted(design, rng.standard_normal((3000, SIDE**2)))
-    found = residual_correlation(design, residual, SIDE)
-    mean, spread = found.correlation.mean(axis=0), found.correlation.std(axis=0) / np.sqrt(3000)
-    assert np.abs(mean / spread).max() < 5
-    # what is taken out is seen: without it, or with the other sign, the nearest lags would be off by more than that
-    image = residual.reshape(-1, SIDE, SIDE)
-    raw = np.mean(image[:, :, 1:] * image[:, :, :-1], axis=(1, 2)) / found.variance
-    assert abs(raw.mean()) > 6 * spread[LAGS.index((0, 1))]
-
-
-def test_correlation_is_found_at_its_own_lag():
-    """Two common pixels of three along the main diagonal: 2/3 at (1, 1), 1/3 at (2, 2), none elsewhere."""
-    rng = np.random.default_rng(2)
-    design = designs(rng, 2000)
-    noise = noisy(rng, 2000, DIAGONAL)
-    _, residual = fitted(design, noise)
-    found = residual_correlation(design, residual, SIDE).correlation.mean(axis=0)
-    for lag, value in zip(LAGS, found, strict=True):
-        # the fit takes more out of noise that resembles the texture than out of white noise: some per cent
-        assert value == pytest.approx({(1, 1): 2 / 3, (2, 2): 1 / 3}.get(lag, 0.0), abs=0.04), lag
-
-
 def dense(design):
     """Of one design (q, p): reply of the place to the pixels (2, p) and projection on what the fit takes (p, p)."""
     solved = np.linalg.solve(design @ design.T, design)

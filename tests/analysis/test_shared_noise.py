@@ -160,6 +160,11 @@ def test_sparse_elimination_is_the_dense_covariance_of_all_image_points():
     assert np.abs(off / sigma[: len(free)] / sigma[: len(free), None]).max() < 2e-5
     points = np.sqrt(found.ground_covariance["F0"][:, [0, 1, 2], [0, 1, 2]]).ravel()
     assert points == pytest.approx(sigma[len(free) :], rel=1e-5)
+    # of what is seen beside the adjusted image points
+    half = np.linalg.solve(spread, design[:, kept])
+    rest = np.linalg.inv(spread) - half @ inverse @ half.T
+    blocks = rest.reshape(36, 2, 36, 2)[np.arange(36), :, np.arange(36)]
+    assert np.eye(2) - at.image_cofactors(found.covariance) == pytest.approx(blocks, abs=1e-5)
 
 
 def test_bad_noise_is_told():

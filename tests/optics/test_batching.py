@@ -37,26 +37,10 @@ def launch(gf7, n: int = 200) -> tuple[np.ndarray, np.ndarray]:
     return origin + rng.uniform(-0.25, 0.25, (n, 2)) @ axes, direction
 
 
-def test_a_batch_of_states_is_a_loop_of_single_states(backend, gf7) -> None:
-    bare = gf7.bare_assembly()
-    states = some_states(7, 1, ("M1", "M2", "M3", "image"))
-    rays = make_rays(backend, *launch(gf7))
-    together = trace(backend, assemble(bare, ["imaging"], states), rays, keep=(1,), world=True)
-    assert together.world is not None
-    batch = (*together.numpy(), *together.numpy(together.world), together.hit(1))
-    for s, state in enumerate(states):
-        single = trace(backend, assemble(bare, ["imaging"], [state]), rays, keep=(1,), world=True)
-        assert single.world is not None
-        alone = (*single.numpy(), *single.numpy(single.world), single.hit(1))
-        for many, one in zip(batch, alone, strict=True):
-            # the same operations; the compiler may contract other products into fma
-            np.testing.assert_allclose(many[s], one[0], rtol=0, atol=1e-14)
-
-
-def ends(backend, systems, rays) -> list[np.ndarray]:
-    found = trace(backend, systems, rays, keep=(0, 2), world=True)
+def ends(backend, systems, rays, keep=(0, 2), **how) -> list[np.ndarray]:
+    found = trace(backend, systems, rays, keep=keep, world=True, **how)
     assert found.world is not None
-    return [*found.numpy(), *found.numpy(found.world), found.hit(0), found.hit(2)]
+    return [*found.numpy(), *found.numpy(found.world), *map(found.hit, keep)]
 
 
 @pytest.mark.parametrize("section", [2, trace_module.SECTION])
@@ -98,17 +82,9 @@ def test_what_is_recorded_of_a_trace_holds_for_any_number_of_rays_and_systems(ba
         position, direction = launch(gf7, rays)
         for start in (position, np.tile(position, (count, 1, 1)) + 1e-3 * np.arange(count)[:, None, None]):
             bundle = make_rays(backend, start, direction)
-            recorded = trace(backend, systems, bundle, keep=(2, 1), world=True)
-            fresh = trace(backend, systems, bundle, keep=(2, 1), world=True, evaluate=False)
-            assert recorded.world is not None
-            assert fresh.world is not None
-            pairs = [
-                *zip(recorded.numpy(), fresh.numpy(), strict=True),
-                *zip(recorded.numpy(recorded.world), fresh.numpy(fresh.world), strict=True),
-                *((recorded.hit(k), fresh.hit(k)) for k in (1, 2)),
-            ]
-            assert pairs[0][0].shape == (count, rays, 3)
-            for one, other in pairs:
+            recorded, fresh = (ends(backend, systems, bundle, (2, 1), evaluate=e) for e in (True, False))
+            assert recorded[0].shape == (count, rays, 3)
+            for one, other in zip(recorded, fresh, strict=True):
                 # the same operations; a kernel of more of them may contract other products into fma
                 np.testing.assert_allclose(one, other, rtol=0, atol=1e-14)
 

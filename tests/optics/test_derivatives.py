@@ -10,7 +10,6 @@ from optics.geometry.tree import Motion, State
 from optics.numerics.number_tree import leaves
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.derivatives import jvp, vjp
-from optics.raytrace.first_order import first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import Traced, make_rays, trace
 from scenes.models.camera_model import IMAGE, collimated, field_direction
@@ -80,32 +79,6 @@ def test_forward_mode_for_every_motion(backend, bare, rays) -> None:
         np.testing.assert_allclose(exact, difference, rtol=1e-7, atol=1e-8)
     moves = np.max(np.abs(forward[0]), axis=(1, 2)) > 0.0
     assert [m for m, moved in zip(MOTIONS, moves, strict=True) if not moved] == [(IMAGE, "scale", 0)]  # a plane
-
-
-def test_ray_matrix_against_neighbouring_rays(backend, gf7, bare) -> None:
-    systems = assemble(bare, ["imaging"])
-    direction = field_direction(gf7.spec, 0.0, 0.0)
-    to_stop = assemble(bare, [gf7.mirrors[:2]])
-    position = collimated(backend, to_stop, direction[None], np.zeros((1, 2)))[0]
-    axes = np.stack([[1.0, 0.0, 0.0], np.cross(direction, [1.0, 0.0, 0.0])])
-    matrix = ray_matrix(backend, systems, 1, position, direction[None], axes[None])
-    h = 1e-5
-    launches = [(position[0] + s * h * a, direction) for a in axes for s in (1, -1)]
-    launches += [(position[0], direction + s * h * a) for a in axes for s in (1, -1)]
-    # the direction's length is second order in h
-    launches = [(p, d / np.linalg.norm(d)) for p, d in launches]
-    traced = trace(backend, systems, make_rays(backend, *(np.array(c) for c in zip(*launches, strict=True))), keep=(1,))
-    image, leaving, _ = columns(traced)
-    for value, by_position, by_angle in (
-        (image, matrix.image_by_position, matrix.image_by_angle),
-        (leaving, matrix.direction_by_position, matrix.direction_by_angle),
-        (traced.hit(1), matrix.stop_by_position, matrix.stop_by_angle),
-    ):
-        slope = ((value[0, 0::2] - value[0, 1::2]) / (2 * h))[:, :2].T
-        np.testing.assert_allclose(by_position[0], slope[:, :2], atol=2e-8)
-        np.testing.assert_allclose(by_angle[0], slope[:, 2:], atol=2e-8)
-    distance = float(gf7.first_order.principal_distance[0])
-    assert first_order(matrix).principal_distance[0] == pytest.approx(distance, rel=1e-9)
 
 
 STEPS = [("M1", "rotate", 0), ("M2", "shift", 2), ("M3", "figure", 7), ("M3", "scale", 0), ("image", "rotate", 1)]

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import simpson
-from scipy.special import j0, j1
 
 from optics.numerics import quadrature
 from optics.numerics.quadrature import PupilNodes
@@ -43,17 +41,6 @@ def test_airy_disk() -> None:
     np.testing.assert_allclose(got / peak, want, rtol=0, atol=1e-10)
     first_dark = 1.2196698912665045 * WAVELENGTH * F_NUMBER
     assert image(perfect(), Grid(first_dark, 0.0, 1), Grid(0.0, 0.0, 1))[0, 0, 0] / peak < 1e-20
-
-
-@pytest.mark.parametrize("dark_rings", [0.4, 1.0, 2.0, 5.0])
-def test_encircled_energy(dark_rings: float) -> None:
-    """1 - J0^2 - J1^2 (Rayleigh), by Simpson's rule for r I(r) along the detector's x."""
-    radius = dark_rings * 1.22 * WAVELENGTH * F_NUMBER
-    r = Grid(0.0, radius / 800, 801)
-    profile = image(perfect(), r, Grid(0.0, 0.0, 1))[0, 0]
-    energy = simpson(2.0 * np.pi * r.points() * profile, x=r.points())
-    z = np.pi * radius / (WAVELENGTH * F_NUMBER)
-    assert energy == pytest.approx(1.0 - j0(z) ** 2 - j1(z) ** 2, abs=1e-8)
 
 
 def test_images_of_a_batch() -> None:

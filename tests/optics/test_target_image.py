@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.special import erf, j0, j1, struve
+from scipy.special import j0, j1, struve
 
 from optics.geometry.vector_shape import HalfPlane
 from optics.numerics import quadrature
@@ -34,23 +34,6 @@ def centred(count: int, step: float) -> Grid:
 
 
 # edge profiles
-
-
-def test_edge_of_a_gaussian_with_an_odd_part() -> None:
-    """H = exp(-(2 pi f s)^2/2 - 2 pi i f a) (1 + c (2 pi i f)^3): E is (1 + c d^3/dx^3) of a shifted error function."""
-    s, a, c = 4e-6, 3e-6, (2e-6) ** 3
-    normal = np.array([0.6, 0.8])
-
-    def transfer(fx, fy):
-        f = fx * normal[0] + fy * normal[1]
-        return np.exp(-2.0 * (np.pi * s * f) ** 2 - 2j * np.pi * f * a) * (1.0 + c * (2j * np.pi * f) ** 3)
-
-    profile = EdgeProfile.build(transfer, normal, 1.4 / s, 60e-6)
-    d = np.linspace(-60e-6, 60e-6, 997)
-    u = (d - a) / s
-    bell = np.exp(-0.5 * u * u) / np.sqrt(2.0 * np.pi)
-    want = 0.5 * (1.0 + erf(u / np.sqrt(2.0))) + c / s**3 * (u * u - 1.0) * bell
-    np.testing.assert_allclose(profile(d), want, rtol=0, atol=1e-8)  # the spline's share; H ends at 1e-17
 
 
 def test_edge_of_a_clear_circular_pupil() -> None:
@@ -118,26 +101,6 @@ def test_middle_of_a_disk_is_the_encircled_energy(radius: float) -> None:
     z = np.pi * radius * CUTOFF
     middle = target_image(pinhole(2.0 * radius), diffraction(), CUTOFF, x, x)[32, 32]
     assert middle == pytest.approx(1.0 - j0(z) ** 2 - j1(z) ** 2, abs=FAINT)
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("angle", [0.0, 0.3])
-def test_bars_have_the_fundamental_of_the_transfer_function(angle: float) -> None:
-    """A square wave of unit height has the amplitude 2/pi; its harmonics from the third on lie beyond the cut-off."""
-    frequency = 65e3
-    x = centred(81, 1.9e-6)
-    target = bar_group(frequency, 61, 1.2e-3, angle)
-    transfer = diffraction(pitch=PITCH)
-    image = target_image(target, transfer, CUTOFF, x, x)
-    n = np.array([np.cos(angle), np.sin(angle)])
-    phase = 2.0 * np.pi * frequency * (n[0] * x.points() + n[1] * x.points()[:, None]).ravel()
-    columns = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)], axis=-1)
-    level, cosine, sine = np.linalg.lstsq(columns, image.ravel())[0]
-    assert 3.0 * frequency > CUTOFF
-    # the ends of the group, 0.46 mm away, take some 4/(pi^3 fc d) of the level and 1e-5 of the amplitude
-    assert cosine == pytest.approx(2.0 / np.pi * transfer(*(frequency * n)).real, abs=2e-5)
-    assert abs(sine) < 2e-5
-    assert level == pytest.approx(0.5, abs=2e-3)
 
 
 def test_shift_of_the_target_is_a_phase_of_the_transfer_function() -> None:

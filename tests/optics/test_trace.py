@@ -19,17 +19,6 @@ from tests.optics.test_tree import motions, poses, vectors
 Z = np.array([0.0, 0.0, 1.0])
 
 
-def test_paraboloid_focuses_the_axis_with_equal_paths(backend) -> None:
-    f = 2.0
-    bench = build(Stage(Surface(-1 / (2 * f), -1.0)), Stage(plane(), PASS, at(-f)))
-    position, direction = beam(disk_points(500, 0.9), -5.0, Z)
-    hit, leaving, path, valid = run(backend, bench, position, direction)
-    assert valid.all()
-    np.testing.assert_allclose(hit, np.broadcast_to([0, 0, -f], hit.shape), atol=2e-15)
-    np.testing.assert_allclose(path, 5.0 + f, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(np.linalg.norm(leaving, axis=-1), 1.0, atol=1e-15)
-
-
 @pytest.mark.parametrize("apart", [0.0, 1e-15, 1e-12, -1e-9, 1e-6, -1e-3])
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 def test_rays_from_the_other_sheet_of_a_hyperboloid_meet_the_one_with_the_vertex(backend, apart, sense) -> None:

@@ -219,21 +219,6 @@ def test_defocused_circle_against_hopkins(waves: float) -> None:
     assert np.max(np.abs(perfect(ratio) - want)) > 0.1  # the defocus is seen
 
 
-@pytest.mark.parametrize("dz", [-1e-3, 1e-3])
-def test_a_perfect_point_beside_the_origin_and_out_of_focus(dz: float) -> None:
-    """Waves that are in phase at (x0, y0, dz) make a perfect image there: sign of defocus and of the image's place."""
-    x0, y0 = 40e-6, -25e-6
-    field = circle()
-    w = np.sqrt(1.0 - field.u**2 - field.v**2)
-    (pupil,) = fit_pupils(replace(field, eikonal=-(x0 * field.u + y0 * field.v + dz * w)), NODES)
-    ratio = np.linspace(0.05, 0.95, 10)
-    f = frequencies(pupil, ratio)
-    got = transfer.transfer(pupil, f, WAVELENGTH, np.array([-dz, 0.0, dz]))
-    want = np.tile(perfect(ratio), 4) * np.exp(-2j * np.pi * f @ [x0, y0])
-    np.testing.assert_allclose(got[2], want, rtol=0, atol=1e-8)
-    assert np.all(np.max(np.abs(np.abs(got[:2]) - np.abs(want)), axis=-1) > 0.3)
-
-
 @pytest.mark.second
 @pytest.mark.parametrize("dz", [-300e-6, 0.0, 300e-6])
 def test_against_the_transform_of_the_image(backend, gf7, traced: PupilFunction, dz: float) -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from optics.geometry.pose import Pose, about_axis, rotation_matrix, rotation_vector
-from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, State, compose
+from optics.geometry.tree import Body, Motion, RigidTree, compose
 
 PIVOT = (0.0, 0.2, -0.1)
 
@@ -61,29 +61,6 @@ def test_scale_grows_distances_but_not_a_rigid_inside(tree: RigidTree) -> None:
     np.testing.assert_allclose(chip[1], chip[0], atol=1e-15)
     assert placed.scale[1, placed.index["a/b"]] == 1.1
     assert placed.scale[1, placed.index["a/plate/chip"]] == 1.0
-
-
-@pytest.mark.parametrize("kind", ["rotate", "shift", "scale"])
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_complex_step_against_differences(tree: RigidTree, kind: str, axis: int) -> None:
-    start = Motion(rotate=(0.1, -0.2, 0.3), shift=(0.1, 0.2, 0.3), pivot="corner", scale=0.02)
-
-    def moved(h: float) -> State:
-        rotate, shift, scale = list(start.rotate), list(start.shift), start.scale
-        if kind == "scale":
-            scale += h
-        else:
-            (rotate if kind == "rotate" else shift)[axis] += h
-        return {"a": Motion((rotate[0], rotate[1], rotate[2]), (shift[0], shift[1], shift[2]), "corner", scale)}
-
-    exact = tree.place([{"a": start}], [("a", kind, axis)])
-    h = 1e-6
-    both = tree.place([moved(h), moved(-h)])
-    for name in ("rotation", "translation", "scale"):
-        values = getattr(both, name)
-        difference = (values[0] - values[1]) / (2 * h)
-        np.testing.assert_allclose(getattr(exact, name)[0].imag / COMPLEX_STEP, difference, atol=1e-9)
-    assert exact.rotation.dtype == np.complex128
 
 
 def test_bad_trees_and_states_are_refused(tree: RigidTree) -> None:

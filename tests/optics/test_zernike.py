@@ -32,24 +32,6 @@ def test_noll_order() -> None:
         assert zernike.noll_to_nm(index) == pair
 
 
-def test_closed_forms() -> None:
-    x, y = np.array([0.3, -0.5]), np.array([0.2, 0.7])
-    r, t = np.hypot(x, y), np.arctan2(y, x)
-    forms = {
-        1: np.ones(2),
-        2: 2 * x,
-        3: 2 * y,
-        4: np.sqrt(3) * (2 * r**2 - 1),
-        5: np.sqrt(6) * r**2 * np.sin(2 * t),
-        6: np.sqrt(6) * r**2 * np.cos(2 * t),
-        7: np.sqrt(8) * (3 * r**3 - 2 * r) * np.sin(t),
-        8: np.sqrt(8) * (3 * r**3 - 2 * r) * np.cos(t),
-        11: np.sqrt(5) * (6 * r**4 - 6 * r**2 + 1),
-    }
-    for index, want in forms.items():
-        np.testing.assert_allclose(zernike.zernike(index, x, y), want, atol=1e-14)
-
-
 def test_orthonormal_over_the_disk() -> None:
     nodes = quadrature.disk(12)
     basis = zernike.basis(zernike.MAX_NOLL, nodes.x, nodes.y)

@@ -10,10 +10,8 @@ import pytest
 from optics.geometry.aperture import Circle, Edge
 from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
-from optics.numerics import quadrature
 from optics.numerics.physical_error import UnphysicalError
 from optics.raytrace.assembly import Interaction
-from optics.waves.wavefront import fit_wavefront, orthonormal_parts
 from scenes.lens.__main__ import read_prescription
 from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
@@ -111,24 +109,6 @@ def test_every_table_tells_one_wavefront_error_of_a_cut_beam(backend, cut) -> No
     assert all(wave.accuracy < 1e-4 for wave in waves)
     for wave in waves:
         assert np.sum(wave.parts**2) + wave.residual**2 == pytest.approx(wave.rms**2, rel=1e-9)
-
-
-@pytest.mark.parametrize("hole", [0.5, 0.8])
-def test_terms_over_a_ring_are_those_of_mahajan(hole: float) -> None:
-    """Defocus and spherical aberration over an annulus: fitted Zernike terms are each larger than the whole."""
-    nodes = quadrature.disk(12, inner=hole)
-    # balanced for the ring, so that only its spherical term is left: r^4 - (1 + e^2) r^2
-    r2 = nodes.x**2 + nodes.y**2
-    wave = r2**2 - (1.0 + hole**2) * r2
-    wave = wave - np.sum(nodes.share * wave)
-    rms = np.sqrt(np.sum(nodes.share * wave**2))
-    parts = orthonormal_parts(nodes.x, nodes.y, nodes.weight, wave, 11)
-    assert parts[10] == pytest.approx(rms, rel=1e-9)
-    np.testing.assert_allclose(parts[:10], 0.0, atol=1e-9 * rms)
-    # Mahajan's: (1 - e^2)^2 / (6 sqrt 5)
-    assert rms == pytest.approx((1.0 - hole**2) ** 2 / (6.0 * np.sqrt(5.0)), rel=1e-9)
-    fitted = fit_wavefront(nodes.x, nodes.y, nodes.weight, wave, 11).coefficients
-    assert np.max(np.abs(fitted[[3, 10]])) > rms
 
 
 def test_parts_of_a_whole_pupil_are_its_coefficients(bare) -> None:

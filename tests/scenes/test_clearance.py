@@ -13,7 +13,6 @@ from scenes.models.clearance import LEAST_GAP, check_clearance, convex_bodies, f
 from scenes.models.obstruction import RAYS, find_obstructions
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
 from scenes.yaml.errors import InputError
-from tests.scenes import monitor_layouts
 from tests.twin.commands import replaced
 
 PAIR = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
@@ -195,24 +194,3 @@ def test_prisms_in_the_way(bare, backend) -> None:
     assert 0.7 * face / pupil < block.share < 2.5 * face / pupil
     assert found["forward/left", "base/forward/monitor/left/prism_0"].share > 0.1
     assert ("backward/imaging", "base/central_prism") not in found
-
-
-@pytest.mark.second
-def test_two_beams_stand_clear(backend, tmp_path) -> None:
-    model = monitor_layouts.built(monitor_layouts.two_beams(), tmp_path, backend)
-    names = ("left", "right", "left_2", "right_2")
-    assert [c.key for c in model.channels] == [f"{c}/{name}" for c in ("forward", "backward") for name in names]
-    obstruction.check_beams(model, backend)
-    found = find_obstructions(model, backend)
-    assert {o.beam for o in found} == {"forward/imaging", "backward/imaging"}
-    # what is not in the monitor's own part of the pupil is only just touched
-    prisms = {c.prism_body("prism_180") for c in model.channels}
-    assert prisms <= {o.body for o in found}
-    assert all(o.body in prisms or o.share < 0.01 for o in found)
-    # each 180-deg prism stands where its own channel says
-    for channel in model.channels:
-        given = model.spec.channels_of(channel.camera)[channel.name]
-        window = model.assembly.nominal_pose(f"{channel.prism_body('prism_180')}/window/entry").translation
-        home = model.assembly.nominal_pose(f"base/{channel.camera}")
-        assert home.inverse().apply(window)[2] == pytest.approx(given.prism_180.distance, abs=0.01)
-        assert model.assembly.elements[f"{channel.key}/return_face"].aperture.radius == 0.5 * channel.aperture

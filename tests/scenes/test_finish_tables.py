@@ -152,12 +152,3 @@ def test_which_surfaces_get_which_finish(tables) -> None:
     put(tables / "m.bsdf", bsdf_text() + "# changed\n")
     with pytest.raises(InputError, match="checksum is another"):
         resolve(tables / "config.yaml")
-
-
-def test_a_table_that_is_not_reciprocal_is_told(tables) -> None:
-    """Light that arrives at 60 deg is scattered twice as much as light that arrives along the normal."""
-    values = np.full((3, 3, 6), 0.1 / np.pi)
-    values[2] *= 2.0
-    put(tables / "m.bsdf", bsdf_text(values, tis=(0.1, 0.1, 0.2)))
-    (text,) = measured_finishes(resolve(job(tables, "{black: m.bsdf}"))).warnings()
-    assert "the BSDF of black surfaces is not reciprocal" in text
