@@ -205,23 +205,6 @@ def test_first_pixel(gf7_pair, path):
     assert placed.pose(channel.ccd_body).rotation[:, 2] == pytest.approx(-placed.pose(PLANE).rotation[:, 2], abs=1e-15)
 
 
-def test_rows_and_columns_of_the_rendered_image(path, spots, motions):
-    """The picture itself moves as the derivative says: array axes are (row, column)."""
-    shift = 20e-6
-    names = ("line +X", "line +Y")
-    photons = path.expected_photons([{}, *(motions[name].state(shift) for name in names)])
-    rows, columns = np.indices(photons.shape[-2:])
-    weight = np.where(photons > 0.05 * photons.max(), photons, 0.0)
-    place = np.stack([(weight * index).sum(axis=(-2, -1)) for index in (rows, columns)], axis=-1)
-    place = place / weight.sum(axis=(-2, -1))[..., None]
-    middle = 0.5 * (np.array(path.shape) - 1)
-    assert place[0] == pytest.approx(np.broadcast_to(middle, (4, 2)), abs=0.3)
-    for k, name in enumerate(names):
-        assert place[1 + k, :2] - place[0, :2] == pytest.approx(spots[name] * shift, abs=0.03)
-        # the other camera sees nothing of it
-        assert place[1 + k, 2:] == pytest.approx(place[0, 2:], abs=1e-6)
-
-
 def test_spot_signs(spots, path, gf7_pair):
     """A shift s of the focal plane moves the spot by -2 s in it: columns run along -X, rows along +Y."""
     double = 2 / path.pitch

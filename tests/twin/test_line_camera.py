@@ -158,22 +158,6 @@ def test_traced_lines_between_the_traced_points(gf7_pair, backend, state) -> Non
         np.testing.assert_allclose(hit[:, 0], 0.0, rtol=0, atol=1e-6 * 7e-6)
 
 
-def test_traced_looks(gf7_pair, backend) -> None:
-    cameras = traced_line_cameras(gf7_pair, backend)
-    for name, degrees in (("forward", 26.0), ("backward", -5.0)):
-        camera = cameras[name]
-        middle = np.array([0.5 * (camera.pixels - 1)])
-        expected = [math.sin(math.radians(degrees)), 0.0, math.cos(math.radians(degrees))]
-        np.testing.assert_allclose(camera.look(middle)[0], expected, rtol=0, atol=1e-12)
-        # the centre's chief ray goes through the camera's origin by definition
-        np.testing.assert_allclose(camera.origin(middle)[0], gf7_pair.spec.cameras[name].position, rtol=0, atol=1e-9)
-        ends = camera.look(np.array([0.0, camera.pixels - 1.0]))
-        assert ends[0, 1] > 0.02 > -0.02 > ends[1, 1]  # the image is turned round: the -Y' end sees +Y
-    assert look_angle(*cameras.values()) == pytest.approx(math.radians(31.0), abs=1e-12)
-    # both lines are parallel to Y, so their planes make the angle of their looks
-    assert dihedral_angle(*cameras.values()) == pytest.approx(math.radians(31.0), abs=1e-9)
-
-
 def test_turns_of_a_camera_change_the_angles_of_looks_and_of_planes() -> None:
     """At looks 0 and a: turned by g about its look, the planes have cos = cos a cos g exactly; rolled by w about its
     own X, a camera keeps its plane and the looks have cos = cos a cos w; along the track the turn about Y counts,

@@ -1,18 +1,14 @@
 """``twin.orbit adjust``: what the command says of blocks that are right, and of blocks that are not."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from analysis.orbit.three_line_model import misclosure
 from scenes.specs.load import SCENES
 from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
 from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
 from scenes.yaml.errors import InputError
 from twin.orbit.block.block_report import block_report
 from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
-from twin.orbit.block.drawn_block import draw_block
 from twin.orbit.block.measured_block import measured_block
 from twin.orbit.block.pass_knowledge import change_covariance
 from twin.orbit.calibration.calibration_run import source_of
@@ -61,21 +57,6 @@ def test_cameras_are_found_within_their_sigmas(run):
     # 16 normals: beyond 4 by chance in 1 of 1000 blocks
     assert np.max(np.abs(ratio)) < 4.0
     assert all(np.all(c.sigma < c.before) for c in run.cameras.values())
-
-
-def test_rays_meet_where_the_true_platform_saw_the_points():
-    """A block without errors: all misclosures vanish for true corrections."""
-    drawn = draw_block(setup(), np.random.SeedSequence(4))
-    for scene in drawn.block.scenes:
-        rays, platform = scene.rays, drawn.platforms[scene.of]
-        camera = drawn.block.cameras[scene.camera].drifted(drawn.change[scene.name])
-        seconds = rays.time - platform.begin
-        here = replace(rays, station=platform.position(seconds), attitude=platform.body_to_itrs(seconds))
-        zero = np.zeros(3)
-        miss = misclosure(camera, here, drawn.ground[rays.point], zero, zero)
-        sigma = np.sqrt(np.diagonal(rays.spread, axis1=1, axis2=2))
-        # image points have their own errors of one sigma, 0.2 px; nothing else is left
-        assert np.sqrt(np.mean((miss / sigma) ** 2)) == pytest.approx(1.0, abs=0.12)
 
 
 @pytest.mark.second

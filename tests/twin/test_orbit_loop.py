@@ -67,11 +67,6 @@ def test_commands_are_those_of_an_integrator_with_a_delay(delay: int) -> None:
 
 def test_above_the_limit_commands_grow_until_the_range_ends() -> None:
     course = np.full((60, 1), ARCSEC)
-    # eigenvalues of the size of the root of the gain: 1.1^30 and 0.9^30 over sixty readings
-    grown = commanded(loop_of({"gain": 1.1, "delay": 1}), course)[:, 0] + ARCSEC
-    calm = commanded(loop_of({"gain": 0.9, "delay": 1}), course)[:, 0] + ARCSEC
-    assert np.abs(grown[-8:]).max() > 8.0 * ARCSEC
-    assert np.abs(calm[-8:]).max() < 0.1 * ARCSEC
     model = loop_of({"gain": 1.1, "delay": 1, "range": "3 arcsec"})
     assert np.abs(commanded(model, course)).max() == pytest.approx(3.0 * ARCSEC)
     commands = [Commands.none(model, False)]

@@ -184,10 +184,7 @@ def test_noise_is_as_large_as_its_sigma(noisy) -> None:
 
 @pytest.mark.second
 def test_the_noise_is_not_the_whole_error(stated) -> None:
-    """Repeats scatter by the noise; the truth is missed by what the spots leave open, as the total sigma says."""
-    seen, free = stated.scatter, len(stated.scatter.heights) - 1
-    total = free * (seen.spread / seen.sigma) ** 2
-    assert chi2.ppf(FALSE_ALARM, free) < total < chi2.isf(FALSE_ALARM, free)
+    """The truth is missed by what the spots leave open, as the total sigma says."""
     later = np.arange(5) != stated.flight.spec.referred
     assert np.all(stated.sigma_total[later] > 20.0 * stated.sigma[later])
     wrong = stated.cases["monitored"].camera

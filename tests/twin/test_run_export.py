@@ -1,7 +1,6 @@
 """python -m twin.export: frames as FITS that twin.recover reads, tables with units, from run folders of any command."""
 
 import io
-import json
 import math
 import shutil
 from dataclasses import replace
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 import tifffile
 import xarray as xr
-from astropy import units
 from astropy.io import fits
 
 from analysis.images.image_file import ImageFile
@@ -21,7 +19,6 @@ from tests.twin.commands import files, invoke
 from tests.twin.study_bench import ROOT
 from twin.export.__main__ import app
 from twin.export.fits_frames import RecordedFrames, expected_fits, frames_fits, read_frames
-from twin.export.result_tables import result_tables
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_files import write_data
 from twin.main_job.render_job import render_job
@@ -85,36 +82,6 @@ def test_exported_frames_give_the_same_readings_to_the_bit(job, exported, backen
     assert found.last.recovered_dict() == job.recovered_dict()
 
 
-@pytest.mark.second
-def test_cards_of_the_files_of_frames_are_what_the_run_says(job, exported) -> None:
-    """Numbers with their units in the comment; the unit is one that FITS knows."""
-    detector, ccd = job.resolved.detector, job.resolved.instrument.monitor.area_ccd
-    expected = {
-        "XPIXSZ": (1e6 * ccd.pitch, "um"),
-        "EXPTIME": (ccd.exposure, "s"),
-        "GAIN": (1.0 / detector.system_gain_dn_per_e, "electron/adu"),
-        "RDNOISE": (detector.dark_noise_e, "electron"),
-        "PRNU": (detector.prnu, "1"),
-    }
-    for i, channel in enumerate(job.experiment.path.channels):
-        for when, frames in (("nominal", job.before[i]), ("perturbed", job.after[i])):
-            name = f"{channel.camera}_{channel.name}_{'before' if when == 'nominal' else 'after'}.fits"
-            with fits.open(exported["fits"] / "images" / name, checksum=True) as file:
-                file.verify("exception")
-                header = file[0].header
-                np.testing.assert_array_equal(file[0].data, frames)
-            assert (header["NFRAMES"], header["SEED"], header["NOTE"]) == (FRAMES, SEED, when)
-            assert header["CAMERA"] == f"{channel.camera}, {channel.name} area CCD"
-            for keyword, (value, unit) in expected.items():
-                assert header[keyword] == pytest.approx(value, rel=1e-14), keyword
-                assert header.comments[keyword].startswith(f"[{unit}] "), keyword
-                # electrons are the one unit that FITS has no word for
-                assert unit == "1" or units.Unit(unit.replace("electron", "count"), format="fits")
-    # light that the header tells is the light that was rendered: grey values without signal lie at the pedestal
-    corner = float(np.mean(job.before[0][:, :4, :4]))
-    assert abs(corner - header["PEDESTAL"]) < 3.0 * header["RDNOISE"] / header["GAIN"]
-
-
 def test_times_maps_and_heights_say_where_and_when_they_are(tmp_path) -> None:
     shape = (2, 5, 4)
     frames = np.arange(math.prod(shape), dtype=np.uint16).reshape(shape)
@@ -173,38 +140,6 @@ def read_back(path: Path) -> dict[str, list]:
         file.verify("exception")
         out = {name: file[1].data[name].tolist() for name in file[1].columns.names}
     return {name: [None if isinstance(v, float) and math.isnan(v) else v for v in col] for name, col in out.items()}
-
-
-@pytest.mark.second
-@pytest.mark.parametrize("tables", ["parquet", "fits"])
-def test_spots_and_readings_are_those_of_the_run(run, exported, tables) -> None:
-    """Tables and the long list of all numbers, with unit and sigma."""
-    if tables == "parquet":
-        pytest.importorskip("pyarrow")
-    found = json.loads((run / "recovered.json").read_text())
-    spots = read_back(exported[tables] / f"tables/spots.{tables}")
-    assert len(spots["row"]) == 8
-    for k in range(8):
-        own = found["spots"][spots["camera"][k]][spots["channel"][k]][spots["state"][k]]
-        assert {name: spots[name][k] for name in own} == own
-    readings = read_back(exported[tables] / f"tables/readings.{tables}")
-    assert len(readings["camera"]) == sum(len(one) for one in found["cameras"].values())
-    for k, camera in enumerate(readings["camera"]):
-        own = found["cameras"][camera][readings["estimator"][k]]
-        assert {name: readings[name][k] for name in own} == own
-    truth = json.loads((run / "truth.json").read_text())["cameras"]
-    true = read_back(exported[tables] / f"tables/true_changes.{tables}")
-    assert true["d_f_um"] == [truth[camera]["d_f_um"] for camera in true["camera"]]
-    points = read_back(exported[tables] / f"tables/points.{tables}")
-    assert points["line"] == [3.5, None]
-    assert points["point"] == [0, 1]
-    listed = result_tables(run, list(json.loads((run / "manifest.json").read_text())["sha256"]))[0]
-    columns = {column.name: column.plain for column in listed.columns}
-    rows = list(zip(columns["file"], columns["key"], strict=True))
-    assert len(set(rows)) == len(rows) > 500
-    k = rows.index(("recovered.json", "cameras.forward.model.d_f_um"))
-    own = found["cameras"]["forward"]["model"]
-    assert [columns[name][k] for name in ("value", "sigma", "unit")] == [own["d_f_um"], own["d_f_um_sigma"], "um"]
 
 
 @pytest.mark.parametrize("form", TABLE_FORMATS)

@@ -40,26 +40,6 @@ def write_manifest(folder: RunFolder, **other: object) -> None:
     folder.write_json(MANIFEST, {"program": "twin.test", "versions": versions(), **times, "sha256": sums, **other})
 
 
-def test_files_that_are_not_as_written_are_found(tmp_path):
-    target = tmp_path / "run"
-    with RunFolder(target) as folder:
-        for name in ("same.txt", "changed.txt", "gone.txt", "link.txt", "folder.txt"):
-            folder.write_text(name, name)
-        run_folder.write_manifest(folder, "twin.test", 1.5e9, 2.0)
-    assert run_folder.altered(target, run_folder.read_manifest(target)) == []
-    (target / "changed.txt").write_text("changed.tXt")
-    for name in ("gone.txt", "link.txt", "folder.txt"):
-        (target / name).unlink()
-    (target / "other.txt").write_text("link.txt")
-    (target / "link.txt").symlink_to("other.txt")
-    (target / "folder.txt").mkdir()
-    wrong = run_folder.altered(target, run_folder.read_manifest(target))
-    assert wrong == ["changed.txt", "folder.txt", "gone.txt", "link.txt"]
-    told = json.loads((target / MANIFEST).read_text("utf-8"))
-    assert told["digest"] == run_folder.seal(told)
-    assert told["digest"] != run_folder.seal(told | {"wall_time_s": 2.5})
-
-
 def test_a_manifest_refuses_what_it_does_not_know(tmp_path):
     with pytest.raises(ValueError, match="colour, size"), RunFolder(tmp_path / "run") as folder:
         run_folder.write_manifest(folder, "twin.test", 1.5e9, 2.0, seed=3, size=1, colour="red")
@@ -302,14 +282,11 @@ def test_force_replaces_nothing_that_is_not_a_run(tmp_path, manifest):
 @pytest.mark.parametrize("force", [False, True])
 def test_a_file_or_a_link_in_the_way(tmp_path, force):
     (tmp_path / "file").touch()
-    with pytest.raises(RunFolderError, match="is not a folder"):
-        RunFolder(tmp_path / "file", force)
     (tmp_path / "link").symlink_to(a_run(tmp_path / "run"))
-    with pytest.raises(RunFolderError, match="is not a folder"):
-        RunFolder(tmp_path / "link", force)
     (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
-    with pytest.raises(RunFolderError, match="is not a folder"):
-        RunFolder(tmp_path / "dangling", force)
+    for name in ("file", "link", "dangling"):
+        with pytest.raises(RunFolderError, match="is not a folder"):
+            RunFolder(tmp_path / name, force)
 
 
 def test_a_place_that_cannot_be(tmp_path):

@@ -11,9 +11,7 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.recovery import recover
 from analysis.monitor.series_smoother import SmoothedSeries, smooth
-from analysis.spots.spot_positions import SeriesNoise
 from optics.geometry.tree import State
 from scenes.models.disturbances import state_of
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -67,7 +65,7 @@ class Courses:
     truth: np.ndarray
     height: np.ndarray
     shifts: np.ndarray
-    noise: Sequence[White | SeriesNoise]
+    noise: Sequence[White]
 
     @property
     def stated(self) -> Disturbances:
@@ -168,34 +166,3 @@ def test_a_few_courses(experiment) -> None:
     courses = traced(experiment("gf7_pair"), TIMES[:5], np.array([0, 2, 4]), 12, 1)
     check_chi_square(courses)
     check_sigmas(courses)
-
-
-@pytest.mark.second
-def test_noise_that_measurements_share(experiment) -> None:
-    """One displaced state measured twice after one reference image, by 8 detectors: the difference of the two loses
-    reference and pattern, their mean keeps both. Each against the covariance of the series."""
-    twin = experiment("gf7_pair")
-    assert twin.stated is not None
-    amounts = twin.stated.draw(np.random.default_rng(4), 1)[0]
-    state = state_of(amounts, twin.stated.components, twin.thermal)
-    photons = twin.path.expected_photons([state, state])
-    count, squares = 8, {"difference": 0.0, "mean": 0.0}
-    shifts, spreads = [], []
-    for seed in range(count):
-        before, after = twin.frames_before(9, seed), twin.frames_after(photons, 9, seed)
-        found = recover(before, after, twin.calibration, threads=2, keep_parts=True)
-        assert found.parts is not None
-        noise = SeriesNoise(found.parts[0], 2)
-        noise.add(found.parts[1])
-        spreads.append(noise.covariance(np.arange(2)).reshape(2, 8, 2, 8))
-        shifts.append(found.shift)
-        assert found.shift_covariance[0] == pytest.approx(spreads[-1][0, :, 0], rel=1e-4, abs=1e-11)
-    # the mean shift is not known: it is that of all detectors, which costs one of them
-    middle = np.mean(shifts, axis=(0, 1))
-    for two, spread in zip(shifts, spreads, strict=True):
-        for name, weights in (("difference", np.array([1.0, -1.0])), ("mean", np.array([0.5, 0.5]))):
-            left = weights @ (two - middle)
-            squares[name] += left @ np.linalg.solve(np.einsum("i,iajb,j->ab", weights, spread, weights), left)
-    for name, degrees in (("difference", 8 * count), ("mean", 8 * (count - 1))):
-        low, high = chi2.ppf(0.5 * FALSE_ALARM, degrees), chi2.isf(0.5 * FALSE_ALARM, degrees)
-        assert low < squares[name] < high, (name, squares[name], degrees)

@@ -9,7 +9,6 @@ from typer.testing import CliRunner
 from tests.twin.study_bench import TEXTS, refusals, write_study
 from twin.study.__main__ import app
 from twin.study.gradient.study_gradient import AD, TRACED, WHOLE, study_gradient
-from twin.study.runs.base_job import Run
 from twin.study.runs.setup import resolve_study
 
 AGREEMENT = 1e-6
@@ -75,27 +74,6 @@ def test_readings_by_posterior_are_differentiated(tmp_path, backend):
     # a more likely motion of the mirror takes more of the shifts upon itself
     assert abs(found.best[8, 1]) > 0.0
     assert found.best[10, 1] > 0.0
-
-
-@pytest.mark.second
-def test_images_say_the_same(small, backend, whole):
-    """The whole job, images and noise included, through steps that move spots by some 0.5 px.
-
-    Runs share their noise, but frames of other spots draw other photons: with one frame a recovered angle has a sigma
-    of 0.035 arcsec, so that a slope of 2 arcsec per arcsec over 20 arcsec is good to 2.5e-3; tolerated are 5 of these,
-    one in 1e6.
-    """
-    setup = resolve_study(small)
-    key = ("job", "perturb", "base/forward/focal_plane", "rotate", 2)
-    ends = [Run(k, ((key, f"{amount!r} arcsec"),), None) for k, amount in enumerate((-10.0, 10.0))]
-    low, high = setup.job.evaluate(setup.tree, ends, backend)
-    at = [run["recovered"]["cameras"]["forward"]["paper_single"] for run in (low, high)]
-    sigma = np.hypot(*(one["d_gamma_arcsec_sigma_noise"] for one in at)) / 20.0
-    exact = whole["ad"][whole["responses"].index("gamma")][whole["factors"].index("turn")]
-    assert sigma < 5e-3
-    assert abs((at[1]["d_gamma_arcsec"] - at[0]["d_gamma_arcsec"]) / 20.0 - exact) < 5.0 * sigma
-    middle = np.array([run["recovered"]["spots"]["forward"]["left"]["after"]["row"] for run in (low, high)])
-    assert np.all(np.abs(middle - 23.5) < 10.0)
 
 
 def test_options_of_runs_are_refused(small):

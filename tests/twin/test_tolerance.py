@@ -28,7 +28,7 @@ from twin.tolerance.merits import Merit
 from twin.tolerance.samples import Workforce, draw_samples, study_of
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.tolerance_report import tolerance_report
-from twin.tolerance.tolerance_run import TOLERANCE, Yield, run_tolerance, worst_jobs
+from twin.tolerance.tolerance_run import Yield, run_tolerance, worst_jobs
 from twin.tolerance.variations import spectrum_shares, states_of
 
 
@@ -171,27 +171,6 @@ def test_an_obscured_camera_is_that_of_the_camera_program(backend, tmp_path) -> 
         assert values[0] == pytest.approx(max(wave.rms for wave in camera.wavefronts(bench.fields)), rel=1e-4)
         least = min(float(np.min(mtf.at(camera.nyquist))) for mtf in camera.mtfs(bench.fields))
         assert values[1] == pytest.approx(least, abs=1e-4)
-
-
-def test_a_budget_from_a_script(backend, tmp_path) -> None:
-    """Whole, in this process: its numbers are those of the cameras that it has drawn."""
-    merits = {k: TEXTS["gf7"]["merits"][k] for k in ("wavefront", "mtf", "f")}
-    run = run_tolerance(budget(tmp_path, merits=merits, samples=20), backend)
-    numbers, values = TOLERANCE(run), run.samples.values
-    good = np.stack([values[:, 0] <= 0.06, values[:, 1] >= 0.35, values[:, 2] <= 0.5e-3], axis=1)
-    assert (numbers["yield"]["passed"], numbers["yield"]["of"]) == (int(np.sum(good.all(axis=1))), 20)
-    assert numbers["merits"]["wavefront"]["variance_shares"]["tilt"] > 0.0
-    for k, (name, unit) in enumerate((("wavefront", 1.0), ("mtf", 1.0), ("f", 1e-6))):
-        told, own = numbers["merits"][name], values[:, k] / unit
-        assert told["yield"]["passed"] == np.sum(good[:, k])
-        # of an MTF the share exceeds the value
-        shares = [100.0 - p if name == "mtf" else p for p in (50.0, 90.0, 95.0)]
-        assert list(told["monte_carlo"].values()) == pytest.approx(np.percentile(own, shares).tolist(), rel=1e-9)
-        assert (told["mean"], told["std"]) == pytest.approx((np.mean(own), np.std(own)), rel=1e-9)
-    focus = run.samples.moves[:, 0]
-    told = numbers["compensators"]["focus"]
-    for key, size in (("std", np.std(focus)), ("largest", np.max(np.abs(focus)))):
-        assert float(told[key].removesuffix(" um")) == pytest.approx(1e6 * size, rel=1e-6), key
 
 
 def test_costs_of_grades_are_those_stated_and_fall_between_them() -> None:
@@ -492,21 +471,6 @@ def test_a_corrupt_chunk_of_cameras_is_reported_and_drawn_again(backend, tmp_pat
     again = draw_samples(setup, bench, backend, 20, 3, force)
     assert [f"chunk {chunk.name} is corrupt" in text for text in warned] == [True]
     np.testing.assert_array_equal(again.values, first.values)
-
-
-@pytest.mark.second
-def test_moves_of_compensators_stand_beside_each_sensitivity(backend, tmp_path) -> None:
-    setup = budget(tmp_path, "few")
-    run = run_tolerance(setup, backend)
-    bench = run.bench
-    ends = np.zeros((2, len(bench.numbers)))
-    ends[:, 0] = (-1.0, 1.0)
-    moved = bench.try_out(ends * bench.sizes).moves
-    np.testing.assert_allclose(sensitivities(bench).moves[0], moved, rtol=1e-6)
-    numbers = TOLERANCE(run)["tolerances"]
-    assert numbers["despace"]["moves_at_plus"]["focus"].endswith(" um")
-    assert float(numbers["despace"]["moves_at_plus"]["focus"].split()[0]) == pytest.approx(1e6 * moved[1, 0], rel=1e-6)
-    assert numbers["figure"]["moves_at_plus"] == {"focus": None, "turn": None}
 
 
 @pytest.mark.parametrize("loose", [30.0, pytest.param(1.0, marks=pytest.mark.second)])

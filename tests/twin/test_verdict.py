@@ -15,7 +15,7 @@ from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE, GROUND
 from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
 from scenes.specs.resolved import resolve
-from twin.main_job.assumptions import assumed, combination
+from twin.main_job.assumptions import assumed
 from twin.main_job.render_command import _table
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
@@ -264,22 +264,6 @@ def test_the_share_of_a_body_is_that_of_its_errors() -> None:
 
 
 @pytest.mark.second
-def test_a_change_is_what_the_cameras_parameters_make_of_it(job) -> None:
-    """The combination of all parameters gives, of the true ones, the true angle and errors on the ground."""
-    run = job(EXAMPLE, LAUNCH, frames=9)
-    true = np.concatenate([run.truth.vector(name)[0] for name in run.truth.cameras])
-    truth = run.truth_dict()
-    for group, p in (("intersection_angle", ANGLE), *(("ground", p) for p in GROUND)):
-        # second order of 10 arcsec: 5e-5 of it
-        assert combination(run.reading, group, p.key) @ true == pytest.approx(truth[group][p.key], rel=2e-3)
-    for k, p in enumerate(PARAMETERS):
-        row = combination(run.reading, "backward", p.key)
-        assert row @ true == pytest.approx(truth["cameras"]["backward"][p.key], rel=1e-12)
-        assert np.count_nonzero(row) == 1
-        assert row[4 + k] != 0.0
-
-
-@pytest.mark.second
 def test_a_change_that_no_cause_makes_has_no_posterior(job, tmp_path) -> None:
     """Focal planes that are heated evenly lengthen lines and principal distances alike: nothing turns, and a posterior
     of 0 ± 0 was told of the turns. Files, table and verdict leave it out; the other estimators read on.
@@ -295,21 +279,6 @@ def test_a_change_that_no_cause_makes_has_no_posterior(job, tmp_path) -> None:
     assert "\N{EM DASH}" in console.export_text()
     assert "0.0 ±" not in judge(run).verdict
     assert json.loads(json.dumps(numbers, allow_nan=False)) == numbers
-
-
-@pytest.mark.second
-def test_sigma_holds_where_there_are_no_doubts_and_each_is_a_warning(job) -> None:
-    for motion in ("{shift: 0 0 0.1 um}", "{shift: 0 0 60 um}"):
-        run = job(f"{{base/forward/M2: {motion}}}", "disturbances: launch")
-        numbers = recovered_numbers(run)
-        assert numbers["sigma_holds"] is (not numbers["doubts"])
-        assert numbers["sigma_holds"] is numbers["disturbances"]["agrees"]
-        assert set(numbers["doubts"]) <= set(numbers["warnings"])
-        assert len(set(numbers["warnings"])) == len(numbers["warnings"])
-    for more in ("disturbances: none", "analysis: {centroid: energy}"):
-        numbers = recovered_numbers(job("{base/forward/M2: {shift: 0 0 0.1 um}}", more))
-        assert "chi_square" in numbers["disturbances"]
-        assert "reduced_chi_square" in numbers["spots"]["forward"]["left"]["after"]
 
 
 @pytest.mark.second
