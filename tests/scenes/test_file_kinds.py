@@ -78,7 +78,13 @@ WRONG = [
     (study, "--gradient", "lab/focus.yaml", "a focus test, which twin.study", "twin.lab focus {} does"),
     (lab, "focus", "lab/distortion.yaml", "which twin.lab focus", "twin.lab distortion {} does"),
     (orbit, "angle", "library/cameras/gf7.yaml", "a camera's prescription, which twin.orbit angle", "twin.camera {} d"),
-    (design, "", "orbit/simulate.yaml", "images of the ground, which twin.design", "twin.orbit simulate {} does"),
+    (
+        design,
+        "",
+        "orbit/simulate.yaml",
+        "images of the ground, which twin.design camera",
+        "twin.orbit simulate {} does",
+    ),
 ]
 
 

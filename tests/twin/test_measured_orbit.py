@@ -6,16 +6,19 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import twin.orbit.__main__ as command
+from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data_setup import (
     resolve_measured_angle,
     resolve_measured_calibration,
 )
 from scenes.specs.measured.pass_files import body_axes_matrix
+from scenes.specs.orbit.angle import EffectsSpec
 from scenes.specs.orbit.setup import resolve_angle, resolve_simulate
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import InputError
@@ -81,6 +84,89 @@ def test_files_give_the_estimates_of_the_simulation(campaign, files) -> None:
     assert again.known_truth is None
     with pytest.raises(AssertionError, match="nobody knows"):
         _ = again.passes[0].bias
+
+
+@pytest.mark.second
+def test_scipy_finds_the_same_from_the_files(tmp_path) -> None:
+    """Collinearity written anew from the definition of the look in camera.json, splines and least squares of SciPy.
+
+    Image points and control have errors, readings none: their weights are then diagonal. Sigmas along the track are
+    those of a line's motion at the mean height of the points, here at that of the field: 1e-5 of themselves."""
+    errors = WHOLE.test.errors
+    tracker = errors.star_tracker.model_copy(update={"noise": (0.0, 0.0, 0.0)})
+    gps = errors.gps.model_copy(update={"noise": (0.0, 0.0, 0.0), "drift": (0.0, 0.0, 0.0)})
+    update = {
+        "errors": errors.model_copy(update={"star_tracker": tracker, "gps": gps}),
+        "effects": EffectsSpec(light_time=False, aberration=False, refraction=False),
+    }
+    update["fields"] = FrozenMap({FIELDS[0]: WHOLE.test.fields[FIELDS[0]].model_copy(update={"relief": 50.0})})
+    setup = small(**update, schemes=((FIELDS[0],),))
+    file = export(tmp_path, setup, flown(setup))
+    _, again = read_back(file)
+    ours = simultaneous(again)
+
+    orbit, attitude, lines, ground, images = (
+        np.genfromtxt(tmp_path / FIELDS[0] / f"{k}.csv", delimiter=",", names=True, dtype=None, autostrip=True)
+        for k in ("orbit", "attitude", "lines", "ground", "image_points")
+    )
+    path = CubicSpline(orbit["time_s"], np.stack([orbit[f"{k}_m"] for k in "xyz"], -1))
+    turn = CubicSpline(attitude["time_s"], np.stack([attitude[f"q{k}"] for k in range(1, 5)], -1))
+    camera = read_yaml(tmp_path / "camera.yaml").data
+    control = ground[ground["role"] == "control"]
+    ids = control["point"].tolist()
+    given = np.stack([control[f"{k}_m"] for k in "xyz"], -1)
+    images = images[np.isin(images["point"], ids)]
+    which = np.array([ids.index(p) for p in images["point"]])
+    names = list(camera["lines"])[:3]
+    line_of = np.array([names.index(c) for c in images["camera"]])
+    seconds = np.empty(len(images))
+    for k, name in enumerate(names):
+        rows = lines[lines["camera"] == name]
+        seconds[line_of == k] = np.interp(images["line"][line_of == k], rows["line"], rows["time_s"])
+    pitch = 6.5e-6
+    y = pitch * (images["pixel"] - 0.5 * (camera["pixels"] - 1))
+    station, body = path(seconds), Rotation.from_quat(turn(seconds)).as_matrix()
+    start, mounts, distortion = [], [], []
+    for name in names:
+        said = WHOLE.camera.lines[name]
+        mounts.append((Rotation.from_rotvec([0.0, said.look, 0.0]) * Rotation.from_rotvec(said.rotate)).as_matrix())
+        start.append([said.principal_distance, *said.principal_point])
+        distortion.append(said.k1)
+    mounts, start, distortion = np.array(mounts), np.array(start), np.array(distortion)
+    free = [k for k in range(9) if k not in (4, 5)]  # x and y of the nadir line are the gauge
+    sigma_x = 0.3 * pitch
+    scale = np.array([1e-5] * 7 + [1e-5] * 3)
+
+    def unpacked(values):
+        inner = start.ravel().copy()
+        inner[free] += values[:7] * scale[:7]
+        return inner.reshape(3, 3), values[7:10] * scale[7:], given + values[10:].reshape(-1, 3)
+
+    def residuals(values):
+        inner, bias, points = unpacked(values)
+        arm = np.einsum("nji,nj->ni", body, points[which] - station)
+        seen = arm @ Rotation.from_euler("XYZ", bias).as_matrix()
+        a, b, c = np.einsum("nji,nj->ni", mounts[line_of], seen).T
+        f, x0, y0 = inner[line_of].T
+        u, v = -x0, y - y0
+        grown = 1.0 + distortion[line_of] * (u * u + v * v)
+        image = np.stack([u * grown + f * a / c, v * grown + f * b / c], -1) / sigma_x
+        return np.concatenate([image.ravel(), (points - given).ravel()])
+
+    theirs = least_squares(residuals, np.zeros(10 + given.size), jac="3-point", x_scale="jac", xtol=1e-15, ftol=1e-15)
+    inner, bias, _ = unpacked(theirs.x)
+    covariance = np.linalg.inv(theirs.jac.T @ theirs.jac)[:10, :10] * scale * scale[:, None]
+    found = {f"{n} {k}": v for n, row in zip(names, inner, strict=True) for k, v in zip("fxy", row, strict=True)}
+    found |= {f"{FIELDS[0]} {k}": v for k, v in zip(("roll", "pitch", "yaw"), bias, strict=True)}
+    order = [n for n in found if n not in gauge_of(again).held]
+    sigma = np.sqrt(np.diag(covariance))
+    for k, name in enumerate(order):
+        assert ours.value(name) == pytest.approx(found[name], abs=1e-3 * sigma[k])
+        assert ours.sigma[name] == pytest.approx(sigma[k], rel=1e-3)
+    where = [ours.names.index(n) for n in order]
+    unit = (ours.covariance[np.ix_(where, where)] - covariance) / sigma / sigma[:, None]
+    assert np.abs(unit).max() < 1e-3
+    assert ours.chi_square == pytest.approx(2.0 * theirs.cost, rel=1e-3)
 
 
 def _other_quaternion(heads, rows):

@@ -71,6 +71,8 @@ def _set_variant(mi: Any, variant: str) -> None:
         mi.set_variant(variant)
     except (ImportError, AttributeError) as error:
         raise PictureError(f"mitsuba {mi.__version__} cannot run its variant {variant}: {error}") from error
+    if mi.variant() != variant:
+        raise PictureError(f"mitsuba runs its variant {mi.variant()} where {variant} is needed")
 
 
 class Studio:
@@ -332,7 +334,7 @@ def staged(instrument: Instrument, paths: LightPaths, shot: Shot) -> tuple[View,
     elif shot.shows == "prisms":
         wanted = [name for name in points if name.startswith(CENTRAL_PRISM) or prism_of(name) == PRISM_0]
         azimuth, elevation, field = -66.0, 24.0, 24.0
-    else:  # the focal plane
+    elif shot.shows == "focal_plane":
         plane = f"{BASE}/{next(iter(instrument.cameras))}/focal_plane"
         wanted = [name for name in points if name.startswith(plane)]
         # into the housing, against the light, a little from the side
@@ -340,6 +342,8 @@ def staged(instrument: Instrument, paths: LightPaths, shot: Shot) -> tuple[View,
         azimuth = float(np.degrees(np.arctan2(y, x))) + 12.0
         elevation = float(np.degrees(np.arctan2(z, np.hypot(x, y)))) + 5.0
         field = 24.0
+    else:
+        raise ValueError(f"a picture shows the instrument, the prisms or the focal plane, not {shot.shows!r}")
     shown = np.concatenate([points[name] for name in wanted])
     view = framed(shown, azimuth, elevation, field, (shot.width, shot.height))
     return view, studio_parts(instrument, paths, view.pixel_at(shown))
