@@ -15,13 +15,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.number_tree import map_leaves
 from optics.numerics.physical_error import PhysicalError
 from optics.raytrace.assembly import Interaction
-from optics.raytrace.element_numbers import (
-    CoordinateNumbers,
-    ElementNumbers,
-    FrameNumbers,
-    IndexNumbers,
-    Structure,
-)
+from optics.raytrace.element_numbers import CoordinateNumbers, ElementNumbers, FrameNumbers, IndexNumbers, Structure
 from optics.raytrace.graded_ray import GradedRay, meeting
 from optics.raytrace.system import SystemBatch, UploadedSystems
 

@@ -17,14 +17,7 @@ from optics.thermal.heat import Temperature, Temperatures
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
-from scenes.specs.disturbances import (
-    JOINT,
-    CauseSpec,
-    DisturbancesSpec,
-    JointSpec,
-    TimeLawSpec,
-    component_named,
-)
+from scenes.specs.disturbances import JOINT, CauseSpec, DisturbancesSpec, JointSpec, TimeLawSpec, component_named
 from scenes.specs.motion_text import node_named
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import ResolvedJob

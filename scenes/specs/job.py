@@ -12,10 +12,7 @@ from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
 from scenes.specs import job_tables
 from scenes.specs.as_built import InstrumentReference
-from scenes.specs.course import (
-    CourseSpec,
-    read_course,
-)
+from scenes.specs.course import CourseSpec, read_course
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
 from scenes.specs.perturbation import (

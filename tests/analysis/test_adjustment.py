@@ -12,15 +12,7 @@ from analysis.calibration.stepwise import stepwise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Prior, Unknowns
 from analysis.orbit.null_space import Gauge, RankError
 from tests.analysis.refusals import refuses
-from tests.analysis.test_three_line_model import (
-    ARCSEC,
-    INTERIOR,
-    PITCH,
-    cameras,
-    field_points,
-    make_rays,
-    observe,
-)
+from tests.analysis.test_three_line_model import ARCSEC, INTERIOR, PITCH, cameras, field_points, make_rays, observe
 from tests.tiers import quick
 
 NOISE = Noise(0.3 * PITCH, 0.5 * ARCSEC)

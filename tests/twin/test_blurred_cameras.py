@@ -8,15 +8,7 @@ import pytest
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.models.camera_model import derive_camera
-from scenes.models.camera_sharpness import (
-    BLURRED,
-    FIELDS,
-    FieldBeams,
-    FocalPlane,
-    blur_warnings,
-    cameras_of,
-    sharpness,
-)
+from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, blur_warnings, cameras_of, sharpness
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, library_names, load_camera

@@ -20,15 +20,7 @@ from scenes.specs.resolved import FocusSetup, resolve_focus, resolve_focus_test
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_report import focus_report as report
-from twin.laboratory.focus_run import (
-    FocusRun,
-    SimulatedFocus,
-    align,
-    align_files,
-    line_turn,
-    mount_of,
-    plan_shims,
-)
+from twin.laboratory.focus_run import FocusRun, SimulatedFocus, align, align_files, line_turn, mount_of, plan_shims
 from twin.laboratory.focus_scan import VERTEX_ERROR
 from twin.run.procedure import BenchError
 

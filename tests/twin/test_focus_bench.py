@@ -19,10 +19,8 @@ from tests.tiers import quick
 from twin.laboratory.focus_bench import BudgetLine, FocusBench, Site
 from twin.sensors.line_ccd import band_wavelengths
 from twin.targets.target_images import ALONG, TABLE_REACH, EdgeImager
-from twin.validation.checks.group import load_printed
 
 ARCMIN = np.pi / 180 / 60
-MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")
 TABLE = 2e-4
 """Error of interpolated transfer functions that twin.targets.target_images states."""
 OUTSIDE = 1e-4

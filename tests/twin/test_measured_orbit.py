@@ -13,10 +13,7 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.orbit_data_setup import (
-    resolve_measured_angle,
-    resolve_measured_calibration,
-)
+from scenes.specs.measured.orbit_data_setup import resolve_measured_angle, resolve_measured_calibration
 from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.specs.orbit.angle import EffectsSpec
 from scenes.specs.orbit.setup import resolve_angle, resolve_simulate

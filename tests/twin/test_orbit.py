@@ -7,15 +7,7 @@ import pytest
 
 from scenes.specs.orbit.flight import OrbitSpec
 from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, RATE, Earth, ut1_of
-from twin.orbit.flight.orbit import (
-    FIELD_RADIUS,
-    GM,
-    J2,
-    Orbit,
-    acceleration,
-    propagate,
-    sun_synchronous_inclination,
-)
+from twin.orbit.flight.orbit import FIELD_RADIUS, GM, J2, Orbit, acceleration, propagate, sun_synchronous_inclination
 
 EARTH = Earth(-0.15, (4e-7, -2e-6))
 EPOCH = "2011-03-05T03:05:00Z"

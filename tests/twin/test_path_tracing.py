@@ -27,14 +27,7 @@ from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, trace_stray
-from twin.path_tracing.tracer import (
-    BALANCED,
-    VARIANTS,
-    PathTracer,
-    Sampling,
-    VariantUnavailable,
-    load_mitsuba,
-)
+from twin.path_tracing.tracer import BALANCED, VARIANTS, PathTracer, Sampling, VariantUnavailable, load_mitsuba
 
 INSTRUMENTS = ["gf7_pair", "monitor_pair"]
 STATE = {

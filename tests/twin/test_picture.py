@@ -21,15 +21,7 @@ from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
 from twin.main_job.render_job import render_job
 from twin.pictures.light_paths import trace_light_paths
-from twin.pictures.picture import (
-    SHOTS,
-    PictureError,
-    Shot,
-    Studio,
-    colour_variant,
-    staged,
-    write_pictures,
-)
+from twin.pictures.picture import SHOTS, PictureError, Shot, Studio, colour_variant, staged, write_pictures
 from twin.pictures.picture_scene import framed, looking, points_in_world
 from twin.pictures.scene_file import build_scene, motions
 

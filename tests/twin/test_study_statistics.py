@@ -28,6 +28,22 @@ def draws(n: int, seed: int = 3) -> np.ndarray:
     return np.random.default_rng(seed).normal(5.0, 2.0, n)
 
 
+@pytest.mark.parametrize("q", [0.5, 0.95])
+def test_intervals_hold_what_they_promise(q) -> None:
+    """Over 2000 samples of 60: order statistics at least 95%, the standard deviation's near 95%."""
+    samples = np.random.default_rng(8).normal(0.0, 1.0, (2000, 60))
+    low, high = estimates.quantile_interval(np.arange(60.0), q)
+    ordered, truth = np.sort(samples, axis=1), stats.norm.ppf(q)
+    inside = ordered[:, int(low)] <= truth
+    inside &= high is None or ordered[:, int(high)] >= truth
+    # binomial, 5 sigma of 2000 trials
+    assert inside.mean() > 0.95 - 5.0 * math.sqrt(0.95 * 0.05 / 2000)
+    ends = np.array([estimates.std_interval(sample) for sample in samples[:500]])
+    share = np.mean((ends[:, 0] <= 1.0) & (ends[:, 1] >= 1.0))
+    # asymptotic: 60 runs cost some 3% of coverage, beside 5 sigma of 500 trials
+    assert 0.92 - 5.0 * math.sqrt(0.05 / 500) < share < 0.999
+
+
 def test_ranks_by_the_binomial_distribution() -> None:
     low, high = estimates.quantile_interval(np.arange(100.0), 0.5)
     # textbook: for the median of 100 the 40th and the 61st value

@@ -34,14 +34,7 @@ from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import path_to_sphere
-from scenes.models.camera_model import (
-    ROOT,
-    CameraModel,
-    camera_alone,
-    derive_camera,
-    field_direction,
-    lenses,
-)
+from scenes.models.camera_model import ROOT, CameraModel, camera_alone, derive_camera, field_direction, lenses
 from scenes.models.camera_sharpness import FIELDS, Cut, FieldBeams, FocalPlane, stop_nodes
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows

@@ -18,14 +18,7 @@ from rich.console import Console
 
 from scenes.yaml.errors import InputError, nearest
 from scenes.yaml.standard_output import BAD_INPUT, FAILURE, print_error
-from twin.operate.estimate_commands import (
-    alarms,
-    estimate_of,
-    exclude,
-    forecast,
-    show_estimate,
-    show_power,
-)
+from twin.operate.estimate_commands import alarms, estimate_of, exclude, forecast, show_estimate, show_power
 from twin.operate.followed import PlanFile, planned
 from twin.operate.life_commands import judge, simulate
 from twin.operate.products_command import products

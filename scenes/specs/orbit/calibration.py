@@ -5,15 +5,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
-from scenes.specs.orbit.angle import (
-    LINES,
-    DatumShift,
-    EffectsSpec,
-    GroundSigma,
-    Relief,
-    TerrainHeight,
-    check_ends,
-)
+from scenes.specs.orbit.angle import LINES, DatumShift, EffectsSpec, GroundSigma, Relief, TerrainHeight, check_ends
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text, unknown

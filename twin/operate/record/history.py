@@ -32,16 +32,7 @@ from twin.operate.record.entries import (
     utc_text,
 )
 from twin.operate.record.place import NotARecord, RecordFailed
-from twin.operate.record.schema import (
-    ACKNOWLEDGEMENT,
-    ALARM,
-    CHECKPOINT,
-    ENTRY,
-    INSTRUMENT,
-    PLAN,
-    REFUSED,
-    SOURCE,
-)
+from twin.operate.record.schema import ACKNOWLEDGEMENT, ALARM, CHECKPOINT, ENTRY, INSTRUMENT, PLAN, REFUSED, SOURCE
 from twin.operate.record.taking import Taken, Taking
 from twin.run.data_files import WRITER
 from twin.run.durable import make_folders, sync_folder
