@@ -368,32 +368,6 @@ PROCEDURES: dict[str, Procedure] = {
     Example: `python -m twin.orbit jitter scenes/orbit/jitter.yaml`
     """,
     ),
-    "orbit loop": Procedure(
-        "loop",
-        setup="scenes.specs.orbit.setup:LoopSetup",
-        resolve="scenes.specs.orbit.setup:resolve_loop",
-        run="twin.orbit.loop.loop_run:run_loop",
-        numbers="twin.orbit.loop.loop_numbers:LOOP",
-        cost="twin.orbit.loop.loop_cost:loop_cost",
-        report="twin.orbit.loop.loop_report:loop_report",
-        files=(
-            FileKind(
-                "orbit_loop",
-                "scenes.specs.orbit.loop:OrbitLoopSpec",
-                "a monitor in a loop",
-                needs=("readings", "corrections"),
-            ),
-        ),
-        varied=True,
-        about="""
-    The monitor in a loop along one orbit: heat and mounts move the cameras, rendered spots are read, and the posterior
-    moves mechanisms that point and refocus, with gain, delay and steps; heights with the loop open and closed.
-
-    loop.json holds what is left of angle, focus and height with sigmas, gain and phase margins, and what no spot shows.
-
-    Example: `python -m twin.orbit loop scenes/orbit/loop.yaml`
-    """,
-    ),
     "orbit match": Procedure(
         "match",
         setup="scenes.specs.measured.orbit_data_setup:MatchSetup",
@@ -428,7 +402,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:MonitorSetup",
         resolve="scenes.specs.orbit.setup:resolve_monitor",
         run="twin.orbit.monitoring.monitoring_run:run_monitor",
-        numbers="twin.orbit.monitoring.monitoring_numbers:MONITOR",
+        numbers="twin.orbit.monitoring.monitoring_numbers:monitor_numbers",
         cost="twin.orbit.monitoring.monitoring_cost:monitoring_cost",
         report="twin.orbit.monitoring.monitoring_report:monitor_report",
         files=(
@@ -436,16 +410,19 @@ PROCEDURES: dict[str, Procedure] = {
                 "orbit_monitor",
                 "scenes.specs.orbit.monitor:OrbitMonitorSpec",
                 "a test of monitoring in orbit",
-                needs=("course", "interval"),
+                one_of=("interval", "mechanisms"),
+                needs=("orbit", "ground"),
             ),
         ),
         varied=True,
         about="""
     Height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper 001's
-    monitor, heights as in papers 000 and 003).
+    monitor, heights as in papers 000 and 003). With `mechanisms:` the loop is closed: what rendered spots say moves
+    mechanisms that point and refocus, with gain, delay and steps, beside the same orbit with the loop open.
 
     monitor.json holds the true and the monitored changes, errors in plan and height as calibrated, monitored at every
-    time and at an interval, the interval's table, metres per arcsecond, and where the rest comes from.
+    time and at an interval, the interval's table, metres per arcsecond, and where the rest comes from; of a closed loop
+    under `loop` what is left of angle, focus and height with sigmas, gain and phase margins, and what no spot shows.
 
     Example: `python -m twin.orbit monitor scenes/orbit/monitor.yaml`
     """,

@@ -26,7 +26,7 @@ CUTS = (
     "twin.orbit.calibration.flown_campaign._simulated_points",
     "twin.orbit.calibration.calibration_run.campaign_of",
     "twin.orbit.calibration.field_images.Imager.measured",
-    "twin.orbit.monitoring.monitoring_flight._changes",
+    "twin.orbit.monitoring.monitoring_run._changes",
     "twin.orbit.images.simulate_run.fly_patch",
     "twin.orbit.export.export_run._exported",
     "twin.orbit.conventions.check_run._searched",

@@ -12,7 +12,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.specs import load
 from scenes.specs.camera import CameraSpec
-from scenes.specs.orbit.setup import resolve_angle, resolve_loop, resolve_monitor, resolve_simulate
+from scenes.specs.orbit.setup import resolve_angle, resolve_monitor, resolve_simulate
 from scenes.specs.resolved import resolve, resolve_focus
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import Spec, validate
@@ -56,7 +56,7 @@ disturbances:
     ("read", "file"),
     [
         *((resolve_angle, f"{load.ORBIT}/{name}.yaml") for name in ("angle", "angle_gf7", "angle_off_axis")),
-        *((resolve_loop, f"{load.ORBIT}/loop.yaml"), (resolve_monitor, f"{load.ORBIT}/monitor.yaml")),
+        *((resolve_monitor, f"{load.ORBIT}/{name}.yaml") for name in ("loop", "monitor")),
         *((resolve_simulate, f"{load.ORBIT}/simulate.yaml"), (resolve_focus, f"{load.LAB}/focus.yaml")),
         *((resolve, "examples/perturb.yaml"), (resolve, CAUSES)),
     ],

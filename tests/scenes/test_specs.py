@@ -135,11 +135,11 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
 
 
 def test_a_loop(tmp_path: Path) -> None:
-    setup = orbit_setup.resolve_loop(write(tmp_path, good("loop")))
+    setup = orbit_setup.resolve_monitor(write(tmp_path, good("loop")))
     test = setup.test
     assert setup.disturbances.name == "orbit"
-    assert test.readings.times == (0.0, 600.0, 1200.0)
-    pointing, roll, focus = (test.corrections[name] for name in ("pointing", "roll", "focus"))
+    assert test.times == (0.0, 600.0, 1200.0)
+    pointing, roll, focus = (test.loop.corrections[name] for name in ("pointing", "roll", "focus"))
     assert pointing.smallest == pytest.approx(0.05 * ARCSEC, rel=1e-12)
     # whole steps alone: 40 of them
     assert pointing.largest == pytest.approx(2.0 * ARCSEC, rel=1e-12)

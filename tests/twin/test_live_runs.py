@@ -25,7 +25,7 @@ from twin.live.source import Source, read_source
 from twin.main_job.job_tables import config_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
-from twin.orbit.monitoring.monitoring_flight import states_of
+from twin.orbit.monitoring.monitor_series import states_of
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.scripting.instrument_twin import InstrumentTwin
 from twin.study.runs.base_job import with_values

@@ -9,16 +9,27 @@ import pytest
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.unseen_motions import unseen_modes
 from scenes.models.disturbances import state_of
-from scenes.specs.orbit.loop import CorrectionSpec, LoopImagesSpec
-from scenes.specs.orbit.setup import LoopSetup, resolve_loop
+from scenes.specs.orbit.monitor import CorrectionSpec, LoopImagesSpec
+from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from scenes.specs.resolved import line_detector
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.loop.loop_course import Commands, LoopCourse, drifting_states, gone_through, reader
-from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model
-from twin.orbit.loop.loop_numbers import CORRECTION, LOOP
-from twin.orbit.loop.loop_report import loop_report
-from twin.orbit.loop.loop_run import LoopRun, run_loop
+from twin.orbit.monitoring.closed_loop import (
+    FOCUS_FIELDS,
+    Commands,
+    Corrector,
+    LoopCourse,
+    LoopModel,
+    defocus,
+    drifting_states,
+    gone_through,
+    loop_model,
+    reader,
+)
+from twin.orbit.monitoring.loop_run import LoopRun
+from twin.orbit.monitoring.monitoring_numbers import CORRECTION, LOOP
+from twin.orbit.monitoring.monitoring_report import monitor_report
+from twin.orbit.monitoring.monitoring_run import run_monitor
 from twin.run.provenance import negative_verdicts
 
 ARCSEC = np.pi / 648000.0
@@ -84,16 +95,16 @@ def test_gain_nothing_dead_bands_and_the_open_loop_leave_mechanisms_alone() -> N
 
 
 @pytest.fixture(scope="module")
-def setup(tmp_path_factory) -> LoopSetup:
-    return resolve_loop(Path(__file__).with_name("orbit_loop.yaml"))
+def setup(tmp_path_factory) -> MonitorSetup:
+    return resolve_monitor(Path(__file__).with_name("orbit_loop.yaml"))
 
 
 @pytest.fixture(scope="module")
-def model(setup: LoopSetup, backend) -> LoopModel:
+def model(setup: MonitorSetup, backend) -> LoopModel:
     return loop_model(setup, MonitorExperiment(setup.resolved, backend))
 
 
-def course_of(setup: LoopSetup, model: LoopModel, still: bool = False, **changed: dict) -> LoopCourse:
+def course_of(setup: MonitorSetup, model: LoopModel, still: bool = False, **changed: dict) -> LoopCourse:
     """A rendered course, with other keys of some corrections."""
     own = tuple(replace(one, spec=one.spec.model_copy(update=changed.get(one.name, {}))) for one in model.correctors)
     loop = LoopModel(model.experiment, model.stated, own)
@@ -102,41 +113,42 @@ def course_of(setup: LoopSetup, model: LoopModel, still: bool = False, **changed
 
 
 @pytest.fixture(scope="module")
-def left_alone(setup: LoopSetup, model: LoopModel) -> LoopCourse:
+def left_alone(setup: MonitorSetup, model: LoopModel) -> LoopCourse:
     return course_of(setup, model, still=True)
 
 
 @pytest.fixture(scope="module")
-def perfect(setup: LoopSetup, model: LoopModel) -> LoopCourse:
+def perfect(setup: MonitorSetup, model: LoopModel) -> LoopCourse:
     return course_of(setup, model)
 
 
 @pytest.fixture(scope="module")
-def idle(setup: LoopSetup, backend) -> LoopRun:
+def idle(setup: MonitorSetup, backend) -> LoopRun:
     """A whole run, with images, whose corrections all have gain 0."""
     test = setup.test
-    still = {name: one.model_copy(update={"gain": 0.0}) for name, one in test.corrections.items()}
+    still = {name: one.model_copy(update={"gain": 0.0}) for name, one in test.loop.corrections.items()}
     images = LoopImagesSpec.model_validate(
         {"times": ["10 min"], "side": 200, "points": {"control": 0, "tie": 20, "reach": 10}}
     )
-    readings = test.readings.model_copy(update={"count": 2})
-    parts = {"test": test.model_copy(update={"corrections": still, "images": images, "readings": readings})}
+    readings = test.loop.readings.model_copy(update={"count": 2})
+    loop = test.loop.model_copy(update={"corrections": still, "images": images, "readings": readings})
     sheets = {name: line_detector(one) for name, one in setup.cameras.items()}
-    return run_loop(setup.model_copy(update={**parts, "line_detectors": sheets}), backend, 3)
+    parts = {"test": test.model_copy(update={"mechanisms": loop}), "line_detectors": sheets}
+    return run_monitor(setup.model_copy(update=parts), backend, 3)
 
 
 @pytest.mark.second
 def test_a_loop_near_its_limit_or_that_makes_anything_worse_leads_the_verdict(idle: LoopRun) -> None:
     """Changes of cameras a fifth larger with the loop closed, and foci half of a percent, of which nobody speaks."""
-    told = loop_report(idle)
+    told = monitor_report(idle)
     assert not told.warnings
-    near = loop_report(replace(idle, margin=1.03, radius=0.99))
+    near = monitor_report(replace(idle, margin=1.03, radius=0.99))
     assert near.verdict.startswith("The loop is barely stable; with the loop closed")
     assert near.warnings[0].startswith(
         "the loop is barely stable: gains of 1.03 times the stated ones make it unstable"
     )
     assert negative_verdicts(LOOP(replace(idle, margin=1.03, radius=0.99))) == ["margins_hold"]
-    lost = loop_report(replace(idle, margin=0.9, radius=1.1))
+    lost = monitor_report(replace(idle, margin=0.9, radius=1.1))
     assert lost.verdict.startswith("The loop is unstable; ")
     assert lost.warnings[0].startswith(
         "the loops together are unstable: largest eigenvalue 1.1; gains below 0.900 times"
@@ -152,7 +164,7 @@ def test_a_loop_near_its_limit_or_that_makes_anything_worse_leads_the_verdict(id
     assert len(worse.worse) == 1 + moved[: 4 * cameras].sum()
     for free, left in worse.worse.values():
         assert left == pytest.approx(1.2 * free, rel=1e-12)
-    told = loop_report(worse)
+    told = monitor_report(worse)
     assert told.verdict.startswith("The loop makes angle, d_alpha of forward, ")
     assert "the loop makes angle worse: its error, RMS over the moments, is 1.20 times" in told.warnings[0]
     assert LOOP(worse)["made_worse"] == list(worse.worse)

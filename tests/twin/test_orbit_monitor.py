@@ -12,7 +12,8 @@ from optics.geometry.tree import Motion
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
-from twin.orbit.monitoring.monitoring_run import rms, run_monitor
+from twin.orbit.monitoring.monitoring_run import run_monitor
+from twin.orbit.monitoring.pair_flight import rms
 from twin.run.procedure import silent
 
 ARCSEC = np.pi / 648000
@@ -215,6 +216,3 @@ def test_smoothed_heights(stated) -> None:
         assert one.agrees
         assert one.consistency.agrees
         assert one.consistency.degrees % 8 == 0
-
-
-# The command

@@ -23,7 +23,6 @@ from twin.orbit.export.ground_accuracy import TOGETHER
 from twin.orbit.export.polynomial_control import residual_sigma
 from twin.orbit.export.quality_sections import quality_answers
 from twin.orbit.images import simulate_report
-from twin.orbit.loop import loop_report
 from twin.orbit.matching import match_report
 from twin.orbit.monitoring import monitoring_report
 from twin.orbit.monitoring.monitoring_numbers import PROPAGATION, SMOOTHING
@@ -78,7 +77,7 @@ WARNINGS: dict[str, Callable[[Any], Any]] = {
     "steps": lambda run: influences.step_warnings(run.all),
     "angle": angle_report._warnings,
     "monitor": monitoring_report._warnings,
-    "loop": loop_report._warnings,
+    "loop": monitoring_report._loop_warnings,
     "distortion": lambda run: distortion_report._warnings(run, run.data),
     "focus": lambda run: focus_report._warnings(run, run.data),
     "turntable": lambda run: turntable_report._warnings(run, run.data),

@@ -214,6 +214,9 @@ def _of_measurement(file: Path) -> Source:
 def _of_orbit(file: Path) -> Source:
     """A monitored orbit as a course, its motions in steps among it."""
     setup = resolve_monitor(file)
+    if setup.test.course is None:
+        problem = "the motions of this orbit are drawn, and there is no course that could be shown"
+        raise setup.test.error(problem, ("mechanisms", "readings"), allowed="a course")
     note = "changes are told against the instrument as designed, and not against the reference time of the orbit's test"
     return Source(_with_motions(setup), about="a monitored orbit", notes=(note,))
 
@@ -230,7 +233,7 @@ def _with_motions(setup: MonitorSetup) -> ResolvedJob:
     plain = resolved.plain()
     motions: dict[str, Any] = {}
     for node, motion in test.motion.items():
-        shares = [motion.share(time) for time in test.course.times]
+        shares = [motion.share(time) for time in test.times]
         motions[node] = {"pivot": motion.pivot}
         for name, kind, values in (("rotate", ANGLE, motion.rotate), ("shift", LENGTH, motion.shift)):
             if any(values):

@@ -23,7 +23,7 @@ PROGRAMS = {
     "recover": ("twin.recover", "recover the same from measured frames"),
     "live": ("twin.live", "the twin in a browser: turn a knob, the spots move"),
     "lab": ("twin.lab", "laboratory tests: focus, distortion, turntable"),
-    "orbit": ("twin.orbit", "adjust, angle, calibrate, check, export, jitter, loop, match, monitor, simulate"),
+    "orbit": ("twin.orbit", "adjust, angle, calibrate, check, export, jitter, match, monitor, simulate"),
     "study": ("twin.study", "vary any key of a job; statistics, sensitivities, gradients"),
     "design": ("twin.design", "optimise a camera, or find the layout of a monitor"),
     "tolerance": ("twin.tolerance", "tolerances with compensators: sensitivities, yield, allocation"),

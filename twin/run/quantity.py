@@ -23,7 +23,19 @@ from twin.run.data_files import DataColumn, DataTable
 S = TypeVar("S")
 T = TypeVar("T")
 _PER_SI: Mapping[str, float] = FrozenMap(
-    {"pm": 1e12, "nm": 1e9, "um": 1e6, "mm": 1e3, "m": 1.0, "km": 1e-3, "us": 1e6, "ms": 1e3, "mK": 1e3, "mW": 1e3}
+    {
+        "pm": 1e12,
+        "nm": 1e9,
+        "um": 1e6,
+        "mm": 1e3,
+        "m": 1.0,
+        "km": 1e-3,
+        "us": 1e6,
+        "ms": 1e3,
+        "min": 1.0 / 60.0,
+        "mK": 1e3,
+        "mW": 1e3,
+    }
     | {"percent": 1e2, "ppm": 1e6, "urad": 1e6, "mrad": 1e3}
 )
 """Unit -> how many of it are one of SI; units that are missing here and below are those of the source."""

@@ -156,16 +156,11 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "offset along, across, down": "true minus measured station in the mean body axes of the pass",
         },
         "monitor": {
-            "times_s, reference_time_s, monitored_times_s": "seconds from the epoch in UTC of the orbit in config.yaml",
-            "cameras": _CAMERA,
-            "intersection_angle": _ANGLE,
-            "height, plan": "local horizon of each point: up, and east and north together",
-        },
-        "loop": {
-            "times_s, held_s": "seconds from the epoch in UTC of the orbit in config.yaml",
-            "quantity, positions": _CAMERA,
-            "angle": _ANGLE,
-            "height": "local horizon of each point, up: found minus true",
+            "times_s, reference_time_s, monitored_times_s, held_s": "seconds from the epoch in UTC of the orbit in "
+            "config.yaml",
+            "cameras, quantity, positions": _CAMERA,
+            "intersection_angle, angle": _ANGLE,
+            "height, plan": "local horizon of each point: up, and east and north together; found minus true",
             "defocus, told_um": "best focus less line CCD along the light, positive downstream",
         },
         "simulate": {

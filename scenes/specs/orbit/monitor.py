@@ -1,5 +1,6 @@
-"""What on-board monitoring buys on the ground (papers 001, 000, 003), as a file in scenes/orbit gives it: a course of
-temperatures and motions of a stereo pair along an orbit, monitoring at an interval, points intersected without control.
+"""What on-board monitoring buys on the ground (papers 001, 000, 003), as a file in scenes/orbit gives it: a stereo pair
+whose cameras move along an orbit, monitored at an interval or in a loop with mechanisms; points intersected without
+control.
 """
 
 import math
@@ -12,19 +13,39 @@ from pydantic import AfterValidator, Field, model_validator
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.spans import number_of
 from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment, no_such_time
-from scenes.specs.disturbances import JobDisturbances
+from scenes.specs.disturbances import JobDisturbances, component_named
 from scenes.specs.job import AnalysisSpec, JobSpec, PerturbationSpec, RenderSpec, checked_nodes
 from scenes.specs.orbit.angle import Relief, TerrainHeight, check_ends
-from scenes.specs.orbit.calibration import Count, FieldLength, LineTime
+from scenes.specs.orbit.calibration import Count, FieldLength, LineTime, Side
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
+from scenes.specs.orbit.scene import GroundSpec as SceneGroundSpec
+from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.specs.perturbation import NodeInfo, PlainPerturbationSpec, perturbation_issues
-from scenes.yaml.errors import InputError, Problem
+from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Flag, Name, NothingIsEmpty, Number, Paths, Reference, Seed, Spec, TitledSpec, Whole
-from scenes.yaml.units import MOMENT
+from scenes.yaml.spec import (
+    Flag,
+    Name,
+    Named,
+    NothingIsEmpty,
+    Number,
+    Paths,
+    Reference,
+    Seed,
+    Spec,
+    Text,
+    TitledSpec,
+    Whole,
+)
+from scenes.yaml.units import ANGLE, LENGTH, MOMENT, Kind, parse_quantity
 
 _EVEN = 1e-6
 """Seconds; steps between times that differ by less are equal."""
+_WHOLE = 1e-9
+"""Of a step, by which a range is rounded to whole ones."""
+_KINDS: dict[str, Kind] = {"rotate": ANGLE, "shift": LENGTH}
+"""Kind of a mechanism's motion -> what its steps measure."""
+_QUANTITIES: dict[str, Kind] = {"d_alpha": ANGLE, "d_beta": ANGLE, "d_gamma": ANGLE, "d_f": LENGTH, "defocus": LENGTH}
 
 Span = Annotated[float, Quantity(MOMENT, smallest="0 s", largest="100000 h")]
 Interval = Annotated[float, Quantity(MOMENT, above_zero=True, largest="100000 h")]
@@ -124,8 +145,155 @@ class MonitorErrorsSpec(ErrorsSpec):
     switched_on: Flag = True
 
 
+class CorrectionSpec(Spec):
+    """What acts on one quantity of the posterior.
+
+    With every reading the command changes by `gain` times what the posterior says is left of the quantity, over what
+    the mechanism does to it.
+
+    Attributes:
+        camera: whose quantity it is.
+        quantity: `d_alpha`, `d_beta`, `d_gamma`, `d_f`, or `defocus`, best focus less line CCD.
+        mechanism: the motion of a body that corrects it, in words without amount: `forward/focal_plane shift z`; by
+            default the line of sight is corrected in the processing of the images on the ground, and no body moves.
+        gain: share of what is left that one reading corrects.
+        delay: readings after which a command has its effect; 0 for at once, before the images of that moment.
+        step: the mechanism moves by whole steps, with unit; by default it moves by any amount.
+        range: to either side of where it stands at the beginning, with unit; none by default.
+        dead_band: what is left and is smaller is left alone, in the quantity's unit.
+        response: what the mechanism does over what it is known to do; the estimate does not know it.
+    """
+
+    camera: Name
+    quantity: Literal["d_alpha", "d_beta", "d_gamma", "d_f", "defocus"]
+    mechanism: Text | None = None
+    gain: Annotated[Number, Field(ge=0.0, le=4.0)]
+    delay: Annotated[Whole, Field(ge=0, le=20)] = 0
+    step: Text | None = None
+    range: Text | None = None
+    dead_band: Text | None = None
+    response: Annotated[Number, Field(gt=0.0, le=4.0)] = 1.0
+
+    @model_validator(mode="after")
+    def _can_be(self) -> "CorrectionSpec":
+        if self.mechanism is None and self.quantity == "defocus":
+            allowed = "mechanism: the motion of a body, as forward/focal_plane shift z"
+            raise Problem("no processing corrects the focus", "no mechanism", allowed, within=("quantity",))
+        if self.mechanism is None and self.response != 1.0:
+            allowed = "no response, or a mechanism"
+            raise Problem(
+                "a correction by processing does what it says", str(self.response), allowed, None, ("response",)
+            )
+        try:
+            kind = self.motion[1]
+        except Problem as problem:
+            raise problem.below("mechanism") from None
+        if self.mechanism is not None and kind not in _KINDS:
+            raise Problem("no motion of a mechanism", shown(kind), "rotate or shift, and an axis", None, ("mechanism",))
+        for key in ("step", "range", "dead_band"):
+            self._size(key)
+        if self.largest == 0.0:
+            raise Problem("less than one step", shown(self.range), f"{self.step} or more", None, ("range",))
+        return self
+
+    @property
+    def motion(self) -> tuple[str, str, str, str]:
+        """Node, kind, axis and pivot of the mechanism; empty for none."""
+        return ("", "", "", "") if self.mechanism is None else component_named(self.mechanism)
+
+    def kind_of(self, key: str) -> Kind:
+        """What ``step``, ``range`` or ``dead_band`` measures."""
+        own = self.mechanism is not None and key != "dead_band"
+        return _KINDS[self.motion[1]] if own else _QUANTITIES[self.quantity]
+
+    def _size(self, key: str) -> float | None:
+        text = getattr(self, key)
+        if text is None:
+            return None
+        kind = self.kind_of(key)
+        try:
+            value = parse_quantity(text, kind)
+        except Problem as problem:
+            raise problem.below(key) from None
+        if not value > 0.0:
+            raise Problem("not greater than zero", shown(text), kind.allowed, None, (key,))
+        return value
+
+    @property
+    def smallest(self) -> float | None:
+        """The step, rad or m."""
+        return self._size("step")
+
+    @property
+    def largest(self) -> float | None:
+        """The range to either side, rad or m; of a mechanism of steps that of its whole steps."""
+        reach, step = self._size("range"), self._size("step")
+        return reach if reach is None or step is None else step * math.floor(reach / step + _WHOLE)
+
+    @property
+    def band(self) -> float:
+        """The dead band, rad or m of the quantity."""
+        return self._size("dead_band") or 0.0
+
+
+class ReadingsSpec(Spec):
+    """When the spots are read, and images are taken just after.
+
+    Attributes:
+        begin: of the first, seconds from the orbit's epoch.
+        every: from one to the next.
+        count: how many.
+    """
+
+    begin: Moment = 0.0
+    every: Interval
+    count: Annotated[Whole, Field(ge=2, le=1000)]
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Seconds from the orbit's epoch."""
+        return tuple(self.begin + self.every * k for k in range(self.count))
+
+
+class LoopImagesSpec(Spec):
+    """Pairs of line images, rendered after some of the readings with the loop open and closed.
+
+    Attributes:
+        times: of these readings, seconds from the orbit's epoch.
+        side: lines and pixels of every image.
+        ground: what is there.
+        points: how points of the second camera's image are sought in the first one's; `tie` says how many.
+    """
+
+    times: Annotated[tuple[Moment, ...], Field(min_length=1, max_length=20)]
+    side: Annotated[Side, Field(le=2000)] = 400
+    ground: SceneGroundSpec = SceneGroundSpec()
+    points: ImagePointsSpec = ImagePointsSpec.model_validate({"control": 0, "tie": 60, "reach": 16})
+
+    @model_validator(mode="after")
+    def _has_ties(self) -> "LoopImagesSpec":
+        if not self.points.tie:
+            raise Problem("no points of one image are sought in the other", "tie: 0", "some", None, ("points", "tie"))
+        return self
+
+
+class MechanismsSpec(Spec):
+    """Mechanisms that point and refocus by what the monitor's readings say, beside the same pair left alone.
+
+    Attributes:
+        readings: when the spots are read where the file has no course: amounts of what is stated to move are then drawn
+            by its laws in time. With a course they are read at each of its times.
+        corrections: name -> what acts on what the readings say.
+        images: pairs of line images; none without this section.
+    """
+
+    readings: ReadingsSpec | None = None
+    corrections: Annotated[Named[CorrectionSpec], Field(min_length=1, max_length=50)]
+    images: LoopImagesSpec | None = None
+
+
 class OrbitMonitorSpec(TitledSpec):
-    """Height errors along an orbit with and without on-board monitoring.
+    """Height errors along an orbit with and without on-board monitoring, or with mechanisms that act on its readings.
 
     Attributes:
         name: as the file is called.
@@ -134,8 +302,9 @@ class OrbitMonitorSpec(TitledSpec):
         cameras: the two that make the stereo pair; the first is turned against the second. All of the instrument's when
             it has two.
         perturb: node -> a constant perturbation against the nominal instrument, as in a job.
-        course: evenly spaced times from the orbit's epoch, with temperatures.
-        motion: node -> how it moves.
+        course: evenly spaced times from the orbit's epoch, with temperatures. Mechanisms have `readings` in its place
+            where amounts are drawn.
+        motion: node -> how it moves, which no estimate knows.
         reference: one of the times, at which the cameras were calibrated and the monitor's reference images were taken.
         disturbances: what is expected to move, and how it goes on in time, as in a job: the monitor's values and their
             sigmas rest on it. The instrument's by default.
@@ -144,11 +313,12 @@ class OrbitMonitorSpec(TitledSpec):
             stated, all measurements are smoothed together, too.
         intervals: that are compared; by default all that divide the course.
         apply: which of the monitor's values correct the cameras.
+        mechanisms: in place of `reference` and `interval`: the loop is closed, and every reading is acted upon.
         frames: of one measurement; as many as the instrument's monitor takes by default.
         analysis: how the monitor's images are analysed.
         repeats: how often a measurement is repeated with noise drawn anew, for the scatter.
         earth: its rotation.
-        orbit: true orbit, over the course and a minute more at either end.
+        orbit: true orbit, over all times and a minute more at either end.
         attitude: true attitude.
         line_time: from one image line to the next, seconds.
         ground: check points.
@@ -159,13 +329,14 @@ class OrbitMonitorSpec(TitledSpec):
     instrument: Reference
     cameras: tuple[Name, ...] | None = None
     perturb: Paths[PlainPerturbationSpec] = Field(default_factory=FrozenMap)
-    course: CourseSpec
+    course: CourseSpec | None = None
     motion: Paths[MotionSpec] = Field(default_factory=FrozenMap)
-    reference: Moment
+    reference: Moment | None = None
     disturbances: JobDisturbances | None = None
-    interval: Interval
+    interval: Interval | None = None
     intervals: tuple[Interval, ...] | None = None
     apply: Annotated[tuple[Parameter, ...], AfterValidator(_once)] = PARAMETERS
+    mechanisms: MechanismsSpec | None = None
     frames: Frames | None = None
     analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec.model_construct()
     repeats: Repeats = 40
@@ -179,34 +350,63 @@ class OrbitMonitorSpec(TitledSpec):
 
     @model_validator(mode="after")
     def _times_fit(self) -> "OrbitMonitorSpec":
-        if self.course.motion or self.course.table is not None:
-            name = "motion" if self.course.motion else "table"
-            allowed = "times and temperature under course; motions under the test's own motion"
-            raise Problem(f"the course of this test has no {name}", None, allowed, within=("course", name))
-        times = self.course.times
-        steps = [b - a for a, b in pairwise(times)]
-        for k, step in enumerate(steps):
-            if abs(step - steps[0]) > _EVEN:
-                found = f"{moment(times[k])} to {moment(times[k + 1])} after steps of {moment(steps[0])}"
-                raise Problem(
-                    "the times are not evenly spaced", found, "equal steps", within=("course", "times", k + 1)
-                )
-        for k, time in enumerate(times):
-            if wrong := self.orbit.misses(time):
-                raise wrong.below("course", "times", k)
-        if number_of(self.reference, times) is None:
-            raise no_such_time(self.reference, times, "one of course.times").below("reference")
-        self._check_interval(self.interval, ("interval",))
-        for k, interval in enumerate(self.intervals or ()):
-            self._check_interval(interval, ("intervals", k))
         if self.cameras is not None and (len(self.cameras) != 2 or len(set(self.cameras)) != 2):
             found = ", ".join(self.cameras) or "none"
             raise Problem("not a pair of cameras", found, "two different cameras", within=("cameras",))
+        self._require_keys()
+        if self.course is not None:
+            self._check_course(self.course)
+        for k, time in enumerate(self.times):
+            if wrong := self.orbit.misses(time):
+                raise wrong.below(*self.times_key, *(() if self.course is None else ("times", k)))
+        if self.mechanisms is None:
+            if number_of(self.reference_time, self.times) is None:
+                raise no_such_time(self.reference_time, self.times, "one of course.times").below("reference")
+            self._check_interval(self.every, ("interval",))
+            for k, interval in enumerate(self.intervals or ()):
+                self._check_interval(interval, ("intervals", k))
+        elif self.mechanisms.images is not None:
+            for k, time in enumerate(self.mechanisms.images.times):
+                if number_of(time, self.times) is None:
+                    wrong = no_such_time(time, self.times, "the time of a reading")
+                    raise wrong.below("mechanisms", "images", "times", k)
         return self
 
-    def _check_interval(self, interval: float, key: tuple[str | int, ...]) -> None:
+    def _require_keys(self) -> None:
+        """Problem unless the file has either what monitoring needs, or what a loop needs."""
+        loop = self.mechanisms
+        for key in ("course", "reference", "interval"):
+            if loop is None and getattr(self, key) is None:
+                raise Problem(f"'{key}' is missing", None, f"{key}, or mechanisms where the loop is closed")
+        if loop is None:
+            return
+        for key in ("reference", "interval", "intervals", "apply", "repeats"):
+            if getattr(self, key) != type(self).model_fields[key].default:
+                problem = f"mechanisms act on every reading, and a loop has no {key}"
+                raise Problem(problem, None, f"{key} or mechanisms, not both", within=(key,))
+        if self.perturb and self.course is None:
+            problem = "drawn amounts are those of the instrument as designed, without a perturbation"
+            raise Problem(problem, None, "perturb with a course", within=("perturb",))
+        if (self.course is None) is (loop.readings is None):
+            found = "neither" if loop.readings is None else "both"
+            allowed = "readings: {every: 4 min, count: 25}, or the file's course"
+            raise Problem("the times of the readings", found, allowed, within=("mechanisms",))
+
+    def _check_course(self, course: CourseSpec) -> None:
+        """Problem unless its times are evenly spaced, and all that moves stands under the test's own motion."""
+        if course.motion or course.table is not None:
+            name = "motion" if course.motion else "table"
+            allowed = "times and temperature under course; motions under the test's own motion"
+            raise Problem(f"the course of this test has no {name}", None, allowed, within=("course", name))
+        steps = [b - a for a, b in pairwise(course.times)]
+        for k, step in enumerate(steps):
+            if abs(step - steps[0]) > _EVEN:
+                found = f"{moment(course.times[k])} to {moment(course.times[k + 1])} after steps of {moment(steps[0])}"
+                raise Problem("the times are not evenly spaced", found, "equal steps", None, ("course", "times", k + 1))
+
+    def _check_interval(self, interval: float, key: KeyPath) -> None:
         """Problem unless the interval is a multiple of the step and not longer than the course."""
-        step, span = self.step, self.course.times[-1] - self.course.times[0]
+        step, span = self.step, self.times[-1] - self.times[0]
         if interval > span + _EVEN:
             raise Problem("longer than the course", moment(interval), f"at most {moment(span)}", within=key)
         if abs(interval - step * round(interval / step)) > _EVEN or interval < step - _EVEN:
@@ -216,34 +416,60 @@ class OrbitMonitorSpec(TitledSpec):
             )
 
     @property
+    def loop(self) -> MechanismsSpec:
+        """The mechanisms of a test that has some."""
+        assert self.mechanisms is not None
+        return self.mechanisms
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Times of the course, or of the readings of a loop without one, seconds from the orbit's epoch."""
+        if self.course is not None:
+            return self.course.times
+        assert self.loop.readings is not None
+        return self.loop.readings.times
+
+    @property
+    def times_key(self) -> KeyPath:
+        """Where the file has its times."""
+        return ("mechanisms", "readings") if self.course is None else ("course",)
+
+    @property
     def step(self) -> float:
-        """Between the course's times, seconds."""
-        return self.course.times[1] - self.course.times[0]
+        """Between the times, seconds."""
+        return self.times[1] - self.times[0]
+
+    @property
+    def every(self) -> float:
+        """From one measurement of the monitor to the next, seconds."""
+        assert self.interval is not None
+        return self.interval
 
     @property
     def compared(self) -> tuple[float, ...]:
         """Intervals of the comparison, ascending, seconds."""
         if self.intervals is not None:
             return tuple(sorted(set(self.intervals)))
-        count = len(self.course.times) - 1
+        count = len(self.times) - 1
         return tuple(self.step * n for n in range(1, count + 1) if count % n == 0)
 
     @property
     def referred(self) -> int:
         """Number of the reference time, from 0."""
-        number = number_of(self.reference, self.course.times)
+        number = number_of(self.reference_time, self.times)
         assert number is not None
         return number
 
     @property
     def reference_time(self) -> float:
-        """Return the course's time that is the reference, seconds."""
-        return self.course.times[self.referred]
+        """Time at which the cameras were calibrated, seconds."""
+        assert self.reference is not None
+        return self.reference
 
     def measured(self, interval: float) -> list[int]:
         """Numbers of the times at which the monitor measures at this interval: from the reference on, to both sides."""
         every = round(interval / self.step)
-        return [k for k in range(len(self.course.times)) if (k - self.referred) % every == 0]
+        return [k for k in range(len(self.times)) if (k - self.referred) % every == 0]
 
     @property
     def job(self) -> JobSpec:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
 
 from pydantic import Field
 
@@ -15,13 +14,11 @@ from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.job import JobSpec
 from scenes.specs.orbit.angle import LINES, OrbitAngleSpec, usual_angles
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.flight import PayloadTestSpec
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec
-from scenes.specs.orbit.loop import OrbitLoopSpec
-from scenes.specs.orbit.monitor import OrbitMonitorSpec
+from scenes.specs.orbit.monitor import MechanismsSpec, OrbitMonitorSpec
 from scenes.specs.orbit.scene import LineImageSpec
 from scenes.specs.orbit.simulate import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
@@ -30,8 +27,6 @@ from scenes.yaml.errors import KeyPath, names_text, unknown
 from scenes.yaml.spec import Paths, Spec
 from scenes.yaml.units import ANGLE, format_quantity
 from scenes.yaml.yaml_file import read_yaml
-
-PairTest = TypeVar("PairTest", OrbitMonitorSpec, OrbitLoopSpec)
 
 
 def load_three_line_camera(name_or_path: str | Path) -> ThreeLineCameraSpec:
@@ -208,7 +203,7 @@ def resolve_calibration(path: str | Path) -> CalibrationSetup:
     return setup
 
 
-class PairSetup(ExperimentSetup[PairTest]):
+class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
     """A stereo pair along its orbit, monitored, with its instrument.
 
     Attributes:
@@ -216,12 +211,14 @@ class PairSetup(ExperimentSetup[PairTest]):
         cameras: what the instrument's cameras are called -> prescription.
         detector: data sheet of the monitor's area CCDs.
         disturbances: what is stated to move, None for nothing.
+        line_detectors: as cameras -> data sheet of the line CCD that images; None where no line images are rendered.
     """
 
     instrument: InstrumentSpec
     cameras: Paths[CameraSpec]
     detector: DetectorSpec
     disturbances: DisturbancesSpec | None = None
+    line_detectors: Paths[DetectorSpec] | None = None
 
     @property
     def resolved(self) -> ResolvedJob:
@@ -242,70 +239,47 @@ class PairSetup(ExperimentSetup[PairTest]):
         return first, second
 
 
-class MonitorSetup(PairSetup[OrbitMonitorSpec]):
-    """A monitored orbit with its instrument."""
-
-
-class LoopSetup(PairSetup[OrbitLoopSpec]):
-    """A monitor in a loop with mechanisms, with its instrument.
-
-    Attributes:
-        line_detectors: what the instrument's cameras are called -> data sheet of the line CCD that images; empty where
-            none are rendered.
-    """
-
-    line_detectors: Paths[DetectorSpec] = Field(default_factory=FrozenMap)
-
-
 def resolve_monitor(path: str | Path) -> MonitorSetup:
     """Read a monitored orbit and the instrument it refers to; a run's config.yaml can be given in its place.
 
     Raises:
-        InputError: a file cannot be read or is not valid, or test and instrument do not fit.
+        InputError: a file cannot be read or is not valid, test and instrument do not fit, or nothing is stated to move
+            that mechanisms could act on.
     """
     setup = read_setup(MonitorSetup, path)
     if setup is None:
         test = load.load_named(OrbitMonitorSpec, load.ORBIT, path)
-        setup = MonitorSetup.model_construct(test=test, **_parts_of(test.job))
+        parts = dict(resolve_job(test.job))
+        sheets = None
+        if test.mechanisms is not None and test.mechanisms.images is not None:
+            sheets = FrozenMap({name: line_detector(camera) for name, camera in parts["cameras"].items()})
+        parts = {key: parts[key] for key in ("instrument", "cameras", "detector", "disturbances")}
+        setup = MonitorSetup.model_construct(test=test, line_detectors=sheets, **parts)
     _require_pair(setup.test, setup.instrument, setup.cameras)
+    if setup.test.mechanisms is not None:
+        _require_mechanisms(setup, setup.test.mechanisms)
     return setup
 
 
-def resolve_loop(path: str | Path) -> LoopSetup:
-    """Read a monitor in a loop and the instrument it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: a file cannot be read or is not valid, test and instrument do not fit, or nothing is stated to move.
-    """
-    setup = read_setup(LoopSetup, path)
-    if setup is None:
-        test = load.load_named(OrbitLoopSpec, load.ORBIT, path)
-        parts = _parts_of(test.job)
-        sheets = {} if test.images is None else {name: line_detector(one) for name, one in parts["cameras"].items()}
-        setup = LoopSetup.model_construct(test=test, line_detectors=FrozenMap(sheets), **parts)
+def _require_mechanisms(setup: MonitorSetup, loop: MechanismsSpec) -> None:
+    """InputError unless something is stated to move, mechanisms act on the pair, and its images have data sheets."""
     test = setup.test
-    _require_pair(test, setup.instrument, setup.cameras)
     if setup.disturbances is None:
         problem = "nothing is stated to move, so that spots say nothing of what to correct"
         raise test.error(problem, ("disturbances",), allowed="the name of a file in scenes/library/disturbances")
-    if test.images is not None and (missing := [name for name in setup.cameras if name not in setup.line_detectors]):
-        problem = f"images need the data sheet of the line CCD of camera {missing[0]!r}"
-        raise test.error(problem, ("images",), allowed="line_detectors with one for each camera")
-    for name, correction in test.corrections.items():
+    if loop.images is not None:
+        for name in setup.cameras:
+            if name not in (setup.line_detectors or {}):
+                problem = f"images need the data sheet of the line CCD of camera {name!r}"
+                allowed = "line_detectors with one for each camera"
+                raise test.error(problem, ("mechanisms", "images"), allowed=allowed)
+    for name, correction in loop.corrections.items():
         if correction.camera not in setup.pair:
             wrong = unknown("no camera of the pair", correction.camera, setup.pair)
-            raise test.error(wrong, ("corrections", name, "camera"))
-    return setup
+            raise test.error(wrong, ("mechanisms", "corrections", name, "camera"))
 
 
-def _parts_of(job: JobSpec) -> dict[str, Any]:
-    held = dict(resolve_job(job))
-    return {key: held[key] for key in ("instrument", "cameras", "detector", "disturbances")}
-
-
-def _require_pair(
-    test: OrbitMonitorSpec | OrbitLoopSpec, instrument: InstrumentSpec, cameras: Paths[CameraSpec]
-) -> None:
+def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: Paths[CameraSpec]) -> None:
     """InputError unless the pair has monitors and looks two ways, and the points lie on the second line."""
     names = tuple(instrument.cameras)
     for name in names:

@@ -83,9 +83,8 @@ autocollimators = _plain(load.load_autocollimator_test)
 operation = _plain(read_operation)
 orbit, errors, study, spectrum = map(_spec, (OrbitSpec, ErrorsSpec, StudySpec, SpectrumHolder))
 camera_text = _spec(CameraSpec)
-angle, loop, monitor, simulate = map(
-    _plain,
-    (orbit_setup.resolve_angle, orbit_setup.resolve_loop, orbit_setup.resolve_monitor, orbit_setup.resolve_simulate),
+angle, monitor, simulate = map(
+    _plain, (orbit_setup.resolve_angle, orbit_setup.resolve_monitor, orbit_setup.resolve_simulate)
 )
 calibration, jitter, adjust = map(_plain, (orbit_setup.resolve_calibration, orbit_setup.resolve_jitter, resolve_adjust))
 match = _plain(resolve_match)

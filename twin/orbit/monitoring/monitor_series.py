@@ -18,13 +18,17 @@ from analysis.monitor.series_smoother import smooth, window_of
 from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SeriesNoise, SpotError
-from optics.geometry.tree import State
+from optics.geometry.tree import State, compose
 from optics.numerics.threads import cores, one_blas_thread
+from optics.thermal.heat import Temperature
+from scenes.models.job_state import motions_of
+from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import moment
 from scenes.specs.instrument import CENTRAL_PRISM
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, Record, light_of, read
 from twin.monitor.truth import Truth
+from twin.orbit.monitoring.pair_flight import TOO_FAR, moves_at
 from twin.run.procedure import BenchError
 
 if TYPE_CHECKING:
@@ -32,7 +36,43 @@ if TYPE_CHECKING:
 
 CHUNK = 25
 """States rendered at once, to bound memory."""
-TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
+
+
+def states_of(
+    experiment: MonitorExperiment,
+    spec: OrbitMonitorSpec,
+    numbers: Sequence[int] | None = None,
+    only: tuple[str, str] | None = None,
+) -> list[State]:
+    """States at times of the course.
+
+    Args:
+        experiment: the instrument.
+        spec: the test.
+        numbers: of the times, all by default.
+        only: "temperature" or "motion", and the node of the course that alone has one; the others of the course have
+            temperatures of 0 K, so that nothing is inherited. What `perturb` says stays.
+
+    Raises:
+        InputError: a temperature at or below 0 K at some time, or one at which a glass's index is not known.
+    """
+    job, bodies = spec.job, {body.path: body for body in experiment.instrument.assembly.tree.bodies}
+    course, out = spec.course, []
+    assert course is not None
+    for k in range(len(course.times)) if numbers is None else numbers:
+        time, fields = course.times[k], job.fields(k)
+        if only is not None:
+            fields = {path: field if only == ("temperature", path) else Temperature() for path, field in fields.items()}
+        try:
+            experiment.thermal.check(fields)
+            state = experiment.thermal.state(fields, motions_of(job))
+        except TemperatureError as error:
+            own = error.origin in course.temperature
+            key = ("course", *course.key(error.origin, k)) if own else ("perturb", error.origin, "temperature")
+            raise spec.error(f"{error} at {moment(time)}", key, allowed=error.allowed) from error
+        moves = {} if only is not None and only[0] == "temperature" else moves_at(spec, time, only and only[1])
+        out.append(compose(state, moves, bodies))
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +155,8 @@ class Measured:
             times: of the states, seconds.
             spots: their names.
         """
-        told = self.evidence.course_doubt([moment(time) for time in times], spots)
-        return () if told is None else (told,)
+        doubt = self.evidence.course_doubt([moment(time) for time in times], spots)
+        return () if doubt is None else (doubt,)
 
     @property
     def shifts(self) -> np.ndarray:
@@ -185,7 +225,7 @@ class MonitorSeries:
         """(T, 2 C) shifts without noise by temperatures that the file gives to the monitor's prisms themselves."""
         job = self.spec.job
         states = []
-        for k in range(len(self.spec.course.times)):
+        for k in range(len(self.spec.times)):
             own = {p: f for p, f in job.fields(k).items() if "/monitor/" in p or p.startswith(CENTRAL_PRISM)}
             states.append(self.experiment.thermal.state(own, {}))
         shifts = self.clean(states).shifts
@@ -220,7 +260,7 @@ class MonitorSeries:
             return np.asarray(every[:, self._own])
         out = []
         for k, number in enumerate(numbers):
-            one, span = slice(k, k + 1), stated.between(spec.reference_time, spec.course.times[number])
+            one, span = slice(k, k + 1), stated.between(spec.reference_time, spec.times[number])
             shifts = Shifts(before[one], after[one], measured.covariance[one], cameras, span)
             out.append(Posterior().gain(shifts)[0, self._own])
         return np.array(out)
@@ -239,7 +279,7 @@ class MonitorSeries:
         if stated is not None:
             left = []
             for gain, number in zip(gains, numbers, strict=True):
-                span = stated.between(self.spec.reference_time, self.spec.course.times[number])
+                span = stated.between(self.spec.reference_time, self.spec.times[number])
                 root = (gain @ span.spots - span.parameters[self._own]) @ span.root
                 left.append(root @ root.T)
             total = noise + np.array(left)
@@ -256,7 +296,7 @@ class MonitorSeries:
         if stated is None or noise is None:
             raise ValueError("smoother: needs stated disturbances and a series")
         at = np.array(self.spec.measured(interval))
-        times = np.array(self.spec.course.times)
+        times = np.array(self.spec.times)
         with one_blas_thread():
             found = smooth(
                 stated, times[at], measured.shifts[at], _Some(noise, at), times, reference=self.spec.reference_time
@@ -338,6 +378,6 @@ class MonitorSeries:
         except SpotError as error:
             state, spot = divmod(error.indices[0], self.experiment.calibration.spots)
             channel, reason = self.experiment.path.channels[spot].key, error.reasons[error.indices[0]]
-            time = moment(self.spec.course.times[min(numbers[state], len(self.spec.course.times) - 1)])
+            time = moment(self.spec.times[min(numbers[state], len(self.spec.times) - 1)])
             text = f"the spot {channel} cannot be measured at {time} ({reason})"
             raise BenchError(text, ("course",), TOO_FAR) from error

@@ -1,289 +1,133 @@
-"""Report of a monitored orbit: the main table, sections."""
+"""Report of a monitored orbit, with the loop open or closed."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
+from analysis.monitor import disturbances
 from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.unseen_motions import UnseenMode
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
+from scenes.yaml.errors import names_text
 from twin.monitor.time_series import jump_text
-from twin.orbit.monitoring.monitoring_numbers import MONITOR, SUMMARY
-from twin.orbit.monitoring.monitoring_plots import PART_NAMES, figure_svg
-from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
-from twin.run.artefact import SYMBOLS, Cell, SvgFigure, Table
+from twin.orbit.monitoring.loop_run import LoopRun, height_rms
+from twin.orbit.monitoring.monitoring_numbers import (
+    BY_CAMERA,
+    CAUSE,
+    CORRECTION,
+    IMAGES,
+    INTERVAL,
+    LOOP,
+    MODE,
+    MONITOR,
+    PART,
+    PASS,
+    SMOOTHED,
+    SUMMARY,
+    motions_of,
+    positions,
+)
+from twin.orbit.monitoring.monitoring_plots import PARTS, monitoring_figure
+from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun
+from twin.orbit.monitoring.pair_flight import rms
+from twin.run.artefact import SYMBOLS, CsvFile, Table, significant
+from twin.run.data_files import csv_table
+from twin.run.quantity import Record
 from twin.run.report import Report, Section, answer
 from twin.sensors.area_detector import coarse_warnings
 
-if TYPE_CHECKING:
-    from scenes.specs.orbit.setup import MonitorSetup
+_BODIES, _MOTIONS = 3, 3
+"""Bodies and motions of a mode that are named in words."""
+_LEAST = 1e-6
+"""Numbers of a mode below this are rounding."""
 
 
-def _sections(run: MonitorRun) -> tuple[Section, ...]:
-    """All parts."""
-    smoothed = (_smoothed(run),) if run.smoothing else ()
-    return (_angle(run), _height(run), *smoothed, _interval(run), _rest(run), _conversion(run), _noise(run))
-
-
-def _angle(run: MonitorRun) -> Section:
-    error = (run.angle - run.angle_change) / ARCSEC
-    text = (
-        f"Traced, the angle changes by {np.ptp(run.angle_change) / ARCSEC:.3g} arcsec over the course. The monitor "
-        f"follows it to {rms(error):.2g} arcsec RMS, {np.abs(error).max():.2g} arcsec at worst. Both are counted from "
-        f"the reference at {moment(run.flight.spec.reference)}, when the cameras were calibrated and the monitor took "
-        "its reference.",
-    )
-    figure = SvgFigure(
-        "angle",
-        "Intersection angle over the orbit",
-        f"Estimator {run.flight.estimator}, all frames.",
-        figure_svg("angle", run),
-    )
-    return Section("Intersection angle", text, (figure, *(_changes(run, name) for name in run.flight.pair)))
-
-
-def _changes(run: MonitorRun, name: str) -> Table:
-    flight = run.flight
-    rows: list[tuple[Cell, ...]] = []
-    for time, true, monitored in zip(flight.times, flight.truth[name], flight.monitored[name].vector, strict=True):
-        both = zip(true * PER_SI, monitored * PER_SI, strict=True)
-        rows.append((float(time / 60.0), *(float(v) + 0.0 for pair in both for v in pair)))
-    heads = ["time [min]"]
-    for key in PARAMETERS:
-        heads += [f"{SYMBOLS[key]} [{'µm' if key == 'd_f' else 'arcsec'}]", "monitored"]
-    return Table(
-        f"changes-{name.lower()}",
-        f"Changes of {name}, true and monitored",
-        "Since the reference.",
-        tuple(heads),
-        rows,
-        (1, *([3] * 6), 1, 1),
-    )
-
-
-def _height(run: MonitorRun) -> Section:
-    floor = run.cases["true"]
-    text = (
-        "What the cameras alone do is the difference to the true cameras with the same image points, orbit and "
-        f"attitude. True cameras leave {floor.height_rms:.3g} m in height and {floor.plan_rms:.3g} m in plan.",
-        "Attitude errors that both cameras share turn the body, not the angle: the monitor does not see them. One "
-        f"arcsecond in pitch of both makes {abs(run.conversion.of_common):.2f} m of height, for the pair does not look "
-        "evenly forward and back.",
-    )
-    caption = "Above: mean over the points. Below: all errors, with the points' noise."
-    figure = SvgFigure("height", "Height errors over the orbit", caption, figure_svg("height", run))
-    return Section("Heights with and without monitoring", text, (figure,))
-
-
-def _smoothed(run: MonitorRun) -> Section:
-    spec, stated = run.flight.spec, run.setup.disturbances
-    assert stated is not None
-    chosen = run.smoothed
-    found = chosen.consistency
-    rows: list[tuple[Cell, ...]] = [
-        (
-            float(interval / 60.0),
-            len(spec.measured(interval)),
-            one.interpolated.camera_height_rms,
-            one.case.camera_height_rms,
-            one.factor,
-            rms(one.sigma),
-            one.furthest,
-            one.consistency.chi_square / one.consistency.degrees,
-        )
-        for interval, one in run.smoothing.items()
-    ]
-    table = Table(
-        "smoothing",
-        "Heights smoothed against heights interpolated, from the same measurements",
-        "By the cameras alone, RMS over all times, metres; the sigma that the smoother states; the largest error over "
-        f"its sigma, limit {chosen.limit:.2f}; chi-square of the shifts over its degrees of freedom.",
-        ("interval [min]", "measurements", "linear [m]", "smoothed [m]", "factor", "σ [m]", "largest/σ", "χ²/n"),
-        rows,
-        (1, None, 3, 3, 2, 3, 2, 2),
-    )
-    fits = "agree" if found.agrees else "do not agree"
-    reach = "lies within" if chosen.agrees else "goes beyond"
-    text = (
-        f"All measurements together, by the prior ({stated.name}) and its time laws: the best "
-        f"linear estimate at every time. Measured every {moment(spec.interval)}, it makes the cameras' height error "
-        f"{_times(chosen.factor, 'smaller')} than values that are linear between the measurements.",
-        f"Its sigma is {rms(chosen.sigma):.2f} m RMS; the largest error is {chosen.furthest:.2f} of its sigma, which "
-        f"{reach} the limit of {chosen.limit:.2f} (false alarm at most {FALSE_ALARM:g}). Measured shifts {fits} with "
-        f"the prior: chi-square {found.chi_square:.4g} of {found.degrees} degrees of freedom, limit "
-        f"{found.limit:.4g}.",
-    )
-    caption = "Mean over the points, with the total sigma of the smoothed height."
-    figure = SvgFigure("smoothed", "Heights between the measurements", caption, figure_svg("smoothed", run))
-    return Section("Between the measurements", text, (figure, table))
-
-
-def _interval(run: MonitorRun) -> Section:
-    rows: list[tuple[Cell, ...]] = [
-        (
-            float(interval / 60.0),
-            len(run.flight.spec.measured(interval)),
-            case.height_rms,
-            case.worst,
-            case.camera_height_rms,
-            case.plan_rms,
-        )
-        for interval, case in run.intervals.items()
-    ]
-    table = Table(
-        "intervals",
-        "Height error against the monitoring interval",
-        "Measured from the reference on, linear between, held before the first and after the last; metres.",
-        ("interval [min]", "measurements", "height RMS", "worst time", "by the cameras", "plan RMS"),
-        rows,
-        (1, None, 3, 3, 3, 3),
-    )
-    figure = SvgFigure("interval", "RMS in height against the interval", "Over all times.", figure_svg("interval", run))
-    return Section("How often to measure", (), (figure, table))
-
-
-def _rest(run: MonitorRun) -> Section:
-    flight = run.flight
-    rows: list[tuple[Cell, ...]] = [
-        (PART_NAMES[name], rms(part), float(np.abs(part).max())) for name, part in run.parts.items()
-    ]
-    parts = Table(
-        "parts",
-        "Parts of the corrected cameras' height error",
-        "Metres, over all times; signed, they add up to the whole but for products of two small errors.",
-        ("part", "RMS [m]", "largest [m]"),
-        rows,
-        (None, 4, 4),
-    )
-    causes: list[tuple[Cell, ...]] = []
-    for cause in flight.causes:
-        without, left = run.cause_heights(cause)
-        errors = [float(cause.error[n][0] / ARCSEC) + 0.0 for n in flight.pair]
-        causes.append((cause.what, cause.path, without, left, *errors))
-    table = Table(
-        "causes",
-        f"Each cause alone, at {moment(float(flight.times[flight.worst]))}",
-        "Height that it makes without monitoring, and height that the monitor makes by misreading it; error of the "
-        "monitored Δα.",
-        ("cause", "node", "unmonitored [m]", "misread [m]", *(f"{n} Δα [arcsec]" for n in flight.pair)),
-        causes,
-        (None, None, 3, 3, 4, 4),
-    )
-    largest = max(run.parts, key=lambda name: rms(run.parts[name]))
-    text = (
-        f"Most of the rest comes from {PART_NAMES[largest]}, {rms(run.parts[largest]):.2g} m RMS. A prism that bends "
-        "the beam by its own temperature looks to the monitor like a camera that has turned.",
-        "The true four parameters put through the correction leave "
-        f"{1e3 * rms(run.parts['beyond_parameters']):.2g} mm RMS in height and {run.residual / ARCSEC:.2g} arcsec at "
-        "the worst place of a line: what a camera does beyond them, such as a change of distortion.",
-        *_worse(run),
-    )
-    caption = "Mean over the points; parts below 5 mm are left out."
-    figure = SvgFigure("remainder", "What the correction leaves", caption, figure_svg("remainder", run))
-    return Section("Where the rest comes from", text, (figure, parts, table))
-
-
-def _worse(run: MonitorRun) -> tuple[str, ...]:
-    """What the monitor says worse than nothing would."""
-    flight, found = run.flight, []
-    for name in flight.pair:
-        for k, key in enumerate(PARAMETERS):
-            error, change = (rms(v[:, k]) for v in (flight.clean[name] - flight.truth[name], flight.truth[name]))
-            if error > change and key in flight.spec.apply:
-                found.append(
-                    f"{SYMBOLS[key]} of {name}, by {error * PER_SI[k]:.2g} {'µm' if key == 'd_f' else 'arcsec'} RMS"
-                )
-    if not found:
-        return ()
-    return (
-        f"The monitor misreads by more than the true change: {'; '.join(found)}. Such values are better left out, by "
-        "the key apply.",
-    )
-
-
-def _conversion(run: MonitorRun) -> Section:
-    conversion, flight = run.conversion, run.flight
-    rows: list[tuple[Cell, ...]] = []
-    at = flight.spec.referred
-    for name in flight.pair:
-        slopes = [float(v) for v in run.slopes[name][at] / PER_SI]
-        rows.append((name, conversion.traced[name], conversion.theory[name], *slopes))
-    table = Table(
-        "conversion",
-        "Metres of height",
-        "Of a whole camera turned by 1 arcsec about its Y and traced, by base to height, and of each parameter that "
-        "the analysis is told wrongly: a bias of the monitor acts like this.",
-        (
-            "camera",
-            "traced [m/arcsec]",
-            "theory [m/arcsec]",
-            "Δα [m/arcsec]",
-            "Δβ [m/arcsec]",
-            "Δγ [m/arcsec]",
-            "Δf [m/µm]",
-        ),
-        rows,
-        (None, 4, 4, 4, 4, 4, 6),
-    )
-    predicted = -sum(run.slopes[n][:, 0] * flight.truth[n][:, 0] for n in flight.pair)
-    none = run.cases["none"].camera
-    size = rms(none) or 1.0
-    by_angle = -conversion.of_angle * run.angle_change / ARCSEC
-    text = (
-        f"Base to height is {conversion.base_to_height:.3f}. An arcsecond of the angle, half from each camera, is "
-        f"{abs(conversion.of_angle):.2f} m; it is more by the camera that looks farther aside, so that the angle alone "
-        f"gives the height without monitoring to {100.0 * rms(none - by_angle) / size:.1f}% of its RMS, and the "
-        f"Δα of both cameras to {100.0 * rms(none - predicted) / size:.1f}%.",
-    )
-    return Section("From arcseconds to metres", text, (table,))
-
-
-def _noise(run: MonitorRun) -> Section:
-    seen, (low, high) = run.scatter, run.scatter.limits
-    verdict = "agrees" if seen.agrees else "does not agree"
-    text = (
-        f"Measured {len(seen.heights)} times at {moment(float(run.flight.times[run.flight.worst]))}, reference images "
-        f"and detectors' patterns drawn anew, heights scatter by {1e3 * seen.spread:.2f} mm; the monitor's covariance "
-        f"propagates to {1e3 * seen.sigma:.2f} mm. The ratio {seen.spread / seen.sigma:.3f} {verdict} with its limits "
-        f"{low:.2f} to {high:.2f} (false alarm {FALSE_ALARM:g}).",
-    )
-    return Section("Noise of the monitor", text)
-
-
-def monitor_report(run: MonitorRun) -> Report:
+def monitor_report(run: MonitorRun | LoopRun) -> Report:
     """Report of a monitored orbit."""
-    setup = run.setup
-    cases, spec = run.cases, setup.test
+    if isinstance(run, LoopRun):
+        return Report(
+            "A monitor in the loop",
+            *_loop_verdict(run),
+            _facts(run),
+            _loop_summary(run),
+            (_orbit(run), *_images(run), _loops(run), _unseen(run)),
+            warnings=(*LOOP.warnings(run), *_worse_warnings(run), *_loop_warnings(run)),
+        )
+    smoothed = (_smoothed(run),) if run.smoothing else ()
+    return Report(
+        "What on-board monitoring buys on the ground",
+        *_verdict(run),
+        _facts(run),
+        _table(run),
+        (_angle(run), _height(run), *smoothed, _interval(run), _rest(run), _conversion(run), _noise(run)),
+        warnings=_warnings(run),
+    )
+
+
+def _shown(record: Record[Any]) -> list[str]:
+    """Keys of a record that its tables show."""
+    return [one.key for one in record if one.head]
+
+
+def _facts(run: MonitorRun | LoopRun) -> tuple[tuple[str, str], ...]:
+    setup, test, errors, on = run.setup, run.setup.test, run.setup.test.errors, run.setup.test.errors.switched_on
+    span = f"{moment(test.times[0])} to {moment(test.times[-1])} in steps of {moment(test.step)}"
+    stated = setup.disturbances.name if setup.disturbances else "none stated: sigmas are of the noise alone"
+    own: tuple[tuple[str, str], ...] = (
+        (
+            ("Reference", moment(test.reference_time)),
+            ("Applied", ", ".join(test.apply)),
+            ("Disturbances", stated),
+            ("Check points", f"{test.ground.points} at each time, both views from the state at that time"),
+            ("Calibration at the reference", "taken as exact"),
+        )
+        if isinstance(run, MonitorRun)
+        else (
+            ("Readings", f"{len(test.times)}, rendered and recovered"),
+            ("Disturbances", f"{stated}, whose laws in time the estimate knows"),
+            ("Motions", "of the course" if test.course is not None else "drawn by these laws"),
+            ("Check points", f"{test.ground.points} at each moment, both views from the state at that moment"),
+            ("Lines of sight", "exact, traced; points are drawn about them; matched where line images are rendered"),
+        )
+    )
+    return (
+        ("Instrument", f"{setup.instrument.name}, {setup.instrument.description}"),
+        ("Pair", f"{setup.pair[0]} against {setup.pair[1]}"),
+        ("Course", f"{span}, from {test.orbit.epoch}"),
+        *own,
+        ("Image points", f"σ {errors.image:g} px, drawn, not matched in images" if on else "exact"),
+        ("Monitor's frames", "with noise" if on and errors.monitor else "without noise"),
+        ("Effects on the light", "taken as corrected"),
+        ("Description", test.description),
+    )
+
+
+def _verdict(run: MonitorRun) -> tuple[str, tuple[str, ...]]:
+    cases, spec = run.cases, run.flight.spec
     none, chosen, floor = cases["none"], cases["interval"], cases["true"]
     bought = none.height_rms - chosen.height_rms
     others = floor.height_rms**2 > 0.5 * chosen.height_rms**2
     limit = "images, orbit and attitude" if others else "the remaining errors of the monitor"
     verdict, more = answer(
-        f"Monitoring every {moment(spec.interval)} changes the heights' error from {none.height_rms:.2f} m to "
+        f"Monitoring every {moment(spec.every)} changes the heights' error from {none.height_rms:.2f} m to "
         f"{chosen.height_rms:.2f} m RMS{'' if bought > 0.0 else ', which is no gain'}",
         f"with the true cameras {floor.height_rms:.2f} m would remain, so that {limit} cause most of the error",
         f"the intersection angle changes by {np.ptp(run.angle_change) / ARCSEC:.2g} arcsec: see the errors over the "
         "course",
         _gain(run),
     )
-    lead = (
-        *more,
+    alone = (
         f"The cameras alone: {none.camera_height_rms:.2f} m without, {chosen.camera_height_rms:.2f} m with this "
         f"interval, {cases['monitored'].camera_height_rms:.2f} m monitored at every time. "
-        f"One arcsecond of the angle is {abs(run.conversion.of_angle):.1f} m of height.",
+        f"One arcsecond of the angle is {abs(run.conversion.of_angle):.1f} m of height."
     )
-    return Report(
-        "What on-board monitoring buys on the ground",
-        verdict,
-        lead,
-        _facts(setup),
-        _table(run),
-        _sections(run),
-        warnings=_warnings(run),
-    )
+    return verdict, (*more, alone)
 
 
 def _times(factor: float, less: str) -> str:
@@ -310,7 +154,7 @@ def _table(run: MonitorRun) -> Table:
     spec = run.flight.spec
     names = {
         "none": "as calibrated, no monitoring",
-        "interval": f"monitored every {moment(spec.interval)}",
+        "interval": f"monitored every {moment(spec.every)}",
         "smoothed": "the same measurements, smoothed",
         "monitored": "monitored at every time",
         "parameters": "true four parameters (bound)",
@@ -321,40 +165,380 @@ def _table(run: MonitorRun) -> Table:
         "Errors at check points over the course",
         "RMS of all points and times; worst: RMS of the worst time; by the cameras: without image, orbit and attitude.",
         {name: SUMMARY(run.cases[key]) for key, name in names.items() if key in run.cases},
-        [one.key for one in SUMMARY if one.head],
+        _shown(SUMMARY),
         "cameras",
     )
 
 
-def _facts(setup: MonitorSetup) -> tuple[tuple[str, str], ...]:
-    test, errors = setup.test, setup.test.errors
-    times = test.course.times
-    span = f"{moment(times[0])} to {moment(times[-1])} in steps of {moment(test.step)}"
-    on = errors.switched_on
-    return (
-        ("Instrument", f"{setup.instrument.name}, {setup.instrument.description}"),
-        ("Pair", f"{setup.pair[0]} against {setup.pair[1]}"),
-        ("Course", f"{span}, from {test.orbit.epoch}"),
-        ("Reference", moment(test.reference)),
-        ("Applied", ", ".join(test.apply)),
-        (
-            "Disturbances",
-            setup.disturbances.name if setup.disturbances else "none stated: sigmas are of the noise alone",
-        ),
-        ("Check points", f"{test.ground.points} at each time, both views from the state at that time"),
-        ("Image points", f"σ {errors.image:g} px, drawn, not matched in images" if on else "exact"),
-        ("Monitor's frames", "with noise" if on and errors.monitor else "without noise"),
-        ("Calibration at the reference", "taken as exact"),
-        ("Effects on the light", "taken as corrected"),
-        ("Description", test.description),
+def _angle(run: MonitorRun) -> Section:
+    error = (run.angle - run.angle_change) / ARCSEC
+    text = (
+        f"Traced, the angle changes by {np.ptp(run.angle_change) / ARCSEC:.3g} arcsec over the course. The monitor "
+        f"follows it to {rms(error):.2g} arcsec RMS, {np.abs(error).max():.2g} arcsec at worst. Both are counted from "
+        f"the reference at {moment(run.flight.spec.reference_time)}, when the cameras were calibrated and the monitor "
+        "took its reference.",
     )
+    caption = f"Estimator {run.flight.estimator}, all frames."
+    figure = monitoring_figure("angle", "Intersection angle over the orbit", caption, run)
+    return Section("Intersection angle", text, (figure, *(_changes(run, name) for name in run.flight.pair)))
+
+
+def _changes(run: MonitorRun, name: str) -> Table:
+    flight = run.flight
+    both = np.stack([flight.truth[name], flight.monitored[name].vector], axis=-1) * PER_SI[:, None]
+    heads = ["time [min]"]
+    for key in PARAMETERS:
+        heads += [f"{SYMBOLS[key]} [{'µm' if key == 'd_f' else 'arcsec'}]", "monitored"]
+    rows = np.column_stack([flight.times / 60.0, both.reshape(len(both), -1)]) + 0.0
+    title = f"Changes of {name}, true and monitored"
+    decimals = (1, *([3] * 6), 1, 1)
+    return Table(f"changes-{name.lower()}", title, "Since the reference.", heads, rows.tolist(), decimals)
+
+
+def _height(run: MonitorRun) -> Section:
+    floor = run.cases["true"]
+    text = (
+        "What the cameras alone do is the difference to the true cameras with the same image points, orbit and "
+        f"attitude. True cameras leave {floor.height_rms:.3g} m in height and {floor.plan_rms:.3g} m in plan.",
+        "Attitude errors that both cameras share turn the body, not the angle: the monitor does not see them. One "
+        f"arcsecond in pitch of both makes {abs(run.conversion.of_common):.2f} m of height, for the pair does not look "
+        "evenly forward and back.",
+    )
+    caption = "Above: mean over the points. Below: all errors, with the points' noise."
+    figure = monitoring_figure("height", "Height errors over the orbit", caption, run)
+    return Section("Heights with and without monitoring", text, (figure,))
+
+
+def _smoothed(run: MonitorRun) -> Section:
+    spec, stated = run.flight.spec, run.setup.disturbances
+    assert stated is not None
+    chosen = run.smoothed
+    found = chosen.consistency
+    table = SMOOTHED.table(
+        "smoothing",
+        "Heights smoothed against heights interpolated, from the same measurements",
+        "By the cameras alone, RMS over all times; the sigma that the smoother states; the largest error over its "
+        f"sigma, limit {chosen.limit:.2f}; chi-square of the shifts and its degrees of freedom.",
+        [SMOOTHED((run, *item)) for item in run.smoothing.items()],
+        _shown(SMOOTHED),
+    )
+    fits = "agree" if found.agrees else "do not agree"
+    reach = "lies within" if chosen.agrees else "goes beyond"
+    text = (
+        f"All measurements together, by the prior ({stated.name}) and its time laws: the best "
+        f"linear estimate at every time. Measured every {moment(spec.every)}, it makes the cameras' height error "
+        f"{_times(chosen.factor, 'smaller')} than values that are linear between the measurements.",
+        f"Its sigma is {rms(chosen.sigma):.2f} m RMS; the largest error is {chosen.furthest:.2f} of its sigma, which "
+        f"{reach} the limit of {chosen.limit:.2f} (false alarm at most {FALSE_ALARM:g}). Measured shifts {fits} with "
+        f"the prior: chi-square {found.chi_square:.4g} of {found.degrees} degrees of freedom, limit "
+        f"{found.limit:.4g}.",
+    )
+    caption = "Mean over the points, with the total sigma of the smoothed height."
+    figure = monitoring_figure("smoothed", "Heights between the measurements", caption, run)
+    return Section("Between the measurements", text, (figure, table))
+
+
+def _interval(run: MonitorRun) -> Section:
+    table = INTERVAL.table(
+        "intervals",
+        "Height error against the monitoring interval",
+        "Measured from the reference on, linear between, held before the first and after the last.",
+        [INTERVAL((run, interval)) for interval in run.intervals],
+        _shown(INTERVAL),
+    )
+    figure = monitoring_figure("interval", "RMS in height against the interval", "Over all times.", run)
+    return Section("How often to measure", (), (figure, table))
+
+
+def _rest(run: MonitorRun) -> Section:
+    flight = run.flight
+    parts = PART.table(
+        "parts",
+        "Parts of the corrected cameras' height error",
+        "Over all times; signed, they add up to the whole but for products of two small errors.",
+        {PARTS[name][0]: PART(part) for name, part in run.parts.items()},
+        _shown(PART),
+        "part",
+    )
+    causes = CAUSE.table(
+        "causes",
+        f"Each cause alone, at {moment(float(flight.times[flight.worst]))}",
+        "Height that it makes without monitoring, and height that the monitor makes by misreading it.",
+        [CAUSE((run, cause)) for cause in flight.causes],
+        ("what", "node", "height_without_monitoring_m", "height_left_by_monitor_m"),
+    )
+    largest = max(run.parts, key=lambda name: rms(run.parts[name]))
+    text = (
+        f"Most of the rest comes from {PARTS[largest][0]}, {rms(run.parts[largest]):.2g} m RMS. A prism that bends "
+        "the beam by its own temperature looks to the monitor like a camera that has turned.",
+        "The true four parameters put through the correction leave "
+        f"{1e3 * rms(run.parts['beyond_parameters']):.2g} mm RMS in height and {run.residual / ARCSEC:.2g} arcsec at "
+        "the worst place of a line: what a camera does beyond them, such as a change of distortion.",
+        *_worse(run),
+    )
+    caption = "Mean over the points; parts below 5 mm are left out."
+    figure = monitoring_figure("remainder", "What the correction leaves", caption, run)
+    return Section("Where the rest comes from", text, (figure, parts, causes))
+
+
+def _worse(run: MonitorRun) -> tuple[str, ...]:
+    """What the monitor says worse than nothing would."""
+    flight, worse = run.flight, []
+    for name in flight.pair:
+        for k, key in enumerate(PARAMETERS):
+            error, change = (rms(v[:, k]) for v in (flight.clean[name] - flight.truth[name], flight.truth[name]))
+            if error > change and key in flight.spec.apply:
+                worse.append(
+                    f"{SYMBOLS[key]} of {name}, by {error * PER_SI[k]:.2g} {'µm' if key == 'd_f' else 'arcsec'} RMS"
+                )
+    if not worse:
+        return ()
+    return (
+        f"The monitor misreads by more than the true change: {'; '.join(worse)}. Such values are better left out, by "
+        "the key apply.",
+    )
+
+
+def _conversion(run: MonitorRun) -> Section:
+    conversion, flight = run.conversion, run.flight
+    table = BY_CAMERA.table(
+        "conversion",
+        "Metres of height",
+        "Of a whole camera turned by 1 arcsec about its Y and traced, by base to height, and of each parameter that "
+        "the analysis is told wrongly: a bias of the monitor acts like this.",
+        {name: BY_CAMERA((run, name)) for name in flight.pair},
+        label="camera",
+    )
+    predicted = -sum(flight.slopes[n][:, 0] * flight.truth[n][:, 0] for n in flight.pair)
+    none = run.cases["none"].camera
+    size = rms(none) or 1.0
+    by_angle = -conversion.of_angle * run.angle_change / ARCSEC
+    text = (
+        f"Base to height is {conversion.base_to_height:.3f}. An arcsecond of the angle, half from each camera, is "
+        f"{abs(conversion.of_angle):.2f} m; it is more by the camera that looks farther aside, so that the angle alone "
+        f"gives the height without monitoring to {100.0 * rms(none - by_angle) / size:.1f}% of its RMS, and the "
+        f"Δα of both cameras to {100.0 * rms(none - predicted) / size:.1f}%.",
+    )
+    return Section("From arcseconds to metres", text, (table,))
+
+
+def _noise(run: MonitorRun) -> Section:
+    seen, (low, high) = run.scatter, run.scatter.limits
+    verdict = "agrees" if seen.agrees else "does not agree"
+    text = (
+        f"Measured {len(seen.heights)} times at {moment(float(run.flight.times[run.flight.worst]))}, reference images "
+        f"and detectors' patterns drawn anew, heights scatter by {1e3 * seen.spread:.2f} mm; the monitor's covariance "
+        f"propagates to {1e3 * seen.sigma:.2f} mm. The ratio {seen.spread / seen.sigma:.3f} {verdict} with its limits "
+        f"{low:.2f} to {high:.2f} (false alarm {FALSE_ALARM:g}).",
+    )
+    return Section("Noise of the monitor", text)
 
 
 def _warnings(run: MonitorRun) -> tuple[str, ...]:
     out = [*coarse_warnings(run.setup), *run.flight.doubts]
-    together = run.flight.smoothed.get(run.flight.spec.interval)
+    together = run.flight.smoothed.get(run.flight.spec.every)
     out += [jump_text(one) for one in (together.jumps if together is not None else None) or ()]
     out += MONITOR.warnings(run)
     if run.cases["monitored"].camera_height_rms > run.cases["none"].camera_height_rms:
         out.append("monitoring makes heights worse: the monitor's own errors are larger than the cameras' changes")
+    return tuple(out)
+
+
+def _loop_verdict(run: LoopRun) -> tuple[str, tuple[str, ...]]:
+    left, free = height_rms(run.closed), height_rms(run.open)
+    sigma, hidden = rms(run.closed.posterior(run.closed.slopes)[1]), rms(run.unseen[0])
+    stands = "" if run.margins_hold else f"the loop is {'barely stable' if run.stable else 'unstable'}; "
+    if run.worse:
+        stands += f"the loop makes {names_text(list(run.worse))} worse; "
+    angle = rms(run.closed.true(run.closed.angle)) / ARCSEC, rms(run.open.true(run.open.angle)) / ARCSEC
+    return answer(
+        f"{stands}with the loop closed the cameras make height errors of {significant(left, 2)} m RMS over the orbit, "
+        f"with the loop open {significant(free, 2)} m; the posterior's sigma is {significant(sigma, 2)} m",
+        f"what no spot shows costs {significant(hidden, 2)} m, which no gain takes away, and {_margin(run)}",
+        f"the angle between the lines of sight is {significant(angle[0], 2)} arcsec RMS off, with the loop open "
+        f"{significant(angle[1], 2)} arcsec",
+        _focus_words(run),
+    )
+
+
+def _margin(run: LoopRun) -> str:
+    if not math.isfinite(run.margin):
+        return "no correction acts"
+    phase = f", the smallest phase margin {run.phase_deg:.0f} deg" if math.isfinite(run.phase_deg) else ""
+    return f"all gains together may be {significant(run.margin, 3)} times as large before the loop is unstable{phase}"
+
+
+def _focus_words(run: LoopRun) -> str:
+    """What the loop does to the focus, and what the spots tell of it."""
+    told = []
+    for k, name in enumerate(run.pair):
+        row = run.model.row(name, "defocus")
+        prior = float(np.sqrt(_row_variance(run, row)))
+        if prior > 0.0:
+            told.append(f"{float(run.unseen[1 + k].max()) / prior:.1%} of {name}'s")
+    return f"of the standard deviation of the focus the spots leave {' and '.join(told)} as it was" if told else ""
+
+
+def _row_variance(run: LoopRun, row: int) -> float:
+    """Variance of one of the quantities before any reading."""
+    effect = run.model.stated.parameters[row]
+    return float(effect @ run.model.stated.correlation @ effect)
+
+
+def _loop_summary(run: LoopRun) -> Table:
+    return PASS.table(
+        "loop",
+        "What the loop leaves",
+        "RMS over the moments. Height: mean over the points, by the cameras alone; all errors: of each point, with "
+        "those of image points, orbit and attitude; σ: as the posterior says it; MTF at Nyquist, the least of all.",
+        {"loop open": PASS((run, run.open)), "loop closed": PASS((run, run.closed))},
+        _shown(PASS),
+        "course",
+    )
+
+
+def _orbit(run: LoopRun) -> Section:
+    caption = "True values by the exact trace; bands are what the posterior says after each reading, ±σ."
+    course = monitoring_figure("course", "What is left over the orbit", caption, run)
+    places = monitoring_figure("positions", "Where the mechanisms stand", "When images are taken.", run)
+    heads = ["time [s]"]
+    columns: list[np.ndarray] = [run.closed.course.times]
+    for label, one in (("open", run.open), ("closed", run.closed)):
+        told, sigma = one.posterior(one.slopes)
+        heads += [f"{label} angle [arcsec]", f"{label} height [m]", f"{label} height told [m]", f"{label} σ [m]"]
+        columns += [one.true(one.angle) / ARCSEC, one.heights.camera, told, sigma]
+    for corrector in run.model.correctors:
+        heads.append(f"{corrector.name} [{corrector.unit[0]}]")
+        columns.append(positions(run, corrector.name))
+    rows = csv_table([heads, *np.stack(columns, axis=-1).tolist()]).decode()
+    text = (
+        "At every moment the spots are rendered where the mechanisms stand and recovered, the filter of the stated "
+        "laws takes them less what the known positions do to the spots, commands go out, mechanisms move, and images "
+        "are taken. The estimate never sees the state.",
+        f"True cameras leave {significant(run.closed.flight.true_case.height_rms, 2)} m RMS in height by image points, "
+        "orbit and attitude.",
+        "Turns that both cameras share with the base turn the body and not the angle: no monitor sees them, the star "
+        "trackers do.",
+    )
+    return Section("Over the orbit", text, (course, places, CsvFile("moments", "All numbers", "", rows)))
+
+
+def _images(run: LoopRun) -> tuple[Section, ...]:
+    if not run.closed.images:
+        return ()
+    rows = {
+        f"{label}, {moment(float(one.course.times[pair.moment]))}": IMAGES((one, pair))
+        for label, one in (("open", run.open), ("closed", run.closed))
+        for pair in one.images
+    }
+    table = IMAGES.table(
+        "images",
+        "Heights from rendered line images",
+        "Points of the second camera's image, matched in the first one's: mean height error with σ by their scatter; "
+        "the same of drawn points over the whole swath, and by the cameras alone; matching, found minus true place, "
+        "and the σ that it states.",
+        rows,
+        _shown(IMAGES)[1:],
+        "loop, after",
+    )
+    text = (
+        "At these moments both lines are rendered over the same ground through the states that the mechanisms have "
+        "left, their points matched, and intersected by the lines that the user knows.",
+    )
+    return (Section("Line images", text, (table,)),)
+
+
+def _loops(run: LoopRun) -> Section:
+    rows = {name: CORRECTION((run, name, one)) for name, one in run.loops.items()}
+    for row in rows.values():
+        row["mechanism"] = row["mechanism"] or "on the ground"
+    table = CORRECTION.table(
+        "corrections",
+        "Each correction as a loop",
+        "Limit: gain below which a loop of this delay is stable. Cycle: steps by which a mechanism of whole steps goes "
+        "to and fro at worst although nothing changes. Told: share of what a mechanism does beyond what is known that "
+        "the spots tell.",
+        rows,
+        (
+            *("camera", "quantity", "mechanism", "gain", "delay", "gain_limit", "gain_margin", "phase_margin_deg"),
+            *("cycle_steps", "seen"),
+        ),
+        "name",
+    )
+    text = (
+        "An integrator of gain g whose command has its effect d readings later has the open loop "
+        "L(z) = g z^-(d+1) / (1 - 1/z) by readings, and is stable below g = 2 sin(π / (4 d + 2)).",
+        f"Together, with what mechanisms do to each other's quantities, the largest eigenvalue is {run.radius:.3f}.",
+    )
+    caption = (
+        "Left: L in the complex plane with the point −1. Right: share of a swing that is left when images are taken."
+    )
+    figure = monitoring_figure("open-loop", "Open loop, and what the closed loop leaves of a drift", caption, run)
+    return Section("Stability", text, (table, figure))
+
+
+def _unseen(run: LoopRun) -> Section:
+    rows = []
+    for mode in run.modes:
+        row = {key: v if isinstance(v, dict | list) or abs(v) > _LEAST else 0.0 for key, v in MODE((run, mode)).items()}
+        rows.append(row | {"bodies": _bodies(mode), "motions": _motions(run, mode)})
+    table = MODE.table(
+        "unseen",
+        "Motions that no spot shows",
+        f"For one standard deviation of each mode: combinations of stated motions that leave every spot where it is. "
+        f"First and second: {run.pair[0]} and {run.pair[1]}.",
+        rows,
+        ("height_m", "angle_arcsec", "defocus_first_um", "defocus_second_um", "bodies", "motions"),
+    )
+    hidden = rms(run.unseen[0])
+    foci = " and ".join(significant(1e6 * float(one.max()), 2) for one in run.unseen[1:])
+    text = (
+        f"{run.model.stated.spots.shape[0]} spot coordinates stand against {len(run.model.stated.labels)} stated "
+        f"motions. What they do to heights and no spot shows is {significant(hidden, 2)} m, to the focus {foci} µm, "
+        "one standard deviation; no gain, no rate of readings and no filter goes below, unless something else than the "
+        "spots is measured.",
+    )
+    return Section("What the loop cannot see", text, (table,))
+
+
+def _bodies(mode: UnseenMode) -> str:
+    return ", ".join(f"{body} {share:.0%}" for body, share in list(mode.bodies.items())[:_BODIES])
+
+
+def _motions(run: LoopRun, mode: UnseenMode) -> str:
+    every = motions_of(run, mode)[:_MOTIONS]
+    return ", ".join(f"{one['motion']} {significant(one['amount'], 2, sign=True)} {one['unit']}" for one in every)
+
+
+def _worse_warnings(run: LoopRun) -> Iterator[str]:
+    """Yield a warning of every error that is larger with the loop closed."""
+    for label, (free, left) in run.worse.items():
+        times = f"{significant(left / free, 3)} times that of the loop open" if free else "0 with the loop open"
+        yield f"the loop makes {label} worse: its error, RMS over the moments, is {times}"
+
+
+def _loop_warnings(run: LoopRun) -> tuple[str, ...]:
+    out = [*coarse_warnings(run.setup)]
+    for name, one in run.loops.items():
+        if one.ends:
+            first = moment(float(run.closed.course.times[one.ends[0]]))
+            out.append(f"the range of {name} ends: held at {len(one.ends)} of the readings, first at {first}")
+        if one.cycle is not None and one.cycle.steps > 1:
+            out.append(
+                f"{name} can go to and fro by {one.cycle.steps} steps although nothing changes: a smaller gain, a "
+                "shorter delay or a dead band stops it"
+            )
+    for label, course in (("closed", run.closed.course), ("open", run.open.course)):
+        out += [f"with the loop {label} {jump_text(one)}" for one in course.jumps]
+        out += PASS.warnings((run, run.closed if label == "closed" else run.open))
+        if course.evidence is not None:
+            spots = [channel.key for channel in run.model.experiment.path.channels]
+            doubt = course.evidence.course_doubt([moment(float(time)) for time in course.times], spots)
+            out += [] if doubt is None else [f"with the loop {label}, {doubt}"]
+    worst = max(run.ratios, key=lambda name: run.ratios[name])
+    if run.ratios[worst] > run.ratio_limit:
+        out.append(
+            f"the posterior's {worst} is wrong by up to {run.ratios[worst]:.3g} of its sigma, limit "
+            f"{run.ratio_limit:.2f} (false alarm {disturbances.FALSE_ALARM:g})"
+        )
     return tuple(out)

@@ -16,16 +16,34 @@ from scipy.stats import chi2, norm
 
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.intersection_angle import exact
-from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, between, check_errors, intersect_pair
+from analysis.orbit.forward_intersection import IntersectionError, between
 from analysis.units import ARCSEC
+from optics.geometry.tree import Motion, State, compose
 from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from scenes.specs.instrument import BASE
 from scenes.specs.orbit.monitor import PARAMETERS
-from twin.orbit.monitoring.monitor_series import Readings
-from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight, View, fly_monitored, in_analysis
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.truth import Truth
+from twin.orbit.flight.corrected_lines import calibrated_line
+from twin.orbit.flight.line_camera import LineCamera, look_angle
+from twin.orbit.monitoring.loop_run import LoopRun, run_loop
+from twin.orbit.monitoring.monitor_series import MonitorSeries, Readings, SmoothedReadings, states_of
+from twin.orbit.monitoring.pair_flight import (
+    TOO_FAR,
+    CaseErrors,
+    PairFlight,
+    in_analysis,
+    look_down,
+    point_errors,
+    traced_pair,
+)
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
+    from scenes.specs.orbit.monitor import OrbitMonitorSpec
     from scenes.specs.orbit.setup import MonitorSetup
 
 CASES = ("none", "monitored", "interval", "smoothed", "parameters", "true")
@@ -35,48 +53,184 @@ lines. The last two are bounds that no measurement gives.
 """
 FALSE_ALARM = 1e-4
 """Chance that right sigmas are called wrong, both sides together."""
-_STEP = np.array([ARCSEC, ARCSEC, ARCSEC, 10e-6])
-"""Steps of the derivatives, rad and m: over them the intersection is linear to 1e-5."""
 
 
 @dataclass(frozen=True, eq=False)
-class CaseErrors:
-    """Errors at the check points over T times.
+class Cause:
+    """One entry of the file alone, all others without effect.
 
     Attributes:
-        plan: (T,) RMS, both axes, metres; height: (T,) likewise.
-        bias: (T,) mean of the height errors, found minus true.
-        camera: (T,) the same less that of the true cameras at the same image points, orbit and attitude: what the
-            cameras alone do.
-        camera_plan: (T,) RMS over the points of what the cameras alone do in plan; camera_height: likewise in height.
+        what: temperature or motion.
+        path: of the node.
+        truth: camera -> (4,) true changes since the reference.
+        error: camera -> (4,) what the monitor says, without noise, minus the truth.
     """
 
-    plan: np.ndarray
-    height: np.ndarray
-    bias: np.ndarray
-    camera: np.ndarray
-    camera_plan: np.ndarray
-    camera_height: np.ndarray
+    what: str
+    path: str
+    truth: Mapping[str, np.ndarray]
+    error: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorFlight(PairFlight):
+    """Truth and measurements at T times, counted from the reference, at which the lines were calibrated.
+
+    Attributes:
+        spec: the test.
+        looks: nominal look angles of the two cameras, radians.
+        truth: camera -> (T, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) since the reference.
+        angle: (T,) true angle between the lines of sight, radians.
+        estimator: by which the monitor's shifts are read.
+        monitored: what the monitor says of the cameras' changes since the reference.
+        smoothed: seconds -> what all its measurements at this interval say together; empty where nothing is stated to
+            move.
+        clean: camera -> (T, 4) as monitored, from expected images without noise.
+        prisms: camera -> (T, 4) what temperatures that the file gives to prisms alone make it say, without noise.
+        repeated: what the monitor says at time `worst`, measured again and again.
+        worst: number of the time with the largest change of the angle.
+        causes: what each temperature and motion of the file does alone at time `worst`, without noise.
+        turned: camera -> its line at the reference when the whole camera is turned by 1 arcsec about its Y.
+        doubts: where the monitor's sigmas do not hold, for its spots are not as calibrated.
+    """
+
+    spec: OrbitMonitorSpec
+    looks: tuple[float, float]
+    truth: Mapping[str, np.ndarray]
+    angle: np.ndarray
+    estimator: str
+    monitored: Readings
+    smoothed: Mapping[float, SmoothedReadings]
+    clean: Mapping[str, np.ndarray]
+    prisms: Mapping[str, np.ndarray]
+    repeated: Readings
+    worst: int
+    causes: tuple[Cause, ...]
+    turned: Mapping[str, LineCamera]
+    doubts: tuple[str, ...] = ()
 
     @property
-    def plan_rms(self) -> float:
-        """RMS error in plan over all times, metres."""
-        return rms(self.plan)
+    def mask(self) -> np.ndarray:
+        """(4,) 1 for parameters that are applied."""
+        return np.array([float(name in self.spec.apply) for name in PARAMETERS])
 
-    @property
-    def height_rms(self) -> float:
-        """RMS error in height over all times, metres."""
-        return rms(self.height)
+    def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(T,) of the mean height, metres, by parameters (T, 4) of each camera that the analysis is told too much."""
+        every = [np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair]
+        return np.asarray(np.sum(every, axis=0))
 
-    @property
-    def camera_height_rms(self) -> float:
-        """RMS of what the cameras alone do in height over all times, metres."""
-        return rms(self.camera_height)
+    def variance(self, covariance: np.ndarray, at: int | None = None) -> np.ndarray:
+        """Variance (S,) of the mean height by the pair's values, m^2.
 
-    @property
-    def worst(self) -> float:
-        """Largest RMS in height of one time, metres."""
-        return float(self.height.max())
+        Args:
+            covariance: (S, 8, 8) of the pair's values.
+            at: number of the time to which all of them belong; None for one of each time.
+        """
+        both = np.concatenate([self.slopes[n] * self.mask for n in self.pair], axis=1)
+        slope = both if at is None else both[at]
+        return np.asarray(np.einsum("...i,...ij,...j->...", slope, covariance, slope))
+
+
+def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorFlight:
+    """Trace, render, measure, look down.
+
+    Raises:
+        InputError: an unknown node or an impossible temperature.
+        BenchError: the test cannot be carried out as its file says.
+        AimError, BeamMissedError: light is lost.
+    """
+    spec, pair = setup.test, setup.pair
+    ground_seed, monitor_seed = np.random.SeedSequence(seed).spawn(2)
+    number = int(np.random.default_rng(monitor_seed).integers(2**31))
+    parts = 6
+    advance("monitor", 0, parts)
+    experiment = MonitorExperiment(setup.resolved, backend)
+    spec.check_nodes(experiment.instrument.nodes)
+    states = states_of(experiment, spec)
+    advance("monitor", 1, parts)
+    reference, bodies = states[spec.referred], {body.path: body for body in experiment.instrument.assembly.tree.bodies}
+
+    def turned(camera: str) -> State:
+        return compose(reference, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
+
+    lines = tuple(traced_pair(experiment, state, pair) for state in states)
+    by_arcsec = {name: traced_pair(experiment, turned(name), pair)[name] for name in pair}
+    advance("monitor", 2, parts)
+    angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
+    worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
+    # before the images, which take longer
+    views = look_down(spec, pair, lines, ground_seed, advance)
+    monitor = MonitorSeries(experiment, spec, reference, pair)
+    noisy, clean = monitor.measured(states, number)
+    truth, distance = _changes(clean.truth, spec.referred)
+    used = noisy if spec.errors.switched_on and spec.errors.monitor else clean
+    gains = monitor.gains(used, range(len(states)))
+    advance("monitor", 3, parts)
+    prisms = monitor.of_prisms()
+    advance("monitor", 4, parts)
+    repeated = monitor.repeated(states[worst], spec.repeats, number + 1, worst)
+    advance("monitor", 5, parts)
+    causes = _causes(experiment, spec, monitor, worst, gains[worst])
+    advance("monitor", 6, parts)
+    axes, smoothed = experiment.sight.axes, {}
+    if experiment.disturbances is not None:
+        smoothed = {interval: monitor.smoothed(used, interval) for interval in {spec.every, *spec.compared}}
+    return MonitorFlight(
+        pair,
+        np.array(spec.times),
+        lines,
+        FrozenMap({n: calibrated_line(lines[spec.referred][n], axes[n], distance[n]) for n in pair}),
+        views,
+        spec,
+        (experiment.instrument.spec.cameras[pair[0]].look, experiment.instrument.spec.cameras[pair[1]].look),
+        FrozenMap({name: truth[name] for name in pair}),
+        angle,
+        monitor.estimator,
+        monitor.readings(used, range(len(states))),
+        FrozenMap(smoothed),
+        FrozenMap(monitor.by_camera(gains, clean.shifts)),
+        FrozenMap(monitor.by_camera(gains, prisms)),
+        monitor.readings(repeated, [worst] * spec.repeats),
+        worst,
+        causes,
+        FrozenMap(by_arcsec),
+        used.doubts(spec.times, [channel.key for channel in experiment.path.channels]),
+    )
+
+
+def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Camera -> (T, 4) true changes since the reference, and camera -> principal distance there.
+
+    The trace refers changes to the nominal camera; their differences are those between two states but for products of
+    two arcseconds, 1e-11 rad.
+    """
+    out, distance = {}, {}
+    for name in truths[0].cameras:
+        every = [one.cameras[name] for one in truths]
+        values = np.concatenate([change.vector for change in every])
+        out[name] = values - values[reference]
+        distance[name] = float(np.concatenate([c.principal_distance for c in every])[reference])
+    return out, distance
+
+
+def _causes(
+    experiment: MonitorExperiment, spec: OrbitMonitorSpec, monitor: MonitorSeries, worst: int, gain: np.ndarray
+) -> tuple[Cause, ...]:
+    """What each temperature of the course and each motion does from the reference to time number ``worst``, at which
+    the estimator has this gain (8, 2 C).
+    """
+    assert spec.course is not None
+    named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]
+    states = [s for what, path in named for s in states_of(experiment, spec, (spec.referred, worst), (what, path))]
+    found = monitor.clean(states)
+    truth, _ = _changes(found.truth, 0)
+    estimates = monitor.by_camera(gain, found.shifts)
+    out = []
+    for k, (what, path) in enumerate(named):
+        true, read = ({n: v[n][2 * k + 1] - v[n][2 * k] for n in monitor.pair} for v in (truth, estimates))
+        error = {n: read[n] - true[n] for n in monitor.pair}
+        out.append(Cause(what, path, FrozenMap(true), FrozenMap(error)))
+    return tuple(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +348,6 @@ class MonitorRun:
         intervals: seconds -> errors with values interpolated over it.
         angle: (T,) change of the intersection angle by the monitor, radians; angle_sigma: of its error, angle_noise: of
             that what the noise does.
-        slopes: camera -> (T, 4) change of the mean height with the parameters that the analysis assumes, m/rad, m/m.
         sigma: (T,) of the mean height by the noise of the monitor, propagated, metres.
         sigma_total: (T,) likewise of the whole error; None where nothing is stated to move.
         smoothing: seconds -> heights smoothed from measurements at this interval; empty likewise.
@@ -213,7 +366,6 @@ class MonitorRun:
     angle: np.ndarray
     angle_sigma: np.ndarray
     angle_noise: np.ndarray
-    slopes: Mapping[str, np.ndarray]
     sigma: np.ndarray
     sigma_total: np.ndarray | None
     smoothing: Mapping[float, Smoothing]
@@ -230,28 +382,32 @@ class MonitorRun:
     @property
     def smoothed(self) -> Smoothing:
         """Heights smoothed from the measurements at the file's interval; there is none without a prior."""
-        return self.smoothing[self.flight.spec.interval]
+        return self.smoothing[self.flight.spec.every]
 
     def cause_heights(self, cause: Cause) -> tuple[float, float]:
         """Height errors that a cause alone makes at its time, metres: without monitoring, and by what the monitor
         misreads.
         """
-        flight, mask = self.flight, _mask(self.flight)
-        slopes = {n: self.slopes[n][flight.worst] for n in flight.pair}
+        flight, mask = self.flight, self.flight.mask
+        slopes = {n: flight.slopes[n][flight.worst] for n in flight.pair}
         without = sum(float(-slopes[n] @ cause.truth[n]) for n in flight.pair)
         return without, sum(float(slopes[n] @ (mask * cause.error[n])) for n in flight.pair)
 
 
-def rms(values: np.ndarray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
+def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance = silent) -> MonitorRun | LoopRun:
+    """Fly, measure, intersect: ``python -m twin.orbit monitor``; with mechanisms the loop is closed.
 
-
-def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance = silent) -> MonitorRun:
-    """Fly, measure, intersect: ``python -m twin.orbit monitor``. Raises BenchError, InputError as `fly_monitored`."""
-    flight = fly_monitored(setup, backend, seed, advance)
+    Raises:
+        InputError: an unknown node, a mechanism that the instrument does not have, or an impossible temperature.
+        BenchError: the test cannot be carried out as its file says.
+    """
+    spec = setup.test
     try:
-        return _analysed(flight, setup, seed)
+        if spec.mechanisms is not None:
+            return run_loop(setup, backend, seed, advance)
+        return _analysed(fly_monitored(setup, backend, seed, advance), setup, seed)
+    except (AimError, BeamMissedError) as error:
+        raise BenchError(f"the instrument cannot be rendered: {error}", spec.times_key, TOO_FAR) from error
     except IntersectionError as error:
         raise BenchError(str(error), ("cameras",), "cameras that look different ways") from error
 
@@ -259,29 +415,26 @@ def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advan
 def _analysed(flight: MonitorFlight, setup: MonitorSetup, seed: int) -> MonitorRun:
     """All cases of a flight."""
     count, spec = len(flight.times), flight.spec
-    monitored = {n: flight.monitored[n].vector * _mask(flight) for n in flight.pair}
-    changes = {
-        "none": {n: np.zeros((count, 4)) for n in flight.pair},
-        "monitored": monitored,
-        "interval": _interpolated(flight, monitored, spec.interval),
-        "parameters": dict(flight.truth),
-    }
-    true = _intersected(flight, [_true_pair(flight, k) for k in range(count)])
-    cases = {name: case_errors(_intersected(flight, _corrected(flight, each)), true) for name, each in changes.items()}
-    cases["true"] = case_errors(true, true)
+    monitored = {n: flight.monitored[n].vector * flight.mask for n in flight.pair}
 
     def interpolated(interval: float) -> CaseErrors:
-        changes = _interpolated(flight, monitored, interval)
-        return case_errors(_intersected(flight, _corrected(flight, changes)), true)
+        at = spec.measured(interval)
+        return flight.case({n: between(flight.times, flight.times[at], v[at]) for n, v in monitored.items()})
 
+    cases = {
+        "none": flight.case({n: np.zeros((count, 4)) for n in flight.pair}),
+        "monitored": flight.case(monitored),
+        "interval": interpolated(spec.every),
+        "parameters": flight.case(flight.truth),
+        "true": flight.true_case,
+    }
     intervals = {interval: interpolated(interval) for interval in spec.compared}
-    slopes = _slopes(flight)
     smoothing = {
-        interval: _smoothing(flight, slopes, interval, true, intervals.get(interval, cases["interval"]))
+        interval: _smoothing(flight, interval, intervals.get(interval, cases["interval"]))
         for interval in sorted(flight.smoothed)
     }
     if smoothing:
-        cases["smoothed"] = smoothing[spec.interval].case
+        cases["smoothed"] = smoothing[spec.every].case
     first, second = (flight.monitored[n] for n in flight.pair)
     angle = exact(first, second, *flight.looks, *flight.monitored.across)
     total = flight.monitored.total
@@ -294,152 +447,37 @@ def _analysed(flight: MonitorFlight, setup: MonitorSetup, seed: int) -> MonitorR
         angle.change_rad,
         angle.sigma_rad,
         angle.noise_rad,
-        FrozenMap(slopes),
-        np.sqrt(_propagated(flight, slopes, flight.monitored.noise)),
-        None if total is None else np.sqrt(_propagated(flight, slopes, total)),
+        np.sqrt(flight.variance(flight.monitored.noise)),
+        None if total is None else np.sqrt(flight.variance(total)),
         FrozenMap(smoothing),
-        FrozenMap(_parts(flight, slopes, cases)),
+        FrozenMap(_parts(flight, cases)),
         _conversion(flight),
-        _scatter(flight, slopes),
+        _scatter(flight),
         max(_residual(flight, n, k) for n in flight.pair for k in range(count)),
     )
 
 
-def _smoothing(
-    flight: MonitorFlight, slopes: Mapping[str, np.ndarray], interval: float, true: np.ndarray, between: CaseErrors
-) -> Smoothing:
-    found, mask = flight.smoothed[interval], _mask(flight)
-    readings: Readings = found.readings
+def _smoothing(flight: MonitorFlight, interval: float, interpolated: CaseErrors) -> Smoothing:
+    found = flight.smoothed[interval]
+    readings, mask = found.readings, flight.mask
     assert readings.total is not None
-    changes = {n: readings[n].vector * mask for n in flight.pair}
-    case = case_errors(_intersected(flight, _corrected(flight, changes)), true)
-    wrong = [np.sum(slopes[n] * mask * (readings[n].vector - flight.truth[n]), axis=1) for n in flight.pair]
+    case = flight.case({n: readings[n].vector * mask for n in flight.pair})
+    wrong = flight.height({n: mask * (readings[n].vector - flight.truth[n]) for n in flight.pair})
     # what rounding leaves at the reference is no sigma
-    variance = np.maximum(_propagated(flight, slopes, readings.total), 0.0)
-    return Smoothing(case, between, np.sum(wrong, axis=0), np.sqrt(variance), found.consistency)
+    variance = np.maximum(flight.variance(readings.total), 0.0)
+    return Smoothing(case, interpolated, wrong, np.sqrt(variance), found.consistency)
 
 
-def _mask(flight: MonitorFlight) -> np.ndarray:
-    """(4,) 1 for parameters that are applied."""
-    return np.array([float(name in flight.spec.apply) for name in PARAMETERS])
-
-
-def _interpolated(flight: MonitorFlight, monitored: Mapping[str, np.ndarray], interval: float) -> dict[str, np.ndarray]:
-    at = flight.spec.measured(interval)
-    return {n: between(flight.times, flight.times[at], values[at]) for n, values in monitored.items()}
-
-
-def _corrected(flight: MonitorFlight, changes: Mapping[str, np.ndarray]) -> list[list[CalibratedLine]]:
-    return [[flight.calibrated[n].corrected(changes[n][k]) for n in flight.pair] for k in range(len(flight.times))]
-
-
-def _true_pair(flight: MonitorFlight, k: int) -> list[CalibratedLine]:
-    return [flight.true_line(n, k) for n in flight.pair]
-
-
-def _found(flight: MonitorFlight, cameras: Sequence[CalibratedLine], k: int, exact_data: bool = False) -> np.ndarray:
-    return point_errors(cameras, flight.views[k], exact_data)
-
-
-def point_errors(cameras: Sequence[CalibratedLine], view: View, exact_data: bool = False) -> np.ndarray:
-    """Errors (n, 3) east, north, up of points that two cameras intersect, metres.
-
-    Args:
-        cameras: the two, as the analysis takes them.
-        view: the points.
-        exact_data: with exact image points, orbit and attitude.
-
-    Raises:
-        IntersectionError: rays that are parallel.
-    """
-    seen = view.exact if exact_data else view.seen
-    return check_errors(intersect_pair(cameras[0], cameras[1], *seen).ground, view.ground).error
-
-
-def _intersected(flight: MonitorFlight, cameras: list[list[CalibratedLine]]) -> np.ndarray:
-    """(T, n, 3) errors."""
-    return np.array([_found(flight, pair, k) for k, pair in enumerate(cameras)])
-
-
-def case_errors(found: np.ndarray, true: np.ndarray) -> CaseErrors:
-    """Errors of a case.
-
-    Args:
-        found: (T, n, 3) errors east, north, up of the points, metres.
-        true: (T, n, 3) those by the true cameras with the same image points, orbit and attitude.
-    """
-    alone = found - true
-    return CaseErrors(
-        plan=np.sqrt(np.mean(np.sum(found[..., :2] ** 2, axis=-1), axis=1)),
-        height=np.sqrt(np.mean(found[..., 2] ** 2, axis=1)),
-        bias=found[..., 2].mean(axis=1),
-        camera=alone[..., 2].mean(axis=1),
-        camera_plan=np.sqrt(np.mean(np.sum(alone[..., :2] ** 2, axis=-1), axis=1)),
-        camera_height=np.sqrt(np.mean(alone[..., 2] ** 2, axis=1)),
-    )
-
-
-def _slopes(flight: MonitorFlight) -> dict[str, np.ndarray]:
-    return height_slopes(flight.calibrated, flight.pair, flight.views)
-
-
-def height_slopes(
-    calibrated: Mapping[str, CalibratedLine], pair: tuple[str, str], views: Sequence[View]
-) -> dict[str, np.ndarray]:
-    """Camera -> (T, 4) slopes of the mean height by d_alpha, d_beta, d_gamma and d_f that the analysis is told, m/rad
-    and m/m: central differences of the intersection of exact image points.
-
-    Args:
-        calibrated: camera -> its line, about which they are taken.
-        pair: the two cameras.
-        views: of T times.
-    """
-    out = {}
-    for i, name in enumerate(pair):
-        table = np.empty((len(views), 4))
-        for k, view in enumerate(views):
-            for j, step in enumerate(_STEP):
-                ends = []
-                for sign in (1.0, -1.0):
-                    both = [calibrated[n] for n in pair]
-                    both[i] = both[i].corrected(sign * step * np.eye(4)[j])
-                    ends.append(float(point_errors(both, view, exact_data=True)[:, 2].mean()))
-                table[k, j] = (ends[0] - ends[1]) / (2.0 * step)
-        out[name] = table
-    return out
-
-
-def _propagated(
-    flight: MonitorFlight, slopes: Mapping[str, np.ndarray], covariance: np.ndarray, at: int | None = None
-) -> np.ndarray:
-    """Variance (S,) of the mean height by the pair's values, m^2.
-
-    Args:
-        flight: truth and measurements.
-        slopes: camera -> (T, 4).
-        covariance: (S, 8, 8) of the pair's values.
-        at: number of the time to which all of them belong; None for one of each time.
-    """
-    both = np.concatenate([slopes[n] * _mask(flight) for n in flight.pair], axis=1)
-    slope = both if at is None else both[at]
-    return np.asarray(np.einsum("...i,...ij,...j->...", slope, covariance, slope))
-
-
-def _parts(
-    flight: MonitorFlight, slopes: Mapping[str, np.ndarray], cases: Mapping[str, CaseErrors]
-) -> dict[str, np.ndarray]:
-    def height(values: Mapping[str, np.ndarray]) -> np.ndarray:
-        every = [np.sum(slopes[n] * _mask(flight) * values[n], axis=1) for n in flight.pair]
-        return np.asarray(np.sum(every, axis=0))
+def _parts(flight: MonitorFlight, cases: Mapping[str, CaseErrors]) -> dict[str, np.ndarray]:
+    def applied(values: Mapping[str, np.ndarray]) -> np.ndarray:
+        return flight.height({n: flight.mask * values[n] for n in flight.pair})
 
     system = {n: flight.clean[n] - flight.truth[n] for n in flight.pair}
-    left_out = {n: -flight.truth[n] * (1.0 - _mask(flight)) for n in flight.pair}
-    unused = np.sum([np.sum(slopes[n] * left_out[n], axis=1) for n in flight.pair], axis=0)
     return {
-        "prisms": height(flight.prisms),
-        "other_systematic": height({n: system[n] - flight.prisms[n] for n in flight.pair}),
-        "noise": height({n: flight.monitored[n].vector - flight.clean[n] for n in flight.pair}),
-        "not_applied": np.asarray(unused),
+        "prisms": applied(flight.prisms),
+        "other_systematic": applied({n: system[n] - flight.prisms[n] for n in flight.pair}),
+        "noise": applied({n: flight.monitored[n].vector - flight.clean[n] for n in flight.pair}),
+        "not_applied": flight.height({n: -flight.truth[n] * (1.0 - flight.mask) for n in flight.pair}),
         "beyond_parameters": cases["parameters"].camera,
         "interpolation": cases["interval"].camera - cases["monitored"].camera,
     }
@@ -450,13 +488,13 @@ def _conversion(flight: MonitorFlight) -> Conversion:
     k = flight.spec.referred
     view, traced = flight.views[k], {}
     first, second = flight.pair
-    calm = _found(flight, _true_pair(flight, k), k, exact_data=True)[:, 2].mean()
+    calm = point_errors(flight.true_pair(k), view, exact_data=True)[:, 2].mean()
     slant, incidence = {}, {}
     up = view.ground / np.linalg.norm(view.ground, axis=1, keepdims=True)
     for i, name in enumerate(flight.pair):
-        pair = _true_pair(flight, k)
+        pair = flight.true_pair(k)
         pair[i] = in_analysis(flight.turned[name], flight.calibrated[name])
-        traced[name] = float(_found(flight, pair, k, exact_data=True)[:, 2].mean() - calm)
+        traced[name] = float(point_errors(pair, view, exact_data=True)[:, 2].mean() - calm)
         arm = view.exact[i].station - view.ground
         slant[name] = np.linalg.norm(arm, axis=1)
         forward = np.cross(up, view.exact[i].attitude[:, :, 1])  # along the track, level
@@ -471,15 +509,15 @@ def _conversion(flight: MonitorFlight) -> Conversion:
     return Conversion(FrozenMap(traced), FrozenMap(theory), float(np.mean(np.abs(ratio))))
 
 
-def _scatter(flight: MonitorFlight, slopes: Mapping[str, np.ndarray]) -> Scatter:
+def _scatter(flight: MonitorFlight) -> Scatter:
     """Exact image points, so that the monitor's noise is all there is."""
-    k, mask = flight.worst, _mask(flight)
-    monitored = {n: flight.repeated[n].vector * mask for n in flight.pair}
+    k = flight.worst
+    monitored = {n: flight.repeated[n].vector * flight.mask for n in flight.pair}
     heights = []
     for row in range(flight.spec.repeats):
         pair = [flight.calibrated[n].corrected(monitored[n][row]) for n in flight.pair]
-        heights.append(_found(flight, pair, k, exact_data=True)[:, 2].mean())
-    variance = _propagated(flight, slopes, flight.repeated.noise, k)
+        heights.append(point_errors(pair, flight.views[k], exact_data=True)[:, 2].mean())
+    variance = flight.variance(flight.repeated.noise, k)
     return Scatter(np.array(heights), float(np.sqrt(np.mean(variance))))
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.orbit.forward_intersection import CalibratedLine, Sightings, check_errors, intersect_pair
+from analysis.orbit.forward_intersection import check_errors, intersect_pair
 from scenes.specs.orbit.scene import ControlSpec, LineImageSpec
 from scenes.specs.resolved import target_band
 from twin.orbit.flight.corrected_lines import corrected_line
@@ -23,12 +23,12 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.images.image_points import POINTS_REMEDY, PointsError, tie_points
 from twin.orbit.images.line_optics import LineOptics
 from twin.orbit.images.patch import PatchError, fly_patch, imaged_lines
-from twin.orbit.monitoring.monitoring_flight import HALF_SPAN, Flown, second_view
+from twin.orbit.monitoring.pair_flight import HALF_SPAN, Flown, PairFlight, second_view, sightings
 from twin.run.procedure import BenchError
 from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.setup import LoopSetup
+    from scenes.specs.orbit.setup import MonitorSetup
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +62,10 @@ class ImagedPair:
 
 
 def imaged_pair(
-    setup: LoopSetup,
+    setup: MonitorSetup,
+    flight: PairFlight,
     moment: int,
-    lines: Mapping[str, LineCamera],
     nominal: Mapping[str, LineCamera],
-    known: Mapping[str, CalibratedLine],
     changes: Mapping[str, np.ndarray],
     foci: Mapping[str, float],
     flown: Flown,
@@ -76,10 +75,9 @@ def imaged_pair(
 
     Args:
         setup: the loop.
+        flight: lines as they truly are, and as calibrated in the analysis's form.
         moment: number of the reading.
-        lines: camera -> its line as it truly is.
-        nominal: as it was calibrated.
-        known: the same in the analysis's form.
+        nominal: camera -> its line as it was calibrated.
         changes: camera -> (4,) what the processing takes for its change.
         foci: camera -> its defocus, metres.
         flown: orbit and attitude.
@@ -88,9 +86,9 @@ def imaged_pair(
     Raises:
         BenchError: a patch that a line cannot image, or too few points in it.
     """
-    spec, pair, images = setup.test, setup.pair, setup.test.images
+    spec, pair, images = setup.test, setup.pair, setup.test.loop.images
     assert images is not None
-    time = spec.readings.times[moment]
+    time, lines, known = spec.times[moment], flight.lines[moment], flight.calibrated
     begin, count = time - HALF_SPAN, int(2.0 * HALF_SPAN / spec.line_time)
 
     def sensor(line: LineCamera, measured: bool) -> Sensor:
@@ -111,15 +109,18 @@ def imaged_pair(
         patch = fly_patch(recording, place, size, images.ground, ControlSpec(), stream(seed, 1))
         ties = tie_points(patch, images.points, source=pair[1])
     except (PatchError, PointsError) as error:
-        raise BenchError(f"line images: {error}", ("images",), POINTS_REMEDY) from error
+        raise BenchError(f"line images: {error}", ("mechanisms", "images"), POINTS_REMEDY) from error
     good = ties.in_all
     if np.count_nonzero(good) < _FEWEST:
         problem = f"line images: only {np.count_nonzero(good)} of {len(good)} points were matched"
-        raise BenchError(problem, ("images",), POINTS_REMEDY)
+        raise BenchError(problem, ("mechanisms", "images"), POINTS_REMEDY)
     ground = patch.true_point(pair[1], *ties.lines[pair[1]].place[good].T)
     should = np.stack(true[pair[0]].image(ground), axis=1)
     one, two = ((known[name].corrected(changes[name]), ties.lines[name].image[good]) for name in pair)
-    first, second = (_sightings(users[name], places) for name, (_, places) in zip(pair, (one, two), strict=True))
+    first, second = (
+        sightings(users[name], users[name].trajectory, *places.T)
+        for name, (_, places) in zip(pair, (one, two), strict=True)
+    )
     errors = check_errors(intersect_pair(one[0], two[0], first, second).ground, ground).error
     return ImagedPair(moment, errors, one[1] - should, ties.lines[pair[0]].usual_sigma, len(good))
 
@@ -130,7 +131,7 @@ _TRANSMISSION = 0.8
 """Of a lens, mean over the spectrum, as of payloads that say none."""
 
 
-def _optics(setup: LoopSetup, name: str, defocus: float) -> LineOptics:
+def _optics(setup: MonitorSetup, name: str, defocus: float) -> LineOptics:
     camera = setup.cameras[setup.instrument.cameras[name].camera]
     band = camera.bands[target_band(camera)]
     f_number = camera.focal_length / camera.entrance_pupil
@@ -145,11 +146,6 @@ def _optics(setup: LoopSetup, name: str, defocus: float) -> LineOptics:
         diffusion=band.diffusion,
         tdi=band.tdi,
     )
+    assert setup.line_detectors is not None
     sheet = setup.line_detectors[setup.instrument.cameras[name].camera]
     return LineOptics.from_specs(image, band.pixels, band.pitch, setup.test.line_time, sheet)
-
-
-def _sightings(sensor: Sensor, places: np.ndarray) -> Sightings:
-    seconds = sensor.time(places[:, 0])
-    trajectory = sensor.trajectory
-    return Sightings(places[:, 1], trajectory.position(seconds), trajectory.body_to_itrs(seconds))

@@ -26,28 +26,32 @@ from analysis.monitor.control_loop import (
 )
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.unseen_motions import UnseenMode, floor, unseen_modes
-from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.spans import number_of
-from optics.raytrace.aim import AimError
-from optics.raytrace.trace import BeamMissedError
 from scenes.specs.orbit.monitor import PARAMETERS
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.corrected_lines import calibrated_line
-from twin.orbit.flight.line_camera import LineCamera, traced_line_cameras
-from twin.orbit.loop.line_images import ImagedPair, imaged_pair
-from twin.orbit.loop.loop_course import LoopCourse, drifting_states, gone_through, reader
-from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model
-from twin.orbit.monitoring.monitor_series import TOO_FAR
-from twin.orbit.monitoring.monitoring_flight import fly, in_analysis, look_down
-from twin.orbit.monitoring.monitoring_run import CaseErrors, case_errors, height_slopes, point_errors, rms
-from twin.run.procedure import Advance, BenchError, silent
+from twin.orbit.flight.line_camera import LineCamera
+from twin.orbit.monitoring.closed_loop import (
+    FOCUS_FIELDS,
+    Corrector,
+    LoopCourse,
+    LoopModel,
+    defocus,
+    drifting_states,
+    gone_through,
+    loop_model,
+    reader,
+)
+from twin.orbit.monitoring.line_images import ImagedPair, imaged_pair
+from twin.orbit.monitoring.pair_flight import CaseErrors, PairFlight, fly, look_down, rms, traced_pair
+from twin.run.procedure import Advance
 from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.orbit.setup import LoopSetup
+    from scenes.specs.orbit.setup import MonitorSetup
 
 _IMAGES = 100_000
 """Random stream of line images; moments of the check points have those up to the number of readings."""
@@ -71,6 +75,7 @@ class LoopPass:
 
     Attributes:
         course: of it.
+        flight: its lines and check points.
         truth: (T, P) true quantities when images are taken, less what the processing corrects.
         heights: errors at the check points.
         slopes: (T, P) of the mean height error by the quantities, m/rad and m/m.
@@ -80,6 +85,7 @@ class LoopPass:
     """
 
     course: LoopCourse
+    flight: PairFlight
     truth: np.ndarray
     heights: CaseErrors
     slopes: np.ndarray
@@ -87,7 +93,7 @@ class LoopPass:
     mtf: Mapping[str, np.ndarray]
     images: tuple[ImagedPair, ...] = ()
 
-    def told(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def posterior(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(T,) what the posterior says of a quantity, and its sigma.
 
         Args:
@@ -99,18 +105,14 @@ class LoopPass:
         return value, np.sqrt(np.maximum(variance, 0.0))
 
     def true(self, rows: np.ndarray) -> np.ndarray:
-        """(T,) of a quantity, by the traced states; arguments as of `told`."""
+        """(T,) of a quantity, by the traced states; arguments as of `posterior`."""
         return np.einsum("tp,tp->t", np.broadcast_to(rows, self.truth.shape), self.truth)
 
     def ratio(self, rows: np.ndarray) -> float:
-        """Largest error of what the posterior says of a quantity over its sigma; arguments as of `told`."""
-        value, sigma = self.told(rows)
+        """Largest error of what the posterior says of a quantity over its sigma; arguments as of `posterior`."""
+        value, sigma = self.posterior(rows)
         known = sigma > 0.0
         return float(np.max(np.abs(value - self.true(rows))[known] / sigma[known], initial=0.0))
-
-    def unit(self, row: int) -> np.ndarray:
-        """(P,) of one of the quantities."""
-        return np.eye(self.truth.shape[1])[row]
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +143,6 @@ class LoopRun:
         seed: of all random numbers.
         model: of the loop.
         closed: with the corrections; open: without.
-        bare: errors of the true cameras at the points of the closed course: image, orbit and attitude.
         loops: of the corrections, by name.
         radius: largest size of the eigenvalues of all loops together.
         margin: by how much all gains together may be larger.
@@ -149,12 +150,11 @@ class LoopRun:
         unseen: (3, T) standard deviations of the same that no estimate from the spots can have less of.
     """
 
-    setup: LoopSetup
+    setup: MonitorSetup
     seed: int
     model: LoopModel
     closed: LoopPass
     open: LoopPass
-    bare: CaseErrors
     loops: Mapping[str, LoopFacts]
     radius: float
     margin: float
@@ -193,7 +193,7 @@ class LoopRun:
     @property
     def ratios(self) -> dict[str, float]:
         """Quantity -> largest error of what the posterior says of it over its sigma, both courses together."""
-        rows = {f"defocus of {name}": self.open.unit(self.model.row(name, "defocus")) for name in self.pair}
+        rows = {f"defocus of {name}": self.model.unit(name, "defocus") for name in self.pair}
         every = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
         every |= {name: (row, row) for name, row in rows.items()}
         return {name: max(self.closed.ratio(one), self.open.ratio(two)) for name, (one, two) in every.items()}
@@ -213,44 +213,35 @@ class LoopRun:
 _SCALE = np.array([1.0, FOCUS_SCALE, FOCUS_SCALE])
 
 
-def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = silent) -> LoopRun:
-    """Draw, render, read, correct, look down: ``python -m twin.orbit loop``.
+def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> LoopRun:
+    """Draw, render, read, correct, look down: `run_monitor` of a test with mechanisms.
 
     Raises:
         InputError: a mechanism or a node that the instrument does not have, or that does not move so.
         BenchError: the loop cannot be run as its file says.
+        AimError, BeamMissedError: light is lost.
+        IntersectionError: rays that are parallel.
     """
     spec, pair = setup.test, setup.pair
     ground_seed, monitor_seed = np.random.SeedSequence(seed).spawn(2)
     number = int(np.random.default_rng(monitor_seed).integers(2**31))
     advance("trace", 0, 1)
     experiment = MonitorExperiment(setup.resolved, backend)
-    try:
-        model = loop_model(setup, experiment)
-        states = drifting_states(spec, experiment, number)
-        advance("trace", 1, 1)
-        read = reader(model, spec, number)
-        courses = []
-        for part, still in (("readings, loop closed", False), ("readings, loop open", True)):
+    model = loop_model(setup, experiment)
+    states = drifting_states(spec, experiment, number)
+    advance("trace", 1, 1)
+    read = reader(model, spec, number)
+    courses = []
+    for part, still in (("readings, loop closed", False), ("readings, loop open", True)):
 
-            def told(done: int, part: str = part) -> None:
-                advance(part, done, len(states))
+        def report(done: int, part: str = part) -> None:
+            advance(part, done, len(states))
 
-            courses.append(gone_through(model, spec, states, read, still, told))
-        nominal = traced_line_cameras(experiment.instrument, backend)
-        calibrated = {
-            name: calibrated_line(
-                nominal[name], experiment.sight.axes[name], experiment.nominal_truth.principal_distance[name]
-            )
-            for name in pair
-        }
-        passes = [_passed(setup, course, nominal, calibrated, ground_seed, advance) for course in courses]
-    except (AimError, BeamMissedError) as error:
-        raise BenchError(f"the instrument cannot be traced: {error}", ("readings",), TOO_FAR) from error
-    except IntersectionError as error:
-        raise BenchError(str(error), ("cameras",), "cameras that look different ways") from error
-    closed, free = (one for one, _ in passes)
-    rows = _mode_rows(model, pair, free.slopes.mean(axis=0))
+        courses.append(gone_through(model, spec, states, read, still, report))
+    nominal = traced_pair(experiment, {}, pair)
+    closed, free = (_passed(setup, course, nominal, ground_seed, advance) for course in courses)
+    # height and foci of the pair
+    rows = np.stack([free.slopes.mean(axis=0), *(model.unit(name, "defocus") for name in pair)])
     facts = {one.name: _facts(model, k, closed.course) for k, one in enumerate(model.correctors)}
     loops = (
         [one.loop_gain for one in facts.values()],
@@ -263,7 +254,6 @@ def run_loop(setup: LoopSetup, backend: Backend, seed: int, advance: Advance = s
         model,
         closed,
         free,
-        passes[0][1],
         FrozenMap(facts),
         spectral_radius(model.coupling, *loops),
         common_margin(model.coupling, *loops),
@@ -288,66 +278,48 @@ def _floor(model: LoopModel, rows: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(np.diag(floor(model.stated, rows)), 0.0))
 
 
-def _mode_rows(model: LoopModel, pair: tuple[str, str], slopes: np.ndarray) -> np.ndarray:
-    """(3, P) rows of the height and of the foci of the pair."""
-    unit = np.eye(len(slopes))
-    return np.stack([slopes, *(unit[model.row(name, "defocus")] for name in pair)])
-
-
 def _passed(
-    setup: LoopSetup,
+    setup: MonitorSetup,
     course: LoopCourse,
     nominal: Mapping[str, LineCamera],
-    calibrated: Mapping[str, CalibratedLine],
     seed: np.random.SeedSequence,
     advance: Advance,
-) -> tuple[LoopPass, CaseErrors]:
-    """A course with its truth and heights, and the errors of the true cameras at the same points."""
-    model, pair, experiment = course.model, setup.pair, course.model.experiment
-    backend, names = experiment.backend, model.cameras
-    lines = []
-    for state in course.states:
-        traced = traced_line_cameras(experiment.instrument, backend, state)
-        lines.append({name: traced[name] for name in pair})
-    views = look_down(setup.test, setup.test.readings.times, pair, lines, seed, advance)
-    corrected, true = [], []
-    for k, view in enumerate(views):
-        known = [calibrated[n].corrected(model.on_ground(n, course.positions[k])) for n in pair]
-        exact = [in_analysis(lines[k][n], calibrated[n]) for n in pair]
-        corrected.append(point_errors(known, view))
-        true.append(point_errors(exact, view))
-    found, best = np.array(corrected), np.array(true)
-    slopes = height_slopes(calibrated, pair, views)
-    rows = np.zeros((len(views), len(model.stated.parameters)))
-    for name in pair:
-        # what the analysis is told too little of, the height is wrong by the other way
-        rows[:, 4 * names.index(name) : 4 * names.index(name) + 4] = -slopes[name]
+) -> LoopPass:
+    """A course with its truth and heights."""
+    model, pair, experiment, test = course.model, setup.pair, course.model.experiment, setup.test
+    axes, distance = experiment.sight.axes, experiment.nominal_truth.principal_distance
+    lines = tuple(traced_pair(experiment, state, pair) for state in course.states)
+    views = look_down(test, pair, lines, seed, advance)
+    calibrated = FrozenMap({name: calibrated_line(nominal[name], axes[name], distance[name]) for name in pair})
+    flight = PairFlight(pair, course.times, lines, calibrated, views)
+    changes = {name: np.array([model.on_ground(name, row) for row in course.positions]) for name in model.cameras}
     truth = experiment.sight.truth(list(course.states))
-    quality = image_quality(experiment.instrument, backend, list(course.states), FOCUS_FIELDS, obstruction=False)
-    traced_quantities = np.concatenate([*(truth.vector(name) for name in names), defocus(quality).T], axis=1)
-    for k, position in enumerate(course.positions):
-        for name in names:
-            own = slice(4 * names.index(name), 4 * names.index(name) + 4)
-            traced_quantities[k, own] -= model.on_ground(name, position)
+    quality = image_quality(
+        experiment.instrument, experiment.backend, list(course.states), FOCUS_FIELDS, obstruction=False
+    )
+    # what processing undoes is no error of a camera any more
+    left = [truth.vector(name) - changes[name] for name in model.cameras]
+    quantities = np.concatenate([*left, defocus(quality).T], axis=1)
+    slopes = np.zeros(quantities.shape)
+    for name in pair:
+        own = model.row(name, PARAMETERS[0])
+        # what the analysis is told too little of, the height is wrong by the other way
+        slopes[:, own : own + len(PARAMETERS)] = -flight.slopes[name]
     looks = [experiment.instrument.spec.cameras[name].look for name in pair]
-    angle = np.zeros(rows.shape[1])
+    angle = np.zeros(quantities.shape[1])
     angle[[model.row(name, "d_alpha") for name in pair]] = [1.0, -1.0] if looks[0] > looks[1] else [-1.0, 1.0]
     mtf = {
         name: np.stack([one.mtf_along_line.mean(axis=1), one.mtf_along_track.mean(axis=1)], axis=1)
         for name, one in quality.cameras.items()
     }
     images = []
-    for time in setup.test.images.times if setup.test.images is not None else ():
-        number = number_of(time, setup.test.readings.times)
-        assert number is not None  # the file was checked
-        k = number
-        changes = {name: model.on_ground(name, course.positions[k]) for name in pair}
-        foci = {name: float(traced_quantities[k, model.row(name, "defocus")]) for name in pair}
-        given = nominal, calibrated, changes, foci, fly(setup.test, seed), stream(seed, _IMAGES, k)
-        images.append(imaged_pair(setup, k, lines[k], *given))
-    heights = case_errors(found, best)
-    passed = LoopPass(course, traced_quantities, heights, rows, angle, FrozenMap(mtf), tuple(images))
-    return passed, case_errors(best, best)
+    for time in test.loop.images.times if test.loop.images is not None else ():
+        k = number_of(time, test.times)
+        assert k is not None  # the file was checked
+        now = {name: values[k] for name, values in changes.items()}
+        foci = {name: float(quantities[k, model.row(name, "defocus")]) for name in pair}
+        images.append(imaged_pair(setup, flight, k, nominal, now, foci, fly(test, seed), stream(seed, _IMAGES, k)))
+    return LoopPass(course, flight, quantities, flight.case(changes), slopes, angle, FrozenMap(mtf), tuple(images))
 
 
 def height_rms(one: LoopPass) -> float:
