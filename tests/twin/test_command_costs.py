@@ -50,7 +50,6 @@ BEYOND: dict[str, tuple[str, str, str, str]] = {
         "  lines: 400>  lines: 9000|  pixels: 400>  pixels: 8000",
         *("images.lines", "lines and pixels"),
     ),
-    "orbit monitor": (f"{ORBIT}/loop.yaml", "side: 400>side: 2000", "mechanisms.images.side", "lines and pixels"),
     "orbit simulate": (
         f"{ORBIT}/simulate.yaml",
         "lines: 1000, pixels: 1000>lines: 9000, pixels: 9000",

@@ -24,7 +24,7 @@ from twin.orbit.export.polynomial_control import residual_sigma
 from twin.orbit.export.quality_sections import quality_answers
 from twin.orbit.images import simulate_report
 from twin.orbit.matching import match_report
-from twin.orbit.monitoring import monitoring_report
+from twin.orbit.monitoring import monitoring_numbers, monitoring_report
 from twin.orbit.monitoring.monitoring_numbers import PROPAGATION, SMOOTHING
 
 FIELDS = {"body": "base", "labels": ["x"], "sizes": [2.0], "sigmas": [0.1], "units": ["um"], "rivals": {}}
@@ -103,7 +103,7 @@ def any_run(monkeypatch: pytest.MonkeyPatch) -> None:
         (influences, "MeasuredCalibrationSpec"),
     ):
         monkeypatch.setattr(module, name, Run)
-    for module, name in ((calibration_report, "CALIBRATION"), (monitoring_report, "MONITOR")):
+    for module, name in ((calibration_report, "CALIBRATION"), (monitoring_numbers, "MONITOR")):
         monkeypatch.setattr(module, name, Ns(warnings=lambda run: []))
     for name in ("drift_warnings", "step_warnings"):
         monkeypatch.setattr(calibration_report, name, lambda *_: [])

@@ -165,6 +165,11 @@ class Record(Generic[S]):
         """The quantity of that key."""
         return next(one for one in self.quantities if one.key == key)
 
+    @property
+    def headed(self) -> list[str]:
+        """Keys of the quantities that have a head for tables."""
+        return [one.key for one in self.quantities if one.head]
+
     def __call__(self, source: S) -> dict[str, Any]:
         """The numbers of one source, as JSON holds them."""
         found = ((one, one.value(source)) for one in self.quantities)

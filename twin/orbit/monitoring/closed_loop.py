@@ -22,7 +22,7 @@ from analysis.chi_square import chance_beyond, limit_of
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import Jump
-from analysis.monitor.recovery import MeasuredSpots, judged_spots
+from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
@@ -317,22 +317,8 @@ def drifting_states(spec: OrbitMonitorSpec, experiment: MonitorExperiment, seed:
     return [compose(s, moves_at(spec, time), bodies) for time, s in zip(spec.times, drawn, strict=True)]
 
 
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """What is read of one state.
-
-    Attributes:
-        observed: shifts of the spots, px, since the images of the nominal instrument.
-        reference: (D, D) px^2 of the spots in those, from which all shifts are counted.
-        evidence: what the fits of the spots say of their sigmas; None where nobody judged them.
-    """
-
-    observed: Observed
-    reference: np.ndarray
-    evidence: SpotEvidence | None = None
-
-
-Read: TypeAlias = Callable[[State, int], Reading]
+Read: TypeAlias = Callable[[State, int], Recovery]
+"""From a state and the number of its moment to what is read of it: shifts since images of the nominal instrument."""
 
 
 def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
@@ -363,15 +349,12 @@ def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
 
     how = Observing(record, centroid, stated=False, frames=frames)
 
-    def read(state: State, number: int) -> Reading:
-        when = spec.times[number]
+    def read(state: State, number: int) -> Recovery:
         try:
-            found = next(iter(observe(experiment, [state], how, [number]))).recovery
+            return next(iter(observe(experiment, [state], how, [number]))).recovery
         except (*LOST, SpotError) as error:
-            text = f"the spots cannot be read at {moment(when)}: {error}"
+            text = f"the spots cannot be read at {moment(spec.times[number])}: {error}"
             raise BenchError(text, spec.times_key, f"{TOO_FAR}; a smaller range of the mechanisms") from error
-        before, after = (np.diag(sigma[0].ravel() ** 2) for sigma in (found.sigma_before, found.sigma_after))
-        return Reading(Observed(when - spec.times[0], found.shift[0], after), before, found.evidence)
 
     return read
 
@@ -400,14 +383,14 @@ def gone_through(
     evidence: tuple[SpotEvidence, ...] = ()
     for k, state in enumerate(states):
         standing = commands.standing
-        found = read(model.moved(state, standing), k)
-        reading = found.observed
-        evidence += () if found.evidence is None else (found.evidence,)
+        spots = read(model.moved(state, standing), k)
+        evidence += () if spots.evidence is None else (spots.evidence,)
+        before, after = (np.diag(sigma[0].ravel() ** 2) for sigma in (spots.sigma_before, spots.sigma_after))
+        reading = Observed(spec.times[k] - spec.times[0], spots.shift[0] - model.spots @ standing, after)
         if not k:
-            how = SeriesFilter(model.stated, found.reference)
+            how = SeriesFilter(model.stated, before)
             belief = how.start(reading.time)
-        known = replace(reading, value=reading.value - model.spots @ standing)
-        belief, innovation = how.update(belief, known)
+        belief, innovation = how.update(belief, reading)
         chi_square.append(innovation.chi_square)
         if innovation.jump is not None:
             jumps.append(innovation.jump)

@@ -15,15 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import norm
 
-from analysis.monitor.control_loop import (
-    DECAYING,
-    LimitCycle,
-    Margins,
-    common_margin,
-    limit_cycle,
-    margins,
-    spectral_radius,
-)
+from analysis.monitor import control_loop
+from analysis.monitor.control_loop import DECAYING, LimitCycle, Margins
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.unseen_motions import UnseenMode, floor, unseen_modes
 from optics.numerics.frozen_map import FrozenMap
@@ -33,17 +26,8 @@ from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.corrected_lines import calibrated_line
 from twin.orbit.flight.line_camera import LineCamera
-from twin.orbit.monitoring.closed_loop import (
-    FOCUS_FIELDS,
-    Corrector,
-    LoopCourse,
-    LoopModel,
-    defocus,
-    drifting_states,
-    gone_through,
-    loop_model,
-    reader,
-)
+from twin.orbit.monitoring import closed_loop
+from twin.orbit.monitoring.closed_loop import FOCUS_FIELDS, Corrector, LoopCourse, LoopModel, defocus
 from twin.orbit.monitoring.line_images import ImagedPair, imaged_pair
 from twin.orbit.monitoring.pair_flight import CaseErrors, PairFlight, fly, look_down, rms, traced_pair
 from twin.run.procedure import Advance
@@ -227,17 +211,17 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
     number = int(np.random.default_rng(monitor_seed).integers(2**31))
     advance("trace", 0, 1)
     experiment = MonitorExperiment(setup.resolved, backend)
-    model = loop_model(setup, experiment)
-    states = drifting_states(spec, experiment, number)
+    model = closed_loop.loop_model(setup, experiment)
+    states = closed_loop.drifting_states(spec, experiment, number)
     advance("trace", 1, 1)
-    read = reader(model, spec, number)
+    read = closed_loop.reader(model, spec, number)
     courses = []
     for part, still in (("readings, loop closed", False), ("readings, loop open", True)):
 
         def report(done: int, part: str = part) -> None:
             advance(part, done, len(states))
 
-        courses.append(gone_through(model, spec, states, read, still, report))
+        courses.append(closed_loop.gone_through(model, spec, states, read, still, report))
     nominal = traced_pair(experiment, {}, pair)
     closed, free = (_passed(setup, course, nominal, ground_seed, advance) for course in courses)
     # height and foci of the pair
@@ -255,8 +239,8 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
         closed,
         free,
         FrozenMap(facts),
-        spectral_radius(model.coupling, *loops),
-        common_margin(model.coupling, *loops),
+        control_loop.spectral_radius(model.coupling, *loops),
+        control_loop.common_margin(model.coupling, *loops),
         unseen_modes(model.stated, rows, _SCALE),
         np.stack(
             [_floor(model, free.slopes), *(np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])]
@@ -270,8 +254,10 @@ def _facts(model: LoopModel, k: int, course: LoopCourse) -> LoopFacts:
     gain = spec.gain * (1.0 + float(model.seen[k]) * (spec.response - 1.0))
     cycle = None
     if step is not None and spec.gain:
-        cycle = limit_cycle(spec.gain, spec.delay, spec.band / abs(step * one.own))
-    return LoopFacts(one, gain, margins(gain, spec.delay), cycle, tuple(np.flatnonzero(course.held[:, k]).tolist()))
+        cycle = control_loop.limit_cycle(spec.gain, spec.delay, spec.band / abs(step * one.own))
+    return LoopFacts(
+        one, gain, control_loop.margins(gain, spec.delay), cycle, tuple(np.flatnonzero(course.held[:, k]).tolist())
+    )
 
 
 def _floor(model: LoopModel, rows: np.ndarray) -> np.ndarray:

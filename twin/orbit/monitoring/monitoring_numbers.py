@@ -24,9 +24,9 @@ MOST_MOTIONS = 8
 """Motions that a mode names."""
 
 
-def _unsigned(values: Array) -> Array:
-    """Values with plain zeros in place of negative ones."""
-    return np.asarray(values + 0.0)
+def _unsigned(values: Array | None) -> Array | None:
+    """Values with plain zeros in place of negative ones; None stays."""
+    return None if values is None else np.asarray(values + 0.0)
 
 
 CHANGES: Record[Array] = Record(
@@ -48,9 +48,7 @@ ANGLE: Record[MonitorRun] = Record(
     Quantity("reference_deg", lambda run: run.flight.angle[run.flight.spec.referred], "true, at the reference"),
     Quantity("true_change_arcsec", lambda run: _unsigned(run.angle_change), "true change since the reference"),
     Quantity("monitored_change_arcsec", lambda run: _unsigned(run.angle), "change by the monitor"),
-    Quantity(
-        "monitored_change_arcsec_sigma", lambda run: _unsigned(run.angle_sigma), "standard deviation of its error"
-    ),
+    Quantity("monitored_change_arcsec_sigma", lambda run: _unsigned(run.angle_sigma), "sigma of its error"),
     Quantity("monitored_change_arcsec_sigma_noise", lambda run: _unsigned(run.angle_noise), "of that the noise's part"),
     Quantity("true_change_span_arcsec", lambda run: np.ptp(run.angle_change), "largest less smallest true change"),
 )
@@ -59,17 +57,9 @@ SUMMARY: Record[CaseErrors] = Record(
     Quantity("height_rms_m", lambda case: case.height_rms, "in height", "height", 3),
     Quantity("height_worst_m", lambda case: case.worst, "in height at the worst time", "worst", 3),
     Quantity("height_bias_rms_m", lambda case: rms(case.bias), "of the points' mean height error"),
-    Quantity(
-        "height_camera_rms_m",
-        lambda case: case.camera_height_rms,
-        "in height by the cameras",
-        "height by the cameras",
-        4,
-    ),
+    Quantity("height_camera_rms_m", lambda case: case.camera_height_rms, "by the cameras", "height by the cameras", 4),
     Quantity("plan_rms_m", lambda case: case.plan_rms, "in plan", "plan", 3),
-    Quantity(
-        "plan_camera_rms_m", lambda case: rms(case.camera_plan), "in plan by the cameras", "plan by the cameras", 4
-    ),
+    Quantity("plan_camera_rms_m", lambda case: rms(case.camera_plan), "by the cameras", "plan by the cameras", 4),
 )
 SERIES: Record[CaseErrors] = Record(
     "Errors at the check points of each time.",
@@ -84,22 +74,15 @@ CASE: Record[CaseErrors] = Record(
 INTERVAL: Record[tuple[MonitorRun, float]] = Record(
     "Errors where values are interpolated over an interval.",
     Quantity("interval_s", lambda one: one[1], "between measurements", "interval", 1, shown="min"),
-    Quantity("measurements", lambda one: len(one[0].flight.spec.measured(one[1])), "how many there are"),
+    Quantity("measurements", lambda one: len(one[0].flight.spec.measured(one[1])), "of them", "measurements"),
     *SUMMARY.of_part(lambda one: one[0].intervals[one[1]]),
 )
 CONVERSION: Record[MonitorRun] = Record(
     "Metres of height for an arcsecond, at the reference.",
     Quantity("by_angle_m_per_arcsec", lambda run: run.conversion.of_angle, "of the angle", converted=False),
-    Quantity(
-        "by_common_turn_m_per_arcsec", lambda run: run.conversion.of_common, "by which both turn alike", converted=False
-    ),
+    Quantity("by_common_turn_m_per_arcsec", lambda run: run.conversion.of_common, "of both", converted=False),
     Quantity("by_camera_m_per_arcsec", lambda run: run.conversion.traced, "of one camera's Y, traced", converted=False),
-    Quantity(
-        "theory_by_camera_m_per_arcsec",
-        lambda run: run.conversion.theory,
-        "of one camera's Y, by base to height",
-        converted=False,
-    ),
+    Quantity("theory_by_camera_m_per_arcsec", lambda run: run.conversion.theory, "by base to height", converted=False),
     Quantity("base_to_height", lambda run: run.conversion.base_to_height, "base over height of the pair"),
 )
 SLOPES: Record[Array] = Record(
@@ -125,11 +108,7 @@ def _scatter_differs(run: MonitorRun) -> str:
 PROPAGATION: Record[MonitorRun] = Record(
     "Standard deviation of the mean height, and that of the noise against repeats at one time.",
     Quantity("height_m_sigma_noise", lambda run: _unsigned(run.sigma), "over the times, by the monitor's noise"),
-    Quantity(
-        "height_m_sigma",
-        lambda run: None if run.sigma_total is None else _unsigned(run.sigma_total),
-        "over the times, of the whole error; null without a prior on disturbances",
-    ),
+    Quantity("height_m_sigma", lambda run: _unsigned(run.sigma_total), "of the whole error; null without a prior"),
     Quantity("time_s", lambda run: run.flight.times[run.flight.worst], "of the repeats"),
     Quantity("repeats", lambda run: len(run.scatter.heights), "how often the monitor measures"),
     Quantity("sigma_m", lambda run: run.scatter.sigma, "propagated"),
@@ -137,21 +116,15 @@ PROPAGATION: Record[MonitorRun] = Record(
     Quantity("ratio", lambda run: run.scatter.spread / run.scatter.sigma, "spread over sigma"),
     Quantity("lower_limit", lambda run: run.scatter.limits[0], "of the ratio"),
     Quantity("upper_limit", lambda run: run.scatter.limits[1], "of the ratio"),
-    Quantity(
-        "agrees", lambda run: run.scatter.agrees, "whether the ratio lies within the limits", warning=_scatter_differs
-    ),
+    Quantity("agrees", lambda run: run.scatter.agrees, "whether it lies within", warning=_scatter_differs),
 )
 SMOOTHED: Record[tuple[MonitorRun, float, Smoothing]] = Record(
     "Heights by values smoothed from the measurements at one interval.",
     Quantity("interval_s", lambda one: one[1], "between measurements", "interval", 1, shown="min"),
-    Quantity("measurements", lambda one: len(one[0].flight.spec.measured(one[1])), "how many there are"),
+    Quantity("measurements", lambda one: len(one[0].flight.spec.measured(one[1])), "of them", "measurements"),
     Quantity("height_rms_m", lambda one: one[2].case.height_rms, "RMS error in height over all times"),
     Quantity(
-        "height_linear_rms_m",
-        lambda one: one[2].interpolated.camera_height_rms,
-        "in height by the cameras, values linear between the measurements",
-        "linear",
-        3,
+        "height_linear_rms_m", lambda one: one[2].interpolated.camera_height_rms, "by the cameras, linear", "linear", 3
     ),
     Quantity("height_camera_rms_m", lambda one: one[2].case.camera_height_rms, "the same smoothed", "smoothed", 3),
     Quantity("better_than_interpolation", lambda one: one[2].factor, "factor between the two", "factor", 2),
@@ -206,19 +179,9 @@ CAUSE: Record[tuple[MonitorRun, Cause]] = Record(
     Quantity("node", lambda one: one[1].path, "of the instrument's tree"),
     Quantity("true", lambda one: one[1].truth, "true changes, by camera", record=CHANGES),
     Quantity("monitor_error", lambda one: one[1].error, "reading without noise minus truth, by camera", record=CHANGES),
+    Quantity("height_without_monitoring_m", lambda one: one[0].cause_heights(one[1])[0], "caused", "unmonitored", 3),
     Quantity(
-        "height_without_monitoring_m",
-        lambda one: one[0].cause_heights(one[1])[0],
-        "height error that it makes",
-        "unmonitored",
-        3,
-    ),
-    Quantity(
-        "height_left_by_monitor_m",
-        lambda one: one[0].cause_heights(one[1])[1],
-        "height error that a misreading makes",
-        "misread",
-        3,
+        "height_left_by_monitor_m", lambda one: one[0].cause_heights(one[1])[1], "made by misreading", "misread", 3
     ),
 )
 
@@ -235,12 +198,7 @@ MONITOR: Record[MonitorRun] = Record(
     Quantity("height_worst_m", lambda run: run.cases["interval"].worst, "RMS error in height at the worst time"),
     Quantity("height_camera_rms_m", lambda run: run.cases["interval"].camera_height_rms, "in height by the cameras"),
     Quantity("plan_rms_m", lambda run: run.cases["interval"].plan_rms, "RMS error in plan"),
-    Quantity(
-        "height_m_per_arcsec",
-        lambda run: run.conversion.of_angle,
-        "of height for the intersection angle",
-        converted=False,
-    ),
+    Quantity("height_m_per_arcsec", lambda run: run.conversion.of_angle, "by the angle", converted=False),
     Quantity("times_s", lambda run: run.flight.times, "of the course"),
     Quantity("reference_time_s", lambda run: run.flight.spec.reference_time, "when cameras and monitor are calibrated"),
     Quantity("monitored_times_s", lambda run: run.flight.times[run.flight.spec.measured(run.flight.spec.every)]),
@@ -282,9 +240,7 @@ FOCUS: Record[tuple[LoopRun, LoopPass, str]] = Record(
 )
 MOMENTS: Record[LoopPass] = Record(
     "Errors of each moment.",
-    Quantity(
-        "angle_arcsec", lambda one: one.true(one.angle) + 0.0, "true error of the angle between the lines of sight"
-    ),
+    Quantity("angle_arcsec", lambda one: one.true(one.angle) + 0.0, "true error of the angle"),
     Quantity("angle_told_arcsec", lambda one: one.posterior(one.angle)[0] + 0.0, "as the posterior says it"),
     Quantity("angle_told_arcsec_sigma", lambda one: one.posterior(one.angle)[1], "standard deviation of its error"),
     Quantity("height_m", lambda one: one.heights.camera + 0.0, "mean height error by the cameras"),
@@ -302,16 +258,8 @@ IMAGES: Record[tuple[LoopPass, ImagedPair]] = Record(
     Quantity("sought", lambda of: of[1].sought, "points that were sought"),
     Quantity("height_m", lambda of: of[1].height[0], "mean height error of the points", "height", 3),
     Quantity("height_m_sigma", lambda of: of[1].height[1], "of it by the scatter of the points", "σ", 3),
-    Quantity(
-        "drawn_height_m", lambda of: float(of[0].heights.bias[of[1].moment]), "by drawn points", "drawn points", 3
-    ),
-    Quantity(
-        "camera_height_m",
-        lambda of: float(of[0].heights.camera[of[1].moment]),
-        "by the cameras alone",
-        "by the cameras",
-        3,
-    ),
+    Quantity("drawn_height_m", lambda of: of[0].heights.bias[of[1].moment], "by drawn points", "drawn points", 3),
+    Quantity("camera_height_m", lambda of: of[0].heights.camera[of[1].moment], "alone", "by the cameras", 3),
     Quantity("matching_lines_px", lambda of: float(of[1].matching[0]), "RMS across the line", "matching across", 3),
     Quantity("matching_pixels_px", lambda of: float(of[1].matching[1]), "RMS along the line", "along", 3),
     Quantity("stated_lines_px", lambda of: float(of[1].sigma[0]), "sigma that matching states", "stated across", 3),
@@ -336,17 +284,9 @@ def _contradicted(of: tuple[LoopRun, LoopPass]) -> str:
 PASS: Record[tuple[LoopRun, LoopPass]] = Record(
     "One way through the moments.",
     Quantity("angle_rms_arcsec", lambda of: rms(of[1].true(of[1].angle)), "RMS error of the angle", "angle", 3),
-    Quantity(
-        "angle_sigma_rms_arcsec",
-        lambda of: rms(of[1].posterior(of[1].angle)[1]),
-        "of its sigma by the posterior",
-        "σ",
-        3,
-    ),
+    Quantity("angle_sigma_rms_arcsec", lambda of: rms(of[1].posterior(of[1].angle)[1]), "by the posterior", "σ", 3),
     Quantity("height_camera_rms_m", lambda of: height_rms(of[1]), "mean height error by the cameras", "height", 3),
-    Quantity(
-        "height_sigma_rms_m", lambda of: rms(of[1].posterior(of[1].slopes)[1]), "of its sigma by the posterior", "σ", 3
-    ),
+    Quantity("height_sigma_rms_m", lambda of: rms(of[1].posterior(of[1].slopes)[1]), "by the posterior", "σ", 3),
     Quantity("height_rms_m", lambda of: of[1].heights.height_rms, "of all errors in height", "all errors", 3),
     Quantity("defocus_rms_um", _foci, "defocus of the pair's cameras together", "defocus", 2),
     Quantity("mtf_least", lambda of: min(float(of[1].mtf[n].min()) for n in of[0].pair), "at Nyquist", "least MTF", 3),
@@ -383,18 +323,14 @@ CORRECTION: Record[tuple[LoopRun, str, LoopFacts]] = Record(
     Quantity("gain", lambda of: of[2].corrector.spec.gain, "stated", "gain", 3),
     Quantity("delay", lambda of: of[2].corrector.spec.delay, "readings"),
     Quantity("loop_gain", lambda of: of[2].loop_gain, "with what the spots tell of the mechanism's own error"),
-    Quantity(
-        "seen", lambda of: _seen(*of), "share of a mechanism's own error that a reading tells", "told", 3, None, True
-    ),
+    Quantity("seen", lambda of: _seen(*of), "share of its error that a reading tells", "told", 3, None, True),
     Quantity("gain_limit", lambda of: of[2].margins.limit, "below which this loop is stable", "limit", 4),
     Quantity("gain_margin", lambda of: _known(of[2].margins.gain), "limit over loop gain; null for gain 0", decimals=2),
     Quantity("phase_margin_deg", lambda of: _known(of[2].margins.phase_deg), "", "phase margin", 1, converted=False),
     Quantity("stable", lambda of: of[2].margins.stable, "by itself", warning=_unstable_alone),
     Quantity("cycle_steps", lambda of: of[2].cycle and of[2].cycle.steps, "of the limit cycle, peak to peak", "cycle"),
     Quantity("unit", lambda of: of[2].corrector.unit[0], "of positions"),
-    Quantity(
-        "positions", lambda of: positions(of[0], of[1]), "over the moments, when images are taken", converted=False
-    ),
+    Quantity("positions", lambda of: positions(of[0], of[1]), "when images are taken", converted=False),
     Quantity("held_s", lambda of: [float(of[0].closed.course.times[k]) for k in of[2].ends], "when its range ended"),
 )
 
@@ -445,13 +381,9 @@ def _near_limit(run: LoopRun) -> str:
 
 LOOP: Record[LoopRun] = Record(
     "The loop closed and open.",
-    Quantity(
-        "height_closed_rms_m", lambda run: height_rms(run.closed), "mean height error by the cameras, loop closed"
-    ),
+    Quantity("height_closed_rms_m", lambda run: height_rms(run.closed), "by the cameras, loop closed"),
     Quantity("height_open_rms_m", lambda run: height_rms(run.open), "the same with the loop open"),
-    Quantity(
-        "height_sigma_rms_m", lambda run: rms(run.closed.posterior(run.closed.slopes)[1]), "sigma by the posterior"
-    ),
+    Quantity("height_sigma_rms_m", lambda run: rms(run.closed.posterior(run.closed.slopes)[1]), "by the posterior"),
     Quantity("height_unseen_rms_m", lambda run: rms(run.unseen[0]), "what no spot shows, one standard deviation"),
     Quantity("angle_closed_rms_arcsec", lambda run: rms(run.closed.true(run.closed.angle)), "loop closed"),
     Quantity("angle_open_rms_arcsec", lambda run: rms(run.open.true(run.open.angle)), "loop open"),
@@ -466,12 +398,7 @@ LOOP: Record[LoopRun] = Record(
     Quantity("corrections", lambda run: {n: (run, n, one) for n, one in run.loops.items()}, record=CORRECTION),
     Quantity("closed", lambda run: PASS((run, run.closed)), "with the corrections", converted=False),
     Quantity("open", lambda run: PASS((run, run.open)), "without", converted=False),
-    Quantity(
-        "bare",
-        lambda run: SUMMARY(run.closed.flight.true_case),
-        "by the true cameras: image, orbit, attitude",
-        converted=False,
-    ),
+    Quantity("bare", lambda run: SUMMARY(run.closed.flight.true_case), "by the true cameras", converted=False),
     Quantity("unseen", lambda run: [(run, mode) for mode in run.modes], "what no spot shows", record=MODE),
     Quantity("unseen_height_m", lambda run: run.unseen[0], "one standard deviation, over the moments"),
     Quantity("unseen_defocus_um", lambda run: run.unseen[1:, 0], "likewise, of the pair"),

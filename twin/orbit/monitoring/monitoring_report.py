@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -16,29 +15,13 @@ from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.yaml.errors import names_text
 from twin.monitor.time_series import jump_text
+from twin.orbit.monitoring import monitoring_numbers as numbers
 from twin.orbit.monitoring.loop_run import LoopRun, height_rms
-from twin.orbit.monitoring.monitoring_numbers import (
-    BY_CAMERA,
-    CAUSE,
-    CORRECTION,
-    IMAGES,
-    INTERVAL,
-    LOOP,
-    MODE,
-    MONITOR,
-    PART,
-    PASS,
-    SMOOTHED,
-    SUMMARY,
-    motions_of,
-    positions,
-)
 from twin.orbit.monitoring.monitoring_plots import PARTS, monitoring_figure
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun
 from twin.orbit.monitoring.pair_flight import rms
 from twin.run.artefact import SYMBOLS, CsvFile, Table, significant
 from twin.run.data_files import csv_table
-from twin.run.quantity import Record
 from twin.run.report import Report, Section, answer
 from twin.sensors.area_detector import coarse_warnings
 
@@ -57,7 +40,7 @@ def monitor_report(run: MonitorRun | LoopRun) -> Report:
             _facts(run),
             _loop_summary(run),
             (_orbit(run), *_images(run), _loops(run), _unseen(run)),
-            warnings=(*LOOP.warnings(run), *_worse_warnings(run), *_loop_warnings(run)),
+            warnings=(*numbers.LOOP.warnings(run), *_worse_warnings(run), *_loop_warnings(run)),
         )
     smoothed = (_smoothed(run),) if run.smoothing else ()
     return Report(
@@ -68,11 +51,6 @@ def monitor_report(run: MonitorRun | LoopRun) -> Report:
         (_angle(run), _height(run), *smoothed, _interval(run), _rest(run), _conversion(run), _noise(run)),
         warnings=_warnings(run),
     )
-
-
-def _shown(record: Record[Any]) -> list[str]:
-    """Keys of a record that its tables show."""
-    return [one.key for one in record if one.head]
 
 
 def _facts(run: MonitorRun | LoopRun) -> tuple[tuple[str, str], ...]:
@@ -160,12 +138,12 @@ def _table(run: MonitorRun) -> Table:
         "parameters": "true four parameters (bound)",
         "true": "true cameras (bound)",
     }
-    return SUMMARY.table(
+    return numbers.SUMMARY.table(
         "cases",
         "Errors at check points over the course",
         "RMS of all points and times; worst: RMS of the worst time; by the cameras: without image, orbit and attitude.",
-        {name: SUMMARY(run.cases[key]) for key, name in names.items() if key in run.cases},
-        _shown(SUMMARY),
+        {name: numbers.SUMMARY(run.cases[key]) for key, name in names.items() if key in run.cases},
+        numbers.SUMMARY.headed,
         "cameras",
     )
 
@@ -196,10 +174,7 @@ def _changes(run: MonitorRun, name: str) -> Table:
 
 
 def _height(run: MonitorRun) -> Section:
-    floor = run.cases["true"]
     text = (
-        "What the cameras alone do is the difference to the true cameras with the same image points, orbit and "
-        f"attitude. True cameras leave {floor.height_rms:.3g} m in height and {floor.plan_rms:.3g} m in plan.",
         "Attitude errors that both cameras share turn the body, not the angle: the monitor does not see them. One "
         f"arcsecond in pitch of both makes {abs(run.conversion.of_common):.2f} m of height, for the pair does not look "
         "evenly forward and back.",
@@ -214,24 +189,20 @@ def _smoothed(run: MonitorRun) -> Section:
     assert stated is not None
     chosen = run.smoothed
     found = chosen.consistency
-    table = SMOOTHED.table(
+    table = numbers.SMOOTHED.table(
         "smoothing",
         "Heights smoothed against heights interpolated, from the same measurements",
         "By the cameras alone, RMS over all times; the sigma that the smoother states; the largest error over its "
         f"sigma, limit {chosen.limit:.2f}; chi-square of the shifts and its degrees of freedom.",
-        [SMOOTHED((run, *item)) for item in run.smoothing.items()],
-        _shown(SMOOTHED),
+        [numbers.SMOOTHED((run, *item)) for item in run.smoothing.items()],
+        numbers.SMOOTHED.headed,
     )
-    fits = "agree" if found.agrees else "do not agree"
-    reach = "lies within" if chosen.agrees else "goes beyond"
     text = (
         f"All measurements together, by the prior ({stated.name}) and its time laws: the best "
         f"linear estimate at every time. Measured every {moment(spec.every)}, it makes the cameras' height error "
         f"{_times(chosen.factor, 'smaller')} than values that are linear between the measurements.",
-        f"Its sigma is {rms(chosen.sigma):.2f} m RMS; the largest error is {chosen.furthest:.2f} of its sigma, which "
-        f"{reach} the limit of {chosen.limit:.2f} (false alarm at most {FALSE_ALARM:g}). Measured shifts {fits} with "
-        f"the prior: chi-square {found.chi_square:.4g} of {found.degrees} degrees of freedom, limit "
-        f"{found.limit:.4g}.",
+        f"Measured shifts {'agree' if found.agrees else 'do not agree'} with the prior: chi-square "
+        f"{found.chi_square:.4g} of {found.degrees} degrees of freedom, limit {found.limit:.4g}.",
     )
     caption = "Mean over the points, with the total sigma of the smoothed height."
     figure = monitoring_figure("smoothed", "Heights between the measurements", caption, run)
@@ -239,12 +210,12 @@ def _smoothed(run: MonitorRun) -> Section:
 
 
 def _interval(run: MonitorRun) -> Section:
-    table = INTERVAL.table(
+    table = numbers.INTERVAL.table(
         "intervals",
         "Height error against the monitoring interval",
         "Measured from the reference on, linear between, held before the first and after the last.",
-        [INTERVAL((run, interval)) for interval in run.intervals],
-        _shown(INTERVAL),
+        [numbers.INTERVAL((run, interval)) for interval in run.intervals],
+        numbers.INTERVAL.headed,
     )
     figure = monitoring_figure("interval", "RMS in height against the interval", "Over all times.", run)
     return Section("How often to measure", (), (figure, table))
@@ -252,19 +223,19 @@ def _interval(run: MonitorRun) -> Section:
 
 def _rest(run: MonitorRun) -> Section:
     flight = run.flight
-    parts = PART.table(
+    parts = numbers.PART.table(
         "parts",
         "Parts of the corrected cameras' height error",
         "Over all times; signed, they add up to the whole but for products of two small errors.",
-        {PARTS[name][0]: PART(part) for name, part in run.parts.items()},
-        _shown(PART),
+        {PARTS[name][0]: numbers.PART(part) for name, part in run.parts.items()},
+        numbers.PART.headed,
         "part",
     )
-    causes = CAUSE.table(
+    causes = numbers.CAUSE.table(
         "causes",
         f"Each cause alone, at {moment(float(flight.times[flight.worst]))}",
         "Height that it makes without monitoring, and height that the monitor makes by misreading it.",
-        [CAUSE((run, cause)) for cause in flight.causes],
+        [numbers.CAUSE((run, cause)) for cause in flight.causes],
         ("what", "node", "height_without_monitoring_m", "height_left_by_monitor_m"),
     )
     largest = max(run.parts, key=lambda name: rms(run.parts[name]))
@@ -300,24 +271,18 @@ def _worse(run: MonitorRun) -> tuple[str, ...]:
 
 
 def _conversion(run: MonitorRun) -> Section:
-    conversion, flight = run.conversion, run.flight
-    table = BY_CAMERA.table(
+    conversion = run.conversion
+    table = numbers.BY_CAMERA.table(
         "conversion",
         "Metres of height",
         "Of a whole camera turned by 1 arcsec about its Y and traced, by base to height, and of each parameter that "
         "the analysis is told wrongly: a bias of the monitor acts like this.",
-        {name: BY_CAMERA((run, name)) for name in flight.pair},
+        {name: numbers.BY_CAMERA((run, name)) for name in run.flight.pair},
         label="camera",
     )
-    predicted = -sum(flight.slopes[n][:, 0] * flight.truth[n][:, 0] for n in flight.pair)
-    none = run.cases["none"].camera
-    size = rms(none) or 1.0
-    by_angle = -conversion.of_angle * run.angle_change / ARCSEC
     text = (
         f"Base to height is {conversion.base_to_height:.3f}. An arcsecond of the angle, half from each camera, is "
-        f"{abs(conversion.of_angle):.2f} m; it is more by the camera that looks farther aside, so that the angle alone "
-        f"gives the height without monitoring to {100.0 * rms(none - by_angle) / size:.1f}% of its RMS, and the "
-        f"Δα of both cameras to {100.0 * rms(none - predicted) / size:.1f}%.",
+        f"{abs(conversion.of_angle):.2f} m; it is more by the camera that looks farther aside.",
     )
     return Section("From arcseconds to metres", text, (table,))
 
@@ -338,7 +303,7 @@ def _warnings(run: MonitorRun) -> tuple[str, ...]:
     out = [*coarse_warnings(run.setup), *run.flight.doubts]
     together = run.flight.smoothed.get(run.flight.spec.every)
     out += [jump_text(one) for one in (together.jumps if together is not None else None) or ()]
-    out += MONITOR.warnings(run)
+    out += numbers.MONITOR.warnings(run)
     if run.cases["monitored"].camera_height_rms > run.cases["none"].camera_height_rms:
         out.append("monitoring makes heights worse: the monitor's own errors are larger than the cameras' changes")
     return tuple(out)
@@ -369,30 +334,24 @@ def _margin(run: LoopRun) -> str:
 
 
 def _focus_words(run: LoopRun) -> str:
-    """What the loop does to the focus, and what the spots tell of it."""
-    told = []
-    for k, name in enumerate(run.pair):
-        row = run.model.row(name, "defocus")
-        prior = float(np.sqrt(_row_variance(run, row)))
+    """What of the focus the spots leave as it was before any reading."""
+    left, stated = [], run.model.stated
+    for name, unseen in zip(run.pair, run.unseen[1:], strict=True):
+        effect = stated.parameters[run.model.row(name, "defocus")]
+        prior = math.sqrt(float(effect @ stated.correlation @ effect))
         if prior > 0.0:
-            told.append(f"{float(run.unseen[1 + k].max()) / prior:.1%} of {name}'s")
-    return f"of the standard deviation of the focus the spots leave {' and '.join(told)} as it was" if told else ""
-
-
-def _row_variance(run: LoopRun, row: int) -> float:
-    """Variance of one of the quantities before any reading."""
-    effect = run.model.stated.parameters[row]
-    return float(effect @ run.model.stated.correlation @ effect)
+            left.append(f"{float(unseen.max()) / prior:.1%} of {name}'s")
+    return f"of the standard deviation of the focus the spots leave {' and '.join(left)} as it was" if left else ""
 
 
 def _loop_summary(run: LoopRun) -> Table:
-    return PASS.table(
+    return numbers.PASS.table(
         "loop",
         "What the loop leaves",
         "RMS over the moments. Height: mean over the points, by the cameras alone; all errors: of each point, with "
         "those of image points, orbit and attitude; σ: as the posterior says it; MTF at Nyquist, the least of all.",
-        {"loop open": PASS((run, run.open)), "loop closed": PASS((run, run.closed))},
-        _shown(PASS),
+        {"loop open": numbers.PASS((run, run.open)), "loop closed": numbers.PASS((run, run.closed))},
+        numbers.PASS.headed,
         "course",
     )
 
@@ -409,16 +368,11 @@ def _orbit(run: LoopRun) -> Section:
         columns += [one.true(one.angle) / ARCSEC, one.heights.camera, told, sigma]
     for corrector in run.model.correctors:
         heads.append(f"{corrector.name} [{corrector.unit[0]}]")
-        columns.append(positions(run, corrector.name))
+        columns.append(numbers.positions(run, corrector.name))
     rows = csv_table([heads, *np.stack(columns, axis=-1).tolist()]).decode()
     text = (
-        "At every moment the spots are rendered where the mechanisms stand and recovered, the filter of the stated "
-        "laws takes them less what the known positions do to the spots, commands go out, mechanisms move, and images "
-        "are taken. The estimate never sees the state.",
         f"True cameras leave {significant(run.closed.flight.true_case.height_rms, 2)} m RMS in height by image points, "
         "orbit and attitude.",
-        "Turns that both cameras share with the base turn the body and not the angle: no monitor sees them, the star "
-        "trackers do.",
     )
     return Section("Over the orbit", text, (course, places, CsvFile("moments", "All numbers", "", rows)))
 
@@ -427,32 +381,28 @@ def _images(run: LoopRun) -> tuple[Section, ...]:
     if not run.closed.images:
         return ()
     rows = {
-        f"{label}, {moment(float(one.course.times[pair.moment]))}": IMAGES((one, pair))
+        f"{label}, {moment(float(one.course.times[pair.moment]))}": numbers.IMAGES((one, pair))
         for label, one in (("open", run.open), ("closed", run.closed))
         for pair in one.images
     }
-    table = IMAGES.table(
+    table = numbers.IMAGES.table(
         "images",
         "Heights from rendered line images",
         "Points of the second camera's image, matched in the first one's: mean height error with σ by their scatter; "
         "the same of drawn points over the whole swath, and by the cameras alone; matching, found minus true place, "
         "and the σ that it states.",
         rows,
-        _shown(IMAGES)[1:],
+        numbers.IMAGES.headed[1:],
         "loop, after",
     )
-    text = (
-        "At these moments both lines are rendered over the same ground through the states that the mechanisms have "
-        "left, their points matched, and intersected by the lines that the user knows.",
-    )
-    return (Section("Line images", text, (table,)),)
+    return (Section("Line images", (), (table,)),)
 
 
 def _loops(run: LoopRun) -> Section:
-    rows = {name: CORRECTION((run, name, one)) for name, one in run.loops.items()}
+    rows = {name: numbers.CORRECTION((run, name, one)) for name, one in run.loops.items()}
     for row in rows.values():
         row["mechanism"] = row["mechanism"] or "on the ground"
-    table = CORRECTION.table(
+    table = numbers.CORRECTION.table(
         "corrections",
         "Each correction as a loop",
         "Limit: gain below which a loop of this delay is stable. Cycle: steps by which a mechanism of whole steps goes "
@@ -466,8 +416,6 @@ def _loops(run: LoopRun) -> Section:
         "name",
     )
     text = (
-        "An integrator of gain g whose command has its effect d readings later has the open loop "
-        "L(z) = g z^-(d+1) / (1 - 1/z) by readings, and is stable below g = 2 sin(π / (4 d + 2)).",
         f"Together, with what mechanisms do to each other's quantities, the largest eigenvalue is {run.radius:.3f}.",
     )
     caption = (
@@ -480,9 +428,12 @@ def _loops(run: LoopRun) -> Section:
 def _unseen(run: LoopRun) -> Section:
     rows = []
     for mode in run.modes:
-        row = {key: v if isinstance(v, dict | list) or abs(v) > _LEAST else 0.0 for key, v in MODE((run, mode)).items()}
+        row = {
+            key: v if isinstance(v, dict | list) or abs(v) > _LEAST else 0.0
+            for key, v in numbers.MODE((run, mode)).items()
+        }
         rows.append(row | {"bodies": _bodies(mode), "motions": _motions(run, mode)})
-    table = MODE.table(
+    table = numbers.MODE.table(
         "unseen",
         "Motions that no spot shows",
         f"For one standard deviation of each mode: combinations of stated motions that leave every spot where it is. "
@@ -506,7 +457,7 @@ def _bodies(mode: UnseenMode) -> str:
 
 
 def _motions(run: LoopRun, mode: UnseenMode) -> str:
-    every = motions_of(run, mode)[:_MOTIONS]
+    every = numbers.motions_of(run, mode)[:_MOTIONS]
     return ", ".join(f"{one['motion']} {significant(one['amount'], 2, sign=True)} {one['unit']}" for one in every)
 
 
@@ -530,7 +481,7 @@ def _loop_warnings(run: LoopRun) -> tuple[str, ...]:
             )
     for label, course in (("closed", run.closed.course), ("open", run.open.course)):
         out += [f"with the loop {label} {jump_text(one)}" for one in course.jumps]
-        out += PASS.warnings((run, run.closed if label == "closed" else run.open))
+        out += numbers.PASS.warnings((run, run.closed if label == "closed" else run.open))
         if course.evidence is not None:
             spots = [channel.key for channel in run.model.experiment.path.channels]
             doubt = course.evidence.course_doubt([moment(float(time)) for time in course.times], spots)
