@@ -1,4 +1,4 @@
-"""Figures and picture of the page loop.md: one orbit with the monitor in the loop, and the same with the loop open."""
+"""Figures and picture of the loop in orbit.md: one orbit with the loop closed, and the same with the loop open."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def measured() -> dict[str, tuple[float, int, str]]:
     """Run the example and draw the page's picture; figure -> value, decimals, unit."""
     with tempfile.TemporaryDirectory(prefix="figures-") as place:
         run = Path(place, "run")
-        words = ("twin.orbit", "loop", "scenes/orbit/loop.yaml", "--seed", str(SEED), "--quiet", "--out", str(run))
+        words = ("twin.orbit", "monitor", "scenes/orbit/loop.yaml", "--seed", str(SEED), "--quiet", "--out", str(run))
         subprocess.run([sys.executable, "-m", *words], cwd=ROOT, check=True)
-        found = json.loads((run / "loop.json").read_text("utf-8"))
+        found = json.loads((run / "monitor.json").read_text("utf-8"))["loop"]
         PICTURE.write_text(short((run / "artefacts/course.svg").read_text("utf-8")), "utf-8")
     out = {f"loop.{name}": (float(found[key]), digits, unit) for name, (key, digits, unit) in _TOP.items()}
     for course in ("open", "closed"):

@@ -20,7 +20,7 @@ NOTEBOOKS = ("start", "my_camera", "heat", "targets_mtf", "orbit_calibration", "
 GUIDES = (
     *("live", "monitor", "monitor_layout", "monitor_design", "disturbances", "finite_elements", "stray_light"),
     *("measured_frames", "coming_from", "camera", "prescriptions", "laboratory", "measured_laboratory"),
-    *("orbit", "loop", "block", "measured_orbit", "orbit_files", "operation", "studies", "export", "limits"),
+    *("orbit", "block", "measured_orbit", "orbit_files", "operation", "studies", "export", "limits"),
 )
 MEANING = ("conventions", "glossary")
 PROGRAM = ("promises", "stability", "architecture", "by_hand", "installed")

@@ -38,7 +38,6 @@ READ_BY = {
     "orbit_calibration": "`python -m twin.orbit calibrate FILE`",
     "orbit_simulate": "`python -m twin.orbit simulate FILE`",
     "orbit_monitor": "`python -m twin.orbit monitor FILE`",
-    "orbit_loop": "`python -m twin.orbit loop FILE`",
     "orbit_check": "`python -m twin.orbit check FILE`",
     "orbit_match": "`python -m twin.orbit match FILE`",
     "orbit_jitter": "`python -m twin.orbit jitter FILE`",

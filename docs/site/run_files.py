@@ -330,7 +330,6 @@ FOLDERS = {
     "twin.orbit check": "twin/orbit/conventions",
     "twin.orbit match": "twin/orbit/matching",
     "twin.orbit jitter": "twin/orbit/jitter",
-    "twin.orbit loop": "twin/orbit/loop",
     "twin.study --gradient": "twin/study/gradient",
     "twin.study": "twin/study/report",
 }

@@ -9,7 +9,8 @@ import pytest
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.unseen_motions import unseen_modes
 from scenes.models.disturbances import state_of
-from scenes.specs.orbit.monitor import CorrectionSpec, LoopImagesSpec
+from scenes.specs.course import CourseSpec
+from scenes.specs.orbit.monitor import CorrectionSpec, LoopImagesSpec, MotionSpec
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from scenes.specs.resolved import line_detector
 from twin.monitor.image_quality import image_quality
@@ -207,6 +208,22 @@ def test_a_perfect_loop_leaves_the_sigma_of_the_posterior(model, left_alone, per
             assert np.all(np.abs(true[:, rows]) < 4.9 * course.sigma[:, rows])
     tilt = model.row("forward", "d_alpha")
     assert np.abs(left_alone.expected[:, tilt]).max() > 5.0 * left_alone.sigma[:, tilt].max()
+
+
+@pytest.mark.second
+def test_a_loop_takes_back_what_a_course_and_its_motions_do(setup, model) -> None:
+    """Readings at the times of a course: a camera that jumps by 2 arcsec is turned back to what the posterior knows."""
+    course = CourseSpec.model_validate(
+        {"times": ["0 min", "10 min"], "temperature": {"base/forward": {"change": ["0 K", "0.1 K"]}}}
+    )
+    jump = MotionSpec.model_validate({"rotate": ["0 arcsec", "2 arcsec", "0 arcsec"], "begin": "5 min"})
+    loop = setup.test.loop.model_copy(update={"readings": None})
+    test = setup.test.model_copy(update={"course": course, "motion": {"base/forward": jump}, "mechanisms": loop})
+    own = setup.model_copy(update={"test": test})
+    left, free = (course_of(own, model, still=still) for still in (False, True))
+    true, free_true = (model.experiment.sight.truth(list(one.states)).vector("forward")[:, 0] for one in (left, free))
+    assert free_true[1] - free_true[0] == pytest.approx(2.0 * ARCSEC, rel=0.05)
+    assert np.all(np.abs(true) < 4.9 * left.sigma[:, model.row("forward", "d_alpha")])
 
 
 @pytest.mark.second

@@ -133,7 +133,7 @@ SMOOTHED: Record[tuple[MonitorRun, float, Smoothing]] = Record(
     Quantity("ratio_limit", lambda one: one[2].limit, "of this ratio"),
     Quantity("agrees", lambda one: one[2].agrees, "whether the ratio lies within its limit"),
     Quantity("chi_square", lambda one: one[2].consistency.chi_square, "of the measured shifts", "χ²", 1),
-    Quantity("degrees_of_freedom", lambda one: one[2].consistency.degrees, "of chi-square", "of"),
+    Quantity("degrees_of_freedom", lambda one: one[2].consistency.degrees, "of chi-square", "degrees of freedom"),
     Quantity("chi_square_limit", lambda one: one[2].consistency.limit, "of chi-square"),
     Quantity("shifts_agree", lambda one: one[2].consistency.agrees, "whether chi-square lies within its limit"),
 )
@@ -358,7 +358,7 @@ MODE: Record[tuple[LoopRun, UnseenMode]] = Record(
     Quantity("defocus_second_um", lambda of: float(of[1].quantities[2]), "of its second", decimals=2),
     Quantity("largest_spot_px", lambda of: of[1].spots, "by which the motions move a spot"),
     Quantity("bodies", lambda of: dict(of[1].bodies), "body -> share of the variance"),
-    Quantity("motions", lambda of: motions_of(*of), "the largest, with their amounts", converted=False),
+    Quantity("motions", lambda of: motions_of(*of), "with their amounts", "largest motions", converted=False),
 )
 
 

@@ -79,7 +79,7 @@ def _facts(run: MonitorRun | LoopRun) -> tuple[tuple[str, str], ...]:
         ("Pair", f"{setup.pair[0]} against {setup.pair[1]}"),
         ("Course", f"{span}, from {test.orbit.epoch}"),
         *own,
-        ("Image points", f"σ {errors.image:g} px, drawn, not matched in images" if on else "exact"),
+        ("Image points", f"σ {errors.image:g} px, drawn" if on else "exact"),
         ("Monitor's frames", "with noise" if on and errors.monitor else "without noise"),
         ("Effects on the light", "taken as corrected"),
         ("Description", test.description),
