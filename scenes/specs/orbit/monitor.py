@@ -1,4 +1,4 @@
-"""What on-board monitoring buys on the ground (papers 001, 000, 003), as a file in scenes/orbit gives it: a stereo pair
+"""On-board monitoring and what it buys on the ground (papers 001, 000, 003), as files in scenes/orbit: a stereo pair
 whose cameras move along an orbit, monitored at an interval or in a loop with mechanisms; points intersected without
 control.
 """
@@ -42,7 +42,7 @@ from scenes.yaml.units import ANGLE, LENGTH, MOMENT, Kind, parse_quantity
 _EVEN = 1e-6
 """Seconds; steps between times that differ by less are equal."""
 _WHOLE = 1e-9
-"""Of a step, by which a range is rounded to whole ones."""
+"""Share of a step by which a range is rounded to whole ones."""
 _KINDS: dict[str, Kind] = {"rotate": ANGLE, "shift": LENGTH}
 """Kind of a mechanism's motion -> what its steps measure."""
 _QUANTITIES: dict[str, Kind] = {"d_alpha": ANGLE, "d_beta": ANGLE, "d_gamma": ANGLE, "d_f": LENGTH, "defocus": LENGTH}
@@ -53,7 +53,7 @@ Frames = Annotated[Whole, Field(ge=1, le=1000)]
 Repeats = Annotated[Whole, Field(ge=8, le=500)]
 Parameter = Literal["d_alpha", "d_beta", "d_gamma", "d_f"]
 PARAMETERS: tuple[Parameter, ...] = ("d_alpha", "d_beta", "d_gamma", "d_f")
-"""What the monitor says of a camera."""
+"""Changes of a camera that the monitor gives."""
 
 
 def _once(names: tuple[Parameter, ...]) -> tuple[Parameter, ...]:
@@ -146,7 +146,7 @@ class MonitorErrorsSpec(ErrorsSpec):
 
 
 class CorrectionSpec(Spec):
-    """What acts on one quantity of the posterior.
+    """A correction of one quantity of the posterior.
 
     With every reading the command changes by `gain` times what the posterior says is left of the quantity, over what
     the mechanism does to it.
@@ -202,7 +202,7 @@ class CorrectionSpec(Spec):
         return ("", "", "", "") if self.mechanism is None else component_named(self.mechanism)
 
     def kind_of(self, key: str) -> Kind:
-        """What ``step``, ``range`` or ``dead_band`` measures."""
+        """Return the kind of quantity of ``step``, ``range`` or ``dead_band``."""
         own = self.mechanism is not None and key != "dead_band"
         return _KINDS[self.motion[1]] if own else _QUANTITIES[self.quantity]
 

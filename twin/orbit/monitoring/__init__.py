@@ -1,1 +1,1 @@
-"""What the on-board monitor buys on the ground: the flight, the procedure, JSON, report."""
+"""A monitored stereo pair in orbit: flight, readings, heights, the loop with mechanisms, numbers, report."""

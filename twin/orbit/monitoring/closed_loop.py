@@ -57,7 +57,7 @@ FOCUS_FIELDS = (0.7, 0.0, -0.7)
 _READ = 1e-3
 """Pixels to which one reading knows a spot, about."""
 _SMALL = 1e-6
-"""Of a mechanism's own effect on its quantity, over that of 1 rad or 1 m, below which it is none."""
+"""Effect of a mechanism on its quantity, for 1 rad or 1 m, below which it has none; rad or m."""
 _DISTANCE: Mapping[str, float] = FrozenMap({"shift": 1e-5, "rotate": 5e-6})
 """Steps of mechanisms over which a focus is differentiated, m and rad: foci are known to 1e-8 m."""
 _DRAWN = 20
@@ -85,7 +85,7 @@ class Corrector:
 
     @property
     def own(self) -> float:
-        """What it does to its quantity."""
+        """Return the effect of 1 rad or 1 m on its quantity."""
         return float(self.effect[self.row])
 
     @property
@@ -276,17 +276,17 @@ class LoopCourse:
 
     @property
     def degrees(self) -> int:
-        """Of freedom of all chi-squares together."""
+        """Degrees of freedom of all chi-squares together."""
         return int(len(self.times) * self.model.stated.spots.shape[0])
 
     @property
     def limit(self) -> float:
-        """Of the sum of all chi-squares, exceeded with a chance of `FALSE_ALARM` where all is as stated."""
+        """Limit of the sum of all chi-squares, exceeded with a chance of `FALSE_ALARM` where all is as stated."""
         return float(limit_of(FALSE_ALARM, self.degrees))
 
     @property
     def agrees(self) -> bool:
-        """Whether the readings, together and one by one, agree with what is stated."""
+        """Return whether the readings, together and one by one, agree with what is stated."""
         return float(self.chi_square.sum()) <= self.limit and self.contradiction is None
 
     @property

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ImagedPair:
-    """What one pair of images gave.
+    """Points that were matched in one pair of images, and intersected.
 
     Attributes:
         moment: number of the reading after which they are taken.
@@ -128,7 +128,7 @@ def imaged_pair(
 _FEWEST = 8
 """Points, of which a mean height and its scatter are told."""
 _TRANSMISSION = 0.8
-"""Of a lens, mean over the spectrum, as of payloads that say none."""
+"""Transmission of a lens, mean over the spectrum: that of payloads that say none."""
 
 
 def _optics(setup: MonitorSetup, name: str, defocus: float) -> LineOptics:

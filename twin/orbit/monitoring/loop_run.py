@@ -147,7 +147,7 @@ class LoopRun:
 
     @property
     def stable(self) -> bool:
-        """Whether all loops together are."""
+        """Return whether all loops together are stable."""
         return self.radius < DECAYING
 
     @property
@@ -184,7 +184,7 @@ class LoopRun:
 
     @property
     def ratio_limit(self) -> float:
-        """Of `ratios`, exceeded with a chance of `FALSE_ALARM` at most whatever the correlations."""
+        """Limit of `ratios`, exceeded with a chance of `FALSE_ALARM` at most whatever the correlations."""
         return float(norm.isf(0.5 * FALSE_ALARM / (2 * len(self.closed.course.times) * len(self.ratios))))
 
     @property

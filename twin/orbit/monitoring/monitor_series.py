@@ -1,4 +1,4 @@
-"""What the monitor of a stereo pair says over a course, counted from its reference images."""
+"""Readings of the monitor of a stereo pair over a course, counted from its reference images."""
 
 from __future__ import annotations
 
@@ -266,7 +266,7 @@ class MonitorSeries:
         return np.array(out)
 
     def readings(self, measured: Measured, numbers: Sequence[int]) -> Readings:
-        """What each state's own shifts say.
+        """Return what the shifts of each state say alone.
 
         Args:
             measured: S states.
@@ -335,7 +335,7 @@ class MonitorSeries:
     def _observed(
         self, states: Sequence[State], records: Sequence[Record], numbers: Sequence[int] = (), series: bool = False
     ) -> list[tuple[list[Recovery], SeriesNoise | None, list[Truth]]]:
-        """What each of some ways to record images says of the same states, piece by piece, as `Measured.of` takes it.
+        """Observe the same states by several ways to record images, piece by piece, as `Measured.of` takes it.
 
         Args:
             states: to be observed.

@@ -363,7 +363,7 @@ MODE: Record[tuple[LoopRun, UnseenMode]] = Record(
 
 
 def angle_of(run: LoopRun, mode: UnseenMode) -> float:
-    """What a mode does to the angle, radians."""
+    """Return the change of the angle by a mode, radians."""
     return float(run.open.angle @ run.model.stated.parameters @ mode.motions)
 
 
@@ -412,5 +412,5 @@ CLOSED: Record[LoopRun] = Record(
 
 
 def monitor_numbers(run: MonitorRun | LoopRun) -> dict[str, Any]:
-    """What monitor.json holds."""
+    """Return the numbers of a run, as monitor.json holds them."""
     return CLOSED(run) if isinstance(run, LoopRun) else MONITOR(run)

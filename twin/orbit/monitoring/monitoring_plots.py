@@ -126,7 +126,7 @@ def _interval_figure(run: MonitorRun) -> Figure:
 
 
 def _parts_figure(run: MonitorRun) -> Figure:
-    """What the corrected cameras are still wrong by, in parts."""
+    """Height error of the corrected cameras, in parts."""
     minutes = run.flight.times / 60.0
     figure, (axes,) = _panels(3.8, 1)
     axes.plot(minutes, run.cases["interval"].camera, color=svg.INK, lw=1.6, label="together, with the file's interval")

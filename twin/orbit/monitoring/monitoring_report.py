@@ -116,7 +116,7 @@ def _times(factor: float, less: str) -> str:
 
 
 def _gain(run: MonitorRun) -> str:
-    """What smoothing buys at the file's interval; empty where nothing is stated to move."""
+    """Return what smoothing buys at the file's interval; empty where nothing is stated to move."""
     if not run.smoothing:
         return ""
     chosen = run.smoothed
@@ -253,7 +253,7 @@ def _rest(run: MonitorRun) -> Section:
 
 
 def _worse(run: MonitorRun) -> tuple[str, ...]:
-    """What the monitor says worse than nothing would."""
+    """Name the changes that the monitor says worse than nothing would."""
     flight, worse = run.flight, []
     for name in flight.pair:
         for k, key in enumerate(PARAMETERS):
@@ -334,7 +334,7 @@ def _margin(run: LoopRun) -> str:
 
 
 def _focus_words(run: LoopRun) -> str:
-    """What of the focus the spots leave as it was before any reading."""
+    """Return the share of the focus that the spots leave as it was before any reading."""
     left, stated = [], run.model.stated
     for name, unseen in zip(run.pair, run.unseen[1:], strict=True):
         effect = stated.parameters[run.model.row(name, "defocus")]

@@ -216,8 +216,8 @@ def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndar
 def _causes(
     experiment: MonitorExperiment, spec: OrbitMonitorSpec, monitor: MonitorSeries, worst: int, gain: np.ndarray
 ) -> tuple[Cause, ...]:
-    """What each temperature of the course and each motion does from the reference to time number ``worst``, at which
-    the estimator has this gain (8, 2 C).
+    """Return what each temperature of the course and each motion does from the reference to time number ``worst``, at
+    which the estimator has this gain (8, 2 C).
     """
     assert spec.course is not None
     named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]

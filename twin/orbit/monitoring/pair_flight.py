@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.monitor import OrbitMonitorSpec
 
 TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
-"""What helps where light is lost or a spot cannot be measured."""
+"""Remedy where light is lost or a spot cannot be measured."""
 HALF_SPAN = 60.0
 """Seconds of the orbit to either side of a time of the course that its images take; two views 53 degrees apart from 500
 km are 70 s apart."""
