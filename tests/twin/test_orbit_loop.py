@@ -15,18 +15,8 @@ from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from scenes.specs.resolved import line_detector
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.monitoring.closed_loop import (
-    FOCUS_FIELDS,
-    Commands,
-    Corrector,
-    LoopCourse,
-    LoopModel,
-    defocus,
-    drifting_states,
-    gone_through,
-    loop_model,
-    reader,
-)
+from twin.orbit.monitoring import closed_loop
+from twin.orbit.monitoring.closed_loop import FOCUS_FIELDS, Commands, Corrector, LoopCourse, LoopModel, defocus
 from twin.orbit.monitoring.loop_run import LoopRun
 from twin.orbit.monitoring.monitoring_numbers import CORRECTION, LOOP
 from twin.orbit.monitoring.monitoring_report import monitor_report
@@ -102,15 +92,15 @@ def setup(tmp_path_factory) -> MonitorSetup:
 
 @pytest.fixture(scope="module")
 def model(setup: MonitorSetup, backend) -> LoopModel:
-    return loop_model(setup, MonitorExperiment(setup.resolved, backend))
+    return closed_loop.loop_model(setup, MonitorExperiment(setup.resolved, backend))
 
 
 def course_of(setup: MonitorSetup, model: LoopModel, still: bool = False, **changed: dict) -> LoopCourse:
     """A rendered course, with other keys of some corrections."""
     own = tuple(replace(one, spec=one.spec.model_copy(update=changed.get(one.name, {}))) for one in model.correctors)
     loop = LoopModel(model.experiment, model.stated, own)
-    states = drifting_states(setup.test, model.experiment, 3)
-    return gone_through(loop, setup.test, states, reader(loop, setup.test, 7), still)
+    states = closed_loop.drifting_states(setup.test, model.experiment, 3)
+    return closed_loop.gone_through(loop, setup.test, states, closed_loop.reader(loop, setup.test, 7), still)
 
 
 @pytest.fixture(scope="module")
