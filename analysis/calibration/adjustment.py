@@ -398,12 +398,6 @@ class _Problem:
         covariance_of_points = covariance
         if robust == "huber":
             covariance = covariance + covariance @ _scores(equations, standard, state.weights) @ covariance
-        for name in self.cameras:
-            if f"{name} f" in names and state.state.values[index(names, f"{name} f")] <= 0.0:
-                raise CalibrationError(
-                    f"calibration: the principal distance of {name} becomes negative, as of a mirrored image: is the"
-                    " sense in which pixels are counted right?"
-                )
         cuts = np.cumsum([len(f.ground) for f in self.fields])[:-1]
         spread = equations.point_covariance(covariance)
         spread[state.lost] = np.nan

@@ -330,10 +330,7 @@ def _reduce(
     own_blocks = _point_blocks(point, rows.place, weights.image / weights.factor.get("image", 1.0), total) + held.data
     # of what was given up no ray has any weight
     own_blocks[exact | ~np.any(own_blocks, axis=(1, 2))] = np.eye(3)
-    try:
-        point_inverse = _blocks(np.asarray(np.linalg.inv(own_blocks), np.float64))
-    except np.linalg.LinAlgError:
-        raise CalibrationError("calibration: too few good rays are left at a tie point") from None
+    point_inverse = _blocks(np.asarray(np.linalg.inv(own_blocks), np.float64))
     miss = rows.miss.ravel()
     right_point = np.asarray(design_point.T @ (row_weight * miss) + held @ departure.ravel())
     normal = (every.T @ weighted - cross.T @ (point_inverse @ cross)).tocsc()

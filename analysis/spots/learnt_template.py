@@ -160,8 +160,6 @@ def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> LearntTemplat
     light = _filtered(light, passed)
     wide = np.pad(light * _taper(light.shape), MARGIN_PX)
     core = np.where(wide > _CORE * wide.max(), wide, 0.0)
-    if not (core.sum() > 0.0 and wide.sum() > 0.0):
-        raise SpotError({0: "no spot: too little light is left to learn its shape from"})
     row = float(core.sum(axis=1) @ np.arange(wide.shape[0]) / core.sum())
     column = float(core.sum(axis=0) @ np.arange(wide.shape[1]) / core.sum())
     share = math.sqrt(float(np.median(noise.temporal_variance_dn2(image, 1) / screened.counts))) / float(peak[0])

@@ -10,6 +10,7 @@ from analysis.spots.learnt_template import FittedSpot, learn_template, learnt_sh
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, fit_screened
 from analysis.spots.spot_positions import SeriesNoise, SpotError
+from analysis.spots.spot_template import SpotTemplate
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
 
@@ -127,6 +128,19 @@ def test_a_spot_that_pixels_do_not_sample_is_refused(width, narrow):
         assert learn_template(screened(mean), NOISE).light > 0.0
         return
     refuses(SpotError, "too narrow", learn_template, screened(mean), NOISE)
+
+
+def test_a_spot_beyond_the_template_is_refused():
+    """A shape known in 96 x 96 pixels fills 64 x 64 of them for a spot within some 13 pixels of their middle."""
+    row, column = np.indices((96, 96)) - 48.0
+    template = SpotTemplate.from_image(np.exp(-0.055 * (row**2 + column**2)), 48.0, 48.0, SHAPE)
+    for place, reached in ((FIRST, True), ((50.0, 50.0), False)):
+        image = screened(spot(place))
+        given = (image.mean, image.counts, image.good, NOISE, template)
+        if reached:
+            assert np.abs(fit_screened(*given).positions.position[0] - place).max() < 0.1
+        else:
+            refuses(SpotError, "left the range of the template", fit_screened, *given)
 
 
 def test_a_shape_that_is_mostly_noise_is_refused():

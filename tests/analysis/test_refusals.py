@@ -2,37 +2,48 @@
 
 import os
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import pytest
 import tifffile
 from astropy.io import fits
+from scipy import sparse
 
-from analysis.block.block import Term
+from analysis.block import block_adjustment, reweighting
+from analysis.block.block import CamerasKnowledge, Term
 from analysis.block.block_adjustment import adjust_block
 from analysis.block.plausible_block import pruned
 from analysis.block.processes import BlockError, Law
+from analysis.calibration import normal_equations, strip_adjustment
+from analysis.calibration.adjustment import adjust
+from analysis.calibration.strip_adjustment import adjust_strip
 from analysis.images.fits_image import fits_cards
 from analysis.images.image_file import ImageError, ImageFile, Region
 from analysis.matching.correlation import distinct_points
 from analysis.matching.matches import MatchOptions, resampled
 from analysis.measurement_error import UndeterminedError
+from analysis.monitor import limits
 from analysis.monitor.estimators import ESTIMATORS, Posterior, Shifts
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.model_fit import gain, observability
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
-from analysis.monitor.recovery import measure_spots
+from analysis.monitor.recovery import measure_spots, recover
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import StateSpace
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import measure_pages
+from analysis.orbit import forward_intersection, jitter_lines, jitter_spectrum
 from analysis.orbit.calibration_parameters import CalibrationError
 from analysis.orbit.forward_intersection import (
     CalibratedLine,
     IntersectionError,
     Sightings,
     check_errors,
+    intersect,
     intersect_pair,
 )
 from analysis.orbit.image_correction import image_correction
@@ -47,12 +58,13 @@ from analysis.spots.spot_positions import noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.turntable.angle_fits import cross_validate, fit
 from analysis.turntable.dividing_error import CalibrationSeries
+from tests.analysis import test_adjustment
 from tests.analysis.drawn_blocks import Plan, draw
 from tests.analysis.refusals import refuses
 from tests.analysis.stated_motions import TimeLaw, disturbances
 from tests.analysis.test_monitor_limits import some_cameras
 from tests.analysis.test_spot_centroids import NOISE, SHAPE, airy
-from tests.analysis.test_three_line_model import SEEN
+from tests.analysis.test_three_line_model import SEEN, cameras, make_rays
 
 
 def test_blocks():
@@ -64,6 +76,7 @@ def test_blocks():
     some = {name: replace(k, covariance=k.covariance[:4, :4]) for name, k in block.known.items()}
     still = {name: replace(k, covariance=0.0 * k.covariance) for name, k in block.known.items()}
     white = (Term(Law("attitude", "white", (1e-6,) * 3, 0.5)),)
+    unwatched = CamerasKnowledge((), np.zeros((0, 2, 4)), np.eye(0))
 
     def scene(**changes):
         return {"scenes": (replace(first, **changes), *block.scenes[1:])}
@@ -80,6 +93,7 @@ def test_blocks():
         r"covariance \(4, 4\) of 2 passes": {"known": some},
         "needs a standard deviation above zero": {"known": still, "monitored": None},
         "needs a constant error of each of them": {"attitude": white},
+        "the monitor says nothing of camera 'fore'": {"monitored": unwatched},
     }.items():
         refuses(BlockError, said, adjust_block, replace(block, **changes))
     refuses(BlockError, "no sensor is called 'radar'; there are", block.without, "radar")
@@ -88,7 +102,41 @@ def test_blocks():
     refuses(BlockError, "no point is seen by two scenes, and none is control", pruned, lonely)
 
 
-def test_images(tmp_path):
+def test_normal_equations_that_cannot_be_solved(monkeypatch):
+    """Of an indefinite matrix neither a dense nor a sparse factor leads to a covariance."""
+    indefinite = sparse.csc_matrix([[1.0, 2.0], [2.0, 1.0]])
+    refuses(BlockError, "singular", block_adjustment._Factor, indefinite)
+    monkeypatch.setattr(block_adjustment, "_DENSE", 0)
+    refuses(BlockError, "singular", block_adjustment._Factor(indefinite).inverse)
+    refuses(CalibrationError, "cannot be solved for", normal_equations._inverse, indefinite.toarray())
+
+
+@pytest.mark.parametrize("cut", ["block", "rounds", "calibration", "strip", "intersection", "half widths"])
+def test_what_does_not_converge_is_no_result(monkeypatch, cut):
+    """Each iteration is cut short; what it would return is where it stands, which no sigma covers."""
+    rng, noise, line = np.random.default_rng(1), replace(test_adjustment.NOISE, attitude_interval=0.125), cameras()
+    block, rays = draw(Plan(ties=4, control=2, check=1, footprints=0), rng).block, make_rays(SEEN, rng, noise)
+    field, how = test_adjustment.measured(test_adjustment.VIEW, rng), {"gauge": test_adjustment.HOLD_X}
+    module, name, error, said, call = {
+        "block": (block_adjustment, "_MOST", BlockError, "are adjusted at once", partial(adjust_block, block)),
+        "rounds": (reweighting, "_ROUNDS", BlockError, "do not settle", partial(adjust_block, block, robust="huber")),
+        "calibration": (
+            reweighting,
+            "_ROUNDS",
+            CalibrationError,
+            "do not settle",
+            partial(adjust, [field], test_adjustment.LABORATORY, test_adjustment.NOISE, **how, robust="huber"),
+        ),
+        "strip": (strip_adjustment, "_STEPS", CalibrationError, "", partial(adjust_strip, rays, line, noise)),
+        "intersection": (forward_intersection, "_STEPS", CalibrationError, "", partial(intersect, rays, line, noise)),
+        "half widths": (limits, "_STEPS", ArithmeticError, "", partial(limits._half_widths, np.ones((2, 1)), 0.95)),
+    }[cut]
+    call()
+    monkeypatch.setattr(module, name, 1)
+    refuses(error, said or "no convergence|no end", call)
+
+
+def test_images(tmp_path, monkeypatch):
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, np.zeros((2, 3, 8, 9), np.uint16), photometric="minisblack")
     refuses(ImageError, "page 9 does not exist", ImageFile.open, path, None, 9, "")
@@ -102,6 +150,9 @@ def test_images(tmp_path):
         (tmp_path / "b.png").write_bytes(spoilt)
         refuses(ImageError, "cut off or damaged", ImageFile.open, tmp_path / "b.png")
     refuses(ImageError, "page 9 does not exist", ImageFile.open, tmp_path / "a.png", None, 9, "")
+    with monkeypatch.context() as patched:
+        patched.setattr(ImageFile, "_stored", lambda self: iter([np.zeros((9, 8), np.uint8)]))
+        refuses(ImageError, "another number of rows or columns", ImageFile.open(tmp_path / "a.png").read, {})
     tifffile.imwrite(path, np.zeros((3, 8, 9)), photometric="minisblack", volumetric=True, tile=(16, 16, 16))
     refuses(ImageError, "pages of rows and columns are needed", ImageFile.open, path)
     tifffile.imwrite(path, shape=(40, 4000, 4000), dtype=np.uint16, photometric="minisblack")
@@ -150,6 +201,8 @@ def test_monitor():
     how = SeriesFilter(disturbances(laws[:1], see[:, :1], see[:, :1]))
     refuses(UndeterminedError, "need noise", how.update, how.start(0.0), Observed(0.0, np.zeros(4), 0.0 * eye))
     refuses(ValueError, "no centroid 'mean'; there are", measure_spots, np.zeros((1, 9, 9)), 1, None, "mean", 1)
+    frames, two = np.zeros((1, 3, 2, 8, 8)), SimpleNamespace(spots=2)
+    refuses(ValueError, "has 2 spots, the images 3", recover, frames[0], frames, two, "ml", 1)
     refuses(ValueError, r"need \(..., 4\) and \(..., 4, 4\)", CameraParameters.from_vector, np.zeros(3), eye)
 
 
@@ -166,7 +219,7 @@ def test_orbit():
     refuses(ValueError, "must be", image_correction, place, place[:3], np.tile(np.eye(2), (4, 1, 1)), "shift")
 
 
-def test_jitter():
+def test_jitter(monkeypatch):
     time = np.linspace(0.0, 10.0, 200)
     given = Observations.of_disparities(time, time + 0.1, 0.0 * time, 0.1)
     parts = given.value, given.group, given.time, given.weight, given.nuisance
@@ -176,6 +229,10 @@ def test_jitter():
     refuses(JitterError, "moments that lie apart", splined, given, 0.0, 1.0)
     once = Observations.of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, degree=0)
     refuses(JitterError, "all observations are of one moment", periodogram, once, 0.5, 6.0)
+    refuses(JitterError, "moves nothing", jitter_lines._fitted, given, np.array([2.0]), np.zeros(1))
+    periodogram(given, 0.5, 2.0)
+    monkeypatch.setattr(jitter_spectrum, "BLIND", 2.0)
+    refuses(JitterError, "all frequencies between 0.5 and 2 Hz are blind", periodogram, given, 0.5, 2.0)
 
 
 def test_edges_and_angles():

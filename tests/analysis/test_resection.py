@@ -156,6 +156,10 @@ def test_bad_input():
     with pytest.raises(ResectionError, match="reference 'left' is none of the lines forward, nadir, backward"):
         resect(station, lines, reference="left")
     refuses(ResectionError, "no lines", resect, station, {})
+    points = lines["nadir"].strip.points.copy()
+    points[0] = 2.0 * SCENE.station - points[0]
+    above = replace(lines["nadir"], strip=replace(lines["nadir"].strip, points=points))
+    refuses(ResectionError, "nadir line lie behind the camera", resect, station, lines | {"nadir": above})
     bare = replace(lines["nadir"], strip=replace(lines["nadir"].strip, points=np.zeros((0, 3))))
     refuses(ResectionError, "the nadir line has no points", resect, station, lines | {"nadir": bare})
     refuses(ResectionError, "positive definite", resect, Station.of(SCENE.station, np.diag([1.0, 1.0, 0.0])), lines)
