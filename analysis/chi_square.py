@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc, chdtri, gammaln, xlogy
 
-__all__ = ["chance_beyond", "density", "limit_of"]
-
 
 def chance_beyond(chi_square: Any, degrees: Any) -> Any:
     """Probability of a larger chi-square.

@@ -8,8 +8,6 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-__all__ = ["OfStates"]
-
 
 class OfStates:
     """Base of a dataclass whose fields are arrays of S states along the first axis.

@@ -16,8 +16,6 @@ from analysis.block.point_reduction import PriorGroup, Reduction
 from analysis.block.processes import BlockError, Support
 from analysis.orbit.three_line_model import BIAS, DRIFT
 
-__all__ = ["DATUM", "Assembly", "Process", "assembled"]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 OFFSET = ("along", "across", "down")

@@ -12,20 +12,6 @@ from numpy.typing import NDArray
 from analysis.block.processes import BlockError, Law
 from analysis.orbit.three_line_model import LineModel, Rays
 
-__all__ = [
-    "SENSORS",
-    "Block",
-    "CameraKnowledge",
-    "CamerasKnowledge",
-    "Footprints",
-    "Pass",
-    "Points",
-    "Scene",
-    "Term",
-    "Terrain",
-    "TrackerAngle",
-]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Scope = Literal["pass", "tracker", "block"]

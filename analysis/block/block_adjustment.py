@@ -26,8 +26,6 @@ from analysis.block.processes import BlockError
 from analysis.block.reweighting import SETTLED, GroupTest, Rule, UnsettledError, settled
 from analysis.block.shares import Pool, SharedReduction
 
-__all__ = ["BlockAdjustment", "adjust_block", "kept_block"]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 _CONVERGED = 1e-6

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from analysis.block.processes import Support
 
-__all__ = ["Corrections", "Part", "by_rotation_vector", "cross", "turned", "turned_back"]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 

@@ -19,8 +19,6 @@ from scipy.stats import norm
 from analysis.block.assembly import Process
 from analysis.block.block_adjustment import BlockAdjustment
 
-__all__ = ["LawTest", "law_tests"]
-
 Array = NDArray[np.float64]
 _KINDS = ("white", "walk", "slow")
 _LARGEST = 4000

@@ -22,8 +22,6 @@ from analysis.block.processes import Law
 from analysis.orbit.ground_errors import level_axes
 from analysis.orbit.null_space import echelon, shown
 
-__all__ = ["Network", "Open", "datum_test", "network_of", "open_combinations", "simplified"]
-
 Array = NDArray[np.float64]
 _SHOWN = 0.25
 """Of the largest part: smaller parts of a combination are not named."""

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from analysis.block.corrections import Corrections, by_rotation_vector, cross, turned, turned_back
 from analysis.orbit.three_line_model import LineModel, Rays
 
-__all__ = ["FixedPoints", "Heights", "LineImage", "Packets", "Pointings"]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 

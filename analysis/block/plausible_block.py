@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from analysis.block.block import Block
 from analysis.block.processes import BlockError
 
-__all__ = ["FAR", "check_places", "pruned"]
-
 FAR = 0.02
 """Radians between where a point is said to be and where its image looks: 10 km below 500 km. Orbits and attitudes are
 known a hundred times better."""

@@ -20,8 +20,6 @@ from scipy import sparse
 from analysis.block.packets import Packets
 from analysis.block.reweighting import standardised_packets
 
-__all__ = ["Bundle", "Checked", "Eliminated", "PriorGroup", "Reduced", "Reduction", "Rows", "State"]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 _PIECE = 4_000

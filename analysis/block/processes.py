@@ -32,8 +32,6 @@ from scipy import sparse
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.ray_noise import spline_blend, spline_precision
 
-__all__ = ["STEPPED", "BlockError", "Kind", "Law", "Support"]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]

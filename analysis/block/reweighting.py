@@ -15,24 +15,6 @@ from scipy.stats import chi2
 
 from analysis.measurement_error import MeasurementError
 
-__all__ = [
-    "HUBER",
-    "LARGEST_FACTOR",
-    "REJECT",
-    "SETTLED",
-    "GroupTest",
-    "Robust",
-    "Rule",
-    "UnsettledError",
-    "bounded",
-    "extrapolated",
-    "limits",
-    "median_factor",
-    "robust_weights",
-    "settled",
-    "standardised_packets",
-]
-
 Array = NDArray[np.float64]
 S = TypeVar("S", bound="Weighted")
 T = TypeVar("T")

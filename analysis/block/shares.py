@@ -17,8 +17,6 @@ from scipy import sparse
 
 from analysis.block.point_reduction import Checked, Eliminated, Reduction, State
 
-__all__ = ["Pool", "SharedReduction"]
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 

@@ -26,8 +26,6 @@ from analysis.orbit.calibration_parameters import CalibrationError, CalibrationF
 from analysis.orbit.ray_noise import ray_covariance
 from analysis.orbit.three_line_model import LineModel, Partials, Rays, misclosure, partials
 
-__all__ = ["Equations", "Hidden", "Residuals", "State", "Weights", "assemble"]
-
 Array = NDArray[np.float64]
 _CHUNK = 512
 """Points or image points whose covariances are made at once."""

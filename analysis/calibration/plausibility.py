@@ -16,8 +16,6 @@ from analysis.orbit.calibration_parameters import CalibrationError, CalibrationF
 from analysis.orbit.ray_noise import ray_covariance
 from analysis.orbit.three_line_model import BIAS, INTERIOR, LineModel, misclosure, partials
 
-__all__ = ["FarPointsError", "NoiseError", "check_places", "single_ray"]
-
 Array = NDArray[np.float64]
 FARTHEST = 2e3
 """Metres on the ground. No launch, no datum moves half of the points farther: an arc minute is 150 m, a second of a

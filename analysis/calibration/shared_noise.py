@@ -19,8 +19,6 @@ from analysis.block.processes import Law, Support
 from analysis.orbit.calibration_parameters import CalibrationField, Noise, NoiseTerm
 from analysis.orbit.three_line_model import Partials, Rays
 
-__all__ = ["SharedNoise"]
-
 Array = NDArray[np.float64]
 
 

@@ -21,8 +21,6 @@ from analysis.orbit.calibration_parameters import CalibrationError, CalibrationF
 from analysis.orbit.null_space import free_basis, solved
 from analysis.orbit.three_line_model import LineModel
 
-__all__ = ["Stepwise", "stepwise"]
-
 Array = NDArray[np.float64]
 # A combination of both blocks that keeps more than this of its error in a round is open: it needs a million rounds.
 _OPEN = 1.0 - 1e-6

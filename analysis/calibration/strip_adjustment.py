@@ -35,8 +35,6 @@ from analysis.orbit.calibration_parameters import CalibrationError, CalibrationF
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import BIAS, LineModel, Rays, bias_rotation
 
-__all__ = ["Datum", "StripAdjustment", "adjust_strip"]
-
 Array = NDArray[np.float64]
 _NAME = "strip"
 _STEPS = 10

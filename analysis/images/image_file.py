@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from analysis.images import fits_image, tiff_image
 from analysis.images.image_header import JPEG_MAGIC, PNG_MAGIC, ImageError, ImageHeader, jpeg_header, png_header
 
-__all__ = ["GAMMAS", "ImageError", "ImageFile", "Region", "recorded", "tone_curve"]
-
 Array = NDArray[np.float64]
 MOST_BYTES = 1 << 29
 """Largest size of one decoded page, and of the frames of one file together."""

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from analysis.instrument_state.state_estimate import StateEstimate
 
-__all__ = ["Combination", "combinations"]
-
 Array = NDArray[np.float64]
 KNOWN = 0.5
 """Standard deviation of a combination after the measurements, of one before, below which it is called known."""

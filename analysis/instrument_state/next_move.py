@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-__all__ = ["Actuators", "NextMove", "best_move", "measurement_worth", "truncated_move"]
-
 Array = NDArray[np.float64]
 _MOST_NODES = 600
 """Nodes of the search; the best move found by then is told, and that it may not be the best of all."""

@@ -21,8 +21,6 @@ from analysis.chi_square import chance_beyond, limit_of
 from analysis.measurement_error import UndeterminedError
 from analysis.short_repr import shows
 
-__all__ = ["FALSE_ALARM", "Agreement", "MeasuredGroup", "StateEstimate", "StatePrior", "estimate_state"]
-
 Array = NDArray[np.float64]
 Predict = Callable[[Array], Array]
 """States (S, M), SI -> what the measurements would read without errors, (S, D), group after group; NaN where the light

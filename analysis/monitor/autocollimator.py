@@ -30,17 +30,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.measurement_error import UndeterminedError
 
-__all__ = [
-    "AXES",
-    "ReadingMap",
-    "column_component",
-    "exact_reading",
-    "mean_difference",
-    "mirror_rotation",
-    "reading_of_normal",
-    "relation_factor",
-]
-
 Array = NDArray[np.float64]
 AXES = ("X", "Y", "Z")
 

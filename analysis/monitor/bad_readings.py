@@ -28,8 +28,6 @@ from scipy.special import expit, gammaln, logsumexp
 from analysis.monitor.filter_state import BadReading, Track
 from analysis.monitor.untold_jumps import Jumper
 
-__all__ = ["RECENT", "bad_reading", "chance_good", "jump_evidence", "may_be_bad"]
-
 Array = NDArray[np.float64]
 # chance beforehand that a reading is bad
 _SHARE = 1e-3

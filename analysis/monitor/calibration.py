@@ -16,8 +16,6 @@ from analysis.short_repr import shows
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
 
-__all__ = ["CameraCalibration", "MonitorCalibration"]
-
 Array = NDArray[np.float64]
 PAIR = ("left", "right")
 """Names of the channels at the +Y and at the -Y end of a line, which paper 001 numbers 1 and 2."""

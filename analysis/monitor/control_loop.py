@@ -28,18 +28,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "DECAYING",
-    "LimitCycle",
-    "Margins",
-    "common_margin",
-    "limit_cycle",
-    "margins",
-    "open_loop",
-    "rejection",
-    "spectral_radius",
-]
-
 Array = NDArray[np.float64]
 DECAYING = 1.0 - 1e-12
 """Largest eigenvalue of loops that are stable: of one that only comes to rest somewhere else rounding makes either."""

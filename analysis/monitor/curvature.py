@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from analysis.states import OfStates
 
-__all__ = ["BEYOND", "Curvature", "LinearReading", "MotionModel", "Retraced", "read_again"]
-
 Array = NDArray[np.float64]
 BEYOND = 3.0
 """Sigmas of a quantity by which a linear reading may be off before it is worked out anew."""

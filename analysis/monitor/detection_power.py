@@ -24,8 +24,6 @@ from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import UNSEEN
 from analysis.monitor.series_filter import SeriesFilter
 
-__all__ = ["READINGS", "SHARES", "Power", "detection_power"]
-
 Array = NDArray[np.float64]
 READINGS, SHARES = (1, 3, 10), (0.5, 0.95)
 """Numbers of readings after a jump within which it is found, and in which share of cases."""

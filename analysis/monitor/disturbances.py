@@ -18,8 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.chi_square import chance_beyond, density, limit_of
 from analysis.short_repr import shows
 
-__all__ = ["FALSE_ALARM", "Consistency", "Disturbances", "Suspect", "TimeLaw", "chi_squares", "consistency"]
-
 Array = NDArray[np.float64]
 FALSE_ALARM = 1e-3
 """Chance that shifts within what is stated are called a contradiction."""

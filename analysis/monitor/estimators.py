@@ -23,18 +23,6 @@ from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
 
-__all__ = [
-    "ESTIMATORS",
-    "Estimator",
-    "Formula",
-    "LeastSquares",
-    "OfEachCamera",
-    "Posterior",
-    "Shifts",
-    "applicable",
-    "judged",
-]
-
 Array = NDArray[np.float64]
 PARAMETERS_EACH = 4
 """Parameters of one camera."""

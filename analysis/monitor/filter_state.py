@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from analysis.monitor.jump_detection import Jump
 
-__all__ = ["Aside", "BadReading", "Belief", "Innovation", "Observed", "Track", "Whitened"]
-
 Array = NDArray[np.float64]
 
 

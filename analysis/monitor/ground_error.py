@@ -22,8 +22,6 @@ from analysis.measurement_error import UndeterminedError
 from analysis.short_repr import shows
 from analysis.states import OfStates
 
-__all__ = ["EARTH_RADIUS_M", "GroundError", "GroundGeometry"]
-
 Array = NDArray[np.float64]
 EARTH_RADIUS_M = 6_371_000.0
 """Mean radius (IUGG). The Earth's flattening and turn change the figures here by less than 1 %."""

@@ -22,8 +22,6 @@ from analysis.monitor.monitoring import CameraParameters
 from analysis.short_repr import shows
 from analysis.states import OfStates
 
-__all__ = ["IntersectionAngleChange", "exact"]
-
 Array = NDArray[np.float64]
 
 

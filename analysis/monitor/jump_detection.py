@@ -35,25 +35,6 @@ from scipy.special import gammaincc, gammaln, ndtr
 from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 
-__all__ = [
-    "MOST",
-    "UNSEEN",
-    "Amounts",
-    "Candidate",
-    "Jump",
-    "Step",
-    "Steps",
-    "candidates",
-    "knots",
-    "larger",
-    "likeliest",
-    "sized",
-    "steps",
-    "untold_share",
-    "with_jumps",
-    "with_unfound",
-]
-
 Array = NDArray[np.float64]
 MOST = 100
 """Jumps that are looked for in one series."""

@@ -20,8 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.measurement_error import MeasurementError, UndeterminedError
 from analysis.units import ARCSEC, UM_PER_M
 
-__all__ = ["MotionReport", "ObservabilityReport", "RankError", "gain", "observability"]
-
 Array = NDArray[np.float64]
 _SHOWN = (
     ("d_alpha", 1 / ARCSEC, '"'),

@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.monitor.calibration import CameraCalibration
 from analysis.units import ARCSEC, UM_PER_M
 
-__all__ = ["ANGLE", "ANGLE_GROUP", "CAMERA_PARAMETERS", "GROUND", "GROUND_GROUP", "Parameter", "rows_of"]
-
 Array = NDArray[np.float64]
 ANGLE_GROUP, GROUND_GROUP = "intersection_angle", "ground"
 """Keys of files under which the readings of two cameras together stand; those of a camera stand under its name."""

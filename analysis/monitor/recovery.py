@@ -25,19 +25,6 @@ from analysis.spots.fit_state import FitStates, fit_states, require_rest, widene
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
 from analysis.states import OfStates
 
-__all__ = [
-    "Estimates",
-    "MeasuredSpots",
-    "Recovery",
-    "estimates",
-    "estimates_of",
-    "joint",
-    "judged_spots",
-    "measure_spots",
-    "recover",
-    "recovery_of",
-]
-
 Array = NDArray[np.float64]
 MeasuredSpots: TypeAlias = tuple[SpotPositions, FitStates]
 """Spots with how good their fits are."""

@@ -52,8 +52,6 @@ from analysis.monitor.state_space import HeatInputs, StateSpace
 from analysis.monitor.told_jumps import Bodies, mixed
 from analysis.monitor.untold_jumps import Hint, Jumper, blended, jumpers
 
-__all__ = ["SeriesFilter"]
-
 Array = NDArray[np.float64]
 _NEARLY = 1e-11
 """Of the sum of its eigenvalues, by which information is made regular."""

@@ -23,8 +23,6 @@ from analysis.monitor.filter_state import Belief, Observed, Whitened
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.untold_jumps import added
 
-__all__ = ["hinted", "jointly", "smoothed"]
-
 T = TypeVar("T")
 Array = NDArray[np.float64]
 _PIECE = 400

@@ -48,8 +48,6 @@ from analysis.monitor.jump_detection import (
     with_unfound,
 )
 
-__all__ = ["LARGEST", "SeriesChanges", "ShiftNoise", "SmoothedSeries", "smooth", "window_of"]
-
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int_]
 LARGEST = 2400

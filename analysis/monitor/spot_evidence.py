@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from analysis.spots.fit_state import FALSE_ALARM, FitStates
 
-__all__ = ["SpotDoubt", "SpotEvidence"]
-
 Array = NDArray[np.float64]
 ALIKE = 2.0
 """Times that a core's chi-square may be that of the frames' noise where this explains both."""

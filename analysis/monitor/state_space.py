@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 
-__all__ = ["HeatInputs", "StateSpace"]
-
 Array = NDArray[np.float64]
 _INTERVALS = 200
 """Between readings, of which the transitions are kept."""

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from analysis.monitor.jump_detection import Amounts, Candidate, Jump, larger
 
-__all__ = ["Bodies", "mixed"]
-
 Array = NDArray[np.float64]
 _UNLIKELY = 1e-4
 """Of the weight of the likeliest body and place, below which it was not there."""

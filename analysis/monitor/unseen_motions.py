@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from analysis.monitor.disturbances import Disturbances
 from analysis.short_repr import shows
 
-__all__ = ["UnseenMode", "floor", "unseen_modes"]
-
 Array = NDArray[np.float64]
 _NOTHING = 1e-12
 """Of the largest eigenvalue of what a law's motions do to the spots, below which there is rounding alone."""

@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.jump_detection import Amounts, Candidate
 
-__all__ = ["Hint", "Jumper", "added", "blended", "jumpers"]
-
 Array = NDArray[np.float64]
 _SCALES = (0.125, 0.25, 0.5, 1.0, 2.0)
 """Sizes of jumps over those stated."""

@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.measurement_error import MeasurementError
 
-__all__ = ["LARGEST_GREY", "EdgeError", "EdgeLine", "checked_region", "grey_fault", "locate_edge", "pixel_noise"]
-
 Array = NDArray[np.float64]
 Axis = Literal["x", "y"]
 # Smallest region: along the edge, and across it.

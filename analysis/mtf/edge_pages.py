@@ -26,8 +26,6 @@ from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.mtf.slanted_edge import EdgeMtf
 from analysis.spots.noise import NoiseModel
 
-__all__ = ["different_pages", "grey_step", "left_over", "mean_page", "measure_pages"]
-
 Array = NDArray[np.float64]
 FALSE_ALARM = 1e-4
 """Rate at which pages are aligned although the edge does not move in them."""

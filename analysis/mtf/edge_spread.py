@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtr
 
-__all__ = ["EdgeDesign", "EdgeSpread", "fit_edge_spread"]
-
 Array = NDArray[np.float64]
 _STEP_WIDTH = 0.5
 _TAIL_WIDTH = 1.0

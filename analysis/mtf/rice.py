@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import i0e, i1e
 
-__all__ = ["measured_bias", "rice_bias", "rice_sigma", "signal_modulus"]
-
 Array = NDArray[np.float64]
 
 

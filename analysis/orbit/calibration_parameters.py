@@ -21,18 +21,6 @@ from scipy.spatial.transform import Rotation
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.three_line_model import BIAS, DRIFT, INTERIOR, LineModel, Rays
 
-__all__ = [
-    "RATE",
-    "CalibrationError",
-    "CalibrationField",
-    "Noise",
-    "NoiseTerm",
-    "Parameters",
-    "Prior",
-    "Unknowns",
-    "monitor_priors",
-]
-
 Array = NDArray[np.float64]
 OFFSET = ("along", "across", "down")
 RATE = tuple(f"{n} rate" for n in BIAS)

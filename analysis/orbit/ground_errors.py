@@ -15,17 +15,6 @@ from scipy.special import erf, ndtri
 
 from analysis.orbit.calibration_parameters import vertical
 
-__all__ = [
-    "Accuracy",
-    "circle_of_points",
-    "circular_error",
-    "interval_of_points",
-    "level_axes",
-    "linear_error",
-    "predicted",
-    "realised",
-]
-
 Array = NDArray[np.float64]
 _SHARE = 0.9
 _DIRECTIONS = 0.5 * np.pi * (np.arange(32) + 0.5) / 32

@@ -30,8 +30,6 @@ from scipy.stats import chi2
 
 from analysis.measurement_error import MeasurementError
 
-__all__ = ["METHODS", "Method", "NearVerticalWarning", "PlaneError", "PlaneFit", "Station", "Strip", "fit_plane"]
-
 Array = NDArray[np.float64]
 Method = Literal["printed", "corrected", "tls"]
 METHODS: tuple[Method, ...] = get_args(Method)

@@ -19,8 +19,6 @@ from scipy.linalg import toeplitz
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.three_line_model import Partials, Rays
 
-__all__ = ["ray_covariance", "reading_variance", "spline_blend", "spline_precision"]
-
 Array = NDArray[np.float64]
 _RHO = 2.0 - np.sqrt(3.0)
 _NEEDED = 4

@@ -30,8 +30,6 @@ from scipy.stats import chi2
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.planes import Station, Strip
 
-__all__ = ["ObservedLine", "Resection", "ResectionError", "resect"]
-
 Array = NDArray[np.float64]
 _ATTITUDE = ("roll", "pitch", "yaw")
 _STATION = ("station x", "station y", "station z")

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["WHITE_GAIN", "ThirdDifference", "third_difference"]
-
 Array = NDArray[np.float64]
 WHITE_GAIN = float(np.sqrt(20.0))
 # Steps of time that differ by more are gaps: third differences over them mean something else.

@@ -31,19 +31,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.measurement_error import UndeterminedError
 
-__all__ = [
-    "BIAS",
-    "DRIFT",
-    "INTERIOR",
-    "LineModel",
-    "Partials",
-    "Rays",
-    "Seen",
-    "bias_rotation",
-    "misclosure",
-    "partials",
-]
-
 Array = NDArray[np.float64]
 INTERIOR = ("f", "x", "y")
 BIAS = ("roll", "pitch", "yaw")

@@ -24,8 +24,6 @@ from analysis.spots.centroid import energy_centroid, mean_frames
 from analysis.spots.noise import NoiseModel
 from analysis.turntable.dividing_error import CalibrationSeries
 
-__all__ = ["CALIBRATED", "SMOOTH", "Distortion", "PointMeans", "Spots", "locate_spots", "reduce_sets"]
-
 Array = NDArray[np.float64]
 CALIBRATED = ("constant", "principal_distance", "principal_point")
 """What distortion is counted from: eq. (2) with a constant."""

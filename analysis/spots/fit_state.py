@@ -17,8 +17,6 @@ from analysis.chi_square import limit_of
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.states import OfStates
 
-__all__ = ["FALSE_ALARM", "UNRESTED", "FitStates", "fit_states", "require_rest", "widened"]
-
 Array = NDArray[np.float64]
 FALSE_ALARM = 1e-8
 """Chance that one of both limits of one fit is exceeded by a spot that is as calibrated: 2e-7 of a run with four spots

@@ -13,8 +13,6 @@ from scipy.stats import chi2
 
 from analysis.spots.noise import NoiseModel
 
-__all__ = ["FALSE_ALARM", "MEDIAN", "MOST_MOVES", "aligned", "basis_of", "place_scatter", "robust_fit", "shown_pixels"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 FALSE_ALARM = 1e-6

@@ -36,17 +36,6 @@ from analysis.spots.frame_movement import (
 )
 from analysis.spots.noise import NoiseModel
 
-__all__ = [
-    "FALSE_ALARM",
-    "Finding",
-    "FramesError",
-    "ScreenedFrames",
-    "noise_ratio",
-    "screen_frames",
-    "shown_noise",
-    "subtracted_level",
-]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Released = Callable[[NDArray[Any]], None]

@@ -18,8 +18,6 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate, TemplateRangeError
 
-__all__ = ["CORE_SHARE", "cramer_rao_bound", "image_bound", "maximum_likelihood_fit"]
-
 Array = NDArray[np.float64]
 _REST_PX = 1e-6
 _FLUX_SIGMAS = 5.0

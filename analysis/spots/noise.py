@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 
 from analysis.spots import rounding
 
-__all__ = ["FurtherNoise", "NoiseModel"]
-
 
 class FurtherNoise(Protocol):
     """Noise beyond the linear model, by its variance in one pixel, electrons squared."""

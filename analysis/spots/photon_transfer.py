@@ -22,8 +22,6 @@ from analysis.spots import rounding
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import NoiseModel
 
-__all__ = ["PhotonTransfer", "PixelCorrection", "photon_transfer", "pixel_correction"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _HOT_SIGMAS = 10.0

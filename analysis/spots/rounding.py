@@ -24,8 +24,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-__all__ = ["COARSE", "FEW", "FINE", "SHOWN", "WHOLE", "noise_range", "systematic_variance", "temporal_part"]
-
 Array = NDArray[np.float64]
 WHOLE = 1.0 / 12.0
 """Variance of rounding, DN^2, in one frame."""

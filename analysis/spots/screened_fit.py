@@ -29,8 +29,6 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
 
-__all__ = ["CORE_SHARE", "FitTerms", "ScreenedFit", "fit_screened", "model_parts", "one_shape"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _REST_PX, _MOST_STEPS = 1e-6, 60

@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 from analysis.measurement_error import MeasurementError
 from analysis.spots.noise import NoiseModel
 
-__all__ = ["NoiseParts", "SeriesNoise", "SpotError", "SpotPositions", "difference_covariance", "noise_parts"]
-
 Array = NDArray[np.float64]
 
 

@@ -27,8 +27,6 @@ from scipy.interpolate import BSpline
 
 from analysis.measurement_error import MeasurementError, UndeterminedError
 
-__all__ = ["SmearedShape", "SpotTemplate", "TemplateRangeError"]
-
 Array = NDArray[np.float64]
 _DEGREE = 5
 _TAPS = _DEGREE + 1

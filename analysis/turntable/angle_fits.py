@@ -27,19 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from analysis.measurement_error import UndeterminedError
-from analysis.turntable.angle_network import NotConvergedError, network
-
-__all__ = [
-    "FITS",
-    "GAP_ORDER",
-    "AngleFit",
-    "CrossValidation",
-    "NotConvergedError",
-    "angles_left",
-    "cross_validate",
-    "fewest",
-    "fit",
-]
+from analysis.turntable.angle_network import network
 
 Array = NDArray[np.float64]
 Curve = Callable[[Array], Array]

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from analysis.measurement_error import MeasurementError
 
-__all__ = ["NotConvergedError", "gradient", "network", "response"]
-
 Array = NDArray[np.float64]
 Curve = Callable[[Array], Array]
 

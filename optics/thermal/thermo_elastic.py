@@ -21,21 +21,7 @@ from skfem import CellBasis, ElementHex2, ElementTetP2, MeshHex2, MeshTet1
 
 from optics.materials.material import Material
 from optics.numerics.physical_error import UnphysicalError
-from optics.thermal.deformation import Displacement, FaceChange, Finder, face_change, rigid_modes
-
-__all__ = [
-    "Bonded",
-    "Displacement",
-    "ElasticBody",
-    "FaceChange",
-    "Field",
-    "Kinematic",
-    "Support",
-    "face_change",
-    "free_linear_field",
-    "solve",
-    "solve_many",
-]
+from optics.thermal.deformation import Displacement, Finder, rigid_modes
 
 Field = Callable[[np.ndarray], Any]
 """Something at points: (P, 3) metres -> (P,)."""

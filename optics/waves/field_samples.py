@@ -14,8 +14,6 @@ from functools import lru_cache
 
 import numpy as np
 
-__all__ = ["LONGEST", "FieldSamples"]
-
 LONGEST = 256
 """Points of a grid for which samples are worked out; longer ones are cut, since the work grows with the cube."""
 

@@ -8,8 +8,10 @@ import pytest
 from analysis.chi_square import limit_of
 from analysis.monitor.spot_evidence import AFTER, BEFORE, NOISE, SpotEvidence
 from analysis.spots import likelihood
-from analysis.spots.centroid import SpotError, energy_centroid, gaussian_fit, maximum_likelihood_fit
+from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.fit_state import fit_states, require_rest, widened
+from analysis.spots.likelihood import maximum_likelihood_fit
+from analysis.spots.spot_positions import SpotError
 from analysis.spots.spot_template import SpotTemplate
 from tests.analysis import test_spot_centroids as spots
 from tests.analysis.refusals import refuses

@@ -13,9 +13,11 @@ from analysis.block.block_adjustment import adjust_block
 from analysis.block.plausible_block import pruned
 from analysis.block.processes import BlockError, Law
 from analysis.images.fits_image import fits_cards
-from analysis.images.image_file import ImageError, ImageFile, Region
+from analysis.images.image_file import ImageFile, Region
+from analysis.images.image_header import ImageError
 from analysis.matching.correlation import distinct_points
-from analysis.matching.matches import MatchOptions, resampled
+from analysis.matching.options import MatchOptions
+from analysis.matching.spline import resampled
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.estimators import ESTIMATORS, Posterior, Shifts
 from analysis.monitor.filter_state import Observed
@@ -38,12 +40,14 @@ from analysis.orbit.forward_intersection import (
 from analysis.orbit.image_correction import image_correction
 from analysis.orbit.jitter_lines import splined
 from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
-from analysis.orientation.interior import OrientationError, fit_interior_orientation, line_orientation
-from analysis.spots.centroid import difference_covariance, energy_centroid, gaussian_fit, maximum_likelihood_fit
+from analysis.orientation.distortion_model import OrientationError
+from analysis.orientation.interior import fit_interior_orientation, line_orientation
+from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import FramesError
+from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import photon_transfer, pixel_correction
-from analysis.spots.spot_positions import noise_parts
+from analysis.spots.spot_positions import difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.turntable.angle_fits import cross_validate, fit
 from analysis.turntable.dividing_error import CalibrationSeries

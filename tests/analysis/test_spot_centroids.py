@@ -11,20 +11,11 @@ import pytest
 from scipy import stats
 from scipy.special import j1
 
-from analysis.spots.centroid import (
-    _GAUSS_MOVE_PX,
-    SpotError,
-    _wandered,
-    cramer_rao_bound,
-    difference_covariance,
-    energy_centroid,
-    gaussian_fit,
-    maximum_likelihood_fit,
-    mean_frames,
-)
-from analysis.spots.likelihood import image_bound
+from analysis.spots.centroid import _GAUSS_MOVE_PX, _wandered, energy_centroid, gaussian_fit, mean_frames
+from analysis.spots.likelihood import cramer_rao_bound, image_bound, maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_image import sane
+from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.spots.spot_template import SpotTemplate
 from tests.analysis.refusals import refuses
 from tests.tiers import quick

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.special import eval_legendre
 
-from analysis.wavefront_maps.zernike_table import MapError, read_zernikes
+from analysis.wavefront_maps.wavefront_map import MapError
+from analysis.wavefront_maps.zernike_table import read_zernikes
 from analysis.wavefront_maps.zernike_terms import (
     MOST_TERMS,
     annular_terms,

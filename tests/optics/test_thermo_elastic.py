@@ -11,7 +11,7 @@ from optics.geometry.surface import Surface, ZernikeFigure, plane
 from optics.geometry.zernike import zernike
 from optics.materials.material import material
 from optics.thermal import thermo_elastic
-from optics.thermal.deformation import rigid_modes
+from optics.thermal.deformation import Displacement, face_change, rigid_modes
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
 from tests.tiers import quick
 
@@ -176,7 +176,7 @@ def test_every_point_of_a_curved_face_is_found_in_its_own_cell(aperture, cells: 
     points = np.stack([x, y, surface.sag(x, y)], axis=-1)[inside]
     # the field u = r, which curved cells hold as well
     np.testing.assert_allclose(
-        thermo_elastic.Displacement(body.nodes, body.nodes, body._finder).at(points), points, atol=1e-9
+        Displacement(body.nodes, body.nodes, body._finder).at(points), points, atol=1e-9
     )
 
 
@@ -247,7 +247,7 @@ def test_a_gradient_through_a_plate_is_a_defocus_of_radius_one_over_a_g() -> Non
     mesh = mirror_mesh(plane(), aperture, 0.03, 1, 10)
     support = thermo_elastic.Kinematic(np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.0, 0.1, 0]]))
     u = thermo_elastic.solve(mesh, SILICA, linear(0.0, (0.0, 0.0, g)), support)
-    found = thermo_elastic.face_change(u, plane(), aperture, Pose())
+    found = face_change(u, plane(), aperture, Pose())
     # the hot side is at +z, where the plate gets longer: z = -a g r^2 / 2
     assert found.figure[4] == pytest.approx(-A * g * radius**2 / (4 * np.sqrt(3)), rel=1e-9)
     others = [found.figure[j] for j in range(5, 16)]
@@ -266,8 +266,8 @@ def test_a_turned_and_shifted_face_with_a_figure_is_read_back() -> None:
     u, v = (inside[:, 0] - 0.002) / 0.02, (inside[:, 1] - 0.003) / 0.02
     local = shift + np.cross(rotate, inside)
     local[:, 2] += 5e-9 * zernike(4, u, v) - 2e-9 * zernike(5, u, v) + 3e-9 * zernike(6, u, v)
-    field = thermo_elastic.Displacement(body.nodes, local @ pose.rotation.T, body._finder)
-    found = thermo_elastic.face_change(field, plane(), aperture, pose)
+    field = Displacement(body.nodes, local @ pose.rotation.T, body._finder)
+    found = face_change(field, plane(), aperture, pose)
     # quadratics in-plane give no rigid part; piston and tilts are orthogonal to Z4..Z6 on the disk
     np.testing.assert_allclose(found.rotate, rotate, rtol=1e-8)
     np.testing.assert_allclose(found.shift, shift, rtol=1e-8)
@@ -281,10 +281,10 @@ def test_the_disk_is_that_of_the_figure_when_there_is_one() -> None:
     body, support = bar()
     (u,) = body.solve_many([linear(0.0, (0.0, 0.0, 2.0))], support)
     pose, aperture = Pose(np.eye(3), np.array([0.5, 0.0, 0.03])), Circle(0.04)
-    small = thermo_elastic.face_change(u, plane(), aperture, pose, terms=6)
-    large = thermo_elastic.face_change(u, plane().with_figure(ZernikeFigure(0.08)), aperture, pose, terms=6)
+    small = face_change(u, plane(), aperture, pose, terms=6)
+    large = face_change(u, plane().with_figure(ZernikeFigure(0.08)), aperture, pose, terms=6)
     assert large.figure[4] == pytest.approx(4.0 * small.figure[4], rel=1e-6)
-    assert set(thermo_elastic.face_change(u, plane(), aperture, pose, terms=3).figure) == set()
+    assert set(face_change(u, plane(), aperture, pose, terms=3).figure) == set()
 
 
 def test_supports_bonds_temperatures_and_points_that_cannot_be_are_refused() -> None:
@@ -304,8 +304,8 @@ def test_supports_bonds_temperatures_and_points_that_cannot_be_are_refused() -> 
         (lambda: body.solve_many([lambda p: p], support), "one value for each"),
         (lambda: u.at([[0.5, 0.0, 0.031]]), "lies outside of the body"),
         (lambda: u.at([0.5, 0.0, 0.0]), "shape"),
-        (lambda: thermo_elastic.face_change(u, plane(), Circle(0.2), pose), "lies outside of the body"),
-        (lambda: thermo_elastic.face_change(u, plane(), Circle(0.02), Pose(), terms=2), "between Z3 and"),
+        (lambda: face_change(u, plane(), Circle(0.2), pose), "lies outside of the body"),
+        (lambda: face_change(u, plane(), Circle(0.02), Pose(), terms=2), "between Z3 and"),
     ):
         with pytest.raises(ValueError, match=words):
             call()

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from analysis.chi_square import limit_of
 from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex, outlying_points
-from analysis.images.image_file import ImageError, ImageFile, Region
+from analysis.images.image_file import ImageFile, Region
+from analysis.images.image_header import ImageError
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
 from analysis.spots.noise import NoiseModel

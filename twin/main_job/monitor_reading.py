@@ -27,8 +27,6 @@ from twin.run.artefact import significant
 from twin.run.provenance import SelfCheck
 from twin.uncertainty.monitor_limits import short_text, unseen_texts
 
-__all__ = ["CENTROID_NOTES", "STATED", "MonitorReading", "contradicted", "stated"]
-
 CENTROID_NOTES = {
     "ml": "maximum-likelihood fit of the calibrated spot shape",
     "gaussian": "fit of a Gaussian",

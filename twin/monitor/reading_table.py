@@ -25,8 +25,6 @@ from analysis.units import ARCSEC
 from twin.monitor.truth import Truth
 from twin.run.artefact import FAR, SAME, decimals_for, fixed
 
-__all__ = ["Reading", "ReadingTable", "reading_table"]
-
 
 @dataclass(frozen=True, eq=False)
 class Reading:

@@ -12,7 +12,8 @@ from twin.run.cli import InputErrorText, Standing, heartbeat
 
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup
-    from twin.operate.estimate.operation import Following, Operation
+    from twin.operate.estimate.following import Following
+    from twin.operate.estimate.operation import Operation
     from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
 

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from analysis.block.shares import Pool
     from optics.numerics.backend import Backend
 
-__all__ = ["cameras_of", "run_operated_block"]
-
 KEYS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
 _NEAR = 0.02

@@ -19,8 +19,6 @@ from scenes.yaml.errors import Problem
 from twin.operate.estimate.operation import Operation
 from twin.operate.record.entries import utc_text
 
-__all__ = ["Posterior", "posterior"]
-
 Array = NDArray[np.float64]
 
 

@@ -34,7 +34,8 @@ from twin.run.procedure import BenchError
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.models.disturbances import Component
-    from twin.operate.estimate.operation import Course, Following, Operation
+    from twin.operate.estimate.following import Course, Following
+    from twin.operate.estimate.operation import Operation
     from twin.operate.record.history import History
     from twin.orbit.export.export_run import ExportSource
 

@@ -37,8 +37,6 @@ from scenes.yaml.errors import Issue
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 from twin.run.frame_store import let_go, mean_of
 
-__all__ = ["ChannelMeasurement", "ChannelResult", "SpotResult", "remedy"]
-
 _DEAREST = 4.0
 """Times that sigma may grow by what is missing, before a spot counts as lost."""
 _REMEDIES = (

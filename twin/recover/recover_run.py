@@ -44,8 +44,6 @@ from twin.run.frame_store import mean_of
 from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import EmvaDetector, told_of_steps
 
-__all__ = ["RecoverRun", "run_recover", "state_name"]
-
 CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure the spots"
 
 

@@ -15,7 +15,7 @@ from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from scenes.specs.operation import OperationSpec
-from twin.operate.estimate.operation import Break, Following, FoundJump
+from twin.operate.estimate.following import Break, Following, FoundJump
 from twin.operate.record.entries import MICRO, Alarm, utc_text
 from twin.operate.record.history import History
 from twin.run.artefact import decimals_for, fixed, plain

@@ -16,8 +16,6 @@ from analysis.monitor.limits import Quantity
 from twin.operate.estimate.standing import SPANS, Scores
 from twin.operate.record.entries import utc_text
 
-__all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "SensorState", "beyond", "widening"]
-
 Array = NDArray[np.float64]
 MOST_BAD = 2
 """Readings taken for bad ones, above which it is said: 3 of 200 come by chance once in a thousand times."""

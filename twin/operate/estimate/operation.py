@@ -38,8 +38,6 @@ from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_tex
 from twin.operate.record.history import USED, History, content_of
 from twin.run.provenance import source_digest
 
-__all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "Operation", "SensorState", "beyond"]
-
 Array = NDArray[np.float64]
 DAY = 86_400 * MICRO
 EVERY = 1000

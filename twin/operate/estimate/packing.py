@@ -18,8 +18,6 @@ from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND, Parame
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import HeatInputs
 
-__all__ = ["packed", "unpacked"]
-
 _FILTER = (Aside, BadReading, Belief, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
 _CLASSES = (*_FILTER, SeriesFilter, TimeLaw, Track)
 _PARAMETERS = {one.key: one for one in (*CAMERA_PARAMETERS, ANGLE, *GROUND)}

@@ -23,8 +23,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 
 from analysis.matching.consensus import DisplacementField, consensus
 from analysis.matching.correlation import distinct_points
-from analysis.matching.matches import MatchOptions, match
-from analysis.matching.options import Reason
+from analysis.matching.matches import match
+from analysis.matching.options import MatchOptions, Reason
 from analysis.matching.spline import resampled
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.physical_error import PhysicalError
