@@ -19,7 +19,7 @@ from optics.design.design_variables import Prescription, Variable
 from optics.design.merit_function import Evaluation, MeritFunction, Operands
 from optics.numerics.backend import Backend
 from optics.numerics.constrained_least_squares import Sample, constrained_least_squares
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 

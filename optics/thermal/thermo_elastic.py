@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 from skfem import CellBasis, ElementHex2, ElementTetP2, MeshHex2, MeshTet1
 
 from optics.materials.material import Material
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.thermal.deformation import Displacement, Finder, rigid_modes
 
 Field = Callable[[np.ndarray], Any]

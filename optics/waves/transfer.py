@@ -23,7 +23,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import map_coordinates, spline_filter
 
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.quadrature import gauss, nodes_for
 from optics.numerics.threads import cores, one_blas_thread
 from optics.waves.pupil_stack import PupilFunction

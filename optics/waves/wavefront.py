@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.geometry import zernike
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 
 
 def eikonal(position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray) -> np.ndarray:

@@ -175,9 +175,7 @@ def test_every_point_of_a_curved_face_is_found_in_its_own_cell(aperture, cells: 
     inside = aperture.contains(x, y)
     points = np.stack([x, y, surface.sag(x, y)], axis=-1)[inside]
     # the field u = r, which curved cells hold as well
-    np.testing.assert_allclose(
-        Displacement(body.nodes, body.nodes, body._finder).at(points), points, atol=1e-9
-    )
+    np.testing.assert_allclose(Displacement(body.nodes, body.nodes, body._finder).at(points), points, atol=1e-9)
 
 
 def test_load_cases_add_up_and_differ_not_from_single_ones() -> None:

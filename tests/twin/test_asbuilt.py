@@ -19,7 +19,7 @@ from analysis.units import ARCSEC
 from analysis.wavefront_maps.orientation import Orientation
 from optics.geometry import zernike
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from scenes.specs.asbuilt import resolve_asbuilt
 from scenes.specs.load import EXAMPLES
 from scenes.specs.tolerance import MeritSpec

@@ -17,7 +17,7 @@ from rasterio.transform import from_origin
 
 import twin.orbit.__main__ as command
 from analysis.orbit.forward_intersection import CalibratedLine
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resolve_measured_angle

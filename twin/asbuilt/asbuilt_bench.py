@@ -14,7 +14,7 @@ from analysis.measurement_error import MeasurementError
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from scenes.models.disturbances import StatedMotions, motions_of_spec
 from scenes.specs.asbuilt import AsBuiltSetup, MeasurementsSpec
 from scenes.specs.tolerance import OF_MONITOR, MeritSpec, ToleranceBudgetSpec, ToleranceSetup

@@ -11,7 +11,7 @@ import numpy as np
 from analysis.instrument_state.known_combinations import Combination, combinations
 from analysis.instrument_state.state_estimate import FALSE_ALARM, Agreement, StateEstimate
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.tolerance import MeritSpec, amount_text
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit

@@ -13,7 +13,7 @@ from analysis.monitor.recovery import recover
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State, compose
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from scenes.models.built import squared_facets
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.instrument_model import Instrument, MisplacedError

@@ -20,7 +20,7 @@ from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.spot_positions import NoiseParts, SeriesNoise, SpotError
 from optics.geometry.tree import Motion, State
 from optics.numerics.threads import one_blas_thread
-from optics.thermal.heat import Temperature
+from optics.thermal.deformation import Temperature
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import CourseSpec, moment

@@ -28,7 +28,7 @@ from pydantic import ValidationError
 
 from analysis.spots.noise import FurtherNoise, NoiseModel
 from analysis.spots.rounding import COARSE, FEW, WHOLE
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.threads import cores
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec

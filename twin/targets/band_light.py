@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import TransferTable, polychromatic_transfer
 from scenes.specs.camera import BandSpec

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.waves.pupil_terms import products
 from optics.waves.transfer import polychromatic_transfer
 from optics.waves.varied_pupil import VariedTransfer

@@ -21,7 +21,7 @@ import numpy as np
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.limits import split
 from optics.geometry.tree import State
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from scenes.specs.tolerance import OF_MONITOR, POSTERIOR, MeritSpec, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.monitor.crosstalk import estimator_gains

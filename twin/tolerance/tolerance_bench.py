@@ -16,7 +16,7 @@ import numpy as np
 
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import PhysicalError, UnphysicalError
+from optics.numerics.invariants import PhysicalError, UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Element
 from optics.raytrace.line_of_sight import line_change, line_tangents

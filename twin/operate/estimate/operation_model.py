@@ -16,7 +16,7 @@ from analysis.monitor.limits import Quantity, quantities
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import HeatInputs
 from optics.numerics.backend import load_backend
-from optics.thermal.heat import Temperature
+from optics.thermal.deformation import Temperature
 from scenes.models.disturbances import HEAT, StatedMotions
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.operation import OperationSetup

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, KroghInterpolator
 from scipy.spatial.transform import Rotation
 
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.spans import in_span
 from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.trajectory import Attitude, Trajectory, readings

@@ -15,7 +15,7 @@ from scipy import fft
 from scipy.ndimage import map_coordinates
 from scipy.sparse import csr_array
 
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.threads import cores
 from twin.orbit.flight.earth import Earth, curvature_radii
 

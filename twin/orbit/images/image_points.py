@@ -27,7 +27,7 @@ from analysis.matching.matches import match
 from analysis.matching.options import MatchOptions, Reason
 from analysis.matching.spline import resampled
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Map
 from twin.orbit.images.imaged_ground import ImagedGround, LineFrame

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Control, make_control

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy import fft
 
-from optics.numerics.physical_error import PhysicalError, UnphysicalError
+from optics.numerics.invariants import PhysicalError, UnphysicalError
 from optics.numerics.threads import cores, one_blas_thread
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame

@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.orbit.jitter_spectrum import Observations
 from optics.geometry.pose import rotation_matrix
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from scenes.specs.orbit.jitter_search import AXES, JitterSearchSpec
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import LightEffects

@@ -19,7 +19,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
-from optics.thermal.heat import Temperature
+from optics.thermal.deformation import Temperature
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import moment
