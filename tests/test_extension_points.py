@@ -27,9 +27,8 @@ import twin.lab
 import twin.render
 import twin.validate
 from analysis.monitor import recovery
-from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.estimators import Formula, OfEachCamera
-from analysis.monitor.parameters import Parameter
+from analysis.monitor.parameters import CameraCalibration, Parameter
 from analysis.spots.centroid import gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
 from analysis.units import ARCSEC

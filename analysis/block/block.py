@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.block.processes import BlockError, Law
 from analysis.orbit.three_line_model import LineModel, Rays
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Scope = Literal["pass", "tracker", "block"]
 SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")

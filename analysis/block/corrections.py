@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.block.processes import Support
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 

@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.block.corrections import Corrections, by_rotation_vector, cross, turned, turned_back
 from analysis.orbit.three_line_model import LineModel, Rays
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 

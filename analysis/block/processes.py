@@ -29,10 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.ray_noise import spline_blend, spline_precision
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital", "jitter")

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import Literal, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 
-Array = NDArray[np.float64]
 S = TypeVar("S", bound="Weighted")
 T = TypeVar("T")
 SETTLED = 1e-3

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from analysis.arrays import Array
 from analysis.block.point_reduction import Checked, Eliminated, Reduction, State
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 

@@ -15,13 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.calibration.normal_equations import State, Weights, assemble
-from analysis.calibration.shared_noise import SharedNoise
+from analysis.arrays import Array
+from analysis.calibration.normal_equations import SharedNoise, State, Weights, assemble
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, Unknowns
 from analysis.orbit.null_space import free_basis, solved
 from analysis.orbit.three_line_model import LineModel
 
-Array = NDArray[np.float64]
 # A combination of both blocks that keeps more than this of its error in a round is open: it needs a million rounds.
 _OPEN = 1.0 - 1e-6
 _RELINEARISED = 3

@@ -24,18 +24,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse.linalg import splu
 from scipy.stats import chi2
 
+from analysis.arrays import Array
 from analysis.block.corrections import Corrections
-from analysis.calibration.normal_equations import Equations, State, Weights, assemble
-from analysis.calibration.shared_noise import SharedNoise
+from analysis.calibration.normal_equations import Equations, SharedNoise, State, Weights, assemble
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import BIAS, LineModel, Rays, bias_rotation
 
-Array = NDArray[np.float64]
 _NAME = "strip"
 _STEPS = 10
 _CONVERGED = 1e-6  # metres, as in forward intersection

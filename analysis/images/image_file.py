@@ -22,10 +22,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.images import fits_image, tiff_image
 from analysis.images.image_header import JPEG_MAGIC, PNG_MAGIC, ImageError, ImageHeader, jpeg_header, png_header
 
-Array = NDArray[np.float64]
 MOST_BYTES = 1 << 29
 """Largest size of one decoded page, and of the frames of one file together."""
 MOST_PIXELS = 4_000_000

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-Array = NDArray[np.float64]
+from analysis.arrays import Array
+
 _MOST_NODES = 600
 """Nodes of the search; the best move found by then is told, and that it may not be the best of all."""
 _CLOSE = 1e-3

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.matching.options import checked_places
 from analysis.measurement_error import UndeterminedError
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 # Of missing every all-right sample while this share is wrong.
 _MISSED, _WRONG = 1e-6, 0.45

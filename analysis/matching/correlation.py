@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.matching.options import Reason, checked_image, checked_places, checked_templates
 
-Array = NDArray[np.float64]
 _SMOOTHING = 1.0
 # Standard deviation of the Gaussian window of the tensor, px: half of a window of matching.
 _WINDOW = 3.0

@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from analysis.arrays import Array
+
 # A parabola and a 5 x 5 window within the margins need that much.
 _LEAST_TEMPLATE = 11
 

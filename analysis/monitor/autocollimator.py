@@ -26,11 +26,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 
-Array = NDArray[np.float64]
 AXES = ("X", "Y", "Z")
 
 

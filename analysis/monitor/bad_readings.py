@@ -22,13 +22,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit, gammaln, logsumexp
 
+from analysis.arrays import Array
 from analysis.monitor.filter_state import BadReading, Track
 from analysis.monitor.untold_jumps import Jumper
 
-Array = NDArray[np.float64]
 # chance beforehand that a reading is bad
 _SHARE = 1e-3
 # logarithms of the odds above which a reading is set aside, against one to which nothing has happened and against the

@@ -23,12 +23,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.jump_detection import Amounts, Candidate
 
-Array = NDArray[np.float64]
 _SCALES = (0.125, 0.25, 0.5, 1.0, 2.0)
 """Sizes of jumps over those stated."""
 _AGAIN = 2.0

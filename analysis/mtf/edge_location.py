@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 
-Array = NDArray[np.float64]
 Axis = Literal["x", "y"]
 # Smallest region: along the edge, and across it.
 LEAST_ALONG, LEAST_ACROSS = 20, 32

@@ -25,14 +25,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from analysis.chi_square import chance_beyond
+from analysis.arrays import Array
 from analysis.mtf.edge_fit import OVERSAMPLING, FittedEdge, fit_edge, path_parts
 from analysis.mtf.edge_location import Axis, EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread
-from analysis.mtf.rice import measured_bias, rice_sigma, signal_modulus
 from analysis.spots.noise import NoiseModel
+from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal_modulus
 
-Array = NDArray[np.float64]
 # Block means of 4 x 4 px that stick out of the fitted edge by more than this share of the contrast.
 _OTHER_STRUCTURE = 0.1
 # Blocks and strips of pixels whose means are tested for structure, px.

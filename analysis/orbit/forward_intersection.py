@@ -24,12 +24,12 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.calibration_parameters import CalibrationError, Noise, vertical
 from analysis.orbit.ray_noise import ray_covariance
 from analysis.orbit.three_line_model import LineModel, Rays, bias_rotation, misclosure, partials
 
-Array = NDArray[np.float64]
 _STEPS = 10
 _CONVERGED = 1e-6  # metres; coordinates of 6.4e6 m are rounded to 1e-9 m
 # Two rays at less than one arc minute do not meet: a base of 150 m under 500 km.

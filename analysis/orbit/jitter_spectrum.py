@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 
-Array = NDArray[np.float64]
 OVERSAMPLING = 6
 """Frequencies in the inverse of the time that is observed; the highest of them has 98% of a line's power."""
 BLIND = 0.1

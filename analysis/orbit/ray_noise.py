@@ -7,19 +7,29 @@ Attitude and station of an exposure are interpolated between readings. The corre
 which is the cubic spline through its own values at the readings (z_{k-1} + 4 z_k + z_{k+1}) / 6. Readings independent
 with unit variance make z a stationary second-order autoregression with the double root -rho, rho = 2 - sqrt 3; its
 covariance is 3 (-rho)^n (n + (1 + rho^2) / (1 - rho^2)), and the precision of a stretch of it has five diagonals.
+
+Quality of an orbit or attitude series by its third differences (paper 003, Table 2).
+
+A third difference x[k+3] - 3 x[k+2] + 3 x[k+1] - x[k] removes a smooth motion, up to its third derivative times dt^3,
+and leaves noise: of white noise with standard deviation s it has the RMS s sqrt(1 + 9 + 9 + 1) = s sqrt(20), and
+neighbours correlate by -15/20. It says nothing of a bias, of a drift or of noise that is slower than a few samples, and
+data that were smoothed before look better than they are. The smooth part is not always small: along a circular orbit at
+500 km the third derivative is 8.4e-3 m/s^3, so 8 mm at 1 s but 8 m at 10 s.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.linalg import toeplitz
 
+from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.three_line_model import Partials, Rays
 
-Array = NDArray[np.float64]
 _RHO = 2.0 - np.sqrt(3.0)
 _NEEDED = 4
 """Neighbouring z that one moment needs: no stretch is shorter."""
@@ -78,3 +88,48 @@ def spline_precision(count: int) -> sparse.csr_matrix:
     corner = np.linalg.inv(_covariance(_NEEDED))
     matrix[:2, :2], matrix[-2:, -2:] = corner[:2, :2], corner[-2:, -2:]
     return sparse.csr_matrix(matrix)
+
+
+WHITE_GAIN = float(np.sqrt(20.0))
+# Steps of time that differ by more are gaps: third differences over them mean something else.
+_UNEVEN = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class ThirdDifference:
+    """Quality of one series.
+
+    Attributes:
+        rms: (k,) of the third differences of each column, as in Table 2.
+        white_sigma: (k,) rms / sqrt(20), standard deviation of one sample if the noise is white.
+    """
+
+    rms: Array
+    white_sigma: Array
+
+
+def third_difference(time: ArrayLike, series: ArrayLike) -> ThirdDifference:
+    """Third differences of an evenly sampled series.
+
+    Args:
+        time: (n,) seconds.
+        series: (n,) or (n, k), metres or radians.
+
+    Raises:
+        ValueError: fewer than five samples, values that are not finite, gaps.
+    """
+    t, x = np.asarray(time, np.float64), np.asarray(series, np.float64)
+    x = x[:, None] if x.ndim == 1 else x
+    if t.ndim != 1 or x.ndim != 2 or len(t) != len(x) or len(t) < 5:
+        raise ValueError(f"third differences: need five samples or more, found times {t.shape} and series {x.shape}")
+    if not (np.all(np.isfinite(t)) and np.all(np.isfinite(x))):
+        raise ValueError("third differences: times and values must be finite")
+    steps = np.diff(t)
+    typical = float(np.median(steps))
+    bad = np.flatnonzero(np.abs(steps - typical) > _UNEVEN * abs(typical))
+    if typical <= 0 or len(bad):
+        where = f"; the step after sample {bad[0]} is {steps[bad[0]]:.6g} s" if len(bad) else ""
+        raise ValueError(f"third differences: times must rise evenly, by {typical:.6g} s{where}")
+    change = np.diff(x, n=3, axis=0)
+    rms = np.sqrt(np.mean(change**2, axis=0))
+    return ThirdDifference(rms, rms / WHITE_GAIN)

@@ -29,9 +29,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 
-Array = NDArray[np.float64]
 INTERIOR = ("f", "x", "y")
 BIAS = ("roll", "pitch", "yaw")
 DRIFT = ("d_alpha", "d_beta", "d_gamma", "d_f")

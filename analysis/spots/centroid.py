@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.spots import spot_image
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 
-Array = NDArray[np.float64]
 # How far the Gaussian's centre may wander from the first guess, px.
 _GAUSS_MOVE_PX = 4
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.stats import chi2
 
+from analysis.arrays import Array
 from analysis.spots.noise import NoiseModel
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 FALSE_ALARM = 1e-6
 """Chance that a test finds something in clean frames of one spot in one state."""

@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.spots import rounding
+from analysis.arrays import Array
 from analysis.spots.frame_screening import FramesError
-from analysis.spots.noise import NoiseModel
+from analysis.spots.noise import WHOLE, NoiseModel, noise_range, systematic_variance, temporal_part
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _HOT_SIGMAS = 10.0
 _RESPONSE = (0.5, 1.5)
@@ -162,7 +161,7 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
         raise FramesError(
             f"the flat frames are only {signal:.3g} DN brighter than the dark ones", "flat frames at half of saturation"
         )
-    dark_steps, steps = rounding.temporal_part(dark_variance), rounding.temporal_part(variance)
+    dark_steps, steps = temporal_part(dark_variance), temporal_part(variance)
     shot = variance - dark_variance + (dark_steps - steps)
     own = max(dark_variance - dark_steps, 0.0)
     dark_spread = dark_variance * math.sqrt(2.0 / (pixels * (len(night) - 1)))
@@ -173,7 +172,7 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
             "raw frames, neither averaged, smoothed nor compressed",
         )
     # of few changes of a grey value another number might have been seen; frames of even light have pixels at all places
-    low, high = rounding.noise_range(dark_variance, 5.0 * dark_spread + 5.0 / (pixels * (len(night) - 1)))
+    low, high = noise_range(dark_variance, 5.0 * dark_spread + 5.0 / (pixels * (len(night) - 1)))
     dark_doubt = max(high - own, own - low)
     if dark_doubt > 0.0:
         spread = math.hypot(spread, dark_doubt)
@@ -189,8 +188,8 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
     if dark_doubt > 0.0:
         noise_sigma = math.hypot(noise_sigma, _square_root_sigma(own, dark_doubt) / gain)
     left, dark_left = variance / len(day), dark_variance / len(night)
-    stays, dark_stays = rounding.WHOLE - steps, rounding.WHOLE - dark_steps
-    hidden = float(rounding.systematic_variance(0.0, low, 1.0))
+    stays, dark_stays = WHOLE - steps, WHOLE - dark_steps
+    hidden = float(systematic_variance(0.0, low, 1.0))
     dsnu, dsnu_sigma = _pattern(level, good, (dark_left, dark_stays), hidden)
     prnu, prnu_sigma = _pattern(light - level, good, (left, dark_left, stays + dark_stays), hidden)
     return PhotonTransfer(

@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from analysis.arrays import Array
 from analysis.spots import spot_image
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _REST_PX, _MOST_STEPS = 1e-6, 60
 _REST_SIGMAS = 1e-4
@@ -124,7 +124,7 @@ class ScreenedFit:
 
     def core_widening(self, learnt_from: ScreenedFit | None = None, noisier: float = 1.0) -> float:
         """Factor of sigma: 1 where the core has the calibrated shape, else the root of its reduced chi-square (as
-        `analysis.spots.fit_state.FitStates.widening`).
+        `analysis.spots.likelihood.FitStates.widening`).
 
         Args:
             learnt_from: as of `core_fits`.

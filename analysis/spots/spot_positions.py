@@ -21,10 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 from analysis.spots.noise import NoiseModel
-
-Array = NDArray[np.float64]
 
 
 class SpotError(MeasurementError, ValueError):

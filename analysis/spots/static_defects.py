@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, signal
 from scipy.stats import chi2, norm
 
+from analysis.arrays import Array
 from analysis.spots import spot_image
 from analysis.spots.frame_movement import FALSE_ALARM
 from analysis.spots.frame_screening import Finding, ScreenedFrames
@@ -34,8 +35,6 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened, model_parts
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
-
-Array = NDArray[np.float64]
 
 
 def repaired_centroid(

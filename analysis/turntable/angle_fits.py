@@ -23,13 +23,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 from analysis.turntable.angle_network import network
 
-Array = NDArray[np.float64]
 Curve = Callable[[Array], Array]
 
 MOST_ORDER = 30

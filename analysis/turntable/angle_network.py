@@ -12,11 +12,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 
-Array = NDArray[np.float64]
 Curve = Callable[[Array], Array]
 
 HIDDEN, RESTARTS = 20, 4

@@ -37,11 +37,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import beta, chi2, norm
 
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 from analysis.turntable import angle_fits
 from analysis.turntable.angle_network import NotConvergedError
 
-Array = NDArray[np.float64]
 FEWEST = 3
 """Fewest readings of which one can be rejected: two readings deviate by the same amount."""
 

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.chi_square import chance_beyond
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
-from analysis.wavefront_maps.wavefront_map import Array, MapError, WavefrontMap
+from analysis.statistics import chance_beyond
+from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
 from analysis.wavefront_maps.zernike_terms import noll_to_nm
 
 _NAMES = {

@@ -17,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from analysis.arrays import Array
 from analysis.wavefront_maps.text_grids import statements, text_of, unit_agreed
-from analysis.wavefront_maps.wavefront_map import Array, MapError, agreed, length_from, metres_per
+from analysis.wavefront_maps.wavefront_map import MapError, agreed, length_from, metres_per
 from analysis.wavefront_maps.zernike_terms import ORDERS, edge_value, nm_to_noll
 
 ORDER_NAMES = {"noll": "noll", "fringe": "fringe", "ansi": "ansi", "osa": "ansi", "osa/ansi": "ansi"}

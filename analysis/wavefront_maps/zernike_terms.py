@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import eval_jacobi
 
-Array = NDArray[np.float64]
+from analysis.arrays import Array
+
 HIGHEST_ORDER = 30
 """Radial order of the last supported terms."""
 MOST_TERMS = (HIGHEST_ORDER + 1) * (HIGHEST_ORDER + 2) // 2

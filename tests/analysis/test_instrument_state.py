@@ -11,9 +11,14 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from analysis.instrument_state.known_combinations import combinations
 from analysis.instrument_state.next_move import Actuators, best_move, measurement_worth, truncated_move
-from analysis.instrument_state.state_estimate import MeasuredGroup, StateEstimate, StatePrior, estimate_state
+from analysis.instrument_state.state_estimate import (
+    MeasuredGroup,
+    StateEstimate,
+    StatePrior,
+    combinations,
+    estimate_state,
+)
 from analysis.measurement_error import UndeterminedError
 from tests.analysis.refusals import refuses
 

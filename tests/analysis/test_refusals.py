@@ -9,8 +9,7 @@ import tifffile
 from astropy.io import fits
 
 from analysis.block.block import Term
-from analysis.block.block_adjustment import adjust_block
-from analysis.block.plausible_block import pruned
+from analysis.block.block_adjustment import adjust_block, pruned
 from analysis.block.processes import BlockError, Law
 from analysis.images.fits_image import fits_cards
 from analysis.images.image_file import ImageFile, Region

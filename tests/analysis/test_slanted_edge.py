@@ -17,9 +17,9 @@ from scipy import stats
 from scipy.interpolate import CubicSpline
 
 from analysis.mtf.edge_location import EdgeError, locate_edge, pixel_noise
-from analysis.mtf.rice import rice_sigma, signal_modulus
 from analysis.mtf.slanted_edge import measure_edge
 from analysis.spots.noise import NoiseModel
+from analysis.statistics import rice_sigma, signal_modulus
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.unseen_motions import unseen_modes
+from analysis.monitor.model_fit import unseen_modes
 from scenes.models.disturbances import state_of
 from scenes.specs.orbit.loop import CorrectionSpec, LoopImagesSpec
 from scenes.specs.orbit.setup import LoopSetup, resolve_loop

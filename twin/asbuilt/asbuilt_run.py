@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.instrument_state.known_combinations import Combination, combinations
-from analysis.instrument_state.state_estimate import FALSE_ALARM, Agreement, StateEstimate
+from analysis.instrument_state.state_estimate import FALSE_ALARM, Agreement, Combination, StateEstimate, combinations
 from optics.numerics.backend import Backend
 from optics.numerics.invariants import PhysicalError
 from scenes.specs.asbuilt import AsBuiltSetup

@@ -18,7 +18,7 @@ from typing import Self
 
 import numpy as np
 
-from analysis.short_repr import shows
+from analysis.arrays import shows
 from optics.geometry import zernike
 from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State

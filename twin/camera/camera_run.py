@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from analysis.arrays import shows
 from analysis.monitor import parameters
-from analysis.short_repr import shows
 from optics.geometry import zernike
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.chi_square import limit_of
 from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex, outlying_points
 from analysis.images.image_file import ImageFile, Region
 from analysis.images.image_header import ImageError
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
 from analysis.spots.noise import NoiseModel
+from analysis.statistics import limit_of
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import cores, one_blas_thread
 from scenes.specs.camera_tests import FocusFiles, NoiseSpec

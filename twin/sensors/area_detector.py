@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from analysis.spots.noise import FurtherNoise, NoiseModel
-from analysis.spots.rounding import COARSE, FEW, WHOLE
+from analysis.spots.noise import COARSE, FEW, WHOLE, FurtherNoise, NoiseModel
 from optics.numerics.invariants import UnphysicalError
 from optics.numerics.threads import cores
 from scenes.specs.detector import DetectorSpec

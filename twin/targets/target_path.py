@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.short_repr import shows
+from analysis.arrays import shows
 from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
 from optics.geometry.tree import PlacedBodies, State

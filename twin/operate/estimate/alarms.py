@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from analysis.chi_square import chance_beyond, limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
+from analysis.statistics import chance_beyond, limit_of
 from scenes.specs.operation import OperationSpec
 from twin.operate.estimate.following import Break, Following, FoundJump
 from twin.operate.record.entries import MICRO, Alarm, utc_text

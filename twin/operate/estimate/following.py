@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
+from analysis.statistics import limit_of
 from twin.operate.estimate.standing import SPANS, Scores
 from twin.operate.record.entries import utc_text
 

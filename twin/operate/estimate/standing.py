@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.filter_state import Belief, Innovation, Observed
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.series_filter import SeriesFilter
+from analysis.statistics import limit_of
 from twin.operate.estimate.operation_model import OperationModel
 from twin.operate.estimate.packing import unpacked
 from twin.operate.record.entries import MICRO

@@ -15,8 +15,7 @@ import numpy as np
 from scipy.stats import chi2, siegelslopes
 
 from analysis.block.reweighting import REJECT
-from analysis.calibration.adjustment import Adjustment
-from analysis.calibration.plausibility import FarPointsError
+from analysis.calibration.adjustment import Adjustment, FarPointsError
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import Rays, misclosure
 from optics.numerics.frozen_map import FrozenMap

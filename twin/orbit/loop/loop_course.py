@@ -13,7 +13,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from analysis.chi_square import chance_beyond, limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import Jump
@@ -22,6 +21,7 @@ from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
+from analysis.statistics import chance_beyond, limit_of
 from optics.geometry.tree import Motion, State, compose
 from optics.numerics.threads import cores, one_blas_thread
 from scenes.models.disturbances import states_of

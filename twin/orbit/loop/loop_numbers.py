@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.monitor.unseen_motions import UnseenMode
+from analysis.monitor.model_fit import UnseenMode
 from scenes.specs.course import moment
 from twin.orbit.loop.line_images import ImagedPair
 from twin.orbit.loop.loop_run import GAIN_MARGIN, PHASE_MARGIN_DEG, LoopFacts, LoopPass, LoopRun, height_rms

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from analysis.monitor.disturbances import FALSE_ALARM
-from analysis.monitor.unseen_motions import UnseenMode
+from analysis.monitor.model_fit import UnseenMode
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from scenes.yaml.errors import names_text

@@ -25,7 +25,7 @@ from analysis.monitor.control_loop import (
     spectral_radius,
 )
 from analysis.monitor.disturbances import FALSE_ALARM
-from analysis.monitor.unseen_motions import UnseenMode, floor, unseen_modes
+from analysis.monitor.model_fit import UnseenMode, floor, unseen_modes
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.spans import number_of
