@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, compose
-from scenes.models.built import squared_facets
 from scenes.models.clearance import convex_bodies
-from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_builder import build_instrument, squared_facets
 from scenes.specs.as_built import as_built_file
 from scenes.specs.load import load_cameras, load_instrument
 from scenes.specs.resolved import resolve, resolve_camera

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from optics.numerics.backend import Backend
-from scenes.specs.events import EVENTS
-from scenes.specs.operation import OperationSetup, read_operation
+from scenes.specs.operation import EVENTS, OperationSetup, read_operation
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, SCALE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
