@@ -85,8 +85,7 @@ from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.runs.study_folder import StudyFolder
 from twin.study.study_files import write_data
-from twin.targets.band_light import BandPupils
-from twin.targets.target_images import View
+from twin.targets.target_images import BandPupils, View
 from twin.validation.checks.check import Check
 from twin.validation.checks.group import CheckGroup
 

@@ -31,8 +31,18 @@ from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.colour import spectral_mtfs
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
-from twin.targets.band_light import WORST_CHANGE, BandPupils
-from twin.targets.target_images import ALONG, DIRECTIONS, PLACES, TRACK, BarDesign, TargetCamera, TargetLostError, View
+from twin.targets.target_images import (
+    ALONG,
+    DIRECTIONS,
+    PLACES,
+    TRACK,
+    WORST_CHANGE,
+    BandPupils,
+    BarDesign,
+    TargetCamera,
+    TargetLostError,
+    View,
+)
 from twin.targets.target_measurement import CURVE, read_bars, read_edge
 from twin.targets.target_path import LocalMap, TargetPath
 

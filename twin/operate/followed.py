@@ -25,7 +25,7 @@ PlanFile = Annotated[
 
 def plan_of(history: History, plan: Path | None) -> OperationSetup | None:
     """The plan in a file, or that of the record; None where the record keeps none. Raises InputError."""
-    from twin.operate.estimate.plans import kept_plan, read_plan
+    from twin.operate.estimate.operation_model import kept_plan, read_plan
 
     return kept_plan(history) if plan is None else read_plan(plan, history)
 

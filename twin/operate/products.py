@@ -21,7 +21,7 @@ from sqlalchemy import select
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
-from twin.operate.estimate.plans import plan_digest
+from twin.operate.estimate.operation_model import plan_digest
 from twin.operate.estimated_motions import EstimatedMotions, LeftOut, Prior, prior_files, state_file
 from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
 from twin.operate.record.schema import ENTRY

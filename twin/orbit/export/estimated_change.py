@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from analysis.orbit.forward_intersection import CalibratedLine
 from twin.orbit.export.rational_polynomial import axis_sigma
-from twin.orbit.flight.corrected_lines import corrected_line
 from twin.orbit.flight.earth import east_north_up
-from twin.orbit.flight.line_camera import LineCamera
+from twin.orbit.flight.line_camera import LineCamera, corrected_line
 from twin.orbit.flight.sensor import Sensor
 
 Array = NDArray[np.float64]

@@ -29,8 +29,7 @@ from twin.orbit.export.estimated_change import EstimatedChange, GroundSigma, gro
 from twin.orbit.export.line_scanner import LineScanner, line_scanner
 from twin.orbit.export.quality import Quality
 from twin.orbit.export.rational_polynomial import RationalPolynomial
-from twin.orbit.flight.corrected_lines import calibrated_lines, corrected_line
-from twin.orbit.flight.line_camera import LineCamera
+from twin.orbit.flight.line_camera import LineCamera, calibrated_lines, corrected_line
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.images.simulate_run import fly_simulation

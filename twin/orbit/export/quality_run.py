@@ -15,8 +15,7 @@ from twin.orbit.export.export_run import Export, ExportedLine, SceneSource
 from twin.orbit.export.ground_accuracy import AccuracyMap, maps_of
 from twin.orbit.export.polynomial_control import controlled, polynomial_correction
 from twin.orbit.export.quality import Controlled, ControlPoints, ProductPolynomial, Quality, Wishes
-from twin.orbit.export.rational_polynomial import RationalPolynomial
-from twin.orbit.export.rpc_files import read_rpc
+from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.dimap_sensor import DimapScene
 

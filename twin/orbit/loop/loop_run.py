@@ -34,8 +34,7 @@ from optics.raytrace.trace import BeamMissedError
 from scenes.specs.orbit.monitor import PARAMETERS
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.flight.corrected_lines import calibrated_line
-from twin.orbit.flight.line_camera import LineCamera, traced_line_cameras
+from twin.orbit.flight.line_camera import LineCamera, calibrated_line, traced_line_cameras
 from twin.orbit.loop.line_images import ImagedPair, imaged_pair
 from twin.orbit.loop.loop_course import LoopCourse, drifting_states, gone_through, reader
 from twin.orbit.loop.loop_model import FOCUS_FIELDS, Corrector, LoopModel, defocus, loop_model

@@ -26,10 +26,9 @@ from scenes.specs.course import moment
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
-from twin.orbit.flight.corrected_lines import calibrated_line
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.orbit.flight.line_camera import LineCamera, look_angle, traced_line_cameras
+from twin.orbit.flight.line_camera import LineCamera, calibrated_line, look_angle, traced_line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory

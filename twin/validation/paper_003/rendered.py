@@ -19,8 +19,7 @@ from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
 from twin.orbit.calibration.schemes import tested, tested_before
-from twin.orbit.ground.grid import GroundFrame
-from twin.orbit.ground.terrain import Terrain
+from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import MARGIN, PushbroomScene, render_patch
