@@ -172,17 +172,6 @@ class BlockAdjustment:
         found[~np.isfinite(self.ground[points]).all(axis=1)] = np.nan
         return found
 
-    def attitude_at(self, of: str, times: Array) -> tuple[Array, Array]:
-        """Correction of the attitude of a pass about the body's axes, (n, 3), radians, with covariances (n, 3, 3)."""
-        columns, factors = self.assembly.corrections(of, times).factors(True)
-        value = np.sum(factors * self.x[columns], axis=1)
-        spread = np.empty((len(times), 3, 3))
-        for i in range(3):
-            for j in range(3):
-                some = self.covariance[columns[:, :, i][:, :, None], columns[:, :, j][:, None, :]]
-                spread[:, i, j] = np.einsum("nk,nkl,nl->n", factors[:, :, i], some, factors[:, :, j])
-        return value, spread
-
     def change(self, scene: str) -> tuple[Array, Array]:
         """Camera of a scene: d_alpha, d_beta, d_gamma, d_f (4,), radians and metres, and their covariance (4, 4)."""
         columns, unit = self.assembly.changes[scene], self.assembly.units[scene]

@@ -32,8 +32,6 @@ MOST_PIXELS = 4_000_000
 """Largest region: the fits need some 250 bytes for each pixel."""
 MOST_STACKED = 16_000_000
 """Largest region in all pages together."""
-GAMMAS = ("srgb", "1", "2.2")
-"""Examples of the tone curves."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _LARGEST_GAMMA = 5.0
 _GZIP = b"\x1f\x8b"

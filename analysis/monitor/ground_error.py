@@ -24,7 +24,6 @@ EARTH_RADIUS_M = 6_371_000.0
 """Mean radius (IUGG). The Earth's flattening and turn change the figures here by less than 1 %."""
 _PLACES = 9
 """Places along the line over which RMS values are taken."""
-AXES = ("along", "across", "height")
 
 
 @shows()

@@ -331,37 +331,6 @@ def _step(
     return theta + step * short[:, None], length, inverse, weighted
 
 
-def cramer_rao_bound(
-    template: SpotTemplate,
-    row: ArrayLike,
-    column: ArrayLike,
-    flux: ArrayLike,
-    background: ArrayLike,
-    noise: NoiseModel,
-    frames: int,
-) -> Array:
-    """Least covariance (B, 2, 2) px^2 of (row, column) that any unbiased estimator can reach when all four are
-    unknown.
-
-    Inverse Fisher information of the normal likelihood (Kay, Estimation Theory, 1993, eq. 3.31) without the term of
-    the variance's own derivative, which Poisson noise does not have.
-
-    Args:
-        template: T shapes; spot b has shape b modulo T.
-        row: (B,), px.
-        column: (B,), px.
-        flux: (B,), DN.
-        background: (B,), DN with black level.
-        noise: of the detector; the fixed pattern counts: the bound is for one image by itself.
-        frames: of which an image is the mean.
-    """
-    values = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, np.float64)) for v in (row, column, flux, background)))
-    theta = np.stack(values, axis=1)
-    which = np.arange(len(theta)) % template.count
-    design, level = spot_image.template_model(theta, which, template)
-    return _bound(design, level, noise, frames)
-
-
 def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: int) -> Array:
     """Cramer-Rao bound (B, 2, 2) px^2 of spots of which there is an image without noise, and no template.
 
@@ -370,8 +339,8 @@ def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: 
             for the slopes (differences of fourth order: the sigmas of a spot whose first dark ring is at 7 px come out
             2e-3 too low, of wider ones less).
         background: DN with black level.
-        noise: as `cramer_rao_bound`.
-        frames: likewise.
+        noise: of the detector; the fixed pattern counts: the bound is for one image by itself.
+        frames: of which an image is the mean.
     """
     image = np.asarray(light, np.float64)
     count, inner = len(image), image[:, 2:-2, 2:-2]

@@ -228,21 +228,3 @@ def tellable(
         allowed=tuple(one for one, p in zip(ranked, chance, strict=True) if p >= false_alarm),
         together=tuple(one for one, c in zip(ranked, chi_square, strict=True) if c - chi_square[0] < limit),
     )
-
-
-def separations(
-    expected: Array, covariance: Array, terms: Sequence[int], readings: Sequence[Orientation] = READINGS
-) -> Array:
-    """By how much wrong readings will raise the chi-square of a measurement that turns out as predicted, (K,).
-
-    A value below twice the logarithm of the odds of ``tellable`` says, before anything is measured, that the reading
-    will not be told from the right one.
-
-    Args:
-        expected: coefficients that are predicted, (F, Z), metres.
-        covariance: as for ``tellable``.
-        terms: indices of Noll, (Z,).
-        readings: relative to the right one.
-    """
-    rest = np.stack([(one.coefficients(expected, terms) - expected).ravel() for one in readings], axis=-1)
-    return np.asarray(np.sum(rest * np.linalg.solve(covariance, rest), axis=0))

@@ -208,18 +208,6 @@ class ElasticBody:
         return values + np.einsum("k,kx->x", amount, rigid_modes(self.nodes)).reshape(-1, 3)
 
 
-def solve(mesh: MeshHex2 | MeshTet1, material: Material, temperature: Field, support: Support) -> Displacement:
-    """Displacement of a body for one temperature change; see ``ElasticBody.solve_many``."""
-    return ElasticBody(mesh, material).solve_many([temperature], support)[0]
-
-
-def solve_many(
-    mesh: MeshHex2 | MeshTet1, material: Material, temperatures: Sequence[Field], support: Support | Sequence[Support]
-) -> tuple[Displacement, ...]:
-    """Displacements of a body for several temperature changes; see ``ElasticBody.solve_many``."""
-    return ElasticBody(mesh, material).solve_many(temperatures, support)
-
-
 def free_linear_field(
     expansion: float, change: float, gradient: Any, about: Any = (0.0, 0.0, 0.0)
 ) -> Callable[[np.ndarray], np.ndarray]:

@@ -144,21 +144,6 @@ class PupilField:
         size = np.asarray(size)[:, None]
         return PupilField(self.u * size, self.v * size, self.eikonal, self.amplitude * size, self.wavelength)
 
-    def repeated(self, count: int) -> PupilField:
-        """Every image ``count`` times in a row."""
-        u, v, eikonal, amplitude = (np.repeat(a, count, axis=0) for a in (self.u, self.v, self.eikonal, self.amplitude))
-        return PupilField(u, v, eikonal, amplitude, self.wavelength)
-
-
-@dataclass(frozen=True, eq=False)
-class PupilTangent:
-    """Derivatives of the arrays of a ``PupilField`` by one parameter, (B, N) each."""
-
-    u: np.ndarray
-    v: np.ndarray
-    eikonal: np.ndarray
-    amplitude: np.ndarray
-
 
 @dataclass(frozen=True)
 class Grid:
@@ -344,31 +329,6 @@ def at_crossings(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     columns = waves(turns * x[..., None] * field.u[:, None])
     wave = rows @ np.swapaxes(columns, 1, 2)
     return np.asarray((wave.real.astype(np.float64) ** 2 + wave.imag.astype(np.float64) ** 2) / field.wavelength**2)
-
-
-def image_derivative(field: PupilField, tangent: PupilTangent, x: Grid, y: Grid) -> np.ndarray:
-    """Derivative of ``image`` by the parameter of ``tangent``, exact, (B, R, C).
-
-    Args:
-        field: of B images.
-        tangent: its derivative by a parameter.
-        x: places along columns, C, metres.
-        y: along rows, R, metres.
-    """
-    k = 2.0 * np.pi / field.wavelength
-    out = np.empty((len(field.u), y.count, x.count))
-    for i in range(len(field.u)):
-        rows = _waves(k * field.v[i], y, 1.0, np.complex128).T
-        phasor = np.exp(1j * k * field.eikonal[i])
-        amplitude = field.amplitude[i] * phasor
-        columns = _waves(k * field.u[i], x, 1.0, np.complex128)
-        here = rows @ (amplitude[:, None] * columns)
-        own = (tangent.amplitude[i] + 1j * k * field.amplitude[i] * tangent.eikonal[i]) * phasor
-        step = rows @ (own[:, None] * columns)
-        step += 1j * k * x.points() * (rows @ ((amplitude * tangent.u[i])[:, None] * columns))
-        step += 1j * k * y.points()[:, None] * (rows @ ((amplitude * tangent.v[i])[:, None] * columns))
-        out[i] = 2.0 * np.real(np.conj(here) * step)
-    return out / field.wavelength**2
 
 
 _AT_ONCE = 2

@@ -53,6 +53,7 @@ from analysis.turntable.dividing_error import CalibrationSeries
 from tests.analysis.drawn_blocks import Plan, draw
 from tests.analysis.refusals import refuses
 from tests.analysis.stated_motions import TimeLaw, disturbances
+from tests.analysis.test_jitter_lines import of_disparities
 from tests.analysis.test_monitor_limits import some_cameras
 from tests.analysis.test_spot_centroids import NOISE, SHAPE, airy
 from tests.analysis.test_three_line_model import SEEN
@@ -171,13 +172,13 @@ def test_orbit():
 
 def test_jitter():
     time = np.linspace(0.0, 10.0, 200)
-    given = Observations.of_disparities(time, time + 0.1, 0.0 * time, 0.1)
+    given = of_disparities(time, time + 0.1, 0.0 * time, 0.1, 0 * time)
     parts = given.value, given.group, given.time, given.weight, given.nuisance
     refuses(JitterError, "do not match", Observations.of, given.value[:9], *parts[1:])
     refuses(JitterError, "their groups are mixed", Observations.of, given.value, given.group[::-1], *parts[2:])
     refuses(JitterError, "do not match mixtures", Observations.of, *parts, mix=np.ones((9, 2, 1)))
     refuses(JitterError, "moments that lie apart", splined, given, 0.0, 1.0)
-    once = Observations.of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, degree=0)
+    once = of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, 0 * time, degree=0)
     refuses(JitterError, "all observations are of one moment", periodogram, once, 0.5, 6.0)
 
 

@@ -135,11 +135,6 @@ def test_all_ways_round():
         assert edge.position == pytest.approx(position, abs=1e-3)
 
 
-def test_frequencies_along_the_axis_are_lower_by_the_cosine():
-    edge = measure_edge(edge_image(10))
-    assert_allclose(edge.frequency_along_axis / edge.frequency.clip(1e-9), [0] + [math.cos(edge.angle)] * 64)
-
-
 def test_spread_functions():
     edge = measure_edge(edge_image(5))
     truth = edge_spread(math.radians(5), 6 + math.ceil(64 / math.sqrt(2)), PAN)

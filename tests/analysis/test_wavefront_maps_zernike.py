@@ -1,17 +1,14 @@
 """Zernike terms in every order against GalSim, prysm and quadrature; tables of coefficients as one and the same."""
 
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.special import eval_legendre
 
 from analysis.wavefront_maps.wavefront_map import MapError
 from analysis.wavefront_maps.zernike_table import read_zernikes
 from analysis.wavefront_maps.zernike_terms import (
     MOST_TERMS,
-    annular_terms,
     ansi_to_nm,
     circle_terms,
     edge_value,
@@ -44,31 +41,6 @@ def test_terms_are_those_of_the_trace():
     np.testing.assert_allclose(circle_terms(range(1, 67), x, y), zernike.basis(66, x, y), rtol=0, atol=2e-12)
 
 
-@pytest.mark.oracle
-@pytest.mark.parametrize(
-    ("last", "inner", "digits"),
-    [(36, 0.0, 2e-13), (36, 0.3, 5e-13), (36, 0.61, 5e-13), (36, 0.9, 5e-11), (66, 0.3, 5e-12)],
-)
-def test_terms_of_rings_are_those_of_galsim(last, inner, digits):
-    """The digits are those of GalSim, which sums monomials: five to ten times what we are off the exact terms below."""
-    galsim = pytest.importorskip("galsim.zernike")
-    x, y = ring(inner)
-    theirs = galsim.zernikeBasis(last, x, y, R_outer=1.0, R_inner=inner)[1:].T
-    np.testing.assert_allclose(annular_terms(last, x, y, inner), theirs, rtol=0, atol=digits)
-
-
-@pytest.mark.parametrize(("inner", "digits"), [(0.0, 1e-13), (0.35, 1e-13), (0.61, 5e-13), (0.8, 5e-11)])
-def test_terms_of_rings_by_mahajan(inner, digits):
-    """Round terms of a ring are Legendre polynomials of its area (J. Opt. Soc. Am. 71, 75, 1981)."""
-    x, y = ring(inner)
-    area = (2.0 * (x**2 + y**2) - 1.0 - inner**2) / (1.0 - inner**2)
-    found = annular_terms(56, x, y, inner)
-    for index in (1, 4, 11, 22, 37, 56):
-        n = noll_to_nm(index)[0]
-        exact = math.sqrt(n + 1) * eval_legendre(n // 2, area)
-        np.testing.assert_allclose(found[:, index - 1], exact, rtol=0, atol=digits)
-
-
 def test_high_terms_keep_their_digits():
     """To the 30th order, where sums of monomials have lost all: unit mean squares by quadrature."""
     node, weight = np.polynomial.legendre.leggauss(40)
@@ -88,7 +60,6 @@ def test_orders_of_every_program():
         orders = [to_nm(j) for j in range(first, first + MOST_TERMS)]
         assert len(set(orders)) == MOST_TERMS
         assert [noll_to_nm(nm_to_noll(n, m)) for n, m in orders] == orders
-    refuses(ValueError, "a radius of 0 to 1 of the ring's", annular_terms, 4, np.ones(3), np.ones(3), 1.0)
     for to_nm, index in ((noll_to_nm, 0), (noll_to_nm, MOST_TERMS + 1), (fringe_to_nm, 38), (ansi_to_nm, -1)):
         refuses(ValueError, "are known", to_nm, index)
 

@@ -131,8 +131,8 @@ def test_any_gradient_reproduces_the_exact_field(name: str) -> None:
     about = corners.mean(axis=0)
     spread = 0.3 * (corners[[0, 3, 5]] - about) + about
     cases = [(1.0, (0, 0, 0)), (0.0, (0, 0, 3.0)), (0.0, (0, 2.0, 0)), (0.0, (5.0, 0, 0)), (0.3, (1.0, 2.0, -3.0))]
-    found = thermo_elastic.solve_many(
-        mesh, SILICA, [linear(c, g, about) for c, g in cases], thermo_elastic.Kinematic(spread)
+    found = thermo_elastic.ElasticBody(mesh, SILICA).solve_many(
+        [linear(c, g, about) for c, g in cases], thermo_elastic.Kinematic(spread)
     )
     for (change, gradient), u in zip(cases, found, strict=True):
         exact = thermo_elastic.free_linear_field(A, change, gradient, about)(u.nodes)
@@ -183,7 +183,7 @@ def test_load_cases_add_up_and_differ_not_from_single_ones() -> None:
     fields = [lambda p: p[:, 0] ** 2, lambda p: np.sin(30 * p[:, 1])]
     both = lambda p: fields[0](p) + fields[1](p)  # noqa: E731
     first, second, total = body.solve_many([*fields, both], support)
-    alone = thermo_elastic.solve(polyhedron_mesh(BAR, 0.06), SILICA, fields[1], support)
+    alone = thermo_elastic.ElasticBody(polyhedron_mesh(BAR, 0.06), SILICA).solve_many([fields[1]], support)[0]
     size = np.max(np.abs(total.values))
     np.testing.assert_allclose(first.values + second.values, total.values, atol=1e-10 * size)
     np.testing.assert_allclose(alone.values, second.values, atol=1e-10 * size)
@@ -217,7 +217,7 @@ def test_two_layers_of_one_modulus_bend_as_timoshenko_says() -> None:
     h = 0.02
     mesh = mirror_mesh(plane(), Rectangle(0.2, 0.2), h, 1, 20)
     support = thermo_elastic.Kinematic(np.array([[0.1, 0.0, 0.01], [-0.1, 0.1, 0.01], [-0.1, -0.1, 0.01]]))
-    u = thermo_elastic.solve(mesh, SILICA, lambda p: 1.0 * (p[:, 2] > h / 2), support)
+    u = thermo_elastic.ElasticBody(mesh, SILICA).solve_many([lambda p: 1.0 * (p[:, 2] > h / 2)], support)[0]
     r = 0.1  # well inside: at the rim the layers are relaxed
     line = u.at([[-r, 0, h / 2], [0, 0, h / 2], [r, 0, h / 2]])[:, 2]
     bend = (line[0] - 2 * line[1] + line[2]) / r**2
@@ -244,7 +244,7 @@ def test_a_gradient_through_a_plate_is_a_defocus_of_radius_one_over_a_g() -> Non
     aperture, radius = Rectangle(0.2, 0.15), 0.25
     mesh = mirror_mesh(plane(), aperture, 0.03, 1, 10)
     support = thermo_elastic.Kinematic(np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.0, 0.1, 0]]))
-    u = thermo_elastic.solve(mesh, SILICA, linear(0.0, (0.0, 0.0, g)), support)
+    u = thermo_elastic.ElasticBody(mesh, SILICA).solve_many([linear(0.0, (0.0, 0.0, g))], support)[0]
     found = face_change(u, plane(), aperture, Pose())
     # the hot side is at +z, where the plate gets longer: z = -a g r^2 / 2
     assert found.figure[4] == pytest.approx(-A * g * radius**2 / (4 * np.sqrt(3)), rel=1e-9)

@@ -18,7 +18,7 @@ from optics.numerics.invariants import UnphysicalError
 from optics.raytrace.system import assemble
 from optics.targets.target_shapes import pinhole_target, star_target
 from optics.waves.diffraction import Grid, image
-from optics.waves.imaging import imaging_field
+from optics.waves.imaging import imaging_rays, pupil_field
 from optics.waves.pupil_stack import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_axis import LAUNCH_DISTANCE
@@ -156,7 +156,8 @@ def test_against_brute_force(before_gf7, backend):
     nodes = quadrature.disk(40)
     origin = np.array([[hit[0, 1], hit[0, 0], 0.0]])
     launch = first - LAUNCH_DISTANCE * direction
-    field = imaging_field(backend, systems, to_stop, direction, launch, path.stop, nodes, WAVELENGTH, origin)
+    rays = imaging_rays(backend, systems, to_stop, direction, launch, path.stop, nodes)
+    field = pupil_field(rays, WAVELENGTH, origin)
     along = Grid(-reach * PITCH, step, 2 * reach * fine + 1)
     # direction cosines u belong to X', v to Y': columns of the image run along Y'
     turned = replace(field, u=field.v, v=field.u)

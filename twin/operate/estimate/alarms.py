@@ -27,14 +27,6 @@ LEAST = 1e-6
 _CLOSE = 3.0
 """Difference of log likelihood ratios, below which another body explains a jump nearly as well: 20 to 1."""
 BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "breaks", "jump", "sensor", "contradiction"
-KINDS: Mapping[str, str] = {
-    BROKEN: "a requirement that does not hold now",
-    BREAKS: "a requirement that is expected to break within the horizon",
-    JUMP: "a step of a body",
-    SENSOR: "a sensor of temperature that is dead, stuck or doubtful",
-    CONTRADICTION: "a reading that is further from its prediction than the statement allows",
-}
-"""Kind of alarm -> of what it tells."""
 Row = Mapping[str, Any]
 
 

@@ -12,7 +12,6 @@ from analysis.units import ARCSEC
 from twin.orbit.jitter.jitter_run import JitterRun, PassJitter
 from twin.run import svg
 
-_COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN)
 _MOST = 4000
 _SIGMAS = 5.0
 

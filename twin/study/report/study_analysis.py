@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
-from scenes.specs.study import ParetoSpec, StudySpec, ThresholdSpec
+from scenes.specs.study import ParetoSpec, ThresholdSpec
 from twin.run.quantity import Quantity, Record
 from twin.study.report import study_statistics as statistics
 from twin.study.report.linear_model import Effect, LinearModel, MainEffect, linear_model, main_effects
@@ -351,16 +350,6 @@ class StudyAnalysis:
 
 def _swing_in_sigmas(effect: Any, std: Estimate | None) -> float:
     return float(effect.swing.value) / (2.0 * std.value) if std is not None and std.value > 0.0 else 0.0
-
-
-def summary(dataset: xr.Dataset, study: StudySpec) -> dict[str, Any]:
-    """What the report says of a study, as plain data for JSON; intervals are those of 95%.
-
-    Args:
-        dataset: as ``twin.study.study_files.make_dataset`` makes it.
-        study: as the user wrote it.
-    """
-    return STATISTICS(StudyAnalysis.of(StudyRuns.of(dataset, study)))
 
 
 def _finite(value: float | None) -> float | None:
