@@ -1,11 +1,10 @@
-"""The chi-square distribution by SciPy's special functions.
+"""Distributions and scales that measurements are judged by: chi-square, shares, scales that outliers do not move, Rice's.
 
-They are what ``scipy.stats.chi2`` calls, to the bit, without the package's import, which is a tenth of a short command.
-
-Modulus of a complex number with Gaussian noise: Rice's distribution (Rice, Bell Syst. Tech. J. 24, 46 (1945)).
+The functions of chi-square are what ``scipy.stats.chi2`` calls, to the bit, without that package's import, which is a
+tenth of a short command.
 
 A modulation is the modulus of a Fourier coefficient. Noise makes the modulus longer on average: where the signal is
-gone, sigma sqrt(pi/2) is left.
+gone, sigma sqrt(pi/2) is left (Rice, Bell Syst. Tech. J. 24, 46 (1945)).
 """
 
 from __future__ import annotations
@@ -17,6 +16,9 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtrc, chdtri, gammaln, i0e, i1e, xlogy
 
 from analysis.arrays import Array
+
+_NORMAL_SIZE = 1.4826
+"""Standard deviation of a normal distribution over the median of the sizes."""
 
 
 def chance_beyond(chi_square: Any, degrees: Any) -> Any:
@@ -48,6 +50,42 @@ def density(chi_square: Any, degrees: Any) -> Any:
     """
     half = 0.5 * np.asarray(degrees, dtype=np.float64)
     return np.exp(xlogy(half - 1.0, chi_square) - 0.5 * np.asarray(chi_square) - gammaln(half) - np.log(2.0) * half)
+
+
+def share_interval(met: int, count: int, confidence: float) -> tuple[float, float]:
+    """Return the interval of Clopper and Pearson (Biometrika 26, 404 (1934)) of a share; 0 to 1 of none.
+
+    Args:
+        met: how many of the trials succeeded.
+        count: trials.
+        confidence: with which the interval holds the share, at least.
+    """
+    if count == 0:
+        return 0.0, 1.0
+    # not at the top: this import takes longer than short commands
+    from scipy.stats import binomtest
+
+    interval = binomtest(met, count).proportion_ci(confidence, "exact")
+    return float(interval.low), float(interval.high)
+
+
+def robust_sigma(residuals: ArrayLike) -> float:
+    """Return the standard deviation of normal residuals by the median of their sizes, of which half may be wrong.
+
+    Args:
+        residuals: about their middle, of any shape.
+    """
+    return _NORMAL_SIZE * float(np.median(np.abs(residuals)))
+
+
+def robust_variance(squares: ArrayLike) -> float:
+    """Return the variance of normal residuals in a plane, in each direction, by the median: half of them may be wrong.
+
+    Args:
+        squares: of their lengths, (n,).
+    """
+    # median of chi-square with two degrees of freedom is 2 ln 2
+    return float(np.median(squares) / (2.0 * np.log(2.0)))
 
 
 def rice_bias(modulus: ArrayLike, sigma: ArrayLike) -> Array:

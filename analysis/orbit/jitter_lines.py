@@ -31,6 +31,7 @@ from scipy.interpolate import BSpline
 
 from analysis.arrays import Array
 from analysis.orbit.jitter_spectrum import BLIND, JitterError, Observations, Periodogram, periodogram
+from analysis.statistics import robust_sigma
 
 _FINE, _PADDED = 16, 4
 """Moments in a period of the highest frequency, and transformed frequencies in a resolution element: an oscillation
@@ -96,7 +97,6 @@ def peaks(given: Observations, lowest: float, highest: float) -> tuple[Array, Ar
 MOST_LINES = 20
 _FAR = 5.0
 """Robust standard deviations beyond which an observation is wrong: one in two million of good ones is lost."""
-_MEDIAN = 1.4826
 _ROUNDS = 40
 _ARRIVED = 1e-10
 _ASTRAY = 1.0
@@ -352,7 +352,7 @@ def _good(given: Observations, lines: Lines | None) -> NDArray[np.bool_]:
         off = np.abs(value - given.nuisance @ x)
         worst = np.zeros(len(given.time))
         np.maximum.at(worst, given.group, off)
-        again = worst[given.group] <= _FAR * max(_MEDIAN * float(np.median(off)), 1e-300)
+        again = worst[given.group] <= _FAR * max(robust_sigma(off), 1e-300)
         if np.array_equal(again, keep):
             break
         keep = again

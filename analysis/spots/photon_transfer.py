@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from analysis.arrays import Array
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import WHOLE, NoiseModel, noise_range, systematic_variance, temporal_part
+from analysis.statistics import robust_sigma
 
 Mask = NDArray[np.bool_]
 _HOT_SIGMAS = 10.0
@@ -132,7 +133,7 @@ def _usable(dark: Array, flat: Array) -> Mask:
     good = np.ones(dark.shape, dtype=bool)
     for image in (dark, flat):
         away = np.abs(image - np.median(image))
-        good &= away <= _HOT_SIGMAS * max(1.4826 * float(np.median(away)), 1e-9)
+        good &= away <= _HOT_SIGMAS * max(robust_sigma(away), 1e-9)
     return good
 
 
@@ -244,8 +245,7 @@ def pixel_correction(noise: NoiseModel, dark: NDArray[Any] | None, flat: NDArray
     night = _stack(dark if dark is not None else np.zeros((0,)), "dark")
     level = night.mean(axis=0)
     away = level - float(np.median(level))
-    sigma = 1.4826 * float(np.median(np.abs(away)))
-    bad = np.abs(away) > _HOT_SIGMAS * max(sigma, 1e-9)
+    bad = np.abs(away) > _HOT_SIGMAS * max(robust_sigma(away), 1e-9)
     variance = _temporal(np.where(bad, np.median(night, axis=(1, 2), keepdims=True), night))
     stays = float(noise.rounding_variance_dn2(noise.dark_level_dn))
     left = math.sqrt(variance / len(night) + stays) / noise.gain_dn_per_e

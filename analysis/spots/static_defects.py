@@ -35,6 +35,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened, model_parts
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
+from analysis.statistics import robust_sigma
 
 
 def repaired_centroid(
@@ -439,7 +440,7 @@ def _second_light(
             return None
         # what a spot of another shape leaves over lies all around it
         ring = (np.abs(away - away[top]) < 3.0) & (np.hypot(row - top[0], column - top[1]) > 8.0)
-        rest = 1.4826 * float(np.median(np.abs(score[ring]))) if np.count_nonzero(ring) > 20 else 1.0
+        rest = robust_sigma(score[ring]) if np.count_nonzero(ring) > 20 else 1.0
         if score[top] > _ABOVE_RING * max(rest, 1.0):
             return float(top[0]), float(top[1])
         score = np.where(np.hypot(row - top[0], column - top[1]) > 4.0, score, 0.0)

@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import beta, norm
+from scipy.stats import norm
 from sqlalchemy import Select, func, select
 
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
+from analysis.statistics import share_interval
 from optics.numerics.frozen_map import FrozenMap
 from twin.operate.estimate.alarms import name_of, percent
 from twin.operate.record.entries import MICRO, utc_text
@@ -144,9 +145,7 @@ def coverage(sigmas: int, within: int, count: int) -> Coverage:
         within: components that lay within.
         count: all components.
     """
-    rest = 0.5 * (1.0 - CONFIDENCE)
-    low = float(beta.ppf(rest, within, count - within + 1)) if within > 0 else 0.0
-    high = float(beta.ppf(1.0 - rest, within + 1, count - within)) if within < count else 1.0
+    low, high = share_interval(within, count, CONFIDENCE)
     return Coverage(sigmas, WITHIN[sigmas], count, within / count if count else math.nan, low, high)
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
+from analysis.statistics import share_interval
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
@@ -62,8 +62,7 @@ class Yield:
     def count(cls, passing: np.ndarray) -> Yield:
         """Of cameras that pass or not, (S,)."""
         passed, total = int(np.sum(passing)), len(passing)
-        low, high = binomtest(passed, total).proportion_ci(CONFIDENCE, "exact")
-        return cls(passed, total, float(low), float(high))
+        return cls(passed, total, *share_interval(passed, total, CONFIDENCE))
 
     @property
     def share(self) -> float:

@@ -15,6 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from analysis.orbit.jitter_spectrum import Observations
+from analysis.statistics import robust_sigma
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.invariants import PhysicalError
 from scenes.specs.orbit.jitter_search import AXES, JitterSearchSpec
@@ -319,7 +320,7 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
         if kept.sum() < 2 * basis.shape[1]:
             return line.seconds
         left = off - basis @ np.linalg.lstsq(basis[kept], off[kept], rcond=None)[0]
-        kept = np.abs(left) <= _NOISE * np.maximum(sigma, 1.4826 * np.median(np.abs(left[kept])))
+        kept = np.abs(left) <= _NOISE * np.maximum(sigma, robust_sigma(left[kept]))
     noise = np.clip(np.nan_to_num(left), -_NOISE * sigma, _NOISE * sigma)
     return np.asarray(line.sensor.time(line.place[:, 0] - noise))
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from analysis.statistics import share_interval
 from scenes.specs.study import ParetoSpec, ThresholdSpec
 from twin.run.quantity import Quantity, Record
 from twin.study.report import study_statistics as statistics
@@ -145,7 +146,8 @@ class Requirement:
         """
         if self.bounds is None or (self.interval is None and self.count):
             return None
-        return statistics.share_interval(self.met, self.runs)[0], statistics.share_interval(self.most, self.runs)[1]
+        (low, _), (_, high) = (share_interval(met, self.runs, statistics.CONFIDENCE) for met in (self.met, self.most))
+        return low, high
 
 
 def _is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
@@ -191,7 +193,7 @@ def _counted(
     unit: str,
 ) -> Requirement:
     met, count = int(np.sum(good & known)), int(np.sum(known))
-    interval = statistics.share_interval(met, count) if runs.sampled and count else None
+    interval = share_interval(met, count, statistics.CONFIDENCE) if runs.sampled and count else None
     return Requirement(name, text, met, count, runs.count, interval, judged, unit)
 
 
