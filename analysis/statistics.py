@@ -1,4 +1,4 @@
-"""Distributions and scales that measurements are judged by: chi-square, shares, scales that outliers do not move, Rice's.
+"""Distributions and scales that measurements are judged by: chi-square, shares, robust scales, and Rice's distribution.
 
 The functions of chi-square are what ``scipy.stats.chi2`` calls, to the bit, without that package's import, which is a
 tenth of a short command.
