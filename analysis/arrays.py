@@ -28,6 +28,10 @@ from analysis.units import ARCSEC, MM_PER_M, UM_PER_M
 
 Array = NDArray[np.float64]
 """Array of float64."""
+Indices = NDArray[np.intp]
+"""Array of indices."""
+Mask = NDArray[np.bool_]
+"""Array of truths."""
 PER_SI: Mapping[str, float] = {
     "mm": MM_PER_M,
     "um": UM_PER_M,

@@ -29,7 +29,7 @@ from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse.linalg import splu
 from scipy.stats import chi2, norm
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Indices
 from analysis.block.assembly import Assembly, Process, assembled, group_ranks
 from analysis.block.block import Block
 from analysis.block.point_reduction import Checked, Reduced, Reduction, State
@@ -100,7 +100,6 @@ def _are_control(block: Block, points: NDArray[np.intp]) -> list[bool]:
     return [bool(v) for v in (block.points.role[points] == "control").tolist()]
 
 
-Indices = NDArray[np.intp]
 _CONVERGED = 1e-6
 """Size of the last step, in sigmas of all unknowns together."""
 _DENSE = 2500

@@ -10,12 +10,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Indices
 from analysis.block.processes import Support
-
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

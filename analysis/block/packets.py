@@ -10,13 +10,10 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Indices
 from analysis.block.corrections import Corrections, by_rotation_vector, cross, turned, turned_back
 from analysis.orbit.three_line_model import LineModel, Rays
-
-Indices = NDArray[np.intp]
 
 
 class Packets(Protocol):

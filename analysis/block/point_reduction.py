@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Indices
 from analysis.block.packets import Packets
 from analysis.block.reweighting import standardised_packets
 
-Indices = NDArray[np.intp]
 _PIECE = 4_000
 """Points that are linearised at once."""
 _FLUSH = 4_000_000

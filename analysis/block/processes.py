@@ -26,14 +26,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Indices
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.ray_noise import spline_blend, spline_precision
 
-Indices = NDArray[np.intp]
 Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital", "jitter")
 STEPPED = ("white", "walk", "slow", "jitter")

@@ -12,13 +12,10 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Indices
 from analysis.block.point_reduction import Checked, Eliminated, Reduction, State
-
-Indices = NDArray[np.intp]
 
 
 class Pool(Protocol):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.stats import norm
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Mask
 from analysis.measurement_error import MeasurementError
 from analysis.spots.frame_movement import (
     FALSE_ALARM,
@@ -36,7 +36,6 @@ from analysis.spots.frame_movement import (
 )
 from analysis.spots.noise import SHOWN, WHOLE, NoiseModel
 
-Mask = NDArray[np.bool_]
 Released = Callable[[NDArray[Any]], None]
 _HELD = 1 << 25
 """Bytes of frames that are worked on at a time."""

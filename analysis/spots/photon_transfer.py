@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Mask
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import WHOLE, NoiseModel, noise_range, systematic_variance, temporal_part
 from analysis.statistics import robust_sigma
 
-Mask = NDArray[np.bool_]
 _HOT_SIGMAS = 10.0
 _RESPONSE = (0.5, 1.5)
 """Range of the response of a usable pixel, relative to that of the others."""

@@ -20,17 +20,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Mask
 from analysis.spots import spot_image
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
 
-Mask = NDArray[np.bool_]
 _REST_PX, _MOST_STEPS = 1e-6, 60
 _REST_SIGMAS = 1e-4
 """Largest last step of other spots, in sigmas. They may be so faint that their positions are uncertain by part of a

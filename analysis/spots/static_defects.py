@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, signal
 from scipy.stats import chi2, norm
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Mask
 from analysis.spots import spot_image
 from analysis.spots.frame_movement import FALSE_ALARM
 from analysis.spots.frame_screening import Finding, ScreenedFrames
@@ -83,7 +83,6 @@ def repaired_centroid(
     return positions, float(np.sqrt(np.trace(new + old) / np.trace(ideal)) - 1.0)
 
 
-Mask = NDArray[np.bool_]
 CLOSER = 4.5
 """Sigmas of a pixel from which it is left out of an image that is known to hold defects."""
 MOST_OTHERS = 3

@@ -15,7 +15,6 @@ from analysis.wavefront_maps.zernike_terms import (
     fringe_to_nm,
     nm_to_noll,
     noll_to_nm,
-    orthonormal,
 )
 from optics.geometry import zernike
 from tests.analysis.refusals import refuses
@@ -70,17 +69,6 @@ def test_terms_of_unit_peak_reach_one_at_the_edge():
         angle = 0.5 * np.pi / m if m < 0 else 0.0
         peak = circle_terms([index], np.cos([-angle]), np.sin([-angle]))[0, 0] / edge_value(n, m)
         assert abs(peak) == pytest.approx(1.0, abs=1e-12)
-
-
-def test_orthonormal_over_any_weight():
-    x, y = ring(0.2)
-    weight = np.where(y < 0.3, 1.0 + x**2, 0.0)
-    basis = circle_terms(range(1, 12), x, y)
-    columns, factor = orthonormal(basis, weight)
-    np.testing.assert_allclose((columns.T * weight) @ columns / weight.sum(), np.eye(11), rtol=0, atol=1e-13)
-    np.testing.assert_allclose((columns @ factor)[y < 0.3], basis[y < 0.3], rtol=0, atol=1e-12)
-    assert (np.diag(factor) > 0.0).all()
-    np.testing.assert_array_equal(factor, np.triu(factor))
 
 
 WAVE = {4: 12e-9, 5: -3e-9, 6: 1e-9, 7: 4e-9, 8: -8e-9, 11: 5e-9}

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex, outlying_points
 from analysis.images.image_file import ImageFile, Region
 from analysis.images.image_header import ImageError
@@ -30,7 +31,6 @@ from twin.laboratory.measured_readings import DataFile
 from twin.run.procedure import Advance, silent
 from twin.targets.target_images import ALONG, DIRECTIONS
 
-Array = NDArray[np.float64]
 MOST_SITES = 3000
 NANOMETRE = 1e-9
 """Places nearer than this are one."""

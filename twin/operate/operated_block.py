@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.block.block import CamerasKnowledge
 from analysis.monitor.limits import Quantity
 from analysis.units import ARCSEC
@@ -36,8 +37,6 @@ from twin.run.procedure import Advance, silent
 if TYPE_CHECKING:
     from analysis.block.shares import Pool
     from optics.numerics.backend import Backend
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

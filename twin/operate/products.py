@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import select
 
+from analysis.arrays import Array
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from twin.operate.record.history import History
     from twin.orbit.export.export_run import ExportSource
 
-Array = NDArray[np.float64]
 STATE, PRIOR = "state", "prior"
 """Names of the files."""
 APART = 60 * MICRO

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import pdtrc
 
+from analysis.arrays import Array
 from analysis.monitor.detection_power import Power, detection_power
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.filter_state import Belief, Observed
@@ -36,7 +37,6 @@ from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_tex
 from twin.operate.record.history import USED, History, content_of
 from twin.run.provenance import source_digest
 
-Array = NDArray[np.float64]
 DAY = 86_400 * MICRO
 EVERY = 1000
 """Readings after which it is kept for good where the estimate stands."""

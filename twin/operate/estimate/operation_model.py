@@ -12,9 +12,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from analysis.arrays import Array
 from analysis.monitor.limits import Quantity, quantities
 from analysis.monitor.parameters import ANGLE, ANGLE_GROUP, CAMERA_PARAMETERS, GROUND, GROUND_GROUP
 from analysis.monitor.series_filter import SeriesFilter
@@ -32,7 +32,6 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.record.entries import digest_of_data, digest_of_job
 from twin.operate.record.history import History
 
-Array = NDArray[np.float64]
 BEFORE = 0.01
 """Share of the mission that passes between the calibration and the first reading: so large are the chance of a jump
 then and its part of the chance of a false alarm.

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from analysis.arrays import Array
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances, TimeLaw
 from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track
 from analysis.monitor.jump_detection import Jump
@@ -80,7 +81,6 @@ def unpacked(content: bytes, *classes: type) -> Any:
     return value(json.loads(arrays.pop("plain").tobytes()))
 
 
-Array = NDArray[np.float64]
 SPANS = (1, 3, 10)
 """Readings in a row that are held together against what was expected of them."""
 KEPT = 200

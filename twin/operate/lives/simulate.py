@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from scenes.models.disturbances import Component, StatedMotions, states_of
 from scenes.models.drawn_motions import causes_of, correlation_root, drawn_motions
 from scenes.specs.operation import OperationSetup
@@ -37,7 +38,6 @@ from twin.run.random_streams import stream
 from twin.run.reference_frames import described
 from twin.run.run_folder import RunFolder
 
-Array = NDArray[np.float64]
 Moments = NDArray[np.int64]
 
 _MOTIONS, _JUMPS, _EVENTS, _DATES, _COEFFICIENTS = 10, 11, 12, 13, 14

@@ -20,16 +20,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from analysis.arrays import Array
 from optics.numerics.threads import one_blas_thread
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import why_unreadable
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.text_file import first_lines, numbers, text_lines
 from twin.orbit.measured.xml_file import Element, read_xml
-
-Array = NDArray[np.float64]
 
 TERMS = 20
 _POWERS = np.array(

@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from analysis.arrays import Array
 from analysis.orbit.forward_intersection import CalibratedLine
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.geometry.tree import State
@@ -40,8 +41,6 @@ from twin.monitor.truth import LineSight
 if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import OrbitCalibrationSpec
     from scenes.specs.orbit.simulate import OrbitSimulateSpec
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

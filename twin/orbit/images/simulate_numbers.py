@@ -10,9 +10,9 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from analysis.arrays import Array
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.numerics.spans import in_span
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
@@ -26,7 +26,6 @@ from twin.orbit.images.simulate_run import Simulation
 from twin.run.quantity import Quantity, Record
 from twin.run.reference_frames import described
 
-Array = NDArray[np.float64]
 _TRUE_POINTS = 21
 """Along each side of the grid of true ground points."""
 _LOOK = (

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.monitor.model_fit import UnseenMode
 from scenes.specs.course import moment
 from twin.orbit.loop.line_images import ImagedPair
@@ -16,7 +16,6 @@ from twin.orbit.monitoring.monitoring_run import rms
 from twin.run.artefact import significant
 from twin.run.quantity import Quantity, Record
 
-Array = NDArray[np.float64]
 MOST_MOTIONS = 8
 """Motions that a mode names."""
 

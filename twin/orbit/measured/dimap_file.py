@@ -25,9 +25,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from analysis.arrays import Array
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.spans import in_span
 from scenes.yaml.errors import InputError, Issue, names_text, shown
@@ -38,8 +38,6 @@ from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
 from twin.orbit.measured.text_file import readings, require_rising
 from twin.orbit.measured.xml_file import Element, read_xml
-
-Array = NDArray[np.float64]
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
 """Products with a rigorous model."""

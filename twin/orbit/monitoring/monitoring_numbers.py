@@ -7,14 +7,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.monitor.monitoring import PER_SI
 from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight
 from twin.orbit.monitoring.monitoring_run import CaseErrors, MonitorRun, Smoothing, rms
 from twin.run.quantity import Quantity, Record
-
-Array = NDArray[np.float64]
 
 
 def _unsigned(values: Array) -> Array:
