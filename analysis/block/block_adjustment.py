@@ -32,10 +32,9 @@ from scipy.stats import chi2, norm
 from analysis.arrays import Array, Indices
 from analysis.block.assembly import Assembly, Process, assembled, group_ranks
 from analysis.block.block import Block
-from analysis.block.point_reduction import Checked, Reduced, Reduction, State
+from analysis.block.point_reduction import Checked, Pool, Reduced, Reduction, SharedReduction, State
 from analysis.block.processes import BlockError
 from analysis.block.reweighting import SETTLED, GroupTest, Rule, UnsettledError, settled
-from analysis.block.shares import Pool, SharedReduction
 
 FAR = 0.02
 """Radians between where a point is said to be and where its image looks: 10 km below 500 km. Orbits and attitudes are

@@ -43,7 +43,7 @@ from analysis.orbit.calibration_parameters import (
     Unknowns,
     index,
 )
-from analysis.orbit.ray_noise import ray_covariance
+from analysis.orbit.forward_intersection import ray_covariance
 from analysis.orbit.three_line_model import BIAS, DRIFT, INTERIOR, LineModel, misclosure, partials
 
 FARTHEST = 2e3

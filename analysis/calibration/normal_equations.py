@@ -39,7 +39,7 @@ from analysis.orbit.calibration_parameters import (
     Prior,
     index,
 )
-from analysis.orbit.ray_noise import ray_covariance
+from analysis.orbit.forward_intersection import ray_covariance
 from analysis.orbit.three_line_model import LineModel, Partials, Rays, misclosure, partials
 
 

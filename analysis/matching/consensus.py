@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import Array, Mask
-from analysis.matching.options import checked_places
+from analysis.matching.correlation import checked_places
 from analysis.measurement_error import UndeterminedError
 
 # Of missing every all-right sample while this share is wrong.

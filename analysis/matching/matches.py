@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
-from analysis.matching.correlation import search
+from analysis.matching.correlation import MatchOptions, Reason, checked_image, checked_places, checked_templates, search
 from analysis.matching.least_squares import least_squares
-from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates
 from analysis.matching.window_checks import FALSE_ALARM, risk
 
 # Side of a block of a JPEG file, px, and lines of an image in which its blocks are looked for.

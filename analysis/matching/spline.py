@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.interpolate import BSpline, PPoly
 
 from analysis.arrays import Array
-from analysis.matching.options import checked_image
+from analysis.matching.correlation import checked_image
 
 _DEGREE = 5
 # Pixels beyond a patch that its spline sees: the prefilter decays by 0.43 a pixel, so the rest is 1e-8.

@@ -34,7 +34,6 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
-from analysis.monitor.bad_readings import RECENT, bad_reading, chance_good, jump_evidence, may_be_bad
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track, Whitened
 from analysis.monitor.jump_detection import (
@@ -51,7 +50,17 @@ from analysis.monitor.jump_detection import (
     untold_share,
 )
 from analysis.monitor.state_space import HeatInputs, StateSpace
-from analysis.monitor.untold_jumps import Hint, Jumper, blended, jumpers
+from analysis.monitor.untold_jumps import (
+    RECENT,
+    Hint,
+    Jumper,
+    bad_reading,
+    blended,
+    chance_good,
+    jump_evidence,
+    jumpers,
+    may_be_bad,
+)
 from analysis.statistics import limit_of
 
 _NEARLY = 1e-11

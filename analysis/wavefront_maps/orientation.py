@@ -13,7 +13,7 @@ from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 from analysis.statistics import chance_beyond
 from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
-from analysis.wavefront_maps.zernike_terms import noll_to_nm
+from analysis.wavefront_maps.zernike_table import noll_to_nm
 
 _NAMES = {
     (False, 0): "as it is",

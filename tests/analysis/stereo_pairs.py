@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from analysis.matching.correlation import MatchOptions
 from analysis.matching.matches import Matches, match
-from analysis.matching.options import MatchOptions
 from analysis.matching.spline import resampled
 from tests.analysis.texture_image import Texture, lattice
 

@@ -14,8 +14,7 @@ from analysis.block.processes import BlockError, Law
 from analysis.images.fits_image import fits_cards
 from analysis.images.image_file import ImageFile, Region
 from analysis.images.image_header import ImageError
-from analysis.matching.correlation import distinct_points
-from analysis.matching.options import MatchOptions
+from analysis.matching.correlation import MatchOptions, distinct_points
 from analysis.matching.spline import resampled
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.estimators import ESTIMATORS, Posterior, Shifts

@@ -6,7 +6,7 @@ import pytest
 from analysis.measurement_error import UndeterminedError
 from analysis.wavefront_maps.orientation import ORIENTATIONS, READINGS, Orientation, tellable
 from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
-from analysis.wavefront_maps.zernike_terms import circle_terms
+from analysis.wavefront_maps.zernike_table import circle_terms
 from tests.analysis.refusals import refuses
 
 TERMS = tuple(range(1, 37))

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.wavefront_maps.wavefront_map import MapError
-from analysis.wavefront_maps.zernike_table import read_zernikes
-from analysis.wavefront_maps.zernike_terms import (
+from analysis.wavefront_maps.zernike_table import (
     MOST_TERMS,
     ansi_to_nm,
     circle_terms,
@@ -15,6 +14,7 @@ from analysis.wavefront_maps.zernike_terms import (
     fringe_to_nm,
     nm_to_noll,
     noll_to_nm,
+    read_zernikes,
 )
 from optics.geometry import zernike
 from tests.analysis.refusals import refuses

@@ -35,7 +35,7 @@ from twin.orbit.block.block_run import BlockRun, run_adjustment
 from twin.run.procedure import Advance, silent
 
 if TYPE_CHECKING:
-    from analysis.block.shares import Pool
+    from analysis.block.point_reduction import Pool
     from optics.numerics.backend import Backend
 
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from optics.numerics.invariants import UnphysicalError
 from optics.waves.pupil_terms import products
-from optics.waves.transfer import polychromatic_transfer
-from optics.waves.varied_pupil import VariedTransfer
+from optics.waves.transfer import VariedTransfer, polychromatic_transfer
 from scenes.models.camera_model import lenses
 from scenes.specs.camera import CameraSpec
 from scenes.specs.spectrum import SpectrumSpec

@@ -26,9 +26,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter, zoom
 
 from analysis.matching.consensus import DisplacementField, consensus
-from analysis.matching.correlation import distinct_points
+from analysis.matching.correlation import MatchOptions, Reason, distinct_points
 from analysis.matching.matches import match
-from analysis.matching.options import MatchOptions, Reason
 from analysis.matching.spline import resampled
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.invariants import PhysicalError
@@ -213,7 +212,7 @@ def _templates_of_image(
 
 
 CONSENSUS = 100
-"""Status of a match that its neighbours contradict; others are codes of `analysis.matching.options.Reason`."""
+"""Status of a match that its neighbours contradict; others are codes of `analysis.matching.correlation.Reason`."""
 SOURCE = 101
 """Status of a tie point in the frame it was chosen in: nothing was matched, its place is its definition."""
 _MASK = 16

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.calibration.adjustment import Adjustment
-from analysis.calibration.stepwise import Stepwise, stepwise
+from analysis.calibration.strip_adjustment import Stepwise, stepwise
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS, INTERIOR, misclosure
 from analysis.units import ARCSEC
