@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import nnls
 
-from optics.design.design_rays import Beams
 from optics.design.design_variables import BIAS, Prescription, Variable
-from optics.design.merit_function import Evaluation, MeritFunction, Operands
+from optics.design.merit_function import Beams, Evaluation, MeritFunction, Operands
 from optics.numerics.backend import Backend
 from optics.numerics.constrained_least_squares import Sample, constrained_least_squares
 from optics.numerics.invariants import PhysicalError

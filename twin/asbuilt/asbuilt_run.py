@@ -18,7 +18,7 @@ from twin.asbuilt.next_step import Advice, advice
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.run.random_streams import stream
-from twin.tolerance.merits import Merit, merit_unit, shown_merit
+from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 
 LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)
 """Quantiles that are told."""

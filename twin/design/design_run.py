@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from optics.design.design_rays import trace_beams
 from optics.design.design_variables import Prescription
-from optics.design.merit_function import Evaluation, MeritFunction, Operands
+from optics.design.merit_function import Evaluation, MeritFunction, Operands, trace_beams
 from optics.design.optimiser import (
     HELD,
     ITERATIONS,

@@ -17,7 +17,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.spectrum import SpectrumSpec
 from scenes.specs.tolerance import ToleranceBudgetSpec
 from twin.camera.camera_optics import CameraOptics
-from twin.tolerance.merits import Merit
+from twin.tolerance.monitor_merit import Merit
 
 TRANSFER = 1e-3
 """By how much an MTF at fixed nodes may differ from that of the designed pupil by itself."""

@@ -31,8 +31,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.targets.target_images import wavelengths_enough
 from twin.tolerance.designed_light import LitRoots, fixed_transfers, light_of
-from twin.tolerance.merits import Merit, merits_of, obstructed_shares, require_bodies
-from twin.tolerance.monitor_merit import MonitorMerit
+from twin.tolerance.monitor_merit import Merit, MonitorMerit, merits_of, obstructed_shares, require_bodies
 from twin.tolerance.variations import VariedNumber, compensator_numbers, states_of, tolerance_numbers
 
 

@@ -23,7 +23,7 @@ from twin.run.quantity import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
 from twin.tolerance.given_warnings import beam_warnings, given_warnings, missed_warnings
 from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
-from twin.tolerance.merits import Merit, merit_unit, shown_merit
+from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 from twin.tolerance.samples import Samples, Workforce, draw_samples
 from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
 from twin.tolerance.variations import states_of

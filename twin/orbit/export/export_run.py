@@ -42,7 +42,7 @@ from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.images.simulate_run import fly_simulation
 from twin.orbit.measured.dimap_sensor import DimapScene, read_scene
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
-from twin.orbit.measured.text_file import text_lines
+from twin.orbit.measured.xml_file import text_lines
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.run_folder import read_manifest
 

@@ -27,8 +27,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import why_unreadable
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.measured.text_file import first_lines, numbers, text_lines
-from twin.orbit.measured.xml_file import Element, read_xml
+from twin.orbit.measured.xml_file import Element, first_lines, numbers, read_xml, text_lines
 
 TERMS = 20
 _POWERS = np.array(

@@ -26,9 +26,9 @@ from analysis.arrays import Array
 from analysis.orbit.forward_intersection import CalibratedLine
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.geometry.tree import State
+from optics.numerics.array_math import in_span
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.spans import in_span
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array
 from optics.geometry.pose import about_axis, rotation_matrix
-from optics.numerics.spans import in_span
+from optics.numerics.array_math import in_span
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.flight.trajectory import Trajectory, readings

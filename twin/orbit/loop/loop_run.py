@@ -27,8 +27,8 @@ from analysis.monitor.control_loop import (
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.model_fit import UnseenMode, floor, unseen_modes
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
+from optics.numerics.array_math import number_of
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.spans import number_of
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.specs.orbit.monitor import PARAMETERS

@@ -28,16 +28,15 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from analysis.arrays import Array
+from optics.numerics.array_math import in_span
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.spans import in_span
 from scenes.yaml.errors import InputError, Issue, names_text, shown
 from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.measured import platform_readings
 from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
-from twin.orbit.measured.text_file import readings, require_rising
-from twin.orbit.measured.xml_file import Element, read_xml
+from twin.orbit.measured.xml_file import Element, read_xml, readings, require_rising
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
 """Products with a rigorous model."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import level_covariance
-from optics.numerics.spans import in_span
+from optics.numerics.array_math import in_span
 from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec
 from scenes.specs.measured.orbit_data_setup import DATA_FILE
 from scenes.specs.measured.pass_files import PlatformFilesSpec
