@@ -27,9 +27,8 @@ import twin.lab
 import twin.render
 import twin.validate
 from analysis.monitor import recovery
-from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.estimators import Formula, OfEachCamera
-from analysis.monitor.parameters import Parameter
+from analysis.monitor.parameters import CameraCalibration, Parameter
 from analysis.spots.centroid import gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
 from analysis.units import ARCSEC
@@ -86,8 +85,7 @@ from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.runs.study_folder import StudyFolder
 from twin.study.study_files import write_data
-from twin.targets.band_light import BandPupils
-from twin.targets.target_images import View
+from twin.targets.target_images import BandPupils, View
 from twin.validation.checks.check import Check
 from twin.validation.checks.group import CheckGroup
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from analysis.arrays import Array, Indices
 from analysis.block.block import Block, CameraKnowledge, CamerasKnowledge, Term
 from analysis.block.corrections import Corrections, Part
 from analysis.block.packets import FixedPoints, Heights, LineImage, Packets, Pointings
@@ -16,10 +16,6 @@ from analysis.block.point_reduction import PriorGroup, Reduction
 from analysis.block.processes import BlockError, Support
 from analysis.orbit.three_line_model import BIAS, DRIFT
 
-__all__ = ["DATUM", "Assembly", "Process", "assembled"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 OFFSET = ("along", "across", "down")
 DATUM = 1000.0
 """Metres: sigma of a common shift of all control points where one is looked for."""

@@ -9,25 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array, Indices
 from analysis.block.processes import BlockError, Law
 from analysis.orbit.three_line_model import LineModel, Rays
 
-__all__ = [
-    "SENSORS",
-    "Block",
-    "CameraKnowledge",
-    "CamerasKnowledge",
-    "Footprints",
-    "Pass",
-    "Points",
-    "Scene",
-    "Term",
-    "Terrain",
-    "TrackerAngle",
-]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Scope = Literal["pass", "tracker", "block"]
 SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
 """What can be left out of a block by name."""

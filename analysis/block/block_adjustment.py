@@ -1,6 +1,17 @@
 """Adjustment of a block: Gauss-Newton on all packets and priors, robust weights, variance components, covariances.
 
 The weights and factors follow the rules of `reweighting`.
+
+What is plainly wrong with a block before it is adjusted: points elsewhere than their images, points seen once.
+
+Whether the readings' errors follow their stated laws: serial correlation of what should be independent.
+
+With the right law the whitened unknowns e of a process are independent, of unit variance; those that are estimated have
+the covariance S = I - C, with C that of the whitened errors after the adjustment. The sum q of the products of
+neighbours in time then has the expectation tr(L S) and the variance 2 tr(L S L S), L the matrix of neighbours: exactly,
+however little of the process the observations tell. White noise that is a walk in truth has neighbours that are alike,
+a walk that is white noise in truth neighbours that are opposite. The size of the errors is what variances tell
+(`GroupTest`), and q is compared at the variance that they have.
 """
 
 from __future__ import annotations
@@ -16,20 +27,78 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse.linalg import splu
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
-from analysis.block.assembly import Assembly, assembled, group_ranks
+from analysis.arrays import Array, Indices
+from analysis.block.assembly import Assembly, Process, assembled, group_ranks
 from analysis.block.block import Block
-from analysis.block.plausible_block import check_places, pruned
-from analysis.block.point_reduction import Checked, Reduced, Reduction, State
+from analysis.block.point_reduction import Checked, Pool, Reduced, Reduction, SharedReduction, State
 from analysis.block.processes import BlockError
 from analysis.block.reweighting import SETTLED, GroupTest, Rule, UnsettledError, settled
-from analysis.block.shares import Pool, SharedReduction
 
-__all__ = ["BlockAdjustment", "adjust_block", "kept_block"]
+FAR = 0.02
+"""Radians between where a point is said to be and where its image looks: 10 km below 500 km. Orbits and attitudes are
+known a hundred times better."""
+_NAMED = 8
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+
+def pruned(block: Block) -> Block:
+    """The block without observations of points that they do not determine: fewer than three rows at a point.
+
+    Raises:
+        BlockError: nothing is left.
+    """
+    rows = np.zeros(len(block.points.ids), np.intp)
+    for scene in block.scenes:
+        np.add.at(rows, scene.rays.point, 2)
+    for one in block.footprints:
+        np.add.at(rows, one.point, 3)
+    if block.terrain is not None:
+        np.add.at(rows, block.terrain.point, 1)
+    rows[block.points.role == "control"] += 3
+    good = rows >= 3
+    if not np.any(good):
+        raise BlockError("block: no point is seen by two scenes, and none is control")
+    scenes = tuple(replace(s, rays=s.rays.taken(good[s.rays.point])) for s in block.scenes)
+    terrain = block.terrain
+    if terrain is not None:
+        terrain = terrain.taken(good[terrain.point])
+    return replace(block, scenes=scenes, terrain=terrain)
+
+
+def check_places(block: Block) -> None:
+    """Whether every point lies about where its images look.
+
+    Raises:
+        BlockError: points that do not, by name.
+    """
+    wrong: list[str] = []
+    control: list[bool] = []
+    for scene in block.scenes:
+        rays = scene.rays
+        if not len(rays.point):
+            continue
+        arm = block.points.start[rays.point] - rays.station
+        away = np.linalg.norm(arm, axis=1, keepdims=True)
+        look = np.einsum("nij,nj->ni", rays.attitude, block.cameras[scene.camera].directions(rays.image))
+        apart = np.linalg.norm(np.cross(look, arm / np.maximum(away, 1.0)), axis=1)
+        bad = (apart > FAR) | (np.sum(look * arm, axis=1) <= 0)
+        names = block.points.ids[rays.point[bad]].tolist()
+        wrong += [f"{name} in {scene.name}" for name in names]
+        control += _are_control(block, rays.point[bad])
+    if not wrong:
+        return
+    shown = ", ".join(wrong[:_NAMED]) + (f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else "")
+    hint = "are their coordinates geocentric (ITRS), in metres and in the order x, y, z?" if all(control) else (
+        "are their images those of the scenes named?"
+    )  # fmt: skip
+    raise BlockError(f"block: these points lie more than {FAR:g} rad from where their images look: {shown}; {hint}")
+
+
+def _are_control(block: Block, points: NDArray[np.intp]) -> list[bool]:
+    return [bool(v) for v in (block.points.role[points] == "control").tolist()]
+
+
 _CONVERGED = 1e-6
 """Size of the last step, in sigmas of all unknowns together."""
 _DENSE = 2500
@@ -100,17 +169,6 @@ class BlockAdjustment:
             found[where] = inner + moved @ self.covariance[np.ix_(columns, columns)] @ np.swapaxes(moved, 1, 2)
         found[~np.isfinite(self.ground[points]).all(axis=1)] = np.nan
         return found
-
-    def attitude_at(self, of: str, times: Array) -> tuple[Array, Array]:
-        """Correction of the attitude of a pass about the body's axes, (n, 3), radians, with covariances (n, 3, 3)."""
-        columns, factors = self.assembly.corrections(of, times).factors(True)
-        value = np.sum(factors * self.x[columns], axis=1)
-        spread = np.empty((len(times), 3, 3))
-        for i in range(3):
-            for j in range(3):
-                some = self.covariance[columns[:, :, i][:, :, None], columns[:, :, j][:, None, :]]
-                spread[:, i, j] = np.einsum("nk,nkl,nl->n", factors[:, :, i], some, factors[:, :, j])
-        return value, spread
 
     def change(self, scene: str) -> tuple[Array, Array]:
         """Camera of a scene: d_alpha, d_beta, d_gamma, d_f (4,), radians and metres, and their covariance (4, 4)."""
@@ -378,3 +436,76 @@ def _result(assembly: Assembly, at: _At, found: _Solution) -> BlockAdjustment:
         reduced=found.reduced,
         iterations=at.steps,
     )
+
+
+_KINDS = ("white", "walk", "slow")
+_LARGEST = 4000
+"""Unknowns of one process above which it is not tested; its matrices are dense."""
+_LEAST = 2.0
+"""Redundancy of a law below which nothing can be said of neighbours."""
+
+
+@dataclass(frozen=True)
+class LawTest:
+    """Neighbours in time of one law's errors, in all its scopes.
+
+    Attributes:
+        group: of the law. kind: as stated.
+        excess: sum of products of neighbours beyond its expectation, in standard deviations; positive where they are
+            alike.
+    """
+
+    group: str
+    kind: str
+    excess: float
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided chance of such an excess."""
+        return float(2.0 * norm.sf(abs(self.excess)))
+
+    def __str__(self) -> str:
+        alike = "alike" if self.excess > 0 else "opposite"
+        return (
+            f"{self.group}: errors that should be independent in a {self.kind} process are {alike} in neighbours"
+            f" ({self.excess:+.1f} sigma, chance {self.p_value:.1g}): the stated law is not that of the readings"
+        )
+
+
+def law_tests(found: BlockAdjustment) -> tuple[LawTest, ...]:
+    """A test of each law with a course in time that the observations tell something of."""
+    sums: dict[str, list[float]] = {}
+    kinds: dict[str, str] = {}
+    for one in found.assembly.every:
+        law = one.support.law
+        if law.kind not in _KINDS or one.support.size > _LARGEST or len(one.support.numbers) < 3:
+            continue
+        value, mean, variance, told = _neighbours(found, one)
+        kinds[law.group] = law.kind
+        total = sums.setdefault(law.group, [0.0, 0.0, 0.0, 0.0])
+        for k, part in enumerate((value, mean, variance, told)):
+            total[k] += part
+    tests = []
+    for group, (value, mean, variance, told) in sums.items():
+        if told >= _LEAST and variance > 0.0:
+            tests.append(LawTest(group, kinds[group], (value - mean) / float(np.sqrt(variance))))
+    return tuple(tests)
+
+
+def _neighbours(found: BlockAdjustment, one: Process) -> tuple[float, float, float, float]:
+    """Sum of products of neighbours, its expectation and variance, and the redundancy of the process."""
+    root = np.kron(one.support.whitened(), np.eye(3))
+    whitened = root.T @ found.x[one.columns]
+    own = found.covariance[np.ix_(one.columns, one.columns)]
+    factor = found.factors[one.support.law.group]
+    spread = factor * np.eye(len(whitened)) - root.T @ own @ root
+    told = float(np.trace(spread)) / factor
+    size = float(whitened @ whitened) / max(float(np.trace(spread)), 1e-12)
+    near = np.zeros_like(spread)
+    rows = np.arange(len(whitened) - 3)
+    near[rows, rows + 3] = near[rows + 3, rows] = 0.5
+    product = near @ spread
+    # at the variance that the errors have: a wrong size alone is no wrong law
+    scale = max(size, 1.0) if told > _LEAST else 1.0
+    mean, variance = float(np.trace(product)), 2.0 * float(np.sum(product * product.T))
+    return float(whitened @ near @ whitened) / scale, mean, variance, told

@@ -10,14 +10,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array, Indices
 from analysis.block.processes import Support
-
-__all__ = ["Corrections", "Part", "by_rotation_vector", "cross", "turned", "turned_back"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import eigh
 from scipy.sparse.csgraph import connected_components
 
+from analysis.arrays import Array
 from analysis.block.assembly import assembled
 from analysis.block.block import Block, Term
 from analysis.block.block_adjustment import BlockAdjustment
@@ -22,9 +22,6 @@ from analysis.block.processes import Law
 from analysis.orbit.ground_errors import level_axes
 from analysis.orbit.null_space import echelon, shown
 
-__all__ = ["Network", "Open", "datum_test", "network_of", "open_combinations", "simplified"]
-
-Array = NDArray[np.float64]
 _SHOWN = 0.25
 """Of the largest part: smaller parts of a combination are not named."""
 _TAKING = 6

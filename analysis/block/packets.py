@@ -10,15 +10,10 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array, Indices
 from analysis.block.corrections import Corrections, by_rotation_vector, cross, turned, turned_back
 from analysis.orbit.three_line_model import LineModel, Rays
-
-__all__ = ["FixedPoints", "Heights", "LineImage", "Packets", "Pointings"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 class Packets(Protocol):

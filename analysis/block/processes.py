@@ -8,7 +8,7 @@ with unknowns z whose prior is that of the process at unit size, the same about 
 
 - `constant`: one z of variance 1. `rate`: one, times the seconds from the middle of the scope.
 - `white`: readings at whole multiples of `interval`, independent, joined by the cubic spline through them
-  (`analysis.orbit.ray_noise` has the algebra). sigma is that of a reading.
+  (`analysis.orbit.forward_intersection` has the algebra). sigma is that of a reading.
 - `walk`: a random walk that is zero at the middle of the scope; sigma is what it gains in a second.
 - `slow`: a first-order Gauss-Markov process of standard deviation sigma and correlation time `time`.
 - `orbital`: amplitudes of cosine and sine of 2 pi t / `time`, of standard deviation sigma each.
@@ -26,16 +26,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from analysis.arrays import Array, Indices
 from analysis.measurement_error import MeasurementError
-from analysis.orbit.ray_noise import spline_blend, spline_precision
+from analysis.orbit.forward_intersection import spline_blend, spline_precision
 
-__all__ = ["STEPPED", "BlockError", "Kind", "Law", "Support"]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital", "jitter")
 STEPPED = ("white", "walk", "slow", "jitter")

@@ -10,30 +10,12 @@ from dataclasses import dataclass
 from typing import Literal, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
+from analysis.statistics import robust_variance
 
-__all__ = [
-    "HUBER",
-    "LARGEST_FACTOR",
-    "REJECT",
-    "SETTLED",
-    "GroupTest",
-    "Robust",
-    "Rule",
-    "UnsettledError",
-    "bounded",
-    "extrapolated",
-    "limits",
-    "median_factor",
-    "robust_weights",
-    "settled",
-    "standardised_packets",
-]
-
-Array = NDArray[np.float64]
 S = TypeVar("S", bound="Weighted")
 T = TypeVar("T")
 SETTLED = 1e-3
@@ -146,12 +128,6 @@ def limits(rows: int) -> tuple[float, float]:
     return float(np.sqrt(chi2.isf(0.05, rows))), float(np.sqrt(chi2.isf(1e-4, rows)))
 
 
-def median_factor(standard: Array) -> float:
-    """Square of the scale of standardised residuals (M, 2) by their median: half of them may be wrong."""
-    # median of chi-square with two degrees of freedom is 2 ln 2
-    return float(np.median(np.sum(standard**2, axis=1)) / (2.0 * np.log(2.0)))
-
-
 def bounded(factor: float) -> float:
     """A variance factor within its bounds."""
     return float(np.clip(factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR))
@@ -240,7 +216,7 @@ def settled(problem: Reweighted[S, T], at: S, rule: Rule) -> tuple[S, T]:
         weight, factor = at.weight, dict(at.factor)
         standard = () if rule.packets is None and rule.factor == "components" else problem.judged(at, found)
         if rule.factor == "median":
-            factor["image"] = bounded(factor["image"] * median_factor(np.concatenate(standard)))
+            factor["image"] = bounded(factor["image"] * robust_variance(np.sum(np.concatenate(standard) ** 2, axis=1)))
         elif rule.factor == "components" and not screening:
             tests = problem.tests(at, found)
             factor |= {g: one.estimated for g, one in tests.items() if rule.groups is None or g in rule.groups}

@@ -16,14 +16,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from analysis.arrays import Array
 from analysis.calibration.normal_equations import Equations
 from analysis.orbit.calibration_parameters import CalibrationField
 from analysis.orbit.three_line_model import Partials, Rays
 
-Array = NDArray[np.float64]
 FALSE_ALARM = 5e-5
 """False-alarm rate of each of the two tests of a run, rates and courses, over all fields together: 1e-4 a run."""
 _WAVES = 4

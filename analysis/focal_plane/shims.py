@@ -20,13 +20,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from analysis.arrays import Array
 from analysis.focal_plane.plane_fit import RigidMotion
 from analysis.measurement_error import MeasurementError
 
-Array = NDArray[np.float64]
 # Holes carry a tilt when the smaller spread of their places is at least this part of the larger: 0.3 mm in 0.3 m.
 _LEAST_SPREAD = 1e-3
 

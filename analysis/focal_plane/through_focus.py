@@ -31,10 +31,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.chi_square import chance_beyond
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
+from analysis.statistics import chance_beyond
 
-Array = NDArray[np.float64]
 QUARTIC = 0.3
 """q of the formula."""
 FRACTION = 0.5

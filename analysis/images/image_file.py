@@ -22,20 +22,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.images import fits_image, tiff_image
 from analysis.images.image_header import JPEG_MAGIC, PNG_MAGIC, ImageError, ImageHeader, jpeg_header, png_header
 
-__all__ = ["GAMMAS", "ImageError", "ImageFile", "Region", "recorded", "tone_curve"]
-
-Array = NDArray[np.float64]
 MOST_BYTES = 1 << 29
 """Largest size of one decoded page, and of the frames of one file together."""
 MOST_PIXELS = 4_000_000
 """Largest region: the fits need some 250 bytes for each pixel."""
 MOST_STACKED = 16_000_000
 """Largest region in all pages together."""
-GAMMAS = ("srgb", "1", "2.2")
-"""Examples of the tone curves."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _LARGEST_GAMMA = 5.0
 _GZIP = b"\x1f\x8b"

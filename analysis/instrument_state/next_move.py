@@ -12,12 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-__all__ = ["Actuators", "NextMove", "best_move", "measurement_worth", "truncated_move"]
+from analysis.arrays import Array
 
-Array = NDArray[np.float64]
 _MOST_NODES = 600
 """Nodes of the search; the best move found by then is told, and that it may not be the best of all."""
 _CLOSE = 1e-3
@@ -95,24 +93,6 @@ def best_move(residual: Array, slope: Array, actuators: Actuators) -> NextMove:
     if cost(still) <= cost(best):
         best = still
     return NextMove(best, cost(best), searched)
-
-
-def truncated_move(residual: Array, slope: Array, actuators: Actuators, kept: int) -> Array:
-    """The classic move: pseudo-inverse of the largest singular values, rounded to whole steps within the limits, (C,).
-
-    Args:
-        residual: measured merit, (R,).
-        slope: as of ``best_move``; columns are scaled to the actuators' ranges.
-        actuators: limits and steps.
-        kept: singular values that are used.
-    """
-    size = np.where(actuators.high > actuators.low, actuators.high - actuators.low, 1.0)
-    u, s, v = np.linalg.svd(slope * size, full_matrices=False)
-    kept = min(kept, len(s))
-    wanted = -size * (v[:kept].T @ ((u[:, :kept].T @ residual) / s[:kept]))
-    wanted = np.clip(wanted, actuators.low, actuators.high)
-    steps = actuators.steps
-    return np.asarray(np.where(steps > 0.0, np.round(wanted / np.where(steps > 0.0, steps, 1.0)) * steps, wanted))
 
 
 def measurement_worth(

@@ -12,13 +12,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from analysis.matching.options import checked_places
+from analysis.arrays import Array, Mask
+from analysis.matching.correlation import checked_places
 from analysis.measurement_error import UndeterminedError
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 # Of missing every all-right sample while this share is wrong.
 _MISSED, _WRONG = 1e-6, 0.45
 _MOST_SAMPLES = 8000

@@ -33,13 +33,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.matching import window_checks
-from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates, joined
+from analysis.matching.correlation import MatchOptions, Reason, checked_image, checked_places, checked_templates, joined
 from analysis.matching.spline import SplineStack, low_passed
 from analysis.matching.template_noise import TemplateNoise, noise_energy, template_noise
 from analysis.matching.window_checks import ResidualCorrelation, WindowHalves, WindowRelief, WindowScales
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 # Points that are fitted together: so few that what is computed of them stays in a processor's cache.
 _CHUNK = 32

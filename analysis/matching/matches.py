@@ -8,15 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.matching.correlation import search
+from analysis.arrays import Array
+from analysis.matching.correlation import MatchOptions, Reason, checked_image, checked_places, checked_templates, search
 from analysis.matching.least_squares import least_squares
-from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates
-from analysis.matching.spline import resampled
 from analysis.matching.window_checks import FALSE_ALARM, risk
 
-__all__ = ["MatchOptions", "Matches", "Reason", "match", "resampled"]
-
-Array = NDArray[np.float64]
 # Side of a block of a JPEG file, px, and lines of an image in which its blocks are looked for.
 _BLOCK, _BLOCK_LINES = 8, 512
 # Ratio of steps between blocks to those within from which places are those of the blocks. JPEG of quality 30 to 95: 1.0

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.interpolate import BSpline, PPoly
 
-from analysis.matching.options import checked_image
+from analysis.arrays import Array
+from analysis.matching.correlation import checked_image
 
-Array = NDArray[np.float64]
 _DEGREE = 5
 # Pixels beyond a patch that its spline sees: the prefilter decays by 0.43 a pixel, so the rest is 1e-8.
 _HALO = 22

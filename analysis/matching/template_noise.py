@@ -38,9 +38,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.matching.spline import SplineStack, low_passed
 
-Array = NDArray[np.float64]
 # Least curvature over the normal matrix, of any combination of unknowns: more than three fifths noise is not known.
 _LEAST = 0.4
 # Below it a combination of unknowns is open, relative to the best known.

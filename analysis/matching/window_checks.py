@@ -43,7 +43,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import ncx2, norm
 
-Array = NDArray[np.float64]
+from analysis.arrays import Array
+
 # Ways to halve a window.
 SPLITS = 4
 # Of the test, a window.

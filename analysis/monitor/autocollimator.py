@@ -26,22 +26,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 
-__all__ = [
-    "AXES",
-    "ReadingMap",
-    "column_component",
-    "exact_reading",
-    "mean_difference",
-    "mirror_rotation",
-    "reading_of_normal",
-    "relation_factor",
-]
-
-Array = NDArray[np.float64]
 AXES = ("X", "Y", "Z")
 
 

@@ -28,19 +28,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "DECAYING",
-    "LimitCycle",
-    "Margins",
-    "common_margin",
-    "limit_cycle",
-    "margins",
-    "open_loop",
-    "rejection",
-    "spectral_radius",
-]
+from analysis.arrays import Array
 
-Array = NDArray[np.float64]
 DECAYING = 1.0 - 1e-12
 """Largest eigenvalue of loops that are stable: of one that only comes to rest somewhere else rounding makes either."""
 _LEAST, _MOST = 1e-6, 1e6

@@ -20,11 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.states import OfStates
+from analysis.arrays import Array, OfStates
 
-__all__ = ["BEYOND", "Curvature", "LinearReading", "MotionModel", "Retraced", "read_again"]
-
-Array = NDArray[np.float64]
 BEYOND = 3.0
 """Sigmas of a quantity by which a linear reading may be off before it is worked out anew."""
 _REST = 1e-2

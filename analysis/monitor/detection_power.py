@@ -17,16 +17,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analysis.chi_square import limit_of
+from analysis.arrays import Array
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import UNSEEN
 from analysis.monitor.series_filter import SeriesFilter
+from analysis.statistics import limit_of
 
-__all__ = ["READINGS", "SHARES", "Power", "detection_power"]
-
-Array = NDArray[np.float64]
 READINGS, SHARES = (1, 3, 10), (0.5, 0.95)
 """Numbers of readings after a jump within which it is found, and in which share of cases."""
 _SIZES = np.geomspace(0.03, 100.0, 71)

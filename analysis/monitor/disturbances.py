@@ -13,14 +13,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from analysis.chi_square import chance_beyond, density, limit_of
-from analysis.short_repr import shows
+from analysis.arrays import Array, shows
+from analysis.statistics import chance_beyond, density, limit_of
 
-__all__ = ["FALSE_ALARM", "Consistency", "Disturbances", "Suspect", "TimeLaw", "chi_squares", "consistency"]
-
-Array = NDArray[np.float64]
 FALSE_ALARM = 1e-3
 """Chance that shifts within what is stated are called a contradiction."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)

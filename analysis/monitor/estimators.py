@@ -16,26 +16,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from analysis.arrays import Array
 from analysis.monitor import model_fit, monitoring
-from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
+from analysis.monitor.parameters import CameraCalibration
 
-__all__ = [
-    "ESTIMATORS",
-    "Estimator",
-    "Formula",
-    "LeastSquares",
-    "OfEachCamera",
-    "Posterior",
-    "Shifts",
-    "applicable",
-    "judged",
-]
-
-Array = NDArray[np.float64]
 PARAMETERS_EACH = 4
 """Parameters of one camera."""
 

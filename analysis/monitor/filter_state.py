@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from analysis.arrays import Array
 from analysis.monitor.jump_detection import Jump
-
-__all__ = ["Aside", "BadReading", "Belief", "Innovation", "Observed", "Track", "Whitened"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

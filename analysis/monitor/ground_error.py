@@ -16,20 +16,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array, OfStates, shows
 from analysis.measurement_error import UndeterminedError
-from analysis.short_repr import shows
-from analysis.states import OfStates
 
-__all__ = ["EARTH_RADIUS_M", "GroundError", "GroundGeometry"]
-
-Array = NDArray[np.float64]
 EARTH_RADIUS_M = 6_371_000.0
 """Mean radius (IUGG). The Earth's flattening and turn change the figures here by less than 1 %."""
 _PLACES = 9
 """Places along the line over which RMS values are taken."""
-AXES = ("along", "across", "height")
 
 
 @shows()

@@ -15,16 +15,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array, OfStates, shows
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.monitoring import CameraParameters
-from analysis.short_repr import shows
-from analysis.states import OfStates
-
-__all__ = ["IntersectionAngleChange", "exact"]
-
-Array = NDArray[np.float64]
 
 
 @shows()

@@ -26,16 +26,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln, ndtr
 
+from analysis.arrays import Array
 from analysis.monitor import parameters
-from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.ground_error import GroundGeometry
-from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
-
-Array = NDArray[np.float64]
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibration, Parameter
 
 
 @dataclass(frozen=True, eq=False)

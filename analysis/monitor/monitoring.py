@@ -28,26 +28,11 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from analysis.short_repr import shows
-from analysis.states import OfStates
+from analysis.arrays import Array, OfStates, shows
 from analysis.units import ARCSEC, UM_PER_M
 
-__all__ = [
-    "FORMULAS",
-    "PARAMETERS",
-    "PER_SI",
-    "CameraParameters",
-    "MonitorGeometry",
-    "coefficients",
-    "derived",
-    "linear",
-    "paper_joint",
-    "paper_single",
-]
-
-Array = NDArray[np.float64]
 FORMULAS = ("paper_single", "paper_joint", "derived")
 PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 """Keys of the parameters in results, which end in their unit."""

@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array, OfStates, shows
 from analysis.monitor import intersection_angle
-from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
 from analysis.monitor.curvature import Curvature, LinearReading, MotionModel, read_again
 from analysis.monitor.disturbances import Consistency, Disturbances, consistency
 from analysis.monitor.estimators import PARAMETERS_EACH, Shifts, applicable
@@ -18,27 +18,12 @@ from analysis.monitor.ground_error import GroundError, GroundGeometry
 from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.limits import quantities
 from analysis.monitor.monitoring import CameraParameters
+from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.monitor.spot_evidence import SpotEvidence
-from analysis.short_repr import shows
 from analysis.spots.centroid import CENTROIDS, mean_frames
-from analysis.spots.fit_state import FitStates, fit_states, require_rest, widened
+from analysis.spots.likelihood import FitStates, fit_states, require_rest, widened
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
-from analysis.states import OfStates
 
-__all__ = [
-    "Estimates",
-    "MeasuredSpots",
-    "Recovery",
-    "estimates",
-    "estimates_of",
-    "joint",
-    "judged_spots",
-    "measure_spots",
-    "recover",
-    "recovery_of",
-]
-
-Array = NDArray[np.float64]
 MeasuredSpots: TypeAlias = tuple[SpotPositions, FitStates]
 """Spots with how good their fits are."""
 

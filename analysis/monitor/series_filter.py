@@ -32,13 +32,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
-from analysis.chi_square import limit_of
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
-from analysis.monitor.bad_readings import RECENT, bad_reading, chance_good, jump_evidence, may_be_bad
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track, Whitened
 from analysis.monitor.jump_detection import (
     Amounts,
+    Bodies,
     Candidate,
     Jump,
     Step,
@@ -46,15 +46,23 @@ from analysis.monitor.jump_detection import (
     candidates,
     knots,
     likeliest,
+    mixed,
     untold_share,
 )
 from analysis.monitor.state_space import HeatInputs, StateSpace
-from analysis.monitor.told_jumps import Bodies, mixed
-from analysis.monitor.untold_jumps import Hint, Jumper, blended, jumpers
+from analysis.monitor.untold_jumps import (
+    RECENT,
+    Hint,
+    Jumper,
+    bad_reading,
+    blended,
+    chance_good,
+    jump_evidence,
+    jumpers,
+    may_be_bad,
+)
+from analysis.statistics import limit_of
 
-__all__ = ["SeriesFilter"]
-
-Array = NDArray[np.float64]
 _NEARLY = 1e-11
 """Of the sum of its eigenvalues, by which information is made regular."""
 

@@ -17,16 +17,14 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from analysis.arrays import Array
 from analysis.monitor.filter_state import Belief, Observed, Whitened
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.untold_jumps import added
 
-__all__ = ["hinted", "jointly", "smoothed"]
-
 T = TypeVar("T")
-Array = NDArray[np.float64]
 _PIECE = 400
 """Readings whose covariances are held at once."""
 

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
-from analysis.chi_square import limit_of
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw
 from analysis.monitor.jump_detection import (
@@ -47,10 +47,8 @@ from analysis.monitor.jump_detection import (
     with_jumps,
     with_unfound,
 )
+from analysis.statistics import limit_of
 
-__all__ = ["LARGEST", "SeriesChanges", "ShiftNoise", "SmoothedSeries", "smooth", "window_of"]
-
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int_]
 LARGEST = 2400
 """Shifts in one factorisation, 46 MB: 300 times of two cameras. A longer series is worked on in pieces of a third of

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.spots.fit_state import FALSE_ALARM, FitStates
+from analysis.arrays import Array
+from analysis.spots.likelihood import FALSE_ALARM, FitStates
 
-__all__ = ["SpotDoubt", "SpotEvidence"]
-
-Array = NDArray[np.float64]
 ALIKE = 2.0
 """Times that a core's chi-square may be that of the frames' noise where this explains both."""
 LOUD = 1.3

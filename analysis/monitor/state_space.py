@@ -26,11 +26,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 
-__all__ = ["HeatInputs", "StateSpace"]
-
-Array = NDArray[np.float64]
 _INTERVALS = 200
 """Between readings, of which the transitions are kept."""
 _NOTHING = 1e-12

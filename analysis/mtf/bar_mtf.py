@@ -31,15 +31,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.chi_square import chance_beyond
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
 from analysis.mtf.edge_pages import different_pages, left_over, mean_page
-from analysis.mtf.rice import measured_bias, rice_sigma, signal_modulus
 from analysis.mtf.slanted_edge import EdgeMtf
 from analysis.spots.noise import NoiseModel
+from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal_modulus
 
-Array = NDArray[np.float64]
 _HARMONICS = (3, 5, 7)
 _LEAST_SIDE = 12
 _LEAST_PATCH = 16

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from analysis.chi_square import limit_of
+from analysis.arrays import Array
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
+from analysis.statistics import limit_of
 
-Array = NDArray[np.float64]
 # Half width of the spline: so many 10-90% widths of the edge, at least so many px, at most this part of the plateau.
 CORE_WIDTHS, _LEAST_CORE, _LARGEST_CORE_SHARE = 4.0, 6.0, 0.7
 # Widest hole between neighbouring sampling phases, px.

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
+from analysis.statistics import robust_sigma
 
-__all__ = ["LARGEST_GREY", "EdgeError", "EdgeLine", "checked_region", "grey_fault", "locate_edge", "pixel_noise"]
-
-Array = NDArray[np.float64]
 Axis = Literal["x", "y"]
 # Smallest region: along the edge, and across it.
 LEAST_ALONG, LEAST_ACROSS = 20, 32
@@ -128,7 +127,7 @@ def pixel_noise(residual: Array) -> float:
     Straight edges of small tilt and slow shading drop out of that difference.
     """
     checker = residual[1:, 1:] - residual[1:, :-1] - residual[:-1, 1:] + residual[:-1, :-1]
-    return 0.7413 * float(np.median(np.abs(checker)))
+    return 0.5 * robust_sigma(checker)
 
 
 def locate_edge(grey: Array) -> EdgeLine:
@@ -271,6 +270,6 @@ def _huber_line(x: Array, y: Array) -> tuple[float, float]:
         slope = float((weight * (x - mean_x)) @ (y - mean_y) / ((weight * (x - mean_x)) @ (x - mean_x)))
         offset = float(mean_y - slope * mean_x)
         residual = np.abs(y - offset - slope * x)
-        limit = 1.5 * 1.4826 * float(np.median(residual)) + 1e-9
+        limit = 1.5 * robust_sigma(residual) + 1e-9
         weight = np.minimum(1.0, limit / np.maximum(residual, limit))
     return offset, slope

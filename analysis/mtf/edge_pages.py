@@ -19,16 +19,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.chi_square import chance_beyond
+from analysis.arrays import Array
 from analysis.mtf import edge_fit, slanted_edge
 from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, locate_edge
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.mtf.slanted_edge import EdgeMtf
 from analysis.spots.noise import NoiseModel
+from analysis.statistics import chance_beyond
 
-__all__ = ["different_pages", "grey_step", "left_over", "mean_page", "measure_pages"]
-
-Array = NDArray[np.float64]
 FALSE_ALARM = 1e-4
 """Rate at which pages are aligned although the edge does not move in them."""
 MOST_PIXELS = 4_000_000

@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtr
 
-__all__ = ["EdgeDesign", "EdgeSpread", "fit_edge_spread"]
+from analysis.arrays import Array
 
-Array = NDArray[np.float64]
 _STEP_WIDTH = 0.5
 _TAIL_WIDTH = 1.0
 # Weight of the third differences of the spline against the data. It decides only where pixels leave gaps between the

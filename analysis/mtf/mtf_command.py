@@ -15,18 +15,18 @@ from typing import Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from analysis.images.image_file import ImageError, ImageFile, Region, tone_curve
+from analysis.arrays import Array
+from analysis.images.image_file import ImageFile, Region, tone_curve
+from analysis.images.image_header import ImageError
 from analysis.mtf.bar_mtf import BarError, BarMtf, measure_bar_pages, page_warnings
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
 from analysis.mtf.slanted_edge import EdgeMtf
 
-Array = NDArray[np.float64]
 BAD_INPUT, NOT_PRINTED = 2, 1
 PLOT_KINDS = (".png", ".pdf", ".svg")
 _LENGTHS = {"nm": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "mm": 1.0}

@@ -6,7 +6,7 @@ one Gauss-Newton step on all pixels, twice; the transform of the line-spread fun
 
 ISO 12233 projects along the rows, and its frequencies are counted along the row. Here they are counted along the
 normal: the result is the cut through the two-dimensional MTF at f (cos angle, sin angle) for axis "x".
-`EdgeMtf.frequency_along_axis` gives the frequency along the row (axis "x") or column (axis "y"), lower by cos(angle).
+Along the row (axis "x") or column (axis "y") the frequency is lower by cos(angle).
 
 Noise passes through a chain that is linear but for the division by the contrast, so its covariance is exact to first
 order: pixel variances -> coefficients -> transfer function with its normalisation -> modulus. The modulus is too long
@@ -25,14 +25,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from analysis.chi_square import chance_beyond
+from analysis.arrays import Array
 from analysis.mtf.edge_fit import OVERSAMPLING, FittedEdge, fit_edge, path_parts
 from analysis.mtf.edge_location import Axis, EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread
-from analysis.mtf.rice import measured_bias, rice_sigma, signal_modulus
 from analysis.spots.noise import NoiseModel
+from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal_modulus
 
-Array = NDArray[np.float64]
 # Block means of 4 x 4 px that stick out of the fitted edge by more than this share of the contrast.
 _OTHER_STRUCTURE = 0.1
 # Blocks and strips of pixels whose means are tested for structure, px.
@@ -409,11 +408,6 @@ class EdgeMtf:
             " light that is not a plane, a rough edge, specks, or noise that neighbouring pixels share. sigma does not"
             " hold what it does to the MTF: take even light or a smaller region"
         )
-
-    @property
-    def frequency_along_axis(self) -> Array:
-        """(F,) cycles/pixel along the row (axis "x") or column (axis "y"): what ISO 12233 plots."""
-        return self.frequency * math.cos(self.angle)
 
     def at(self, frequency: float) -> tuple[float, float]:
         """MTF and sigma at one frequency along the normal, cycles/pixel; cubic between the samples.

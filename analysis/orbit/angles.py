@@ -29,11 +29,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.planes import Method, PlaneFit, Station, Strip, fit_plane
 from analysis.units import ARCSEC
 
-Array = NDArray[np.float64]
 # Below so many sigmas an angle, which cannot be negative, is no longer normally distributed.
 _FOLDED = 3.0
 

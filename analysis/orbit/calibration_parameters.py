@@ -18,22 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.three_line_model import BIAS, DRIFT, INTERIOR, LineModel, Rays
 
-__all__ = [
-    "RATE",
-    "CalibrationError",
-    "CalibrationField",
-    "Noise",
-    "NoiseTerm",
-    "Parameters",
-    "Prior",
-    "Unknowns",
-    "monitor_priors",
-]
-
-Array = NDArray[np.float64]
 OFFSET = ("along", "across", "down")
 RATE = tuple(f"{n} rate" for n in BIAS)
 _SEMI_AXES = np.array([6378137.0, 6378137.0, 6356752.314245])  # WGS84

@@ -9,24 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq, elementwise
 from scipy.special import erf, ndtri
 
+from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import vertical
 
-__all__ = [
-    "Accuracy",
-    "circle_of_points",
-    "circular_error",
-    "interval_of_points",
-    "level_axes",
-    "linear_error",
-    "predicted",
-    "realised",
-]
-
-Array = NDArray[np.float64]
 _SHARE = 0.9
 _DIRECTIONS = 0.5 * np.pi * (np.arange(32) + 0.5) / 32
 """Of the mean over a quarter of a circle, 1e-12 of CE90 for axes of any ratio."""

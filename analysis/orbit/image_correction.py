@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
-Array = NDArray[np.float64]
+from analysis.arrays import Array
+
 Kind = Literal["shift", "affine"]
 
 _FALSE_ALARM = 1e-3

@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 
-Array = NDArray[np.float64]
 OVERSAMPLING = 6
 """Frequencies in the inverse of the time that is observed; the highest of them has 98% of a line's power."""
 BLIND = 0.1
@@ -120,37 +120,6 @@ class Observations:
             unknown = len(v) - found.freedom
             raise JitterError(f"{len(v)} observations with {unknown} unknowns are too few for a spectrum")
         return found
-
-    @classmethod
-    def of_disparities(
-        cls,
-        first: ArrayLike,
-        second: ArrayLike,
-        disparity: ArrayLike,
-        sigma: ArrayLike,
-        pair: ArrayLike | None = None,
-        degree: int = 2,
-    ) -> Observations:
-        """Of one axis, from displacements of places that two lines saw.
-
-        Args:
-            first: (n,) moments of the first sight, seconds.
-            second: (n,) of the second.
-            disparity: (n,) attitude at the second less that at the first, radians.
-            sigma: (n,) or one for all.
-            pair: (n,) whole numbers: of which pair of lines; each has a trend of its own.
-            degree: of the trend in time.
-
-        Raises:
-            JitterError: as `of`.
-        """
-        a, b, d = (np.array(v, np.float64) for v in (first, second, disparity))
-        s = np.broadcast_to(np.asarray(sigma, np.float64), d.shape)
-        which = np.zeros(len(d), int) if pair is None else np.asarray(pair)
-        weight = np.stack([-1.0 / s, 1.0 / s], axis=-1)[..., None]
-        trend = _powers(a, degree) / s[:, None]
-        each = [trend * (which == k)[:, None] for k in np.unique(which)]
-        return cls.of(d / s, np.arange(len(d)), np.stack([a, b], axis=-1), weight, np.concatenate(each, axis=1))
 
     @property
     def axes(self) -> int:

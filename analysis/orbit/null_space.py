@@ -32,27 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh, qr
 
+from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import CalibrationError, index
 from analysis.orbit.three_line_model import BIAS, DRIFT
 from analysis.units import ARCSEC
 
-__all__ = [
-    "WEAK",
-    "WORST",
-    "Combination",
-    "Freedom",
-    "Gauge",
-    "RankError",
-    "combinations",
-    "echelon",
-    "free_basis",
-    "null_vectors",
-    "shown",
-    "solved",
-    "weak_vectors",
-]
-
-Array = NDArray[np.float64]
 # Image motion: 15 px of 6.5 um, 32 arcsec, 75 m on the ground, as without any calibration (paper 003: 100 m class). A
 # camera that is mounted askew by one arc minute lets the pitch be seen, but to 400 px with sixty points of 0.3 px.
 WORST = 1e-4

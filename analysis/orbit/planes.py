@@ -25,14 +25,12 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 
-__all__ = ["METHODS", "Method", "NearVerticalWarning", "PlaneError", "PlaneFit", "Station", "Strip", "fit_plane"]
-
-Array = NDArray[np.float64]
 Method = Literal["printed", "corrected", "tls"]
 METHODS: tuple[Method, ...] = get_args(Method)
 # Points fix the turn of the plane about their line of sight when they spread across it by more than so many sigmas.

@@ -23,16 +23,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.planes import Station, Strip
 
-__all__ = ["ObservedLine", "Resection", "ResectionError", "resect"]
-
-Array = NDArray[np.float64]
 _ATTITUDE = ("roll", "pitch", "yaw")
 _STATION = ("station x", "station y", "station z")
 # A look angle farther than this from the laboratory's, radians, is a mistake and not a change: 1 deg.

@@ -29,22 +29,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 
-__all__ = [
-    "BIAS",
-    "DRIFT",
-    "INTERIOR",
-    "LineModel",
-    "Partials",
-    "Rays",
-    "Seen",
-    "bias_rotation",
-    "misclosure",
-    "partials",
-]
-
-Array = NDArray[np.float64]
 INTERIOR = ("f", "x", "y")
 BIAS = ("roll", "pitch", "yaw")
 DRIFT = ("d_alpha", "d_beta", "d_gamma", "d_f")

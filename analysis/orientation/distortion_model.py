@@ -32,11 +32,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 
-Array = NDArray[np.float64]
 # power of tan W and sign of each term
 _POWER = {
     "constant": (0, 1.0),

@@ -29,12 +29,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
+from analysis.arrays import Array
 from analysis.orientation.distortion_model import OrientationError, design, readings, slope
 
-Array = NDArray[np.float64]
 # With columns of length one, the worst combination of terms has this many times the sigma of the best. Five terms over
 # half a field have 270; f and a constant reach 1000 when the angles lie within 1 % of each other.
 _WORST_CONDITION = 1e3

@@ -19,14 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
+from analysis.arrays import Array
 from analysis.orientation.interior import InteriorOrientation, fit_interior_orientation
 from analysis.spots.centroid import energy_centroid, mean_frames
 from analysis.spots.noise import NoiseModel
 from analysis.turntable.dividing_error import CalibrationSeries
 
-__all__ = ["CALIBRATED", "SMOOTH", "Distortion", "PointMeans", "Spots", "locate_spots", "reduce_sets"]
-
-Array = NDArray[np.float64]
 CALIBRATED = ("constant", "principal_distance", "principal_point")
 """What distortion is counted from: eq. (2) with a constant."""
 SMOOTH = (*CALIBRATED, "radial3")

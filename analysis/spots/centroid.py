@@ -20,25 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.spots import spot_image
-from analysis.spots.likelihood import cramer_rao_bound, maximum_likelihood_fit
+from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_positions import SpotError, SpotPositions, difference_covariance
+from analysis.spots.spot_positions import SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 
-__all__ = [
-    "CENTROIDS",
-    "SpotError",
-    "SpotPositions",
-    "cramer_rao_bound",
-    "difference_covariance",
-    "energy_centroid",
-    "gaussian_fit",
-    "maximum_likelihood_fit",
-    "mean_frames",
-]
-
-Array = NDArray[np.float64]
 # How far the Gaussian's centre may wander from the first guess, px.
 _GAUSS_MOVE_PX = 4
 

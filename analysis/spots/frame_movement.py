@@ -7,16 +7,12 @@ from collections.abc import Callable, Iterator
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.stats import chi2
 
+from analysis.arrays import Array, Mask
 from analysis.spots.noise import NoiseModel
 
-__all__ = ["FALSE_ALARM", "MEDIAN", "MOST_MOVES", "aligned", "basis_of", "place_scatter", "robust_fit", "shown_pixels"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 FALSE_ALARM = 1e-6
 """Chance that a test finds something in clean frames of one spot in one state."""
 MEDIAN = math.pi / 2.0

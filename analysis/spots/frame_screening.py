@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.stats import norm
 
+from analysis.arrays import Array, Mask
 from analysis.measurement_error import MeasurementError
-from analysis.spots import rounding
 from analysis.spots.frame_movement import (
     FALSE_ALARM,
     MEDIAN,
@@ -34,21 +34,8 @@ from analysis.spots.frame_movement import (
     robust_fit,
     shown_pixels,
 )
-from analysis.spots.noise import NoiseModel
+from analysis.spots.noise import SHOWN, WHOLE, NoiseModel
 
-__all__ = [
-    "FALSE_ALARM",
-    "Finding",
-    "FramesError",
-    "ScreenedFrames",
-    "noise_ratio",
-    "screen_frames",
-    "shown_noise",
-    "subtracted_level",
-]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Released = Callable[[NDArray[Any]], None]
 _HELD = 1 << 25
 """Bytes of frames that are worked on at a time."""
@@ -451,7 +438,7 @@ def noise_ratio(
         return None
     middle = stack.median()
     low = float(np.median(middle))
-    if noise.frame_variance_dn2(low) < rounding.SHOWN**2 + rounding.WHOLE:
+    if noise.frame_variance_dn2(low) < SHOWN**2 + WHOLE:
         # frames show what rounding makes of it, more or less, as pixels stand between two steps
         return None
     beside = middle < low + _LIT * (float(middle.max()) - low) if where is None else where

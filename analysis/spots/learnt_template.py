@@ -37,13 +37,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from analysis.arrays import Array
 from analysis.spots import spot_image
 from analysis.spots.frame_screening import Finding, ScreenedFrames
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, noise_parts
 from analysis.spots.spot_template import SmearedShape, SpotTemplate
 
-Array = NDArray[np.float64]
 MARGIN_PX = 40
 """By which the shape is larger than the image, so that it can be shifted over it."""
 _TAPER_PX = 4

@@ -3,24 +3,30 @@
 Model of a pixel: background + flux * shape(row, column); normal likelihood with the variance temporal / frames + fixed
 pattern at the model's grey value. Fisher scoring (Kay, Estimation Theory, 1993, sec. 7.7), from two starts. The
 functions are public through `centroid`. Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
+
+What is to be thought of fits of spots: did they come to rest, and has the spot the shape that was fitted?
+
+Reduced chi-squares are judged twice: over the whole image, which the noise of the frames decides, and over the spot's
+core, which its shape decides. Each limit is exceeded with a chance of `FALSE_ALARM` by a spot that has the calibrated
+shape in frames of the stated noise; both stand for pixels whose noise is that of a normal distribution with the excess
+that shot noise of few electrons has (Satterthwaite, Biometrics Bulletin 2, 110 (1946)).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
+from analysis.arrays import Array, OfStates
 from analysis.spots import spot_image
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate, TemplateRangeError
+from analysis.statistics import limit_of
 
-__all__ = ["CORE_SHARE", "cramer_rao_bound", "image_bound", "maximum_likelihood_fit"]
-
-Array = NDArray[np.float64]
 _REST_PX = 1e-6
 _FLUX_SIGMAS = 5.0
 # Side of the part of the image that the start is sought in, and the number of steps there; they cost a ninth each.
@@ -325,37 +331,6 @@ def _step(
     return theta + step * short[:, None], length, inverse, weighted
 
 
-def cramer_rao_bound(
-    template: SpotTemplate,
-    row: ArrayLike,
-    column: ArrayLike,
-    flux: ArrayLike,
-    background: ArrayLike,
-    noise: NoiseModel,
-    frames: int,
-) -> Array:
-    """Least covariance (B, 2, 2) px^2 of (row, column) that any unbiased estimator can reach when all four are
-    unknown.
-
-    Inverse Fisher information of the normal likelihood (Kay, Estimation Theory, 1993, eq. 3.31) without the term of
-    the variance's own derivative, which Poisson noise does not have.
-
-    Args:
-        template: T shapes; spot b has shape b modulo T.
-        row: (B,), px.
-        column: (B,), px.
-        flux: (B,), DN.
-        background: (B,), DN with black level.
-        noise: of the detector; the fixed pattern counts: the bound is for one image by itself.
-        frames: of which an image is the mean.
-    """
-    values = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, np.float64)) for v in (row, column, flux, background)))
-    theta = np.stack(values, axis=1)
-    which = np.arange(len(theta)) % template.count
-    design, level = spot_image.template_model(theta, which, template)
-    return _bound(design, level, noise, frames)
-
-
 def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: int) -> Array:
     """Cramer-Rao bound (B, 2, 2) px^2 of spots of which there is an image without noise, and no template.
 
@@ -364,8 +339,8 @@ def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: 
             for the slopes (differences of fourth order: the sigmas of a spot whose first dark ring is at 7 px come out
             2e-3 too low, of wider ones less).
         background: DN with black level.
-        noise: as `cramer_rao_bound`.
-        frames: likewise.
+        noise: of the detector; the fixed pattern counts: the bound is for one image by itself.
+        frames: of which an image is the mean.
     """
     image = np.asarray(light, np.float64)
     count, inner = len(image), image[:, 2:-2, 2:-2]
@@ -384,3 +359,99 @@ def _bound(design: Array, level: Array, noise: NoiseModel, frames: int) -> Array
     design = design / np.sqrt(spot_image.variance(level, noise, frames))[:, None]
     information = design @ design.transpose(0, 2, 1)
     return np.asarray(np.linalg.inv(information)[:, :2, :2], dtype=np.float64)
+
+
+FALSE_ALARM = 1e-8
+"""Chance that one of both limits of one fit is exceeded by a spot that is as calibrated: 2e-7 of a run with four spots
+before and after, 1e-4 of a course of a thousand times."""
+UNRESTED = "the fit does not come to rest from either of two starts; the spot has not the calibrated shape"
+"""Why a spot is refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitStates(OfStates):
+    """Judgements of fits, arrays of one shape: (B,), or (S, C) as `reshaped` makes them.
+
+    Attributes:
+        whole, core: reduced chi-squares of all pixels and of the core's; NaN where no shape was fitted.
+        whole_limit, core_limit: of these; infinite where no shape was fitted.
+        whole_sigma, core_sigma: what the noise of the frames makes of them, one standard deviation.
+        noise: the noise of the frames over the stated one, squared, by the median of all pixels.
+    """
+
+    whole: Array
+    core: Array
+    whole_limit: Array
+    core_limit: Array
+    whole_sigma: Array
+    core_sigma: Array
+    noise: Array
+
+    @property
+    def fits(self) -> NDArray[np.bool_]:
+        """Whether the spot has the shape and the noise that were assumed; true where that cannot be told."""
+        beyond = (self.whole > self.whole_limit) | (self.core > self.core_limit)
+        return np.asarray(~beyond)
+
+    @property
+    def widening(self) -> Array:
+        """Factor of sigma: 1 for a spot that fits; else the root of the larger reduced chi-square (Birge, Physical
+        Review 40, 207 (1932)).
+        """
+        with np.errstate(invalid="ignore"):
+            grown = np.sqrt(np.fmax(self.whole, self.core))
+        return np.where(self.fits, 1.0, np.maximum(grown, 1.0))
+
+    def reshaped(self, spots: int) -> FitStates:
+        """(S, C) from S states of C spots each.
+
+        Args:
+            spots: C.
+        """
+        return FitStates(*(values.reshape(-1, spots) for values in vars(self).values()))
+
+
+def fit_states(positions: SpotPositions) -> FitStates:
+    """Judge B fits.
+
+    Args:
+        positions: as measured.
+    """
+    count = positions.row.size
+    if positions.degrees is None or positions.core_chi_square is None:
+        nothing, endless = np.full(count, np.nan), np.full(count, np.inf)
+        return FitStates(nothing, nothing, endless, endless, nothing, nothing, nothing)
+    limit = limit_of(0.5 * FALSE_ALARM, positions.degrees) / positions.degrees
+    whole, core = positions.reduced_chi_square, positions.core_chi_square
+    noise = np.full(count, np.nan) if positions.median_square is None else positions.median_square
+    sigma = np.sqrt(2.0 / positions.degrees)
+    return FitStates(whole, core, limit[:, 0], limit[:, 1], sigma[:, 0], sigma[:, 1], noise)
+
+
+def widened(positions: SpotPositions, factor: Array) -> SpotPositions:
+    """Positions whose sigmas hold what their fits say.
+
+    Args:
+        positions: B of them.
+        factor: of the sigmas, (B,), as `FitStates.widening`.
+    """
+    if np.all(factor == 1.0):
+        return positions
+    square, gain = factor[:, None, None] ** 2, positions.gain_maps
+    return replace(
+        positions,
+        temporal_covariance=positions.temporal_covariance * square,
+        fixed_covariance=positions.fixed_covariance * square,
+        gain_maps=None if gain is None else gain * factor[:, None, None, None],
+    )
+
+
+def require_rest(positions: SpotPositions) -> SpotPositions:
+    """Return the positions; raise SpotError for spots whose fit has not come to rest.
+
+    Args:
+        positions: as measured.
+    """
+    if not np.all(positions.converged):
+        raise SpotError({int(n): UNRESTED for n in np.flatnonzero(~positions.converged)})
+    return positions

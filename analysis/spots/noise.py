@@ -8,27 +8,123 @@ Two kinds are kept apart because they behave differently in a before/after compa
 - fixed-pattern noise (PRNU, DSNU) is the same in every frame, does not average down, and is common to all images that
   the same pixels take.
 
-Rounding to grey values is of the one kind or of the other (`analysis.spots.rounding`): new in every frame where noise
+Rounding to grey values is of the one kind or of the other (`analysis.spots.noise`): new in every frame where noise
 spreads over the steps, and the same in every frame, though another one in every image, where it does not.
 
 What a detector has beyond that model is told as further terms of either kind, each by its variance; like the others
 they are independent from pixel to pixel.
 
 Grey values are in DN as recorded, with the black level and the dark signal still in.
+
+What rounding to whole grey values does to the mean of frames.
+
+A pixel of mean level m and noise n is recorded as the integer nearest to m + n. Over pixels whose m lies anywhere
+between two steps, the error is even and independent of n, with a variance of 1/12 DN^2. But part of it is the same in
+every frame, and stays in the mean of however many: the mean error
+
+    b(m) = sum over k of (-1)^k / (pi k) |phi(2 pi k)| sin(2 pi k m),
+
+phi being the characteristic function of the noise (Widrow and Kollar, Quantization Noise, 2008, sec. 4.3 and 19.2: the
+noise is a dither). Its mean square over m is sum over k of |phi(2 pi k)|^2 / (2 pi^2 k^2): for normal noise of s DN
+1/12 at s = 0, a tenth of that at 0.24 DN, the limit of EMVA 1288 (release 3.1, sec. 6.4), and nothing at 1 DN. The rest
+of the 1/12 is new in every frame. Light comes in electrons: where a gain is near a whole number of grey values per
+electron shot noise does not spread over the steps, and the characteristic function of Poisson's law says so.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+from scipy.special import ndtr
 
-from analysis.spots import rounding
+from analysis.arrays import Array
 
-__all__ = ["FurtherNoise", "NoiseModel"]
+WHOLE = 1.0 / 12.0
+"""Variance of rounding, DN^2, in one frame."""
+FINE = 1.0
+"""DN of normal noise from which all of it is new in every frame: what stays is 4e-19 DN^2."""
+COARSE, FEW = 0.3, 3.0
+"""DN of noise, at so many DN of light, below which rings and wings of a spot are drawn in steps that all frames share:
+what rounding does there is alike in neighbouring pixels, which `systematic_variance` cannot know."""
+SHOWN = 0.4
+"""DN of noise that grey values show to a tenth, wherever between two steps pixels stand."""
+_TERMS, _NOTHING = 60, 1e-12
+"""Harmonics at most, and the square of phi below which they are left out."""
+
+
+def systematic_variance(electrons: ArrayLike, read_e2: ArrayLike, gain: float) -> Any:
+    """Variance over pixels of what rounding does to all frames of an image alike, DN^2, of the shape of ``electrons``.
+
+    Args:
+        electrons: mean of each pixel, of light and dark signal, >= 0: Poisson's law.
+        read_e2: variance of normal noise, electrons squared; a number, or of the shape of ``electrons``.
+        gain: DN per electron.
+    """
+    mean, read = np.asarray(electrons, np.float64), np.asarray(read_e2, np.float64)
+    out = np.zeros(np.broadcast_shapes(mean.shape, read.shape))
+    least = float(read.min()) * gain**2
+    for k in range(1, _TERMS + 1):
+        normal = 4.0 * (math.pi * k) ** 2
+        if normal * least > -math.log(_NOTHING):
+            break
+        out += np.exp(-normal * gain**2 * read - 2.0 * (1.0 - math.cos(2.0 * math.pi * k * gain)) * mean) / (
+            0.5 * normal
+        )
+    return out
+
+
+def temporal_part(variance: float) -> float:
+    """Part of the variance of grey values over frames that rounding causes, DN^2. It is the mean over all places
+    between two steps, for normal noise before rounding.
+
+    Args:
+        variance: DN^2.
+    """
+
+    def excess(own: float) -> float:
+        return own + WHOLE - float(systematic_variance(0.0, own, 1.0)) - variance
+
+    if variance > FINE**2 + WHOLE:
+        return WHOLE
+    if excess(0.0) >= 0.0:
+        return variance
+    return variance - float(brentq(excess, 0.0, variance, xtol=1e-12))
+
+
+@cache
+def _temporal_extremes() -> tuple[Array, Array, Array]:
+    """Noise variances before rounding, (N,) DN^2, and the least and largest variance over frames that a pixel may have
+    with each, over its places between two steps, (N,) DN^2.
+    """
+    sigma = np.linspace(0.0, FINE, 201)[1:, None, None]
+    place = np.linspace(0.0, 0.5, 51)[:, None]
+    steps = np.arange(-8.0, 9.0)
+    share = ndtr((steps + 0.5 - place) / sigma) - ndtr((steps - 0.5 - place) / sigma)
+    mean = (share * steps).sum(axis=-1)
+    variance = (share * steps**2).sum(axis=-1) - mean**2
+    own = sigma.ravel() ** 2
+    return np.append(0.0, own), np.append(0.0, variance.min(axis=1)), np.append(0.25, variance.max(axis=1))
+
+
+def noise_range(variance: float, doubt: float) -> tuple[float, float]:
+    """Least and largest variance of normal noise before rounding, DN^2, that goes with a variance over frames of pixels
+    that all stand at one place between two steps, wherever that is.
+
+    Args:
+        variance: of grey values over frames, DN^2.
+        doubt: by how much it may be wrong, DN^2.
+    """
+    if variance > FINE**2 + WHOLE:
+        return variance - WHOLE, variance - WHOLE
+    own, least, largest = _temporal_extremes()
+    fits = own[(least <= variance + doubt) & (largest >= variance - doubt)]
+    return float(fits.min()), float(fits.max())
 
 
 class FurtherNoise(Protocol):
@@ -94,7 +190,7 @@ class NoiseModel:
         """The part of the variance of one frame that does not depend on the signal: read noise, and the 1/12 DN^2 of
         rounding, temporal or not.
         """
-        return (self.gain_dn_per_e * self.dark_noise_e) ** 2 + rounding.WHOLE
+        return (self.gain_dn_per_e * self.dark_noise_e) ** 2 + WHOLE
 
     @property
     def dsnu_variance_dn2(self) -> float:
@@ -141,7 +237,7 @@ class NoiseModel:
     @property
     def _rounds_coarsely(self) -> bool:
         """Whether read noise alone does not make rounding white at every signal."""
-        return self.gain_dn_per_e * self.dark_noise_e < rounding.FINE
+        return self.gain_dn_per_e * self.dark_noise_e < FINE
 
     def rounding_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
         """Part of the variance of a frame that rounding causes alike in all frames of an image, DN^2; shape of
@@ -151,7 +247,7 @@ class NoiseModel:
             return np.zeros(np.shape(mean_signal_dn))
         electrons = np.maximum(np.subtract(mean_signal_dn, self.offset_dn), 0.0) / self.gain_dn_per_e
         read = self.dark_noise_e**2 + sum(term.temporal_variance_e2(electrons) for term in self.further)
-        return rounding.systematic_variance(electrons, read, self.gain_dn_per_e)
+        return systematic_variance(electrons, read, self.gain_dn_per_e)
 
     def fixed_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
         """Variance over pixels of what is the same in every frame, DN^2: the pattern prnu^2 s^2 + (K dsnu)^2 with s the

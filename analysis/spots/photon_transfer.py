@@ -18,14 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.spots import rounding
+from analysis.arrays import Array, Mask
 from analysis.spots.frame_screening import FramesError
-from analysis.spots.noise import NoiseModel
+from analysis.spots.noise import WHOLE, NoiseModel, noise_range, systematic_variance, temporal_part
+from analysis.statistics import robust_sigma
 
-__all__ = ["PhotonTransfer", "PixelCorrection", "photon_transfer", "pixel_correction"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 _HOT_SIGMAS = 10.0
 _RESPONSE = (0.5, 1.5)
 """Range of the response of a usable pixel, relative to that of the others."""
@@ -135,7 +132,7 @@ def _usable(dark: Array, flat: Array) -> Mask:
     good = np.ones(dark.shape, dtype=bool)
     for image in (dark, flat):
         away = np.abs(image - np.median(image))
-        good &= away <= _HOT_SIGMAS * max(1.4826 * float(np.median(away)), 1e-9)
+        good &= away <= _HOT_SIGMAS * max(robust_sigma(away), 1e-9)
     return good
 
 
@@ -164,7 +161,7 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
         raise FramesError(
             f"the flat frames are only {signal:.3g} DN brighter than the dark ones", "flat frames at half of saturation"
         )
-    dark_steps, steps = rounding.temporal_part(dark_variance), rounding.temporal_part(variance)
+    dark_steps, steps = temporal_part(dark_variance), temporal_part(variance)
     shot = variance - dark_variance + (dark_steps - steps)
     own = max(dark_variance - dark_steps, 0.0)
     dark_spread = dark_variance * math.sqrt(2.0 / (pixels * (len(night) - 1)))
@@ -175,7 +172,7 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
             "raw frames, neither averaged, smoothed nor compressed",
         )
     # of few changes of a grey value another number might have been seen; frames of even light have pixels at all places
-    low, high = rounding.noise_range(dark_variance, 5.0 * dark_spread + 5.0 / (pixels * (len(night) - 1)))
+    low, high = noise_range(dark_variance, 5.0 * dark_spread + 5.0 / (pixels * (len(night) - 1)))
     dark_doubt = max(high - own, own - low)
     if dark_doubt > 0.0:
         spread = math.hypot(spread, dark_doubt)
@@ -191,8 +188,8 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
     if dark_doubt > 0.0:
         noise_sigma = math.hypot(noise_sigma, _square_root_sigma(own, dark_doubt) / gain)
     left, dark_left = variance / len(day), dark_variance / len(night)
-    stays, dark_stays = rounding.WHOLE - steps, rounding.WHOLE - dark_steps
-    hidden = float(rounding.systematic_variance(0.0, low, 1.0))
+    stays, dark_stays = WHOLE - steps, WHOLE - dark_steps
+    hidden = float(systematic_variance(0.0, low, 1.0))
     dsnu, dsnu_sigma = _pattern(level, good, (dark_left, dark_stays), hidden)
     prnu, prnu_sigma = _pattern(light - level, good, (left, dark_left, stays + dark_stays), hidden)
     return PhotonTransfer(
@@ -247,8 +244,7 @@ def pixel_correction(noise: NoiseModel, dark: NDArray[Any] | None, flat: NDArray
     night = _stack(dark if dark is not None else np.zeros((0,)), "dark")
     level = night.mean(axis=0)
     away = level - float(np.median(level))
-    sigma = 1.4826 * float(np.median(np.abs(away)))
-    bad = np.abs(away) > _HOT_SIGMAS * max(sigma, 1e-9)
+    bad = np.abs(away) > _HOT_SIGMAS * max(robust_sigma(away), 1e-9)
     variance = _temporal(np.where(bad, np.median(night, axis=(1, 2), keepdims=True), night))
     stays = float(noise.rounding_variance_dn2(noise.dark_level_dn))
     left = math.sqrt(variance / len(night) + stays) / noise.gain_dn_per_e

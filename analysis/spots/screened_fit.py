@@ -20,19 +20,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from analysis.arrays import Array, Mask
 from analysis.spots import spot_image
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
 
-__all__ = ["CORE_SHARE", "FitTerms", "ScreenedFit", "fit_screened", "model_parts", "one_shape"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 _REST_PX, _MOST_STEPS = 1e-6, 60
 _REST_SIGMAS = 1e-4
 """Largest last step of other spots, in sigmas. They may be so faint that their positions are uncertain by part of a
@@ -126,7 +122,7 @@ class ScreenedFit:
 
     def core_widening(self, learnt_from: ScreenedFit | None = None, noisier: float = 1.0) -> float:
         """Factor of sigma: 1 where the core has the calibrated shape, else the root of its reduced chi-square (as
-        `analysis.spots.fit_state.FitStates.widening`).
+        `analysis.spots.likelihood.FitStates.widening`).
 
         Args:
             learnt_from: as of `core_fits`.

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from analysis.arrays import Array
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 
-Array = NDArray[np.float64]
 _BIN = 4
 # A 4 x 4 bin must stand this many sigmas above the background to be called a spot: with some 600 bins in an image the
 # chance that noise alone does so is below 1e-6.

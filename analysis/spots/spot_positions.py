@@ -21,12 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 from analysis.spots.noise import NoiseModel
-
-__all__ = ["NoiseParts", "SeriesNoise", "SpotError", "SpotPositions", "difference_covariance", "noise_parts"]
-
-Array = NDArray[np.float64]
 
 
 class SpotError(MeasurementError, ValueError):

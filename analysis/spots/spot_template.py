@@ -25,11 +25,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 from scipy.interpolate import BSpline
 
+from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError, UndeterminedError
 
-__all__ = ["SmearedShape", "SpotTemplate", "TemplateRangeError"]
-
-Array = NDArray[np.float64]
 _DEGREE = 5
 _TAPS = _DEGREE + 1
 SHARPEST = 4.0

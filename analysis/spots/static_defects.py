@@ -27,14 +27,15 @@ from numpy.typing import NDArray
 from scipy import ndimage, signal
 from scipy.stats import chi2, norm
 
+from analysis.arrays import Array, Mask
 from analysis.spots import spot_image
-from analysis.spots.frame_screening import FALSE_ALARM, Finding, ScreenedFrames
+from analysis.spots.frame_movement import FALSE_ALARM
+from analysis.spots.frame_screening import Finding, ScreenedFrames
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened, model_parts
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
-
-Array = NDArray[np.float64]
+from analysis.statistics import robust_sigma
 
 
 def repaired_centroid(
@@ -82,7 +83,6 @@ def repaired_centroid(
     return positions, float(np.sqrt(np.trace(new + old) / np.trace(ideal)) - 1.0)
 
 
-Mask = NDArray[np.bool_]
 CLOSER = 4.5
 """Sigmas of a pixel from which it is left out of an image that is known to hold defects."""
 MOST_OTHERS = 3
@@ -439,7 +439,7 @@ def _second_light(
             return None
         # what a spot of another shape leaves over lies all around it
         ring = (np.abs(away - away[top]) < 3.0) & (np.hypot(row - top[0], column - top[1]) > 8.0)
-        rest = 1.4826 * float(np.median(np.abs(score[ring]))) if np.count_nonzero(ring) > 20 else 1.0
+        rest = robust_sigma(score[ring]) if np.count_nonzero(ring) > 20 else 1.0
         if score[top] > _ABOVE_RING * max(rest, 1.0):
             return float(top[0]), float(top[1])
         score = np.where(np.hypot(row - top[0], column - top[1]) > 4.0, score, 0.0)

@@ -37,10 +37,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import beta, chi2, norm
 
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 from analysis.turntable import angle_fits
+from analysis.turntable.angle_fits import NotConvergedError
 
-Array = NDArray[np.float64]
 FEWEST = 3
 """Fewest readings of which one can be rejected: two readings deviate by the same amount."""
 
@@ -329,7 +330,7 @@ def choose(
             trials[name] = Trial(
                 angle_fits.fit(name, *points, seed), angle_fits.cross_validate(name, *points, seed, folds)
             )
-        except angle_fits.NotConvergedError as error:
+        except NotConvergedError as error:
             failed[name] = str(error)
     if not trials:
         raise UndeterminedError(f"no fit of the dividing error succeeded: {'; '.join(failed.values()) or 'none asked'}")

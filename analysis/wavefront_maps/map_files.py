@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from analysis.images import fits_image
-from analysis.images.image_file import ImageError, ImageFile
+from analysis.images.image_file import ImageFile
+from analysis.images.image_header import ImageError
 from analysis.wavefront_maps import text_grids, zygo_files
 from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap, agreed, metres_per
-
-__all__ = ["MapError", "WavefrontMap", "read_map"]
 
 _PUPIL_SCALE = ("PUPLSCAL", "PIXELSCL", "PIXSCALE")
 """Keys of FITS files of pupils with metres per pixel, as POPPY writes and reads them."""

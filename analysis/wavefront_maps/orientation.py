@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.chi_square import chance_beyond
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
-from analysis.wavefront_maps.wavefront_map import Array, MapError, WavefrontMap
-from analysis.wavefront_maps.zernike_terms import noll_to_nm
+from analysis.statistics import chance_beyond
+from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
+from analysis.wavefront_maps.zernike_table import noll_to_nm
 
 _NAMES = {
     (False, 0): "as it is",
@@ -227,21 +228,3 @@ def tellable(
         allowed=tuple(one for one, p in zip(ranked, chance, strict=True) if p >= false_alarm),
         together=tuple(one for one, c in zip(ranked, chi_square, strict=True) if c - chi_square[0] < limit),
     )
-
-
-def separations(
-    expected: Array, covariance: Array, terms: Sequence[int], readings: Sequence[Orientation] = READINGS
-) -> Array:
-    """By how much wrong readings will raise the chi-square of a measurement that turns out as predicted, (K,).
-
-    A value below twice the logarithm of the odds of ``tellable`` says, before anything is measured, that the reading
-    will not be told from the right one.
-
-    Args:
-        expected: coefficients that are predicted, (F, Z), metres.
-        covariance: as for ``tellable``.
-        terms: indices of Noll, (Z,).
-        readings: relative to the right one.
-    """
-    rest = np.stack([(one.coefficients(expected, terms) - expected).ravel() for one in readings], axis=-1)
-    return np.asarray(np.sum(rest * np.linalg.solve(covariance, rest), axis=0))

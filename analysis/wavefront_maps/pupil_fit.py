@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2
 
+from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
-from analysis.wavefront_maps.wavefront_map import Array, MapError, WavefrontMap
-from analysis.wavefront_maps.zernike_terms import circle_terms, noll_to_nm
+from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
+from analysis.wavefront_maps.zernike_table import circle_terms, noll_to_nm
 
 HELD = 1e-6
 """Share of a term that has to be left beside those before it; below it the light does not tell them apart."""

@@ -14,15 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.wavefront_maps.wavefront_map import (
-    Array,
-    MapError,
-    WavefrontMap,
-    agreed,
-    length_from,
-    metres_per,
-    unit_named,
-)
+from analysis.arrays import Array
+from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap, agreed, length_from, metres_per, unit_named
 
 MOST_BYTES = 100_000_000
 MOST_POINTS = 20_000_000

@@ -9,8 +9,8 @@ import sys
 import numpy as np
 from scipy import ndimage
 
+from analysis.matching.correlation import MatchOptions
 from analysis.matching.least_squares import least_squares
-from analysis.matching.options import MatchOptions
 from optics.geometry import zernike
 
 SEED = 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from docs.site.markdown import anchor, code, prose, sentence, slug, table
+from docs.site.markdown import anchor, code, prose, sentence, table
 from docs.site.spec_examples import Example, example, shipped
 from docs.site.spec_keys import Key, Section, sections, summary
 from scenes.schema import MODELS
@@ -171,6 +171,3 @@ def takes_text(key: Key) -> str:
     elif what.startswith(("mapping of the terms", "mapping (")):
         return what
     return "; ".join(part for part in (f"{what} {units}".strip(), key.takes.limits) if part)
-
-
-__all__ = ["FOLDER", "READ_BY", "file_pages", "kinds", "slug", "takes_text", "title"]

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from docs.site.spec_keys import NAMED, NODE, Key, Section, every_key, flow, keys, sections, taken
+from docs.site.spec_keys import NAMED, NODE, Key, Section, every_key, flow, keys, taken
 from scenes.schema import MODELS
 from scenes.specs.load import SCENES
 from scenes.yaml.errors import InputError
@@ -195,6 +195,3 @@ def _values(key: Key) -> Iterator[Any]:
 def examples(kind: str) -> dict[tuple[type[Spec], str], Example]:
     """Example of every key of one sort of file."""
     return {(section.model, key.name): example(kind, section, key) for section, key in every_key(MODELS[kind])}
-
-
-__all__ = ["Example", "accepted", "example", "examples", "kinds_of", "sections", "shipped"]

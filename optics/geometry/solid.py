@@ -24,7 +24,7 @@ import numpy as np
 
 from optics.geometry.pose import Pose
 from optics.geometry.tree import PlacedBodies
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 
 if TYPE_CHECKING:  # takes a third of a second
     import trimesh

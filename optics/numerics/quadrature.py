@@ -106,14 +106,6 @@ def disk_size(phase: float) -> tuple[int, int]:
     return int(np.ceil(0.25 * phase)) + 3, arms + arms % 2
 
 
-@cache
-def square(points: int) -> PupilNodes:
-    """Gauss-Legendre product quadrature over [-1, 1]^2 with points x points nodes."""
-    s, w = gauss(points)
-    x, y = np.meshgrid(s, s)
-    return _frozen(x.ravel(), y.ravel(), np.outer(w, w).ravel())
-
-
 def _frozen(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> PupilNodes:
     arrays = [np.array(a) for a in (x, y, weight)]
     for array in arrays:

@@ -9,7 +9,7 @@ import numpy as np
 
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from optics.raytrace.assembly import Assembly, Element
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace

@@ -7,34 +7,17 @@ along the ray obeys n'' = |g|^2 n, so that
     r(tau) = r0 + T0 tau + g [n0 (cosh x - 1) / |g|^2 + a (sinh x / |g| - tau) / |g|^2],
     optical path = integral of n^2 d tau.
 
-The hyperbolic functions are taken as their power series, which have no 0/0 at g = 0; ``truncation_bound`` bounds what
-is left out. (Born and Wolf, Principles of Optics, section 3.2, for the ray equation.)
+The hyperbolic functions are taken as their power series, which have no 0/0 at g = 0. (Born and Wolf,
+Principles of Optics, section 3.2, for the ray equation.)
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cosh
 from typing import Any
 
 from optics.geometry.surface import SurfaceNumbers, level
 from optics.numerics.number_tree import map_leaves
-
-
-def truncation_bound(gradient: float, length: float, index: float = 1.5) -> tuple[float, float]:
-    """Bounds of the errors of position and optical path (metres) from cutting the series off.
-
-    Args:
-        gradient: |grad n|, 1/m.
-        length: of the ray in the medium, metres.
-        index: refractive index; the ray's parameter is at most length / min(index along it), taken as length.
-    """
-    x = gradient * length
-    growth = cosh(x)  # all later terms together are at most the first one left out times cosh
-    position = gradient * length**2 * (index / 2.0 * x**6 / 20160.0 + index / 6.0 * length * gradient * x**6 / 60480.0)
-    y = (2.0 * x) ** 2
-    path = index**2 * length * (y**4 / 725760.0 + x * y**3 / 20160.0 + x**2 * y**3 / 181440.0)
-    return position * growth, path * cosh(2.0 * x)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Body
 from optics.numerics.array_math import inner, norm
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.raytrace.assembly import Element, Interaction
 
 EDGE = 0.003

@@ -12,8 +12,8 @@ import numpy as np
 
 from optics.geometry.surface import SurfaceNumbers, along, level, newton_step
 from optics.numerics.backend import Backend
+from optics.numerics.invariants import PhysicalError
 from optics.numerics.number_tree import map_leaves
-from optics.numerics.physical_error import PhysicalError
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.element_numbers import CoordinateNumbers, ElementNumbers, FrameNumbers, IndexNumbers, Structure
 from optics.raytrace.graded_ray import GradedRay, meeting

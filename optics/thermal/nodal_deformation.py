@@ -29,7 +29,7 @@ from optics.geometry.pose import triple
 from optics.geometry.surface import GridFigure, Surface
 from optics.geometry.tree import Motion
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 
 if TYPE_CHECKING:  # every file of a job waits for this module, and none for scipy
     from scipy.sparse import sparray

@@ -20,22 +20,8 @@ from scipy.sparse.linalg import splu
 from skfem import CellBasis, ElementHex2, ElementTetP2, MeshHex2, MeshTet1
 
 from optics.materials.material import Material
-from optics.numerics.physical_error import UnphysicalError
-from optics.thermal.deformation import Displacement, FaceChange, Finder, face_change, rigid_modes
-
-__all__ = [
-    "Bonded",
-    "Displacement",
-    "ElasticBody",
-    "FaceChange",
-    "Field",
-    "Kinematic",
-    "Support",
-    "face_change",
-    "free_linear_field",
-    "solve",
-    "solve_many",
-]
+from optics.numerics.invariants import UnphysicalError
+from optics.thermal.deformation import Displacement, Finder, rigid_modes
 
 Field = Callable[[np.ndarray], Any]
 """Something at points: (P, 3) metres -> (P,)."""
@@ -220,18 +206,6 @@ class ElasticBody:
         matrix = np.stack([support.released(mode) for mode in modes], axis=-1)
         amount = np.linalg.solve(matrix, -support.released(at_points))
         return values + np.einsum("k,kx->x", amount, rigid_modes(self.nodes)).reshape(-1, 3)
-
-
-def solve(mesh: MeshHex2 | MeshTet1, material: Material, temperature: Field, support: Support) -> Displacement:
-    """Displacement of a body for one temperature change; see ``ElasticBody.solve_many``."""
-    return ElasticBody(mesh, material).solve_many([temperature], support)[0]
-
-
-def solve_many(
-    mesh: MeshHex2 | MeshTet1, material: Material, temperatures: Sequence[Field], support: Support | Sequence[Support]
-) -> tuple[Displacement, ...]:
-    """Displacements of a body for several temperature changes; see ``ElasticBody.solve_many``."""
-    return ElasticBody(mesh, material).solve_many(temperatures, support)
 
 
 def free_linear_field(

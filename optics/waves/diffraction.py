@@ -11,18 +11,108 @@ with w_j the pupil element. Because exp(ik(ux + vy)) factors, U on a grid of R x
 and an (N x C) matrix: no FFT grid, no padding, pixels wherever the detector has them (Soummer et al., Opt. Express
 15, 15935 (2007), here with arbitrary pupil nodes). Plancherel: with sum w_j |a_j|^2 = P over du dv the image
 integrates to P.
+
+How few samples of a wave are enough: its values on an even grid from others that stand as far apart as its aperture
+allows.
+
+Along one detector axis the field of a beam is a sum of exp(i q x) with |q| no more than the half width of the beam's
+directions. Such a function is known on a whole stretch from little more samples than its Nyquist number, if they reach
+somewhat beyond the stretch's ends (Slepian and Pollak, Bell Syst. Tech. J. 40, 43, 1961; here by least squares over all
+q of the band). A spot that its pixels sample well needs half or a third as many columns and rows as there are pixels.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
 
 from optics.numerics.threads import cores, one_blas_thread
-from optics.waves.field_samples import LONGEST, FieldSamples
+
+LONGEST = 256
+"""Points of a grid for which samples are worked out; longer ones are cut, since the work grows with the cube."""
+
+_BEYOND, _BEYOND_IF_LOOSE = 4.0, 3.0
+"""Nyquist distances by which samples reach beyond each end."""
+
+_TIGHT, _LOOSE = 2e-12, 1e-8
+"""Largest error of a wave of the band."""
+
+_OVER = 1.35
+_MORE, _MORE_IF_LOOSE = 22, 14
+"""Number of samples that is tried first: so many times the Nyquist number, and so many more."""
+
+_WIDER = 1.1
+"""Ladder of bands for which samples are worked out."""
+
+_WORTH = 0.8
+"""Share of the points from which it is as well to take them all."""
+
+_STEEPEST = 2.5
+"""Largest band, radians from one point to the next; beyond it the points themselves are too few."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSamples:
+    """Samples of a field along one axis, even and symmetric about the middle of the points.
+
+    Attributes:
+        step: between two samples, in steps of the points.
+        weights: of the samples (an even number M) in each of the N points, (N, M).
+    """
+
+    step: float
+    weights: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return self.weights.shape[1]
+
+    @classmethod
+    def of(cls, points: int, band: float, loose: bool) -> FieldSamples | None:
+        """Samples for a grid of points, or None where they would not be fewer than the points.
+
+        Args:
+            points: N of the grid, at most ``LONGEST``.
+            band: largest |q|, radians from one point to the next.
+            loose: right to 1e-8 of the sum of all waves' amplitudes, else to 2e-12.
+        """
+        if not 0.0 < band < _STEEPEST:
+            return None
+        rung = int(np.ceil(np.log(band) / np.log(_WIDER)))
+        return _samples(points, rung, loose)
+
+
+@lru_cache(maxsize=64)
+def _samples(points: int, rung: int, loose: bool) -> FieldSamples | None:
+    band = _WIDER**rung
+    nyquist, beyond = np.pi / band, _BEYOND_IF_LOOSE if loose else _BEYOND
+    first = _OVER * points / nyquist + (_MORE_IF_LOOSE if loose else _MORE)
+    reach = 0.5 * (points - 1) + beyond * min(nyquist, 0.25 * points)
+    for count in range(2 * int(np.ceil(0.5 * first)), int(_WORTH * points) + 1, 2):
+        step = 2.0 * reach / (count - 1)
+        # even and odd functions of the band, dense at its ends
+        nodes = (np.arange(2 * count) + 0.5) / (4 * count)
+        known, wanted = _plane_waves(points, count, step, band * np.cos(np.pi * nodes))
+        weights = np.linalg.lstsq(known, wanted, rcond=1e-15)[0]
+        between = band * np.cos(np.pi * (np.arange(2 * count) / (4 * count)))
+        seen, true = _plane_waves(points, count, step, between)
+        if np.max(np.abs(seen @ weights - true)) <= (_LOOSE if loose else _TIGHT):
+            weights = np.ascontiguousarray(weights.T)
+            weights.setflags(write=False)
+            return FieldSamples(step, weights)
+    return None
+
+
+def _plane_waves(points: int, count: int, step: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cosines and sines of frequencies at the samples and at the points."""
+    even = step * (np.arange(count) - 0.5 * (count - 1)), np.arange(points) - 0.5 * (points - 1)
+    first, then = (np.concatenate([np.cos(q[:, None] * x), np.sin(q[:, None] * x)]) for x in even)
+    return first, then
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,21 +143,6 @@ class PupilField:
         """
         size = np.asarray(size)[:, None]
         return PupilField(self.u * size, self.v * size, self.eikonal, self.amplitude * size, self.wavelength)
-
-    def repeated(self, count: int) -> PupilField:
-        """Every image ``count`` times in a row."""
-        u, v, eikonal, amplitude = (np.repeat(a, count, axis=0) for a in (self.u, self.v, self.eikonal, self.amplitude))
-        return PupilField(u, v, eikonal, amplitude, self.wavelength)
-
-
-@dataclass(frozen=True, eq=False)
-class PupilTangent:
-    """Derivatives of the arrays of a ``PupilField`` by one parameter, (B, N) each."""
-
-    u: np.ndarray
-    v: np.ndarray
-    eikonal: np.ndarray
-    amplitude: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -254,31 +329,6 @@ def at_crossings(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     columns = waves(turns * x[..., None] * field.u[:, None])
     wave = rows @ np.swapaxes(columns, 1, 2)
     return np.asarray((wave.real.astype(np.float64) ** 2 + wave.imag.astype(np.float64) ** 2) / field.wavelength**2)
-
-
-def image_derivative(field: PupilField, tangent: PupilTangent, x: Grid, y: Grid) -> np.ndarray:
-    """Derivative of ``image`` by the parameter of ``tangent``, exact, (B, R, C).
-
-    Args:
-        field: of B images.
-        tangent: its derivative by a parameter.
-        x: places along columns, C, metres.
-        y: along rows, R, metres.
-    """
-    k = 2.0 * np.pi / field.wavelength
-    out = np.empty((len(field.u), y.count, x.count))
-    for i in range(len(field.u)):
-        rows = _waves(k * field.v[i], y, 1.0, np.complex128).T
-        phasor = np.exp(1j * k * field.eikonal[i])
-        amplitude = field.amplitude[i] * phasor
-        columns = _waves(k * field.u[i], x, 1.0, np.complex128)
-        here = rows @ (amplitude[:, None] * columns)
-        own = (tangent.amplitude[i] + 1j * k * field.amplitude[i] * tangent.eikonal[i]) * phasor
-        step = rows @ (own[:, None] * columns)
-        step += 1j * k * x.points() * (rows @ ((amplitude * tangent.u[i])[:, None] * columns))
-        step += 1j * k * y.points()[:, None] * (rows @ ((amplitude * tangent.v[i])[:, None] * columns))
-        out[i] = 2.0 * np.real(np.conj(here) * step)
-    return out / field.wavelength**2
 
 
 _AT_ONCE = 2

@@ -4,6 +4,11 @@ An edge lies on a surface, a pupil is a function over the stop. The rays of one 
 are a smooth function of the stop's coordinates, as long as edges stop no ray in the trace. This function is fitted by
 polynomials and inverted at the corners of the edge's outline. What the edge blocks then is convex polygons on the stop,
 which ``optics.waves.pupil_shadow`` takes out of the pupil exactly.
+
+The part of a stop that light comes through: a quadrature over it, and whether it is a ring.
+
+Of a smooth integrand the whole disk is integrated by Gauss' rule, and what shadows take is taken off again, each of
+them by a rule of its own that ends at their sides. So edges leave no raster.
 """
 
 from __future__ import annotations
@@ -15,7 +20,8 @@ import numpy as np
 
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
 from optics.geometry.polygon import area, area_in_disk, compact, intersect, sides, widened
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics import quadrature
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, separate, tiled, without
 from optics.waves.pupil_terms import products, smooth_terms, to_terms
@@ -405,3 +411,60 @@ def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
     for polygon in clear:
         rest = [piece for part in rest for piece in without(part, polygon, fewest=True)]
     return rest
+
+
+ROUND = 1e-4
+"""By how much the second moment of a shadow may exceed that of a disk about the stop's middle with its area: of all
+shapes it has the least."""
+
+
+@dataclass(frozen=True, eq=False)
+class LitStop:
+    """Quadratures over the light of F beams.
+
+    Attributes:
+        x, y: nodes, in units of the stop's radius, (F, N).
+        weight: of the area, (F, N); negative in shadows, 0 for what only fills the rows.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def of(cls, pieces: np.ndarray, rings: int, count: int) -> LitStop:
+        """The stop without shadows.
+
+        Args:
+            pieces: convex polygons on the unit disk that do not overlap, (F, K, V, 2).
+            rings: of the rule over the whole stop.
+            count: nodes along each side of a shadow's box.
+        """
+        nodes = quadrature.disk(rings)
+        points, dark, _ = nodes_in_shadows(pieces, count)
+        whole = (len(pieces), nodes.count)
+        x, y = (
+            np.concatenate([np.broadcast_to(own, whole), taken], axis=1)
+            for own, taken in ((nodes.x, points.real), (nodes.y, points.imag))
+        )
+        return cls(x, y, np.concatenate([np.broadcast_to(nodes.weight, whole), -dark], axis=1))
+
+    @property
+    def light(self) -> np.ndarray:
+        """Share of the stop that light comes through, (F,)."""
+        return np.asarray(np.sum(self.weight, axis=1) / np.pi)
+
+
+def holes(pieces: np.ndarray) -> np.ndarray:
+    """Radius of the hole of each stop whose shadow is one disk about its middle, in units of the stop's, (F,); 0 where
+    there is no shadow, NaN where it is another.
+
+    Args:
+        pieces: convex polygons that do not overlap, (F, K, V, 2).
+    """
+    points, weight, _ = nodes_in_shadows(pieces, 4)
+    taken = np.sum(weight, axis=1)
+    moment = np.sum(weight * np.abs(points) ** 2, axis=1)
+    least = taken**2 / (2.0 * np.pi)
+    is_round = moment <= (1.0 + ROUND) * least
+    return np.asarray(np.where(is_round, np.sqrt(np.maximum(taken, 0.0) / np.pi), np.nan))

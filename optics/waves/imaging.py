@@ -103,7 +103,7 @@ def imaging_rays(
     nodes: PupilNodes,
     first: np.ndarray | None = None,
 ) -> ImagingRays:
-    """Trace the beams of ``imaging_field``; arguments and exceptions as there.
+    """Trace the beams of B systems that image a far point.
 
     Args:
         backend: where to trace.
@@ -114,6 +114,10 @@ def imaging_rays(
         stop: clear aperture of the stop.
         nodes: N nodes of a quadrature over the unit disk.
         first: as for ``aim_collimated``.
+
+    Raises:
+        AimError: the beam does not reach the stop.
+        BeamMissedError: no ray reaches the detector.
     """
     target = stop.radius * np.stack([nodes.x, nodes.y], axis=-1) + np.array(stop.centre)
     launched, axes = aim_collimated(backend, to_stop, direction, launch, target, first)
@@ -135,60 +139,23 @@ def imaging_rays(
     return ImagingRays(place, leaving, path, amplitude, launched, launch_area, axes)
 
 
-def imaging_field(
-    backend: Backend,
-    systems: SystemBatch,
-    to_stop: SystemBatch,
-    direction: np.ndarray,
-    launch: np.ndarray,
-    stop: Circle,
-    nodes: PupilNodes,
-    wavelength: float,
-    origin: np.ndarray | None = None,
-    incoming: Callable[[np.ndarray], np.ndarray] | None = None,
-    first: np.ndarray | None = None,
-) -> PupilField:
-    """Plane waves at the detector for B systems that image a far point.
-
-    Args:
-        backend: where to trace.
-        systems: B systems from the scene to the detector, whose x, y are the image's.
-        to_stop: the same systems, only as far as the stop.
-        direction: of the light, world, unit, (3,) or (B, 3).
-        launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres.
-        stop: clear aperture of the stop.
-        nodes: quadrature over the unit disk.
-        wavelength: metres.
-        origin: image point about which the field is wanted, in the detector's frame, (3,) or (B, 3), metres; default 0.
-        incoming: optical path that the beam brings along beyond that of a plane wave, (B, N) metres, at transverse
-            coordinates (B, N, 2) from the middle of the entrance pupil along the two axes of ``aim_collimated``.
-        first: as for ``aim_collimated``.
-
-    Returns:
-        Unit power through the stop if no other aperture cuts the beam; nodes that another aperture stops carry nothing.
-
-    Raises:
-        AimError: the beam does not reach the stop.
-        BeamMissedError: no ray reaches the detector.
-    """
-    return pupil_field(
-        imaging_rays(backend, systems, to_stop, direction, launch, stop, nodes, first), wavelength, origin, incoming
-    )
-
-
 def pupil_field(
     rays: ImagingRays,
     wavelength: float,
     origin: np.ndarray | None = None,
     incoming: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> PupilField:
-    """Plane waves of traced beams; arguments as ``imaging_field``.
+    """Return the plane waves at the detector of traced beams.
 
     Args:
         rays: B traced beams.
         wavelength: metres.
         origin: image point about which the field is wanted, in the detector's frame, (3,) or (B, 3), metres; default 0.
-        incoming: what the beam brings along beyond a plane wave, as for ``imaging_field``; nothing by default.
+        incoming: optical path that the beam brings along beyond that of a plane wave, (B, N) metres, at transverse
+            coordinates (B, N, 2) from the middle of the entrance pupil along the two axes of ``aim_collimated``.
+
+    Returns:
+        Unit power through the stop if no other aperture cuts the beam; nodes that another aperture stops carry nothing.
     """
     centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (len(rays.path), 3))[:, None]
     leaving = rays.direction

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from scipy.special import j1
 
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from optics.numerics.threads import cores
 
 FIT_ERROR = 1e-6

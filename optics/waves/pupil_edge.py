@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 
 WORST_BEND = 0.3
 """Largest sum of n^2 |c_n|: up to there the edge is convex and the iterations for its chords converge."""

@@ -24,7 +24,7 @@ from optics.geometry.polygon import (
     sides,
     widened,
 )
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.quadrature import gauss
 from optics.waves.pupil_edge import PupilEdge
 

@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.quadrature import PupilNodes, gauss, nodes_for
 from optics.numerics.threads import one_blas_thread
 from optics.waves.diffraction import PupilField

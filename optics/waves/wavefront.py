@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.geometry import zernike
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 
 
 def eikonal(position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -25,29 +25,6 @@ def eikonal(position: np.ndarray, direction: np.ndarray, path: np.ndarray, origi
     return np.asarray(path - np.sum(direction * (position - origin), axis=-1))
 
 
-def path_difference(
-    position: np.ndarray, direction: np.ndarray, path: np.ndarray, chief: int, radius: float = np.inf
-) -> np.ndarray:
-    """Optical path difference on the reference sphere centred where the chief ray meets the image.
-
-    Positive: the actual wavefront is ahead of the reference sphere, i.e. the ray needs less optical path than the
-    chief ray to reach it.
-
-    Args:
-        position: rays at the image, (..., N, 3), metres.
-        direction: unit directions there.
-        path: optical paths to ``position``, (..., N).
-        chief: index of the chief ray.
-        radius: distance from the exit pupil to the image along the chief ray, metres, positive when the pupil lies
-            upstream (may be infinite).
-
-    Returns:
-        (..., N) metres.
-    """
-    to_sphere = path_to_sphere(position, direction, path, position[..., chief : chief + 1, :], radius)
-    return np.asarray(to_sphere[..., chief : chief + 1] - to_sphere)
-
-
 def path_to_sphere(
     position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray, radius: float = np.inf
 ) -> np.ndarray:
@@ -58,7 +35,8 @@ def path_to_sphere(
         direction: unit directions there.
         path: optical paths to ``position``, (..., N).
         origin: the image point, broadcastable to (..., 1, 3).
-        radius: as for ``path_difference``; for an infinite one this is the ``eikonal``.
+        radius: of the sphere, metres, positive when the exit pupil lies upstream; for an infinite one this is the
+            ``eikonal``.
 
     Returns:
         (..., N) metres.

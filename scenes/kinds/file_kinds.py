@@ -68,7 +68,7 @@ FILE_KINDS = (
     ),
     FileKind(
         "error_budget",
-        "scenes.specs.error_budget:ErrorBudgetSpec",
+        "scenes.specs.disturbances:ErrorBudgetSpec",
         "an error budget",
         place=_VALIDATED,
         needs=("angle_errors", "disturbances"),

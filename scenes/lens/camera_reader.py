@@ -13,8 +13,7 @@ from optics.geometry.aperture import Circle
 from optics.geometry.pose import rotation_vector
 from optics.geometry.sag_terms import LAST_NOLL, SAG_TERMS, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
-from optics.materials.dispersion import CatalogueGlass
-from optics.materials.glass import GLASSES
+from optics.materials.glass import GLASSES, CatalogueGlass
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import Interaction

@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from optics.materials.dispersion import FORMULAS, CatalogueGlass, common_glasses
-from optics.materials.glass import GLASSES
+from optics.materials.glass import FORMULAS, GLASSES, CatalogueGlass, common_glasses
 from optics.numerics.frozen_map import FrozenMap
 from scenes.lens.statements import Glasses, Source, glass_key, is_number, read_lines, statement_of
 

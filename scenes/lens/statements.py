@@ -16,7 +16,7 @@ import numpy as np
 from optics.geometry.aperture import Aperture, Edge
 from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
-from optics.materials.dispersion import ABBE_LINES
+from optics.materials.glass import ABBE_LINES
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import LensSurface, Note, Prescription

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
-from optics.design.design_rays import Beams
 from optics.design.design_variables import Prescription, Stand, Variable
-from optics.design.merit_function import Operands
+from optics.design.merit_function import Beams, Operands
 from optics.geometry.surface import plane
 from optics.numerics import quadrature
 from scenes.models.camera_model import IMAGE, surface_of

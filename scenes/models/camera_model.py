@@ -20,7 +20,7 @@ from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Rectangle,
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Body, RigidTree, State
-from optics.materials.dispersion import ABBE_LINES
+from optics.materials.glass import ABBE_LINES
 from optics.numerics.array_math import norm, turned
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap

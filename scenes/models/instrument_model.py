@@ -10,7 +10,7 @@ import numpy as np
 from optics.geometry.solid import Solid
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from optics.raytrace.assembly import Assembly
 from scenes.models.camera_model import CameraModel
 from scenes.specs.baffle import Plate

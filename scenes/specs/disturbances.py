@@ -2,6 +2,8 @@
 
 The estimator `posterior` and the total sigmas of all others rest on this statement. It is a job's or an instrument's
 `disturbances: NAME`, a file of scenes/library/disturbances or of one's own.
+
+An error budget: an instrument, the light of its spots, and the causes whose errors are its lines.
 """
 
 import math
@@ -13,12 +15,13 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, mo
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.course import Term, moment
+from scenes.specs.instrument import Frames, InstrumentSpec, Tilt
 from scenes.specs.motion_text import motion_of
 from scenes.yaml import units
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Text, TitledSpec, short_for
+from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, Reference, Spec, Text, TitledSpec, Whole, short_for
 
 NONE = "none"
 """`disturbances: none`: nothing is stated, and sigmas are those of the noise alone."""
@@ -541,3 +544,44 @@ class JobDisturbancesSpec(Spec):
 
 JobDisturbances = Annotated[JobDisturbancesSpec, short_for("file", str, schema=Reference | JobDisturbancesSpec)]
 """With its keys, or the file's name alone: `disturbances: orbit`."""
+
+
+AngleErrors = Annotated[
+    dict[Name, Annotated[dict[Name, Tilt], AfterValidator(FrozenMap)]], NothingIsEmpty, AfterValidator(FrozenMap)
+]
+
+
+class ErrorBudgetSpec(Spec):
+    """An error budget.
+
+    Attributes:
+        description: for people.
+        instrument: which, by name or path.
+        photons_per_frame: light of one spot in one frame; weak, as noise of the centroid is a line.
+        frames: averaged in one measurement.
+        trials: number of random states for each line.
+        all_together: number of random states with all causes at once.
+        angle_errors: prism (prism_180 or prism_0) -> face -> tilt about its x and y, as made.
+        disturbances: what changes, and by how much: a file of scenes/library/disturbances or of one's own. Each of its
+            causes is a line.
+    """
+
+    description: Text = ""
+    instrument: Reference
+    photons_per_frame: Annotated[Number, Field(gt=0.0, le=1e12)]
+    frames: Frames = 9
+    trials: Annotated[Whole, Field(ge=20, le=100_000)] = 100
+    all_together: Annotated[Whole, Field(ge=20, le=100_000)] = 300
+    angle_errors: AngleErrors
+    disturbances: Reference
+
+    def applied_to(self, instrument: InstrumentSpec) -> InstrumentSpec:
+        """The instrument with this budget's angle errors and light."""
+        monitor = instrument.autocollimator
+        changed = {
+            prism: getattr(monitor, prism).model_copy(update={"angle_errors": errors})
+            for prism, errors in self.angle_errors.items()
+        }
+        reticle = monitor.reticle.model_copy(update={"photons_per_frame": self.photons_per_frame})
+        copied = monitor.model_copy(update={**changed, "reticle": reticle})
+        return instrument.model_copy(update={"monitor": copied})

@@ -6,10 +6,19 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from optics.materials.dispersion import FORMULAS, CatalogueGlass, common_glasses
-from optics.materials.glass import GLASSES, SCHOTT_RANGE, ThermalDispersion, WarmGlass, air_index, glass
+from optics.materials.glass import (
+    FORMULAS,
+    GLASSES,
+    SCHOTT_RANGE,
+    CatalogueGlass,
+    ThermalDispersion,
+    WarmGlass,
+    air_index,
+    common_glasses,
+    glass,
+)
 from optics.materials.material import MATERIALS, TemperatureRange
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from scenes.specs.spectrum import WavelengthRange
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.quantity import Quantity

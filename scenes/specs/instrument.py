@@ -486,11 +486,6 @@ class InstrumentSpec(TitledSpec):
         return cls.model_construct(name=name, cameras=FrozenMap({name: site}))
 
     @property
-    def as_drawn(self) -> InstrumentSpec:
-        """The instrument of the drawing, whatever was built."""
-        return self if self.as_built is None else self.model_copy(update={"as_built": None})
-
-    @property
     def autocollimator(self) -> MonitorSpec:
         """The monitor of an instrument that has one.
 

@@ -13,8 +13,7 @@ from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTest
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.detector import DetectorSpec
-from scenes.specs.disturbances import NONE, DisturbancesSpec
-from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.disturbances import NONE, DisturbancesSpec, ErrorBudgetSpec
 from scenes.specs.instrument import BASE, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown

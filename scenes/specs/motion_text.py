@@ -13,8 +13,6 @@ from scenes.specs.course import noll
 from scenes.yaml.errors import Problem, names_text, nearest, shown, unknown
 from scenes.yaml.units import split_quantity
 
-__all__ = ["FORMS", "key_below", "meant", "motion_of", "node_named", "perturbation_in_words", "put", "short_name"]
-
 AXES = {"x": 0, "y": 1, "z": 2}
 KINDS = {
     "shift": "x|y|z LENGTH",

@@ -1,19 +1,20 @@
 """A plan of operation: what is expected of an instrument over years, what events do to it, and what it has to keep.
 
 The estimate of `twin.operate` follows a record under such a plan.
+
+What can happen to an instrument in operation, by the names that tables, records and plans use.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.disturbances import NONE, DisturbancesSpec
-from scenes.specs.events import EVENTS
 from scenes.specs.job import JobSpec
 from scenes.specs.load import DISTURBANCES, INSTRUMENTS, find_named, is_path
 from scenes.specs.resolved import ResolvedJob, resolve_job
@@ -22,6 +23,11 @@ from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Name, Number, Reference, Spec, Text, Whole, short_for, validate
 from scenes.yaml.units import ANGLE, LENGTH, MOMENT, SCALE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
+
+Event = Literal["safe_mode", "heater_set_point", "refocus", "eclipse_season_begins", "eclipse_season_ends"]
+EVENTS: tuple[str, ...] = get_args(Event)
+"""What can happen to an instrument, other than being read."""
+
 
 ENDINGS: Mapping[str, tuple[Kind, str]] = FrozenMap(
     {

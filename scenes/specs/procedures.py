@@ -204,7 +204,7 @@ PROCEDURES: dict[str, Procedure] = {
             ),
             FileKind(
                 "measured_adjust",
-                "scenes.specs.measured.adjust_data:MeasuredAdjustSpec",
+                "scenes.specs.measured.adjust_setup:MeasuredAdjustSpec",
                 "an adjustment of measured passes",
                 needs=("names", "changes"),
             ),

@@ -13,8 +13,7 @@ from scenes.specs import load
 from scenes.specs.camera import PANCHROMATIC, CameraSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec, require_detector
-from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.disturbances import DisturbancesSpec, ErrorBudgetSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, PerturbationSpec, TargetsSpec, with_tables
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec

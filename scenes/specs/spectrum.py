@@ -1,4 +1,7 @@
-"""The light that a camera sees: how much signal comes at which wavelength."""
+"""The light that a camera sees: how much signal comes at which wavelength.
+
+Light of a black body.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,30 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from optics.materials.black_body import black_body_photons
 from optics.numerics.quadrature import gauss, gauss_of
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import KeyPath, Problem
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
 from scenes.yaml.spec import Number, Reference, Spec, one_given, short_for
 from scenes.yaml.units import LENGTH, TEMPERATURE, format_quantity
+
+
+def black_body_photons(wavelength: np.ndarray, temperature: float) -> np.ndarray:
+    """Spectral radiance of a black body as photons, by Planck's law.
+
+    Args:
+        wavelength: metres, of any shape.
+        temperature: kelvin.
+
+    Returns:
+        Photons/(s m^2 sr m), of the wavelength's shape.
+    """
+    # messages about files wait for this module, and scipy's table of constants is long
+    from scipy import constants
+
+    x = constants.h * constants.c / (wavelength * constants.k * temperature)
+    return np.asarray(2.0 * constants.c / wavelength**4 / np.expm1(x))
+
 
 WavelengthRange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, smallest="100 nm", largest="100 um"), 2)]
 """Shortest and longest, metres."""

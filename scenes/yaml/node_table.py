@@ -37,8 +37,6 @@ HEAT_COLUMNS = (
 """Columns of a table of temperatures: absolute ones, or changes from the instrument's."""
 LONGEST_READING, LONGEST_PER_BYTE = 10.0, 2e-6
 """Seconds for a mesh, and for each of its bytes: ten times what whole files take."""
-READINGS = ("change", "K", "degC")
-"""What the temperatures of a mesh, whose file has no heads, may be."""
 ZERO_CELSIUS = 273.15
 MOST_NODES = 1_000_000
 TABLES = (".csv", ".tsv", ".txt")
@@ -112,7 +110,7 @@ def read_temperatures(
         path: of the file; its ending says what it is.
         unit: of a mesh's coordinates.
         field: name of the temperatures in a mesh, None for its only numbers.
-        reading: of a mesh: what they are, one of `READINGS`.
+        reading: of a mesh: what they are, "change", "K" or "degC".
         sha256: checksum that the file must have, None for any.
 
     Raises:

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from analysis.matching.matches import Matches, MatchOptions, match, resampled
+from analysis.matching.correlation import MatchOptions
+from analysis.matching.matches import Matches, match
+from analysis.matching.spline import resampled
 from tests.analysis.texture_image import Texture, lattice
 
 HALF = 15

@@ -8,7 +8,7 @@ from scipy import stats
 
 from analysis.block.reweighting import LARGEST_FACTOR, REJECT, robust_weights, standardised_packets
 from analysis.calibration.adjustment import adjust
-from analysis.calibration.stepwise import stepwise
+from analysis.calibration.strip_adjustment import stepwise
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Prior, Unknowns
 from analysis.orbit.null_space import Gauge, RankError
 from tests.analysis.refusals import refuses

@@ -31,14 +31,6 @@ def compared(block):
     wrong = np.abs(spread - dense.ground_covariance) / (sigma[:, :, None] * sigma[:, None, :])
     results = {"ground": apart.max(), "ground covariance": wrong.max()}
     for scene in block.scenes:
-        when = scene.rays.time[::9]
-        value, covariance = found.attitude_at(scene.of, when)
-        other, others = dense.turns(scene.of, when)
-        root = np.sqrt(np.diagonal(others, axis1=1, axis2=2))
-        results[f"{scene.name} attitude"] = np.max(np.abs(value - other) / root)
-        results[f"{scene.name} attitude covariance"] = np.max(
-            np.abs(covariance - others) / (root[:, :, None] * root[:, None, :])
-        )
         where = dense.change[scene.of, scene.camera]
         value, covariance = found.change(scene.name)
         others = dense.covariance[np.ix_(where, where)]

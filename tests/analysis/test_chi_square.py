@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.chi_square import chance_beyond, density, limit_of
+from analysis.statistics import chance_beyond, density, limit_of
 
 
 def test_as_scipy_has_it() -> None:

@@ -5,12 +5,13 @@ ends in a second-best place. Spots and noise are those of ``test_spot_centroids`
 import numpy as np
 import pytest
 
-from analysis.chi_square import limit_of
 from analysis.monitor.spot_evidence import AFTER, BEFORE, NOISE, SpotEvidence
 from analysis.spots import likelihood
-from analysis.spots.centroid import SpotError, energy_centroid, gaussian_fit, maximum_likelihood_fit
-from analysis.spots.fit_state import fit_states, require_rest, widened
+from analysis.spots.centroid import energy_centroid, gaussian_fit
+from analysis.spots.likelihood import fit_states, maximum_likelihood_fit, require_rest, widened
+from analysis.spots.spot_positions import SpotError
 from analysis.spots.spot_template import SpotTemplate
+from analysis.statistics import limit_of
 from tests.analysis import test_spot_centroids as spots
 from tests.analysis.refusals import refuses
 from tests.analysis.test_spot_centroids import FRAMES, GAIN, OFFSET, SHAPE, airy, electrons, pattern, record

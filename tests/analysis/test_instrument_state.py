@@ -11,9 +11,14 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from analysis.instrument_state.known_combinations import combinations
-from analysis.instrument_state.next_move import Actuators, best_move, measurement_worth, truncated_move
-from analysis.instrument_state.state_estimate import MeasuredGroup, StateEstimate, StatePrior, estimate_state
+from analysis.instrument_state.next_move import Actuators, best_move, measurement_worth
+from analysis.instrument_state.state_estimate import (
+    MeasuredGroup,
+    StateEstimate,
+    StatePrior,
+    combinations,
+    estimate_state,
+)
 from analysis.measurement_error import UndeterminedError
 from tests.analysis.refusals import refuses
 
@@ -241,7 +246,6 @@ def test_no_range_no_move_and_free_amounts_solve_the_equations() -> None:
     wide = Actuators(("a", "b"), np.full(2, -99.0), np.full(2, 99.0), np.zeros(2), np.zeros(2), np.zeros(2))
     found = best_move(residual, slope, wide).amounts
     assert_allclose(found, np.linalg.lstsq(slope, -residual, rcond=None)[0], atol=1e-9)
-    assert_allclose(truncated_move(residual, slope, wide, 2), found, atol=1e-9)
 
 
 def test_the_worth_of_a_measurement_is_what_it_saves() -> None:

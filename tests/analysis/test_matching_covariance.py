@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.matching.matches import MatchOptions, Reason
+from analysis.matching.correlation import MatchOptions, Reason
 from tests.analysis.stereo_pairs import Pair, layered, textured
 from tests.tiers import quick
 

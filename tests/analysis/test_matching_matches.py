@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from analysis.matching.correlation import _second, distinct_points, search
-from analysis.matching.matches import Matches, MatchOptions, Reason, match
+from analysis.matching.correlation import MatchOptions, Reason, _second, distinct_points, search
+from analysis.matching.matches import Matches, match
 from tests.analysis.refusals import refuses
 from tests.analysis.texture_image import Texture, detected
 

@@ -6,7 +6,7 @@ Half of chi-square a point by simulation; a point may be refused instead. Truth 
 import numpy as np
 import pytest
 
-from analysis.matching.matches import Reason
+from analysis.matching.correlation import Reason
 from tests.analysis.matching_regimes import REGIMES, pair_of
 from tests.analysis.stereo_pairs import Pair
 from tests.tiers import quick

@@ -7,10 +7,10 @@ import pytest
 from scipy.stats import binom, chi2, ncx2
 
 from analysis.monitor import limits
-from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, TimeLaw, consistency
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.monitoring import MonitorGeometry
+from analysis.monitor.parameters import CameraCalibration
 from tests.analysis.stated_motions import correlation_of, disturbances
 
 LOOKS = (0.45, -0.09)

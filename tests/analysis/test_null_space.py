@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import subspace_angles
 
-from analysis.calibration.adjustment import adjust
-from analysis.calibration.normal_equations import State, Weights, assemble
-from analysis.calibration.plausibility import FarPointsError, NoiseError
-from analysis.calibration.shared_noise import SharedNoise
+from analysis.calibration.adjustment import FarPointsError, NoiseError, adjust
+from analysis.calibration.normal_equations import SharedNoise, State, Weights, assemble
 from analysis.orbit.calibration_parameters import CalibrationError, Noise, Parameters, Unknowns
 from analysis.orbit.null_space import WORST, Gauge, RankError, free_basis, null_vectors
 from analysis.orbit.three_line_model import LineModel

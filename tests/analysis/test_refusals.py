@@ -14,16 +14,16 @@ from scipy import sparse
 
 from analysis.block import block_adjustment, reweighting
 from analysis.block.block import CamerasKnowledge, Term
-from analysis.block.block_adjustment import adjust_block
-from analysis.block.plausible_block import pruned
+from analysis.block.block_adjustment import adjust_block, pruned
 from analysis.block.processes import BlockError, Law
 from analysis.calibration import normal_equations, strip_adjustment
 from analysis.calibration.adjustment import adjust
 from analysis.calibration.strip_adjustment import adjust_strip
 from analysis.images.fits_image import fits_cards
-from analysis.images.image_file import ImageError, ImageFile, Region
-from analysis.matching.correlation import distinct_points
-from analysis.matching.matches import MatchOptions, resampled
+from analysis.images.image_file import ImageFile, Region
+from analysis.images.image_header import ImageError
+from analysis.matching.correlation import MatchOptions, distinct_points
+from analysis.matching.spline import resampled
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor import limits
 from analysis.monitor.estimators import ESTIMATORS, Posterior, Shifts
@@ -49,12 +49,14 @@ from analysis.orbit.forward_intersection import (
 from analysis.orbit.image_correction import image_correction
 from analysis.orbit.jitter_lines import splined
 from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
-from analysis.orientation.interior import OrientationError, fit_interior_orientation, line_orientation
-from analysis.spots.centroid import difference_covariance, energy_centroid, gaussian_fit, maximum_likelihood_fit
+from analysis.orientation.distortion_model import OrientationError
+from analysis.orientation.interior import fit_interior_orientation, line_orientation
+from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import FramesError
+from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import photon_transfer, pixel_correction
-from analysis.spots.spot_positions import noise_parts
+from analysis.spots.spot_positions import difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.turntable.angle_fits import cross_validate, fit
 from analysis.turntable.dividing_error import CalibrationSeries
@@ -62,6 +64,7 @@ from tests.analysis import test_adjustment
 from tests.analysis.drawn_blocks import Plan, draw
 from tests.analysis.refusals import refuses
 from tests.analysis.stated_motions import TimeLaw, disturbances
+from tests.analysis.test_jitter_lines import of_disparities
 from tests.analysis.test_monitor_limits import some_cameras
 from tests.analysis.test_spot_centroids import NOISE, SHAPE, airy
 from tests.analysis.test_three_line_model import SEEN, cameras, make_rays
@@ -221,13 +224,13 @@ def test_orbit():
 
 def test_jitter(monkeypatch):
     time = np.linspace(0.0, 10.0, 200)
-    given = Observations.of_disparities(time, time + 0.1, 0.0 * time, 0.1)
+    given = of_disparities(time, time + 0.1, 0.0 * time, 0.1, 0 * time)
     parts = given.value, given.group, given.time, given.weight, given.nuisance
     refuses(JitterError, "do not match", Observations.of, given.value[:9], *parts[1:])
     refuses(JitterError, "their groups are mixed", Observations.of, given.value, given.group[::-1], *parts[2:])
     refuses(JitterError, "do not match mixtures", Observations.of, *parts, mix=np.ones((9, 2, 1)))
     refuses(JitterError, "moments that lie apart", splined, given, 0.0, 1.0)
-    once = Observations.of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, degree=0)
+    once = of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, 0 * time, degree=0)
     refuses(JitterError, "all observations are of one moment", periodogram, once, 0.5, 6.0)
     refuses(JitterError, "moves nothing", jitter_lines._fitted, given, np.array([2.0]), np.zeros(1))
     periodogram(given, 0.5, 2.0)

@@ -8,8 +8,9 @@ import pytest
 
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import ScreenedFrames
+from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.noise import NoiseModel
-from analysis.spots.screened_fit import EDGE_PX, FitTerms, ScreenedFit, fit_screened
+from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import repaired_centroid

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.mtf.rice import measured_bias, rice_bias, rice_sigma, signal_modulus
+from analysis.statistics import measured_bias, rice_bias, rice_sigma, signal_modulus
 
 DRAWS = 400_000
 # Means of so many draws scatter by at most 0.7 sigma / sqrt(DRAWS) = 1.1e-3 sigma; five of that.

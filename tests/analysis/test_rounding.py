@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.spots import rounding
 from analysis.spots.frame_screening import FramesError, noise_ratio, screen_frames
-from analysis.spots.noise import NoiseModel
+from analysis.spots.noise import NoiseModel, systematic_variance
 from analysis.spots.photon_transfer import photon_transfer, pixel_correction
 from analysis.spots.spot_template import SpotTemplate
 from tests.analysis.refusals import refuses
@@ -56,7 +55,7 @@ def test_what_stays_is_the_mean_square_of_the_mean_error(gain, read, electrons):
         recorded = np.rint(place[:, None] + gain * count) @ likely
     error = recorded - gain * electrons - place
     # 60 harmonics leave out 1/(2 pi^2 60), 1 % of the whole, where there is next to no noise
-    found = float(rounding.systematic_variance(electrons, read**2, gain))
+    found = float(systematic_variance(electrons, read**2, gain))
     assert found == pytest.approx(float(np.mean(error**2)), rel=1e-3, abs=0.012 / 12.0)
 
 

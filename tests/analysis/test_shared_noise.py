@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from analysis.calibration.adjustment import adjust
-from analysis.calibration.normal_equations import State, Weights, assemble
-from analysis.calibration.plausibility import single_ray
-from analysis.calibration.shared_noise import SharedNoise
+from analysis.calibration.adjustment import adjust, single_ray
+from analysis.calibration.normal_equations import SharedNoise, State, Weights, assemble
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters
-from analysis.orbit.ray_noise import reading_variance
+from analysis.orbit.forward_intersection import reading_variance
 from analysis.orbit.three_line_model import Partials, Rays, misclosure, partials
 from tests.analysis.refusals import refuses
 from tests.analysis.test_adjustment import (

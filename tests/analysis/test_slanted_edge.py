@@ -17,9 +17,9 @@ from scipy import stats
 from scipy.interpolate import CubicSpline
 
 from analysis.mtf.edge_location import EdgeError, locate_edge, pixel_noise
-from analysis.mtf.rice import rice_sigma, signal_modulus
 from analysis.mtf.slanted_edge import measure_edge
 from analysis.spots.noise import NoiseModel
+from analysis.statistics import rice_sigma, signal_modulus
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
 
@@ -133,11 +133,6 @@ def test_all_ways_round():
         assert_allclose(edge.mtf[:33], first.mtf[:33], atol=1e-4)
         assert edge.angle == pytest.approx(angle, abs=1e-5)
         assert edge.position == pytest.approx(position, abs=1e-3)
-
-
-def test_frequencies_along_the_axis_are_lower_by_the_cosine():
-    edge = measure_edge(edge_image(10))
-    assert_allclose(edge.frequency_along_axis / edge.frequency.clip(1e-9), [0] + [math.cos(edge.angle)] * 64)
 
 
 def test_spread_functions():

@@ -11,20 +11,11 @@ import pytest
 from scipy import stats
 from scipy.special import j1
 
-from analysis.spots.centroid import (
-    _GAUSS_MOVE_PX,
-    SpotError,
-    _wandered,
-    cramer_rao_bound,
-    difference_covariance,
-    energy_centroid,
-    gaussian_fit,
-    maximum_likelihood_fit,
-    mean_frames,
-)
-from analysis.spots.likelihood import image_bound
+from analysis.spots.centroid import _GAUSS_MOVE_PX, _wandered, energy_centroid, gaussian_fit, mean_frames
+from analysis.spots.likelihood import _bound, image_bound, maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
-from analysis.spots.spot_image import sane
+from analysis.spots.spot_image import sane, template_model
+from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.spots.spot_template import SpotTemplate
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
@@ -35,6 +26,16 @@ FRAMES = 9
 GAIN, DARK_NOISE_E, OFFSET, PRNU, DSNU_E = 0.06, 16.0, 64.0, 0.01, 5.0
 NOISE = NoiseModel(GAIN, DARK_NOISE_E, 0.0, OFFSET, PRNU, DSNU_E, 4095.0)
 PEAK_E, SKY_E = 50000.0, 3.0
+
+
+def cramer_rao_bound(template, row, column, flux, background, noise, frames):
+    """Least covariance (B, 2, 2) px^2 of places of spots (B,) of which the template is known, but for their light.
+
+    Inverse Fisher information of the normal likelihood (Kay, Estimation Theory, 1993, eq. 3.31) without the term of
+    the variance's own derivative, which Poisson noise does not have.
+    """
+    theta = np.stack(np.broadcast_arrays(row, column, flux, background), axis=1)
+    return _bound(*template_model(theta, np.arange(len(theta)) % template.count, template), noise, frames)
 
 
 def airy(row, column, shape=SHAPE, zero=FIRST_ZERO_PX):

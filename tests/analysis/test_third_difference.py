@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.orbit.third_difference import WHITE_GAIN, third_difference
+from analysis.orbit.forward_intersection import WHITE_GAIN, third_difference
 from tests.analysis.refusals import refuses
 
 RATE, RADIUS = 1.1068e-3, 6878137.0

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import null_space
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.unseen_motions import floor, unseen_modes
+from analysis.monitor.model_fit import floor, unseen_modes
 from tests.analysis.stated_motions import correlation_of, disturbances
 
 MOTIONS, SPOTS, PARAMETERS = 14, 4, 3

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from analysis.measurement_error import UndeterminedError
 from analysis.wavefront_maps.pupil_fit import Pupil, find_pupil, fit_map
 from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
-from analysis.wavefront_maps.zernike_terms import circle_terms
+from analysis.wavefront_maps.zernike_table import circle_terms
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
 

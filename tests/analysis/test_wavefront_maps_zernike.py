@@ -1,23 +1,20 @@
 """Zernike terms in every order against GalSim, prysm and quadrature; tables of coefficients as one and the same."""
 
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.special import eval_legendre
 
-from analysis.wavefront_maps.zernike_table import MapError, read_zernikes
-from analysis.wavefront_maps.zernike_terms import (
+from analysis.wavefront_maps.wavefront_map import MapError
+from analysis.wavefront_maps.zernike_table import (
     MOST_TERMS,
-    annular_terms,
     ansi_to_nm,
     circle_terms,
     edge_value,
     fringe_to_nm,
     nm_to_noll,
     noll_to_nm,
-    orthonormal,
+    read_zernikes,
 )
 from optics.geometry import zernike
 from tests.analysis.refusals import refuses
@@ -43,31 +40,6 @@ def test_terms_are_those_of_the_trace():
     np.testing.assert_allclose(circle_terms(range(1, 67), x, y), zernike.basis(66, x, y), rtol=0, atol=2e-12)
 
 
-@pytest.mark.oracle
-@pytest.mark.parametrize(
-    ("last", "inner", "digits"),
-    [(36, 0.0, 2e-13), (36, 0.3, 5e-13), (36, 0.61, 5e-13), (36, 0.9, 5e-11), (66, 0.3, 5e-12)],
-)
-def test_terms_of_rings_are_those_of_galsim(last, inner, digits):
-    """The digits are those of GalSim, which sums monomials: five to ten times what we are off the exact terms below."""
-    galsim = pytest.importorskip("galsim.zernike")
-    x, y = ring(inner)
-    theirs = galsim.zernikeBasis(last, x, y, R_outer=1.0, R_inner=inner)[1:].T
-    np.testing.assert_allclose(annular_terms(last, x, y, inner), theirs, rtol=0, atol=digits)
-
-
-@pytest.mark.parametrize(("inner", "digits"), [(0.0, 1e-13), (0.35, 1e-13), (0.61, 5e-13), (0.8, 5e-11)])
-def test_terms_of_rings_by_mahajan(inner, digits):
-    """Round terms of a ring are Legendre polynomials of its area (J. Opt. Soc. Am. 71, 75, 1981)."""
-    x, y = ring(inner)
-    area = (2.0 * (x**2 + y**2) - 1.0 - inner**2) / (1.0 - inner**2)
-    found = annular_terms(56, x, y, inner)
-    for index in (1, 4, 11, 22, 37, 56):
-        n = noll_to_nm(index)[0]
-        exact = math.sqrt(n + 1) * eval_legendre(n // 2, area)
-        np.testing.assert_allclose(found[:, index - 1], exact, rtol=0, atol=digits)
-
-
 def test_high_terms_keep_their_digits():
     """To the 30th order, where sums of monomials have lost all: unit mean squares by quadrature."""
     node, weight = np.polynomial.legendre.leggauss(40)
@@ -87,7 +59,6 @@ def test_orders_of_every_program():
         orders = [to_nm(j) for j in range(first, first + MOST_TERMS)]
         assert len(set(orders)) == MOST_TERMS
         assert [noll_to_nm(nm_to_noll(n, m)) for n, m in orders] == orders
-    refuses(ValueError, "a radius of 0 to 1 of the ring's", annular_terms, 4, np.ones(3), np.ones(3), 1.0)
     for to_nm, index in ((noll_to_nm, 0), (noll_to_nm, MOST_TERMS + 1), (fringe_to_nm, 38), (ansi_to_nm, -1)):
         refuses(ValueError, "are known", to_nm, index)
 
@@ -98,17 +69,6 @@ def test_terms_of_unit_peak_reach_one_at_the_edge():
         angle = 0.5 * np.pi / m if m < 0 else 0.0
         peak = circle_terms([index], np.cos([-angle]), np.sin([-angle]))[0, 0] / edge_value(n, m)
         assert abs(peak) == pytest.approx(1.0, abs=1e-12)
-
-
-def test_orthonormal_over_any_weight():
-    x, y = ring(0.2)
-    weight = np.where(y < 0.3, 1.0 + x**2, 0.0)
-    basis = circle_terms(range(1, 12), x, y)
-    columns, factor = orthonormal(basis, weight)
-    np.testing.assert_allclose((columns.T * weight) @ columns / weight.sum(), np.eye(11), rtol=0, atol=1e-13)
-    np.testing.assert_allclose((columns @ factor)[y < 0.3], basis[y < 0.3], rtol=0, atol=1e-12)
-    assert (np.diag(factor) > 0.0).all()
-    np.testing.assert_array_equal(factor, np.triu(factor))
 
 
 WAVE = {4: 12e-9, 5: -3e-9, 6: 1e-9, 7: 4e-9, 8: -8e-9, 11: 5e-9}

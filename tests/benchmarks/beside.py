@@ -21,8 +21,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from scenes.yaml.standard_output import BAD_INPUT
 from tests.benchmarks.number import shown
-from twin.run.cli import BAD_INPUT, InputErrorText, print_whole
+from twin.run.cli import InputErrorText, print_whole
 
 ROOT = Path(__file__).resolve().parents[2]
 

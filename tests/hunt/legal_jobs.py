@@ -6,8 +6,8 @@ import random
 from collections.abc import Mapping
 from typing import Any
 
-from scenes.models.instrument_model import NodeInfo
 from scenes.specs.load import LIBRARY
+from scenes.specs.perturbation import NodeInfo
 from scenes.yaml.yaml_file import parse_yaml
 
 STATEMENTS = ("orbit", "orbit", "launch", "launch", "paper_001", "none")

@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optics.design.design_rays import beam_axes
 from optics.design.design_variables import BIAS, SHAPE, STAND, Prescription, Variable
-from optics.design.merit_function import MeritFunction, Operands
-from optics.design.optimiser import DesignError
-from optics.design.starts import drawn_start, search
+from optics.design.merit_function import MeritFunction, Operands, beam_axes
+from optics.design.optimiser import DesignError, drawn_start, search
 from scenes.models.camera_design import beams_of, camera_of, prescription_of
 from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics

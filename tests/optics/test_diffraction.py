@@ -6,8 +6,7 @@ import pytest
 from optics.numerics import quadrature
 from optics.numerics.quadrature import PupilNodes
 from optics.waves import diffraction
-from optics.waves.diffraction import Grid, PupilField, airy, image
-from optics.waves.field_samples import LONGEST, FieldSamples
+from optics.waves.diffraction import LONGEST, FieldSamples, Grid, PupilField, airy, image
 from tests.tiers import quick
 
 WAVELENGTH, F_NUMBER = 650e-9, 9.2

@@ -6,9 +6,9 @@ import pytest
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
 from optics.geometry.polygon import area, covered
 from optics.numerics import quadrature
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.waves import edge_shadow
-from optics.waves.lit_stop import LitStop, holes
+from optics.waves.edge_shadow import LitStop, holes
 from optics.waves.pupil_shadow import separate
 from optics.waves.pupil_terms import products, smooth_terms
 from tests.tiers import quick

@@ -29,14 +29,6 @@ def test_disk_is_exact_up_to_its_degree(rings: int, arms: int, inner: float) -> 
     assert checked >= 10
 
 
-def test_square_is_exact_up_to_its_degree() -> None:
-    nodes = quadrature.square(5)
-    assert np.sum(nodes.weight) == pytest.approx(4.0, rel=1e-15)
-    for a in range(0, 10, 2):
-        for b in range(0, 10, 2):
-            assert np.sum(nodes.weight * nodes.x**a * nodes.y**b) == pytest.approx(4 / ((a + 1) * (b + 1)), rel=1e-13)
-
-
 def test_shared_nodes_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="read-only"):
         quadrature.disk(3).x[0] = 1.0

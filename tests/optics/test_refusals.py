@@ -14,7 +14,7 @@ from scipy.spatial import QhullError
 from optics.geometry.aperture import Edge, Polygon
 from optics.geometry.polygon import quadrature as polygon_quadrature
 from optics.materials import scatter
-from optics.materials.dispersion import CatalogueGlass
+from optics.materials.glass import CatalogueGlass
 from optics.materials.scatter import ScatterTable
 from optics.numerics import quadrature
 from optics.raytrace.trace import _redirect

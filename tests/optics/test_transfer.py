@@ -16,7 +16,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves import transfer
 from optics.waves.diffraction import Grid, PupilField, image
-from optics.waves.imaging import aim_collimated, imaging_field
+from optics.waves.imaging import aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_edge import PupilEdge
 from optics.waves.pupil_stack import PupilFunction, circular_pupil, fit_pupils
 from optics.waves.transfer import TransferTable, polychromatic_transfer
@@ -92,9 +92,8 @@ class Camera:
 
     def field(self, nodes: PupilNodes, origin: np.ndarray | None = None) -> PupilField:
         origin = self.centre if origin is None else origin
-        return imaging_field(
-            self.backend, self.systems, self.to_stop, self.direction, self.launch, self.stop, nodes, WAVELENGTH, origin
-        )
+        beam = self.systems, self.to_stop, self.direction, self.launch, self.stop, nodes
+        return pupil_field(imaging_rays(self.backend, *beam), WAVELENGTH, origin)
 
 
 def focal_plane_at(dz: float) -> State:

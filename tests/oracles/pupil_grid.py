@@ -14,7 +14,7 @@ from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.diffraction import Grid, PupilField
-from optics.waves.imaging import aim_collimated, imaging_field
+from optics.waves.imaging import aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_stack import PupilFunction, fit_pupils
 from scenes.models.camera_model import CameraModel, field_direction
 
@@ -40,10 +40,8 @@ class FarPoint:
 
     def field(self, nodes: PupilNodes) -> PupilField:
         """Plane waves about the chief ray's image."""
-        return imaging_field(
-            self.backend, self.systems, self.to_stop, self.direction, self.launch, self.stop, nodes, WAVELENGTH,
-            self.centre,
-        )  # fmt: skip
+        beam = self.systems, self.to_stop, self.direction, self.launch, self.stop, nodes
+        return pupil_field(imaging_rays(self.backend, *beam), WAVELENGTH, self.centre)
 
 
 @dataclass(frozen=True, eq=False)

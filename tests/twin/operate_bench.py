@@ -18,7 +18,7 @@ from tests.twin.operation_records import monitor_entry as own_entry
 from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState
-from twin.operate.estimate.plans import keep_plan
+from twin.operate.estimate.operation_model import keep_plan
 from twin.operate.estimate.standing import Scores
 from twin.operate.record.entries import MICRO, Alarm, Entry
 from twin.operate.record.history import History

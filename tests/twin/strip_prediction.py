@@ -3,8 +3,7 @@ and nothing of the adjustments but the derivatives of the image points."""
 
 import numpy as np
 
-from analysis.calibration.normal_equations import State, Weights, assemble
-from analysis.calibration.shared_noise import SharedNoise
+from analysis.calibration.normal_equations import SharedNoise, State, Weights, assemble
 from analysis.orbit.calibration_parameters import CalibrationField, Parameters, Unknowns
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from analysis.instrument_state.known_combinations import combinations
+from analysis.instrument_state.state_estimate import combinations
 from analysis.monitor.recovery import recover
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, compose

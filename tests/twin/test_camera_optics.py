@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from scenes.models.camera_model import field_direction
 from scenes.models.camera_sharpness import FieldBeams
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.waves.transfer import polychromatic_transfer
 from scenes.specs.spectrum import SpectrumSpec
 from tests.scenes.lens.colour_cameras import colour_camera
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.colour import axial_colour, lateral_colour, spectral_mtfs
-from twin.targets import band_light
+from twin.targets import target_images
 
 FIELDS = [(0.0, 0.0), (1.0, 1.0)]
 
@@ -62,10 +62,10 @@ def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) 
     light, frequency = SpectrumSpec.evenly(500e-9, 640e-9), np.array([0.0, 30e3, 70e3])
     (mtf,) = spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
     (fine,) = achromat.mtfs([(0.0, 0.0)], frequency, *light.rule(24))
-    assert 0.0 < mtf.error <= band_light.WORST_CHANGE
+    assert 0.0 < mtf.error <= target_images.WORST_CHANGE
     np.testing.assert_allclose(mtf.values, fine.values, atol=mtf.error)
-    monkeypatch.setattr(band_light, "LARGEST_RULE", 9)
-    monkeypatch.setattr(band_light, "WORST_CHANGE", 1e-9)
+    monkeypatch.setattr(target_images, "LARGEST_RULE", 9)
+    monkeypatch.setattr(target_images, "WORST_CHANGE", 1e-9)
     with pytest.raises(UnphysicalError, match="still changes by"):
         spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
 

@@ -10,7 +10,7 @@ from optics.geometry.tree import Motion
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.wavefront import path_difference
+from optics.waves.wavefront import path_to_sphere
 from scenes.models.camera_model import collimated, field_direction
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
@@ -271,7 +271,9 @@ def test_a_figure_is_sag_along_the_surfaces_z_and_delays_by_twice_itself_on_m1(g
     states = [{}, {"M1": Motion(figure={term: amplitude})}]
     out = trace(backend, assemble(bare, ["imaging"], states), make_rays(backend, launch, travel), keep=(0,))
     position, direction, path, _ = out.numpy()
-    opd = path_difference(position, direction, path, chief=0)
+    to_sphere = path_to_sphere(position, direction, path, position[..., :1, :])
+    # positive where the wavefront is ahead of the sphere: less path is left to it than of the chief ray
+    opd = to_sphere[..., :1] - to_sphere
     aperture = model.apertures["M1"]
     # the figure's disk is the circle around the rectangular aperture
     x, y = ((out.hit(0)[0, :, :2] - aperture.centre) / np.hypot(aperture.half_x, aperture.half_y)).T

@@ -10,11 +10,11 @@ from scipy import stats
 from analysis.monitor import model_fit, monitoring
 from analysis.monitor.monitoring import PER_SI
 from analysis.monitor.recovery import measure_spots, recover
-from analysis.spots.likelihood import cramer_rao_bound
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.instrument import BASE
 from scenes.yaml.errors import InputError
+from tests.analysis.test_spot_centroids import cramer_rao_bound
 from tests.tiers import quick
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.truth import ground_geometry, trace_truth

@@ -17,8 +17,9 @@ from tests.twin.operation_records import START, entries_of, given, life_of, plan
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.alarms import AGAIN, alarms_of, raise_alarms
-from twin.operate.estimate.operation import Break, Following, FoundJump, Operation, SensorState
-from twin.operate.estimate.plans import keep_plan
+from twin.operate.estimate.following import Break, Following, FoundJump, SensorState
+from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.operation_model import keep_plan
 from twin.operate.record.entries import MICRO, Entry, utc_text
 from twin.operate.record.history import History
 from twin.run.provenance import negative_verdicts

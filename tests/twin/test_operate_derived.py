@@ -12,7 +12,7 @@ from scenes.yaml.errors import Problem
 from tests.twin.commands import invoke
 from tests.twin.record_bench import MINUTE, START, given, made, temperatures
 from twin.operate.__main__ import app
-from twin.operate.estimate.plans import kept_plan, plan_digest, quantity_names, read_plan
+from twin.operate.estimate.operation_model import kept_plan, plan_digest, quantity_names, read_plan
 from twin.operate.record.entries import Alarm
 from twin.operate.record.history import History
 

@@ -26,10 +26,10 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate import operation as operation_module
 from twin.operate.estimate.alarms import alarms_of
-from twin.operate.estimate.following import Course, widening
-from twin.operate.estimate.operation import Operation, beyond
+from twin.operate.estimate.following import Course, beyond, widening
+from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.standing import Scores, Sensor, Standing
-from twin.operate.posterior import posterior
+from twin.operate.operated_block import posterior
 from twin.operate.record.entries import MICRO, Entry
 
 KEYS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")

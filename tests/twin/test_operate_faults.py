@@ -119,7 +119,7 @@ def test_the_command_tells_of_a_database_that_fails(tmp_path: Path, monkeypatch:
     made(tmp_path / "record").close()
     base = sqlite3.connect(tmp_path / "record" / FILE)
     base.execute("BEGIN EXCLUSIVE")
-    monkeypatch.setattr("twin.operate.record.database.WAIT", 0.1)
+    monkeypatch.setattr("twin.operate.record.schema.WAIT", 0.1)
     result = invoke(app, "status", tmp_path / "record")
     base.close()
     assert (result.exit_code, "database is locked" in result.stderr) == (1, True)

@@ -30,7 +30,7 @@ from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app as operate
 from twin.operate.estimate.operation import Operation
-from twin.operate.estimate.plans import keep_plan
+from twin.operate.estimate.operation_model import keep_plan
 from twin.operate.estimated_motions import EstimatedMotions, perturbation, prior_files, state_file
 from twin.operate.product_files import product_files
 from twin.operate.products import Products, _warnings
@@ -39,8 +39,7 @@ from twin.operate.record.entries import MICRO, Entry, micros, utc_text
 from twin.operate.record.history import History, initialised
 from twin.operate.validity import Mark, validity
 from twin.orbit.export.export_run import ExportSource, read_source
-from twin.orbit.flight.corrected_lines import corrected_line
-from twin.orbit.flight.line_camera import traced_line_cameras
+from twin.orbit.flight.line_camera import corrected_line, traced_line_cameras
 
 SCENE = SCENES / ORBIT / "angle_gf7.yaml"
 NOISE = 0.005**2 * np.eye(8)

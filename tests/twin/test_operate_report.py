@@ -21,11 +21,10 @@ from twin.operate.__main__ import app
 from twin.operate.daily_report import _warnings, daily_report, end_of_day, report_html, state_table
 from twin.operate.estimate.alarms import percent
 from twin.operate.estimate.operation import Operation
-from twin.operate.estimate.plans import kept_plan
-from twin.operate.overview import Overview, coverage, points_of, spread, trend
+from twin.operate.estimate.operation_model import kept_plan
+from twin.operate.overview import Overview, coverage, first_time, last_time, points_of, readings, spread, trend
 from twin.operate.record.entries import Alarm, Entry, micros
 from twin.operate.record.history import History, PastHistory, content_of, initialised
-from twin.operate.shown_readings import first_time, last_time, readings
 
 
 @pytest.fixture(scope="module")

@@ -24,8 +24,7 @@ from twin.operate.__main__ import app
 from twin.operate.lives import simulation_run
 from twin.operate.lives.judged_life import covered
 from twin.operate.lives.judged_report import likely_shares
-from twin.operate.lives.simulate import Simulation, sensed_temperatures
-from twin.operate.lives.simulated_life import Life, drawn_life
+from twin.operate.lives.simulate import Life, Simulation, drawn_life, sensed_temperatures
 from twin.operate.lives.simulation_run import take_files
 from twin.operate.record.entries import MICRO, micros
 from twin.operate.record.history import History, content_of, initialised

@@ -19,8 +19,7 @@ from twin.orbit.jitter import sights
 from twin.orbit.jitter.jitter_numbers import JITTER, blind_multiples
 from twin.orbit.jitter.jitter_report import _warnings as jitter_warnings
 from twin.orbit.jitter.jitter_run import JitterRun, fly_strip, run_jitter
-from twin.orbit.jitter.sights import SightsError, sights_of
-from twin.orbit.jitter.steady_platform import SteadyPlatform
+from twin.orbit.jitter.sights import SightsError, SteadyPlatform, sights_of
 
 ARCSEC = np.pi / 648000.0
 READINGS = 0.25

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.unseen_motions import unseen_modes
+from analysis.monitor.model_fit import unseen_modes
 from scenes.models.disturbances import state_of
 from scenes.specs.course import CourseSpec
 from scenes.specs.orbit.monitor import CorrectionSpec, LoopImagesSpec, MotionSpec

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.calibration.plausibility import FarPointsError
+from analysis.calibration.adjustment import FarPointsError
 from scenes.specs.measured.orbit_data_setup import resolve_any_calibration
 from tests.tiers import quick
 from tests.twin.orbit_files import FIELDS, edit, export, flown, read_back, set_keys, small

@@ -17,7 +17,7 @@ from rasterio.transform import from_origin
 
 import twin.orbit.__main__ as command
 from analysis.orbit.forward_intersection import CalibratedLine
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resolve_measured_angle
@@ -39,12 +39,11 @@ from twin.orbit.conventions.check_run import run_check
 from twin.orbit.export.estimated_change import ground_rows
 from twin.orbit.export.export_run import read_exportable, run_export
 from twin.orbit.export.polynomial_export import read_polynomial_source
-from twin.orbit.export.rational_polynomial import RationalPolynomial
-from twin.orbit.export.rpc_files import read_rpc
+from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
-from twin.orbit.images.point_judgement import true_ground
+from twin.orbit.images.point_report import true_ground
 from twin.orbit.images.simulate_run import run_simulation
 from twin.orbit.jitter.sights import SightsError, sights_of
 from twin.orbit.matching.match_run import run_match

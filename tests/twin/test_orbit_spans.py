@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from optics.numerics.spans import ROUNDING, in_span, number_of
+from optics.numerics.array_math import ROUNDING, in_span, number_of
 from scenes.specs.course import CourseSpec
 from scenes.specs.measured.pass_files import PlatformFilesSpec
 from scenes.specs.orbit.setup import load_three_line_camera

@@ -9,7 +9,7 @@ import pytest
 from markupsafe import escape
 
 from tests.twin.policed_page import Policed, breaches
-from twin.pictures.viewer import viewer_programs, viewer_scripts
+from twin.pictures.scene_file import viewer_programs, viewer_scripts
 from twin.run.artefact import Marked, SvgFigure, Table, Text
 from twin.run.page import FIGURES, RunFacts, checksum, inline, page_policy, render_report
 from twin.run.report import Report, Section

@@ -20,8 +20,8 @@ from tests.optics.test_scatter_table import lambert, of_lobe
 from tests.tiers import quick
 from tests.twin.path_bench import flat_mirror, glass_scene, screen, slab
 from twin.path_tracing.families import Event
+from twin.path_tracing.importance_sampling import Leaving, TableDraw, spread
 from twin.path_tracing.source import DiskSource, random_streams
-from twin.path_tracing.spreading import Leaving, TableDraw, spread
 from twin.path_tracing.tables import upload_finishes
 from twin.path_tracing.tracer import PathTracer, Sampling
 

@@ -310,11 +310,11 @@ SCENARIOS = {
 
 def plant(fault: str) -> None:
     """Leave out what keeps acknowledged work through a power cut."""
-    from twin.operate.record import database
+    from twin.operate.record import schema
 
     if fault.startswith("synchronous"):
-        connect = database._on_connect
-        database._on_connect = lambda connection, record: (
+        connect = schema._on_connect
+        schema._on_connect = lambda connection, record: (
             connect(connection, record),
             connection.execute(f"PRAGMA {fault}").close(),
         )
@@ -381,7 +381,7 @@ def record_program(scenario: str, fault: str, layer: Path, inputs: Path, folder:
 def recorded(layer, inputs, tmp_path_factory):
     """Function: scenario and fault -> what was seen; each program runs once."""
     patch = pytest.MonkeyPatch()
-    patch.setattr("twin.operate.record.database.WAIT", 0.1)
+    patch.setattr("twin.operate.record.schema.WAIT", 0.1)
     yield cache(lambda *what: record_program(*what, layer, inputs, tmp_path_factory.mktemp("recorded")))
     patch.undo()
 

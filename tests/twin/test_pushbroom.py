@@ -13,8 +13,7 @@ from scenes.specs.orbit.scene import ControlSpec, GroundSpec, TerrainSpec
 from scenes.specs.orbit.setup import load_three_line_camera
 from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, lost, optics, shaken
 from twin.orbit.flight.line_camera import LineCamera
-from twin.orbit.ground.grid import GroundFrame
-from twin.orbit.ground.terrain import Terrain
+from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
 from twin.orbit.images.patch import PatchError, fly_patch, window_of
 from twin.orbit.images.pushbroom import (

@@ -18,9 +18,9 @@ import xarray as xr
 
 from tests.twin.study_bench import ROOT
 from twin.run import durable, run_folder
-from twin.run.owned_files import LOCK, OLD, PARTIAL, Unfinished, scratch
+from twin.run.owned_files import LOCK, MANIFEST, OLD, PARTIAL, Unfinished, scratch
 from twin.run.provenance import versions
-from twin.run.run_folder import MANIFEST, Numbered, RunFolder, RunFolderError, is_run_folder
+from twin.run.run_folder import Numbered, RunFolder, RunFolderError, is_run_folder
 
 
 def everything(folder: Path) -> set[str]:

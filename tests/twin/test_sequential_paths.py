@@ -23,10 +23,10 @@ from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, scene_beam, screen, ways_and_search
 from twin.path_tracing.clear_ways import ClearWays
 from twin.path_tracing.families import Event, code, nominal_codes
+from twin.path_tracing.importance_sampling import LEAST_KEPT, Followed, Thinning, learn
 from twin.path_tracing.path_result import PathResult
 from twin.path_tracing.source import DiskSource
 from twin.path_tracing.stray_light import monitor_families, pinhole
-from twin.path_tracing.thinning import LEAST_KEPT, Followed, Thinning, learn
 from twin.path_tracing.tracer import BALANCED, FAINT, LEAST_ALONG, PathTracer, Sampling
 
 PATHS, FEW = LEAST_ALONG, 20_000

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from analysis.short_repr import LONGEST, shows, summary
+from analysis.arrays import LONGEST, shows, summary
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 import twin.study.__main__ as command
 from analysis.measurement_error import MeasurementError
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from scenes.specs.procedures import Procedure
 from tests.twin.commands import invoke
 from tests.twin.study_bench import write_study

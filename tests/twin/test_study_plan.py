@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import kstest, norm
 
 from scenes.specs.load import EXAMPLES
+from scenes.specs.samplers import unit_cube
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
@@ -18,7 +19,6 @@ from twin.study.runs import setup
 from twin.study.runs.base_job import BlockResult, check_response, leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK, read_job
-from twin.study.runs.sampling import unit_cube
 from twin.study.runs.setup import resolve_study, study_from_text
 
 FACTORS = STUDY[STUDY.index("factors:") : STUDY.index("design:")]

@@ -14,11 +14,11 @@ from scipy.signal import fftconvolve
 from analysis.mtf.slanted_edge import measure_edge
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.raytrace.system import assemble
 from optics.targets.target_shapes import pinhole_target, star_target
 from optics.waves.diffraction import Grid, image
-from optics.waves.imaging import imaging_field
+from optics.waves.imaging import imaging_rays, pupil_field
 from optics.waves.pupil_stack import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_axis import LAUNCH_DISTANCE
@@ -31,8 +31,18 @@ from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.colour import spectral_mtfs
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
-from twin.targets.band_light import WORST_CHANGE, BandPupils
-from twin.targets.target_images import ALONG, DIRECTIONS, PLACES, TRACK, BarDesign, TargetCamera, TargetLostError, View
+from twin.targets.target_images import (
+    ALONG,
+    DIRECTIONS,
+    PLACES,
+    TRACK,
+    WORST_CHANGE,
+    BandPupils,
+    BarDesign,
+    TargetCamera,
+    TargetLostError,
+    View,
+)
 from twin.targets.target_measurement import CURVE, read_bars, read_edge
 from twin.targets.target_path import LocalMap, TargetPath
 
@@ -146,7 +156,8 @@ def test_against_brute_force(before_gf7, backend):
     nodes = quadrature.disk(40)
     origin = np.array([[hit[0, 1], hit[0, 0], 0.0]])
     launch = first - LAUNCH_DISTANCE * direction
-    field = imaging_field(backend, systems, to_stop, direction, launch, path.stop, nodes, WAVELENGTH, origin)
+    rays = imaging_rays(backend, systems, to_stop, direction, launch, path.stop, nodes)
+    field = pupil_field(rays, WAVELENGTH, origin)
     along = Grid(-reach * PITCH, step, 2 * reach * fine + 1)
     # direction cosines u belong to X', v to Y': columns of the image run along Y'
     turned = replace(field, u=field.v, v=field.u)

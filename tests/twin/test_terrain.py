@@ -8,9 +8,8 @@ import pytest
 from scenes.specs.orbit.scene import ControlSpec, LightSpec, TerrainSpec, TextureSpec
 from tests.tiers import quick
 from twin.orbit.flight.earth import Earth
-from twin.orbit.ground.grid import GroundFrame, SplineGrid, correlated_field, fractal_field
+from twin.orbit.ground.grid import GroundFrame, SplineGrid, Terrain, correlated_field, fractal_field
 from twin.orbit.ground.orthophoto import SCALE, make_control
-from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import Extent, apparent, reflectance
 from twin.orbit.images.image_points import ReferenceHeights
 

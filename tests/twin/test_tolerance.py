@@ -24,7 +24,7 @@ from twin.study.runs.plan import Plan
 from twin.tolerance import allocation, given_warnings, merit_models, samples, tolerance_run
 from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
-from twin.tolerance.merits import Merit
+from twin.tolerance.monitor_merit import Merit
 from twin.tolerance.samples import Workforce, draw_samples, study_of
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.tolerance_report import tolerance_report

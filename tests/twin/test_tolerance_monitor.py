@@ -19,8 +19,7 @@ from twin.monitor.information import built_noise, quantity_rows
 from twin.monitor.monitor_derivative import SMALL, STEPS
 from twin.monitor.monitor_experiment import TEMPLATE_MARGIN
 from twin.monitor.observation import Observing, observe, one_detector
-from twin.tolerance.monitor_merit import ROTATIONS, readings_of
-from twin.tolerance.obstruction_merit import obstructed_shares
+from twin.tolerance.monitor_merit import ROTATIONS, obstructed_shares, readings_of
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance
 from twin.tolerance.variations import states_of

@@ -20,7 +20,8 @@ from tests.twin.commands import invoke
 from tests.twin.study_bench import write_study
 from twin.compare.__main__ import app as compare_app
 from twin.run.data_files import FrameFacts, netcdf, preview_png, tiff
-from twin.run.run_folder import MANIFEST, RunFolder, write_manifest
+from twin.run.owned_files import MANIFEST
+from twin.run.run_folder import RunFolder, write_manifest
 from twin.study.runs.base_job import BlockResult
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.plan import Plan

@@ -8,7 +8,8 @@ import pytest
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import parse_yaml
 from twin.validation.checks.check import Supposed
-from twin.validation.checks.group import FILE, Printed, load_printed
+from twin.validation.checks.group import Printed, load_printed
+from twin.validation.checks.row_names import FILE
 from twin.validation.registry import GROUPS
 
 FOLDERS = sorted((Path(__file__).parents[2] / "twin/validation").glob("paper_*"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +13,7 @@ from analysis.measurement_error import MeasurementError
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from scenes.models.disturbances import StatedMotions, motions_of_spec
 from scenes.specs.asbuilt import AsBuiltSetup, MeasurementsSpec
 from scenes.specs.tolerance import OF_MONITOR, MeritSpec, ToleranceBudgetSpec, ToleranceSetup
@@ -218,27 +217,6 @@ class AsBuiltBench(Site):
             kind.drawn(kind.predict(self.view(true[None], after))[0], rng)
             for kind, after in zip(self.kinds, self.afters, strict=True)
         )
-
-    def after_move(self, name: str, by: np.ndarray, again: Sequence[str]) -> AsBuiltBench:
-        """The bench with one move more, and with measurements that are made again after it.
-
-        Args:
-            name: of the move.
-            by: how far each actuator is meant to go, (C,), SI.
-            again: names of the measurements.
-        """
-        other = copy(self)
-        other.parameters = self.parameters.with_move(name, by, self.test)
-        more = []
-        for kind in self.kinds:
-            if kind.name in again:
-                made = copy(kind)
-                made.name = f"{kind.name} after {name}"
-                more.append(made)
-        other.kinds = (*self.kinds, *more)
-        other.afters = (*self.afters, *[name] * len(more))
-        vars(other).pop("actuators", None)
-        return other
 
     # merits and moves
 

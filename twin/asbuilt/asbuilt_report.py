@@ -26,7 +26,7 @@ from twin.run.svg import (
     shared_legend,
     to_svg,
 )
-from twin.tolerance.merits import merit_head, merit_unit, shown_merit
+from twin.tolerance.monitor_merit import merit_head, merit_unit, shown_merit
 
 _MOST_COMBINATIONS = 12
 _FEW = 3

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from analysis.instrument_state.known_combinations import Combination, combinations
-from analysis.instrument_state.state_estimate import FALSE_ALARM, Agreement, StateEstimate
+from analysis.instrument_state.state_estimate import FALSE_ALARM, Agreement, Combination, StateEstimate, combinations
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.tolerance import MeritSpec, amount_text
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
@@ -19,7 +18,7 @@ from twin.asbuilt.next_step import Advice, advice
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.run.random_streams import stream
-from twin.tolerance.merits import Merit, merit_unit, shown_merit
+from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 
 LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)
 """Quantiles that are told."""

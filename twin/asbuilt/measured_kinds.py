@@ -20,7 +20,7 @@ from analysis.instrument_state.state_estimate import MeasuredGroup
 from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from optics.raytrace.line_of_sight import line_tangents
 from scenes.specs import asbuilt as specs
 from scenes.specs.motion_text import node_named

@@ -8,14 +8,14 @@ then.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from analysis.instrument_state.state_estimate import StatePrior
 from optics.geometry.tree import State
 from optics.numerics.frozen_map import FrozenMap
-from optics.thermal.heat import Temperature
+from optics.thermal.deformation import Temperature
 from scenes.models.disturbances import HEAT, Component, StatedMotions
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
@@ -85,25 +85,6 @@ class Parameters:
             wanted,
             tuple(errors),
             np.array(sigmas),
-        )
-
-    def with_move(self, name: str, by: np.ndarray, test: AsBuiltSpec) -> Parameters:
-        """The same with one move more.
-
-        Args:
-            name: of the move.
-            by: how far each actuator is meant to go, (C,), SI.
-            test: with the actuators' errors.
-        """
-        moved = [k for k in range(len(self.names)) if by[k]]
-        specs = [test.actuators[self.names[k]] for k in moved]
-        sigmas = [np.hypot(one.move_error * by[k], one.accuracy_si) for k, one in zip(moved, specs, strict=True)]
-        return replace(
-            self,
-            moves=(*self.moves, name),
-            wanted=np.concatenate([self.wanted, by[None]]),
-            errors=(*self.errors, *((len(self.moves), k) for k in moved)),
-            error_sigmas=np.concatenate([self.error_sigmas, sigmas]),
         )
 
     @property

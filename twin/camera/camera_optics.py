@@ -18,14 +18,13 @@ from typing import Self
 
 import numpy as np
 
-from analysis.short_repr import shows
+from analysis.arrays import shows
 from optics.geometry import zernike
 from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import hold_within
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError, hold_within
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import equal_area_radius

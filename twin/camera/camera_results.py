@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.short_repr import shows
+from analysis.arrays import shows
 from optics.geometry import zernike
 from optics.numerics.invariants import hold_below, hold_equal, hold_within
 from twin.run.reference_frames import frames_text

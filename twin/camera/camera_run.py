@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from analysis.arrays import shows
 from analysis.monitor import parameters
-from analysis.short_repr import shows
 from optics.geometry import zernike
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.raytrace.line_of_sight import LineChange
 from scenes.models.camera_design import with_plane
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text

@@ -28,7 +28,7 @@ from scenes.specs.spectrum import SpectrumSpec
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, Mtf
 from twin.run.quantity import Quantity, Record
-from twin.targets.band_light import wavelengths_enough
+from twin.targets.target_images import wavelengths_enough
 
 FIRST_RULE = 5
 """Wavelengths of the first rule."""

@@ -10,9 +10,9 @@ import numpy as np
 from optics.geometry.polygon import covered
 from optics.geometry.tree import State
 from optics.numerics import quadrature
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
-from optics.waves.lit_stop import LitStop, holes
+from optics.waves.edge_shadow import LitStop, holes
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, smooth_terms
 from optics.waves.wavefront import PartFit, fit_part, fit_wavefront, orthonormal_parts

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from analysis.short_repr import shows
+from analysis.arrays import shows
 from optics.geometry.aperture import Aperture, Circle, Rectangle
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend

@@ -17,12 +17,12 @@ from optics.geometry import zernike
 from optics.geometry.polygon import area
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.lit_stop import LitStop
+from optics.waves.edge_shadow import LitStop
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, to_terms
 from optics.waves.wavefront import path_to_sphere

@@ -21,7 +21,8 @@ from scenes.yaml.json_file import read_json
 from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import read_yaml
 from twin.run.data_files import read_netcdf
-from twin.run.run_folder import MANIFEST, Manifest, read_manifest
+from twin.run.owned_files import MANIFEST
+from twin.run.run_folder import Manifest, read_manifest
 
 Leaf = float | int | str | bool | None
 LEFT_OUT = frozenset(

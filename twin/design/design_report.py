@@ -8,11 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from optics.design.design_rays import trace_beams
 from optics.design.design_variables import Prescription
-from optics.design.merit_function import Evaluation
-from optics.design.optimiser import Design, rms_error
-from optics.design.starts import Attempt
+from optics.design.merit_function import Evaluation, trace_beams
+from optics.design.optimiser import Attempt, Design, rms_error
 from scenes.models.camera_design import prescription_of
 from twin.design.design_run import DESIGN, DesignRun, agreement, verdict
 from twin.run.artefact import CameraFile, SvgFigure, Table

@@ -8,11 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from optics.design.design_rays import trace_beams
 from optics.design.design_variables import Prescription
-from optics.design.merit_function import Evaluation, MeritFunction, Operands
-from optics.design.optimiser import HELD, ITERATIONS, Design, DesignError, Held, rms_error
-from optics.design.starts import SAME, Attempt, Search, search
+from optics.design.merit_function import Evaluation, MeritFunction, Operands, trace_beams
+from optics.design.optimiser import (
+    HELD,
+    ITERATIONS,
+    SAME,
+    Attempt,
+    Design,
+    DesignError,
+    Held,
+    Search,
+    rms_error,
+    search,
+)
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError

@@ -18,11 +18,10 @@ from twin.export.fits_frames import Card, detector_cards, expected_fits, frames_
 from twin.export.result_tables import result_tables
 from twin.run.artefact import Cell, Table
 from twin.run.data_files import TABLE_FORMATS, DataTable, MissingPackage, read_netcdf
+from twin.run.owned_files import MANIFEST
 from twin.run.procedure import Advance
 from twin.run.report import Report, Section
-from twin.run.run_folder import MANIFEST, Manifest, RunFolder, altered, read_manifest
-
-__all__ = ["FRAMES", "KIND", "NONE", "Exported", "ExportedFile", "export", "export_report", "read_source"]
+from twin.run.run_folder import Manifest, RunFolder, altered, read_manifest
 
 KIND = "files"
 NONE = "none"

@@ -22,8 +22,6 @@ import xarray as xr
 from scenes.specs.resolved import ResolvedJob
 from twin.run.data_files import WRITER, ascii_text
 
-__all__ = ["Card", "RecordedFrames", "detector_cards", "expected_fits", "frames_fits", "read_frames", "run_cards"]
-
 Card = tuple[str, str | int | float, str]
 """Keyword, value, and what it is with its unit in brackets."""
 _SCALE, _TIE, _KEYS = 33550, 33922, 34735

@@ -20,9 +20,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.study import unit_of
 from scenes.yaml.json_file import read_json
 from twin.run.data_files import DataColumn, DataTable
-from twin.run.run_folder import MANIFEST
-
-__all__ = ["NUMBERS", "result_tables"]
+from twin.run.owned_files import MANIFEST
 
 POINTS = "artefacts/points.csv"
 NUMBERS = "numbers"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.orientation.interior import LINE_TERMS, InteriorOrientation, LineOrientation
 from analysis.turntable.dividing_error import DividingCompensation, expected_rejections
 from analysis.units import ARCSEC, MM_PER_M
@@ -16,7 +16,6 @@ from twin.laboratory.measured_readings import DataFile, SpotReadings
 from twin.laboratory.turntable_run import rms
 from twin.run.quantity import Quantity, Record
 
-Array = NDArray[np.float64]
 JOINT_MODEL = "L = constant + principal_distance tan W - principal_point tan^2 W + radial3 tan^3 W"
 _LINE_UNIT = np.array([1.0 / ARCSEC, MM_PER_M, MM_PER_M, 1.0])
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.orientation import interior, measurement
 from analysis.orientation.distortion_model import OrientationError, distortion, principal_distance, principal_point
 from analysis.orientation.distortion_model import principal_distance_and_point as distance_and_point
@@ -39,7 +40,6 @@ from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import usable_fits
 from twin.run.procedure import Advance, BenchError, silent
 
-Array = NDArray[np.float64]
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
 """Fits of the dividing error that compete for the compensation. The network takes minutes to train; the turntable test
 ranks it.

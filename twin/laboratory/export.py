@@ -23,8 +23,6 @@ from twin.laboratory.focus_run import SimulatedFocus, SimulatedState, recorder_o
 from twin.laboratory.turntable_run import TurntableRun
 from twin.run.data_files import FrameFacts, csv_table, tiff
 
-__all__ = ["export_distortion", "export_focus", "export_turntable"]
-
 Files: TypeAlias = Mapping[str, str | bytes]
 """Path in the folder -> contents."""
 COMPARISONS, HELD_OUT, SPOTS = "comparisons.csv", "held_out.csv", "spots.csv"

@@ -20,7 +20,7 @@ from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
-from optics.targets.collimator import TooNarrowError
+from optics.targets.target_image import TooNarrowError
 from scenes.specs.camera_tests import FocusTestSpec, MeasuredFocusSpec
 from scenes.specs.resolved import ExperimentSetup, FocusSetup, MeasuredFocusSetup
 from twin.laboratory import focus_scan

@@ -30,7 +30,7 @@ VERTEX_TREND = 0.15e-6
 """By how much this error changes from the middle to the ends of the line and of the bands, metres, one sigma, since the
 wavefront and the wavelength do."""
 
-_OFFSET, _FRAMES, _PATTERN = range(3)
+_OFFSET, _FRAMES = range(2)
 _COARSE = 4
 """Positions of the first scan that lie within the defocus at which all contrast is gone, at least."""
 _ATTEMPTS = 3

@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.chi_square import limit_of
+from analysis.arrays import Array
 from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex, outlying_points
-from analysis.images.image_file import ImageError, ImageFile, Region
+from analysis.images.image_file import ImageFile, Region
+from analysis.images.image_header import ImageError
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
 from analysis.spots.noise import NoiseModel
+from analysis.statistics import limit_of
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import cores, one_blas_thread
 from scenes.specs.camera_tests import FocusFiles, NoiseSpec
@@ -29,7 +31,6 @@ from twin.laboratory.measured_readings import DataFile
 from twin.run.procedure import Advance, silent
 from twin.targets.target_images import ALONG, DIRECTIONS
 
-Array = NDArray[np.float64]
 MOST_SITES = 3000
 NANOMETRE = 1e-9
 """Places nearer than this are one."""

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.orientation.measurement import CALIBRATED, Spots
 from analysis.turntable.dividing_error import CalibrationSeries, covered, gaps
 from optics.numerics.frozen_map import FrozenMap
@@ -22,7 +23,6 @@ from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import digest_of
 from scenes.yaml.units import ANGLE, LENGTH
 
-Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 MOST_ANGLES = 3000
 """Different angles of a series: the fits have matrices of this many rows and columns."""

@@ -16,12 +16,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.arrays import Array
 from analysis.turntable.dividing_error import CalibrationSeries
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
 from twin.run.random_streams import stream
 
-Array = NDArray[np.float64]
 _TABLE, _CALIBRATION, _HELD_OUT, _SPREAD = range(4)
 """Numbers of the seed's random streams."""
 _FIXED_POINT_STEPS = 8

@@ -6,7 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from analysis.chi_square import chance_beyond
+from analysis.statistics import chance_beyond
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, expected_rejections
 from twin.laboratory.measured_readings import Comparisons, DataFile
 from twin.laboratory.turntable_run import TurntableRun, rms

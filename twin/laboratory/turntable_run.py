@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.turntable.angle_fits import FITS, AngleFit, angles_left, fewest
 from analysis.turntable.dividing_error import CalibrationSeries, Choice, DividingCompensation, choose, compensate
 from optics.numerics.backend import Backend
@@ -25,7 +25,6 @@ from twin.laboratory.measured_readings import Comparisons, read_turntable
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.run.procedure import Advance, silent
 
-Array = NDArray[np.float64]
 TRUTH_READINGS = 4000
 """Readings at which fits are compared with the true curve."""
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)

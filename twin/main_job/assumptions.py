@@ -16,17 +16,6 @@ from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import SmoothedCourse
 from twin.run.artefact import plain, significant
 
-__all__ = [
-    "NOISE",
-    "assumed",
-    "combination",
-    "contradiction",
-    "course_agrees",
-    "doubted",
-    "limits",
-    "share_text",
-]
-
 _NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
 """Without a sentence's end."""
 NOISE = "the noise of the images"

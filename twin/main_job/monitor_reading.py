@@ -10,24 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.calibration import CameraCalibration
+from analysis.arrays import shows
 from analysis.monitor.curvature import BEYOND
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares, consistency
 from analysis.monitor.estimators import Estimator, applicable, judged
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.limits import Quantity, posterior_sigma, quantities, unmoved
+from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import Recovery
-from analysis.short_repr import shows
-from analysis.spots.fit_state import FALSE_ALARM as SPOT_ALARM
-from analysis.spots.fit_state import FitStates
+from analysis.spots.likelihood import FALSE_ALARM as SPOT_ALARM
+from analysis.spots.likelihood import FitStates
 from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
 from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.monitor.truth import Truth
 from twin.run.artefact import significant
 from twin.run.provenance import SelfCheck
 from twin.uncertainty.monitor_limits import short_text, unseen_texts
-
-__all__ = ["CENTROID_NOTES", "STATED", "MonitorReading", "contradicted", "stated"]
 
 CENTROID_NOTES = {
     "ml": "maximum-likelihood fit of the calibrated spot shape",

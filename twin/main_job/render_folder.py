@@ -39,7 +39,7 @@ from twin.main_job.result_sections import (
 )
 from twin.main_job.setup_sections import done_table, facts, setup_section
 from twin.main_job.verdict import judge
-from twin.pictures.viewer import viewer_markup, viewer_programs, viewer_scripts
+from twin.pictures.scene_file import viewer_markup, viewer_programs, viewer_scripts
 from twin.run.artefact import Piece
 from twin.run.page import report_page, write_artefacts
 from twin.run.procedure import WRITE, Session

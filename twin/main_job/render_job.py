@@ -13,9 +13,9 @@ from analysis.monitor.recovery import recover
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State, compose
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import UnphysicalError
-from scenes.models.built import squared_facets
+from optics.numerics.invariants import UnphysicalError
 from scenes.models.camera_sharpness import blur_warnings
+from scenes.models.instrument_builder import squared_facets
 from scenes.models.instrument_model import Instrument, MisplacedError
 from scenes.models.obstruction import find_obstructions, moved_into_beams
 from scenes.models.scenery import measured_finishes

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from analysis.arrays import shows
 from analysis.monitor import parameters
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import Estimator
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
 from analysis.monitor.recovery import Recovery
-from analysis.short_repr import shows
 from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances
 from analysis.monitor.limits import quantities, split
 from analysis.monitor.parameters import rows_of
+from analysis.statistics import limit_of
 from optics.geometry.tree import Motion
 from scenes.models.job_state import motions_of
 from scenes.specs.instrument import BASE, CENTRAL_PRISM

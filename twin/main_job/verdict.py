@@ -26,17 +26,6 @@ from twin.monitor.time_series import TimeSeries
 from twin.run.artefact import FAR, SAME, plain, residual_text, significant
 from twin.run.report import answer
 
-__all__ = [
-    "FALSE_ALARM",
-    "Judgement",
-    "alarm_limit",
-    "judge",
-    "limited",
-    "readings",
-    "recovered_numbers",
-    "sharpness_lost",
-]
-
 FALSE_ALARM = 1e-3
 """Chance that noise and disturbances as stated make any warning of a misreading in a run."""
 _EXPLAINED = 0.2

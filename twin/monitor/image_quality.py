@@ -19,15 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from analysis.short_repr import shows
+from analysis.arrays import shows
 from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
 from optics.geometry.tree import State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import hold_below, hold_equal, hold_within
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError, hold_below, hold_equal, hold_within
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import points_to_world

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances, TimeLaw
-from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, ORIGIN, PlacedBodies, State, compose
+from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State, compose
 from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import Path, leaves
@@ -27,7 +27,6 @@ from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.derivatives import RayTangents, jvp, vjp
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.diffraction import PupilTangent, image_derivative
 from scenes.models.disturbances import Component, StatedMotions, states_of
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
@@ -131,56 +130,8 @@ def spot_jacobian(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> np
     return np.asarray(mean.reshape(len(path.channels), len(motions), 2).swapaxes(1, 2)) / path.pitch
 
 
-def photon_derivative(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> np.ndarray:
-    """Derivative of the expected photons per pixel and frame by elementary motions: AD from the YAML to the pixels.
-
-    Args:
-        path: the monitor.
-        motions: M elementary motions.
-
-    Returns:
-        (M, C, rows, columns), photons per radian, metre or unit.
-    """
-    tangents, sizes = ray_tangents(path, motions)
-    count = len(motions)
-    rays = path.rays([{}])
-    field = path.field_of(rays)
-    # per nominal length of the chip, see ``PupilField.in_lengths_of``
-    grown = tangents.direction + sizes[:, None, None] * np.repeat(rays.direction, count, axis=0)
-    u_step, v_step = grown[..., 0], grown[..., 1]
-    # eikonal = path - d . position with the CCD's centre as the origin
-    position, direction = (np.repeat(a, count, axis=0) for a in (rays.position, rays.direction))
-    eikonal_step = tangents.path - np.sum(tangents.direction * position + direction * tangents.position, axis=-1)
-    u, v, amplitude = (np.repeat(a, count, axis=0) for a in (field.u, field.v, field.amplitude))
-    ratio = path.area_ratio(u, v)
-    ratio_step = path.area_ratio(u_step, v) + path.area_ratio(u, v_step)
-    step = PupilTangent(u_step, v_step, eikonal_step, amplitude * 0.5 * ratio_step / ratio)
-    reach = path.response.reach
-    y, x = (path.grid(axis, reach) for axis in (0, 1))
-    derivative = image_derivative(field.repeated(count), step, x, y)
-    photons = path.response.apply(derivative)
-    photons = path.light_per_pixel[:, None, None, None] * photons.reshape(len(path.channels), count, *photons.shape[1:])
-    return np.asarray(photons.swapaxes(0, 1))
-
-
 CHUNK = 1 << 17
 """Rays, of all channels together, that go back through the trace at once: what they need is about 0.3 GB."""
-
-
-def every_motion(instrument: Instrument) -> tuple[ElementaryMotion, ...]:
-    """All elementary motions there are: shifts, turns and scale of every body, low Zernike figures of every mirror.
-
-    Mirrors turn about the middle of their clear aperture, all other bodies about their origin.
-    """
-    out = []
-    mirrors = {e.body for e in instrument.assembly.elements.values() if not e.surface.is_plane}
-    for body in instrument.assembly.tree.bodies:
-        pivot = "centre" if body.path in mirrors else ORIGIN
-        for kind, axes in (("shift", 3), ("rotate", 3), ("scale", 1)):
-            out += [ElementaryMotion(body.path, kind, axis, pivot) for axis in range(axes)]
-        if body.path in mirrors:
-            out += [ElementaryMotion(body.path, "figure", j, pivot) for j in FIGURE_TERMS]
-    return tuple(out)
 
 
 def spot_gradient(

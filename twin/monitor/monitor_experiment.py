@@ -12,18 +12,18 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
+from analysis.arrays import shows
 from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.monitoring import MonitorGeometry
-from analysis.short_repr import shows
+from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from optics.numerics.threads import one_blas_thread
-from optics.thermal.heat import Temperature
+from optics.thermal.deformation import Temperature
 from optics.thermal.nodal_deformation import NodalDeformation
 from optics.waves.pixel_response import UnsampledImageError
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions

@@ -13,8 +13,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from analysis.arrays import shows
 from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots, recover
-from analysis.short_repr import shows
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State

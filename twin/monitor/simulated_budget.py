@@ -19,9 +19,9 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
-from optics.thermal.heat import Temperature
+from optics.thermal.deformation import Temperature
 from scenes.models.disturbances import states_of
-from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.disturbances import ErrorBudgetSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
+from analysis.arrays import shows
 from analysis.monitor.ground_error import GroundGeometry
-from analysis.short_repr import shows
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import points_to_world

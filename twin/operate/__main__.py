@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 if __name__ == "__main__":
-    from scenes.yaml.interrupt import end_quietly
+    from scenes.yaml.standard_output import end_quietly
 
     end_quietly()
 
@@ -92,7 +92,7 @@ def init(
     """
     from scenes.specs.operation import read_operation
     from scenes.specs.resolved import resolve_with
-    from twin.operate.estimate.plans import keep_plan, read_plan
+    from twin.operate.estimate.operation_model import keep_plan, read_plan
     from twin.operate.record.history import History, initialised
 
     with told() as errors:
@@ -218,7 +218,7 @@ def _new_alarms(errors: Console, history: History, record: str, page: Path | Non
     """Return the alarms that the estimate under the record's plan raises with what was taken, after the report is
     written. What keeps it from being worked out is printed, and is no fault of what was taken.
     """
-    from twin.operate.shown_readings import last_time
+    from twin.operate.overview import last_time
 
     try:
         found = estimate_of(errors, history, None, quiet)

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
+from analysis.statistics import limit_of
 from twin.operate.overview import Overview, Trend, group_name
 from twin.operate.record.entries import MICRO, utc_text
 from twin.run import svg

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
+from analysis.statistics import limit_of
 from scenes.models.disturbances import HEAT
 from scenes.yaml.errors import Problem
 from twin.operate.daily_plots import courses_svg, innovations_svg

@@ -16,7 +16,8 @@ from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict, print_who
 
 if TYPE_CHECKING:
     from analysis.monitor.detection_power import Power
-    from twin.operate.estimate.operation import Course, Following, Operation
+    from twin.operate.estimate.following import Course, Following
+    from twin.operate.estimate.operation import Operation
     from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
 

@@ -12,12 +12,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.monitor.disturbances import Disturbances
 from optics.geometry.tree import Body, Motion
 from optics.numerics.frozen_map import FrozenMap
-from optics.thermal.heat import Temperature
+from optics.thermal.deformation import Temperature
 from scenes.models.disturbances import HEAT, Component, state_of, usual_pivot
 from scenes.models.instrument_model import Instrument
 from scenes.models.joint_disturbances import joint_disturbances, joint_files
@@ -27,7 +27,6 @@ from scenes.specs.job import JobSpec, PerturbationSpec
 from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.yaml.yaml_file import dump_yaml
 
-Array = NDArray[np.float64]
 UNSAID = ("index_gradient",)
 """Kinds of components that `perturb` of a job has no key for."""
 TURNS = ("rotate", "scale")

@@ -12,7 +12,8 @@ from twin.run.cli import InputErrorText, Standing, heartbeat
 
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup
-    from twin.operate.estimate.operation import Following, Operation
+    from twin.operate.estimate.following import Following
+    from twin.operate.estimate.operation import Operation
     from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
 
@@ -24,7 +25,7 @@ PlanFile = Annotated[
 
 def plan_of(history: History, plan: Path | None) -> OperationSetup | None:
     """The plan in a file, or that of the record; None where the record keeps none. Raises InputError."""
-    from twin.operate.estimate.plans import kept_plan, read_plan
+    from twin.operate.estimate.operation_model import kept_plan, read_plan
 
     return kept_plan(history) if plan is None else read_plan(plan, history)
 

@@ -2,6 +2,8 @@
 
 An overview takes the estimate as `twin.operate.estimate.operation` gives it, with the alarms of the record, and says
 in words and rows what holds, what changed and whether predictions came true. Nothing is estimated here.
+
+Return single readings of the monitor as the report shows them: the first and last times, and evenly chosen ones.
 """
 
 from __future__ import annotations
@@ -12,20 +14,71 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import beta, norm
+from scipy.stats import norm
+from sqlalchemy import Select, func, select
 
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
+from analysis.statistics import share_interval
 from optics.numerics.frozen_map import FrozenMap
 from twin.operate.estimate.alarms import name_of, percent
 from twin.operate.record.entries import MICRO, utc_text
-from twin.operate.shown_readings import first_time, readings
+from twin.operate.record.history import History, content_of
+from twin.operate.record.schema import ENTRY, SOURCE
 from twin.run.artefact import SAME, decimals_for, fixed
 
 if TYPE_CHECKING:
     from twin.operate.estimate.following import Break, Course, Following, FoundJump
     from twin.operate.estimate.operation import Operation
     from twin.operate.record.history import History
+
+KIND = "monitor"
+_TOGETHER = 400
+"""Rows asked for at once."""
+
+
+def _rows() -> Select[Any]:
+    return select(*ENTRY.c, SOURCE.c.file).join(SOURCE, ENTRY.c.source_id == SOURCE.c.id).where(ENTRY.c.kind == KIND)
+
+
+def first_time(history: History) -> int:
+    """Time of the first reading of the monitor, microseconds of TAI since 2000; 0 without any."""
+    with history.reading() as connection:
+        found = connection.execute(select(func.min(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)).scalar()
+    return int(found or 0)
+
+
+def last_time(history: History) -> int | None:
+    """Time of the newest reading of the monitor, microseconds of TAI since 2000; None without any."""
+    with history.reading() as connection:
+        found = connection.execute(select(func.max(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)).scalar()
+    return None if found is None else int(found)
+
+
+def readings(history: History, begin: int, end: int, most: int) -> list[dict[str, Any]]:
+    """Readings of the monitor in a span, in the order of time; evenly chosen if there are more than ``most``.
+
+    Args:
+        history: the record.
+        begin: microseconds of TAI since 2000.
+        end: likewise; both ends belong to the span.
+        most: readings.
+
+    Returns:
+        Rows as `History.entries` yields them, with ``content`` as plain data.
+    """
+    c = ENTRY.c
+    query = select(c.id).where(c.kind == KIND, c.time_us >= begin, c.time_us <= end).order_by(c.time_us, c.id)
+    with history.reading() as connection:
+        found = list(connection.execute(query).scalars())
+        step = max(1, -(-len(found) // most))
+        chosen = found[::-1][::step][::-1]  # the newest is always among them
+        rows: list[dict[str, Any]] = []
+        for k in range(0, len(chosen), _TOGETHER):
+            part = connection.execute(_rows().where(c.id.in_(chosen[k : k + _TOGETHER])).order_by(c.time_us, c.id))
+            rows += map(dict, part.mappings())
+    return [{**row, "content": content_of(row)} for row in rows]
+
 
 DAY = 86_400 * MICRO
 """Microseconds."""
@@ -92,9 +145,7 @@ def coverage(sigmas: int, within: int, count: int) -> Coverage:
         within: components that lay within.
         count: all components.
     """
-    rest = 0.5 * (1.0 - CONFIDENCE)
-    low = float(beta.ppf(rest, within, count - within + 1)) if within > 0 else 0.0
-    high = float(beta.ppf(1.0 - rest, within + 1, count - within)) if within < count else 1.0
+    low, high = share_interval(within, count, CONFIDENCE)
     return Coverage(sigmas, WITHIN[sigmas], count, within / count if count else math.nan, low, high)
 
 

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import select
 
+from analysis.arrays import Array
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
-from twin.operate.estimate.plans import plan_digest
+from twin.operate.estimate.operation_model import plan_digest
 from twin.operate.estimated_motions import EstimatedMotions, LeftOut, Prior, prior_files, state_file
 from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
 from twin.operate.record.schema import ENTRY
@@ -34,11 +34,11 @@ from twin.run.procedure import BenchError
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.models.disturbances import Component
-    from twin.operate.estimate.operation import Course, Following, Operation
+    from twin.operate.estimate.following import Course, Following
+    from twin.operate.estimate.operation import Operation
     from twin.operate.record.history import History
     from twin.orbit.export.export_run import ExportSource
 
-Array = NDArray[np.float64]
 STATE, PRIOR = "state", "prior"
 """Names of the files."""
 APART = 60 * MICRO

@@ -48,8 +48,8 @@ def report(
     require_record(record)
     with told() as errors:
         from twin.operate.daily_report import end_of_day
+        from twin.operate.overview import first_time, last_time
         from twin.operate.record.history import History, PastHistory
-        from twin.operate.shown_readings import first_time, last_time
 
         with History(record) as history:
             newest = last_time(history)

@@ -18,10 +18,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.monitor.limits import Quantity
 from twin.operate.record.entries import MICRO
 
-Array = NDArray[np.float64]
 SHARE = 0.2
 """By which an error may be larger than at the time of the estimate."""
 _FIRST = MICRO

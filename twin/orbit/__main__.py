@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 if __name__ == "__main__":
-    from scenes.yaml.interrupt import end_quietly
+    from scenes.yaml.standard_output import end_quietly
 
     end_quietly()
 
@@ -29,9 +29,8 @@ if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.measured.adjust_setup import AnyAdjust
     from twin.orbit.block.block_run import BlockRun
-    from twin.orbit.export.export_run import ExportSource, SceneSource
+    from twin.orbit.export.export_run import ExportSource, SceneSource, Wishes
     from twin.orbit.export.polynomial_export import PolynomialSource
-    from twin.orbit.export.quality import Wishes
 
     Exportable = ExportSource | SceneSource | PolynomialSource
 
@@ -206,10 +205,9 @@ def export(
     }
 
     def resolve() -> tuple[Exportable, tuple[float, float] | None, Wishes]:
-        from twin.orbit.export.export_run import read_exportable
+        from twin.orbit.export.export_run import Wishes, read_control, read_exportable
         from twin.orbit.export.ground_accuracy import CameraUncertainty
         from twin.orbit.export.polynomial_export import read_polynomial_source
-        from twin.orbit.export.quality import Wishes, read_control
 
         stated = {name: _sigma(name, *one) for name, one in sigmas.items() if one[0] is not None}
         uncertainty = CameraUncertainty.of(**stated) if stated else None

@@ -182,6 +182,3 @@ def _joined(names: list[str]) -> str:
         out.append(face if face and body == last else name)
         last = body
     return ", ".join(out)
-
-
-__all__ = ["MARKS", "OUTSIDE", "Touch", "family_name", "nominal_codes", "touches"]

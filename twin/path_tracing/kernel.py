@@ -19,9 +19,9 @@ from optics.numerics.backend import Backend
 from twin.path_tracing import clear_ways
 from twin.path_tracing import tables as layout
 from twin.path_tracing.families import BITS, FACTOR, OUTSIDE, START, Event
+from twin.path_tracing.importance_sampling import Leaving, TableDraw, spread
 from twin.path_tracing.meeting import Flight, Place, locate, next_surface
 from twin.path_tracing.sinks import Arrival, Sinks, record
-from twin.path_tracing.spreading import Leaving, TableDraw, spread
 
 STEP_BACK = 1e-5
 """How far behind a triangle that is passed over the search goes on, metres."""

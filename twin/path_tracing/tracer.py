@@ -13,13 +13,13 @@ from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
 from twin.path_tracing.clear_ways import ClearWays
 from twin.path_tracing.families import Touch, signature, touches
+from twin.path_tracing.importance_sampling import Followed, Thinning, learn
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, follow
 from twin.path_tracing.path_result import Collector, Key, PathResult, event_lists
 from twin.path_tracing.sequential import Left, Step, go_on, pass_along, steps_of
 from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
 from twin.path_tracing.source import DiskSource, Source, pieces, start
 from twin.path_tracing.tables import ROWS_PER_SURFACE, SurfaceForm, upload, way_table
-from twin.path_tracing.thinning import Followed, Thinning, learn
 
 VARIANTS = {"llvm": "llvm_ad_mono", "cuda": "cuda_ad_mono"}
 """Mitsuba's variant whose arrays are those of the backend; triangles are float32 in all of them."""

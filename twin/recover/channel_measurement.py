@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.monitor.calibration import MonitorCalibration
+from analysis.monitor.parameters import MonitorCalibration
 from analysis.monitor.recovery import measure_spots
-from analysis.spots.fit_state import widened
 from analysis.spots.frame_screening import (
     Finding,
     FramesError,
@@ -26,6 +25,7 @@ from analysis.spots.learnt_template import (
     learnt_shift,
     without_slopes,
 )
+from analysis.spots.likelihood import widened
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PixelCorrection
 from analysis.spots.screened_fit import CORE_SHARE, ScreenedFit, one_shape
@@ -36,8 +36,6 @@ from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.yaml.errors import Issue
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 from twin.run.frame_store import let_go, mean_of
-
-__all__ = ["ChannelMeasurement", "ChannelResult", "SpotResult", "remedy"]
 
 _DEAREST = 4.0
 """Times that sigma may grow by what is missing, before a spot counts as lost."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analysis.images.image_file import ImageError, ImageFile
+from analysis.images.image_file import ImageFile
+from analysis.images.image_header import ImageError
 from twin.monitor.monitor_memory import GREY, MonitorSize
 from twin.run.cost import Cost, Lowered
 from twin.run.frame_store import IN_MEMORY, PART

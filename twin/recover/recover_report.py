@@ -18,8 +18,6 @@ from twin.recover.recover_run import RecoverRun, state_name
 from twin.run.artefact import FAR, Cell, SvgFigure, Table, decimals_for, fixed, plain, significant
 from twin.run.report import Report, Section, answer
 
-__all__ = ["KIND", "recover_numbers", "recover_report"]
-
 KIND = "recovered"
 _IN_NO_SIGMA = (
     "σ contains no charge that a CCD leaves behind when it is read out (tails away from the read-out), no reflection "

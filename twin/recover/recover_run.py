@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
+from analysis.arrays import shows
 from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Consistency, Disturbances
 from analysis.monitor.monitoring import MonitorGeometry, coefficients
+from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.monitor.recovery import Recovery, judged_spots, recover, recovery_of
-from analysis.short_repr import shows
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions
@@ -43,8 +43,6 @@ from twin.recover.measured_frames import (
 from twin.run.frame_store import mean_of
 from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import EmvaDetector, told_of_steps
-
-__all__ = ["RecoverRun", "run_recover", "state_name"]
 
 CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure the spots"
 

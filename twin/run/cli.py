@@ -119,8 +119,8 @@ def explained(errors: Console) -> Iterator[None]:
     except Exception as error:
         # the work that failed has imported these; help and a bad file do not wait for them
         from optics.numerics.backend import BackendUnavailable
+        from optics.numerics.invariants import PhysicalError, UnphysicalError
         from optics.numerics.llvm import LibraryMissing
-        from optics.numerics.physical_error import PhysicalError, UnphysicalError
         from twin.run.run_folder import RunFolderError
 
         # a number that cannot be is a fault of the program; light that a state loses is one of what was asked for

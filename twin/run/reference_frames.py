@@ -13,8 +13,6 @@ from typing import Any
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.procedures import PROCEDURES
 
-__all__ = ["FRAMES", "described", "frames_text", "schema"]
-
 _VERSION = 2
 """Version of the files' keys; 1 had no statement of frames."""
 _LATER: Mapping[str, int] = FrozenMap(

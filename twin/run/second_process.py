@@ -23,8 +23,6 @@ from typing import IO, Any
 
 from optics.numerics.threads import cores
 
-__all__ = ["SecondProcess"]
-
 MOST_TASKS = 256
 _HEAD = struct.Struct("=QB")
 """What tells of tasks: bytes that they take, and how many of them the second process does alone."""

@@ -1,4 +1,7 @@
-"""An instrument in a script: load it, perturb it, render it, recover what happened from the images."""
+"""An instrument in a script: load it, perturb it, render it, recover what happened from the images.
+
+A camera in a script: looked at as optical designers do, and perturbed as the instrument that it is or belongs to.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 import pandas as pd
@@ -29,6 +32,7 @@ from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
+from twin.camera.camera_view import CameraView
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_job import render_job
 from twin.monitor.crosstalk import estimator_gains
@@ -41,8 +45,56 @@ from twin.scripting.results import Found, Shot, as_frames, found_table, name_htm
 from twin.scripting.results import shot_of as _shot_of
 from twin.sensors.area_detector import coarse_warnings
 
-if TYPE_CHECKING:
-    from twin.scripting.camera_twin import CameraTwin
+
+class Twin(Protocol):
+    """The instrument that a camera belongs to, as `twin.load` gives it."""
+
+    @property
+    def experiment(self) -> MonitorExperiment:
+        """The modelled instrument."""
+
+    @property
+    def state(self) -> State:
+        """Body -> motion."""
+
+    def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> Self:
+        """The instrument with these bodies perturbed. Raises InputError where that cannot be."""
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class CameraTwin(CameraView):
+    """A camera of an instrument in one state. Made by `load_camera` and `InstrumentTwin.camera`.
+
+    Attributes:
+        twin: the instrument, of which this may be all.
+        name: of the camera in it.
+        obstruction: whether what other bodies take of its beam is missing.
+    """
+
+    twin: Twin = field(repr=False)
+    name: str
+    obstruction: bool = True
+
+    @classmethod
+    def of(cls, twin: Twin, name: str, obstruction: bool = True) -> CameraTwin:
+        """A camera of an instrument, in the instrument's state.
+
+        Args:
+            twin: the instrument.
+            name: of the camera in it.
+            obstruction: whether what other bodies take of its beam is missing.
+        """
+        experiment = twin.experiment
+        seen = CameraView.within(experiment.instrument, name, experiment.backend, twin.state, obstruction)
+        return cls(seen.path, seen.state, twin=twin, name=name, obstruction=obstruction)
+
+    def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> CameraTwin:
+        """The same camera with bodies of its instrument perturbed; arguments and errors as `InstrumentTwin.perturbed`.
+
+        Args:
+            perturb: motions in words, such as ``"M2 shift z 20 um"``, or node -> keys of `perturb:` in a job's YAML.
+        """
+        return CameraTwin.of(self.twin.perturbed(*perturb), self.name, self.obstruction)
 
 
 class _Bench:
@@ -304,7 +356,6 @@ class InstrumentTwin:
             InputError: no camera of that name.
         """
         # it draws
-        from twin.scripting.camera_twin import CameraTwin
 
         name = name or (self.cameras[0] if len(self.cameras) == 1 else "")
         if name not in self.cameras:

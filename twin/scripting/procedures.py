@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.short_repr import shows
+from analysis.arrays import shows
 from optics.numerics.backend import load_backend
 from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import ExperimentSetup

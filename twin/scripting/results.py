@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from analysis.arrays import shows
 from analysis.monitor import parameters
 from analysis.monitor.estimators import judged
 from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
-from analysis.short_repr import shows
 from optics.numerics.backend import Backend
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_files import irradiance

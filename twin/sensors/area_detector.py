@@ -26,9 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from analysis.spots.noise import FurtherNoise, NoiseModel
-from analysis.spots.rounding import COARSE, FEW, WHOLE
-from optics.numerics.physical_error import UnphysicalError
+from analysis.spots.noise import COARSE, FEW, WHOLE, FurtherNoise, NoiseModel
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.threads import cores
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec

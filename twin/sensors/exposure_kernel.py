@@ -40,8 +40,6 @@ from twin.sensors.poisson_numbers import (
     words_of,
 )
 
-__all__ = ["FEWEST", "Reading", "exposing_bytes", "kernels_there"]
-
 FEWEST = 50_000
 """Numbers of an exposure from which it is done by kernels: fewer take as long to hand over as to work out."""
 

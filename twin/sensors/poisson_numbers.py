@@ -31,20 +31,6 @@ from functools import cache
 import numpy as np
 from scipy.special import gammainc, gammaincc, ndtri
 
-__all__ = [
-    "CELLS_PER_UNIT",
-    "MOST_IN_TABLE",
-    "SERIES_END",
-    "TABLE_BITS",
-    "TABLE_END",
-    "poisson_numbers",
-    "poisson_pieces",
-    "poisson_quantile",
-    "quantile_table",
-    "split_stream",
-    "words_of",
-]
-
 TABLE_END = 32.0
 """Mean from which no table is used."""
 SERIES_END = 65536.0

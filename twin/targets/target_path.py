@@ -12,20 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.short_repr import shows
+from analysis.arrays import shows
 from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
-from optics.targets.collimator import Collimator
+from optics.targets.target_image import Collimator
 from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import StopOutlines, settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field

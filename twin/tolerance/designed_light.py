@@ -9,16 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.invariants import UnphysicalError
 from optics.waves.pupil_terms import products
-from optics.waves.transfer import polychromatic_transfer
-from optics.waves.varied_pupil import VariedTransfer
+from optics.waves.transfer import VariedTransfer, polychromatic_transfer
 from scenes.models.camera_model import lenses
 from scenes.specs.camera import CameraSpec
 from scenes.specs.spectrum import SpectrumSpec
 from scenes.specs.tolerance import ToleranceBudgetSpec
 from twin.camera.camera_optics import CameraOptics
-from twin.tolerance.merits import Merit
+from twin.tolerance.monitor_merit import Merit
 
 TRANSFER = 1e-3
 """By how much an MTF at fixed nodes may differ from that of the designed pupil by itself."""

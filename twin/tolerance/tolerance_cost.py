@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from twin.run.cost import Cost, Lowered
 from twin.study.runs.plan import CELL
-from twin.tolerance.merits import AT_FIELDS
+from twin.tolerance.monitor_merit import AT_FIELDS
 
 if TYPE_CHECKING:
     from scenes.specs.tolerance import MeritSpec, ToleranceSetup

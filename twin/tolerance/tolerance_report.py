@@ -11,8 +11,7 @@ from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, d
 from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, shared_legend, to_svg
 from twin.tolerance.merit_models import FARTHEST
-from twin.tolerance.merits import merit_head, merit_unit
-from twin.tolerance.monitor_merit import readings_of
+from twin.tolerance.monitor_merit import merit_head, merit_unit, readings_of
 from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRun, Yield
 
 _FEW = 3

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
+from analysis.statistics import share_interval
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
@@ -23,7 +23,7 @@ from twin.run.quantity import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
 from twin.tolerance.given_warnings import beam_warnings, given_warnings, missed_warnings
 from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
-from twin.tolerance.merits import Merit, merit_unit, shown_merit
+from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 from twin.tolerance.samples import Samples, Workforce, draw_samples
 from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
 from twin.tolerance.variations import states_of
@@ -62,8 +62,7 @@ class Yield:
     def count(cls, passing: np.ndarray) -> Yield:
         """Of cameras that pass or not, (S,)."""
         passed, total = int(np.sum(passing)), len(passing)
-        low, high = binomtest(passed, total).proportion_ci(CONFIDENCE, "exact")
-        return cls(passed, total, float(low), float(high))
+        return cls(passed, total, *share_interval(passed, total, CONFIDENCE))
 
     @property
     def share(self) -> float:

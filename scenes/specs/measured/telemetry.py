@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.events import Event
 from scenes.specs.measured.pass_files import ClockReading, TimeScale
+from scenes.specs.operation import Event
 from scenes.yaml.errors import Problem, names_text, nearest
 from scenes.yaml.spec import Paths, Reference, Spec, Text, not_empty, short_for
 from scenes.yaml.units import ANGLE, LENGTH, MOMENT, TEMPERATURE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity

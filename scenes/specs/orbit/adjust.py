@@ -12,8 +12,16 @@ from pydantic import Field, model_validator
 
 from scenes.specs.orbit.angle import Relief, TerrainHeight
 from scenes.specs.orbit.calibration import CameraDriftSpec, FieldLength, LineTime, MonitorReadingSpec
-from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, Interval, Latitude, Longitude, UtcTime
-from scenes.specs.orbit.jitter import Frequency
+from scenes.specs.orbit.flight import (
+    Altitude,
+    AttitudeSpec,
+    EarthSpec,
+    Frequency,
+    Interval,
+    Latitude,
+    Longitude,
+    UtcTime,
+)
 from scenes.specs.orbit.sensors import SENSORS
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.quantity import AngleSigmas, Quantity, Vector

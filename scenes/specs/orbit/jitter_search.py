@@ -9,8 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.angle import LightEffectsSpec, Moment, TerrainHeight
 from scenes.specs.orbit.calibration import LineTime
-from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, PayloadTestSpec
-from scenes.specs.orbit.jitter import Frequency
+from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, Frequency, OrbitSpec, PayloadTestSpec
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import AngleSigma, Quantity
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole

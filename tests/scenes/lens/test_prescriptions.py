@@ -8,8 +8,7 @@ import pytest
 
 from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.surface import ZernikeFigure
-from optics.materials.dispersion import ABBE_LINES, common_glasses
-from optics.materials.glass import N_BK7
+from optics.materials.glass import ABBE_LINES, N_BK7, common_glasses
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace

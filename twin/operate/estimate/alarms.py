@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from analysis.chi_square import chance_beyond, limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
+from analysis.statistics import chance_beyond, limit_of
 from scenes.specs.operation import OperationSpec
-from twin.operate.estimate.operation import Break, Following, FoundJump
+from twin.operate.estimate.following import Break, Following, FoundJump
 from twin.operate.record.entries import MICRO, Alarm, utc_text
 from twin.operate.record.history import History
 from twin.run.artefact import decimals_for, fixed, plain
@@ -27,14 +27,6 @@ LEAST = 1e-6
 _CLOSE = 3.0
 """Difference of log likelihood ratios, below which another body explains a jump nearly as well: 20 to 1."""
 BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "breaks", "jump", "sensor", "contradiction"
-KINDS: Mapping[str, str] = {
-    BROKEN: "a requirement that does not hold now",
-    BREAKS: "a requirement that is expected to break within the horizon",
-    JUMP: "a step of a body",
-    SENSOR: "a sensor of temperature that is dead, stuck or doubtful",
-    CONTRADICTION: "a reading that is further from its prediction than the statement allows",
-}
-"""Kind of alarm -> of what it tells."""
 Row = Mapping[str, Any]
 
 

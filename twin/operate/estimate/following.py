@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from analysis.chi_square import limit_of
+from analysis.arrays import Array
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
+from analysis.statistics import limit_of
 from twin.operate.estimate.standing import SPANS, Scores
 from twin.operate.record.entries import utc_text
 
-__all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "SensorState", "beyond", "widening"]
-
-Array = NDArray[np.float64]
 MOST_BAD = 2
 """Readings taken for bad ones, above which it is said: 3 of 200 come by chance once in a thousand times."""
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import pdtrc
 
+from analysis.arrays import Array
 from analysis.monitor.detection_power import Power, detection_power
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.filter_state import Belief, Observed
@@ -30,17 +31,12 @@ from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
-from twin.operate.estimate.operation_model import OperationModel, traced_model
-from twin.operate.estimate.packing import packed, unpacked
-from twin.operate.estimate.plans import plan_digest
-from twin.operate.estimate.standing import Standing, Taking
+from twin.operate.estimate.operation_model import OperationModel, plan_digest, traced_model
+from twin.operate.estimate.standing import Standing, Taking, packed, unpacked
 from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
 from twin.operate.record.history import USED, History, content_of
 from twin.run.provenance import source_digest
 
-__all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "Operation", "SensorState", "beyond"]
-
-Array = NDArray[np.float64]
 DAY = 86_400 * MICRO
 EVERY = 1000
 """Readings after which it is kept for good where the estimate stands."""

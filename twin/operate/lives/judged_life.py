@@ -17,18 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.json_file import read_json
-from twin.operate.estimate.operation import Course, Following, Operation
+from twin.operate.estimate.following import Course, Following
+from twin.operate.estimate.operation import Operation
 from twin.operate.record.entries import MICRO, Entry, Given
 from twin.operate.record.history import History, initialised
 from twin.operate.record.run_readings import RESULTS
 from twin.operate.record.telemetry import read_table_file, read_telemetry, tables_of
 from twin.run.procedure import Advance
 
-Array = NDArray[np.float64]
 FOLLOW = "follow the readings"
 WAYS = {
     "ground": "calibration on the ground, kept",

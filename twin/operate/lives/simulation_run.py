@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from optics.numerics.backend import Backend
-from scenes.specs.events import EVENTS
-from scenes.specs.operation import OperationSetup, read_operation
+from scenes.specs.operation import EVENTS, OperationSetup, read_operation
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, SCALE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.estimate.plans import keep_plan, read_plan
+from twin.operate.estimate.operation_model import keep_plan, read_plan
 from twin.operate.lives.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
 from twin.operate.record.entries import one_line, utc_text
 from twin.operate.record.history import History, initialised

@@ -18,7 +18,6 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.json_file import parse_json
 from twin.operate.record import schema
-from twin.operate.record.database import engine_of, failures_told, opened, said, url_of, writing
 from twin.operate.record.entries import (
     DECISION,
     Alarm,
@@ -32,7 +31,22 @@ from twin.operate.record.entries import (
     utc_text,
 )
 from twin.operate.record.place import NotARecord, RecordFailed
-from twin.operate.record.schema import ACKNOWLEDGEMENT, ALARM, CHECKPOINT, ENTRY, INSTRUMENT, PLAN, REFUSED, SOURCE
+from twin.operate.record.schema import (
+    ACKNOWLEDGEMENT,
+    ALARM,
+    CHECKPOINT,
+    ENTRY,
+    INSTRUMENT,
+    PLAN,
+    REFUSED,
+    SOURCE,
+    engine_of,
+    failures_told,
+    opened,
+    said,
+    url_of,
+    writing,
+)
 from twin.operate.record.taking import Taken, Taking
 from twin.run.data_files import WRITER
 from twin.run.durable import make_folders, sync_folder

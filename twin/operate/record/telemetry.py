@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scenes.specs.events import EVENTS
 from scenes.specs.load import INSTRUMENTS, find_named
 from scenes.specs.measured.telemetry import (
     EVENT,
@@ -19,6 +18,7 @@ from scenes.specs.measured.telemetry import (
     ReadingTableSpec,
     TelemetrySpec,
 )
+from scenes.specs.operation import EVENTS
 from scenes.specs.resolved import resolve_with
 from scenes.yaml.csv_table import rows_apart
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown, unknown

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.block.law_tests import LawTest
+from analysis.block.block_adjustment import LawTest
 from analysis.block.network import DatumTest, Network, Open
 from analysis.block.reweighting import GroupTest
 from analysis.orbit.ground_errors import Accuracy

@@ -10,11 +10,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from analysis.block.block import Block
-from analysis.block.block_adjustment import BlockAdjustment, adjust_block, kept_block
-from analysis.block.law_tests import LawTest, law_tests
+from analysis.block.block_adjustment import BlockAdjustment, LawTest, adjust_block, kept_block, law_tests
 from analysis.block.network import DatumTest, Network, Open, datum_test, network_of, open_combinations
+from analysis.block.point_reduction import Pool
 from analysis.block.processes import BlockError
-from analysis.block.shares import Pool
 from analysis.measurement_error import MeasurementError
 from analysis.orbit.ground_errors import Accuracy, level_axes, predicted, realised
 from optics.numerics.frozen_map import FrozenMap

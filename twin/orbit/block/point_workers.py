@@ -16,7 +16,7 @@ _LOST = "a worker was lost with its share of the points; adjust the block again"
 
 @dataclass(frozen=True, eq=False)
 class PointWorkers:
-    """Workers as `analysis.block.shares` uses them: one share for each of those that there are at the start.
+    """Workers as `analysis.block.point_reduction` uses them: one share for each of those that there are at the start.
 
     Attributes:
         workers: the processes.

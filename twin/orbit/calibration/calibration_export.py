@@ -14,7 +14,7 @@ from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable
-from twin.orbit.images.imaged_ground import BEYOND
+from twin.orbit.images.image_points import BEYOND
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 

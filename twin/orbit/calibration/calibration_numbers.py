@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.calibration.adjustment import Adjustment
 from analysis.calibration.hidden_terms import FALSE_ALARM
 from analysis.calibration.strip_adjustment import Datum
@@ -24,11 +24,8 @@ from twin.orbit.calibration.latitude import LatitudeFit
 from twin.orbit.calibration.schemes import FieldErrors, Repeatability, Repeats, SchemeMeans, meets
 from twin.orbit.calibration.screening import ground_sample, meeting_of
 from twin.orbit.calibration.strip import Strips
-from twin.orbit.images.point_judgement import LineJudgement
+from twin.orbit.images.point_report import LineJudgement
 from twin.run.quantity import Quantity, Record
-
-Array = NDArray[np.float64]
-
 
 # --- errors at check points, by scheme -------------------------------------------------------------------
 

@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.calibration.adjustment import Adjustment
-from analysis.calibration.plausibility import FarPointsError, NoiseError
-from analysis.calibration.stepwise import Stepwise, stepwise
+from analysis.calibration.adjustment import Adjustment, FarPointsError, NoiseError
+from analysis.calibration.strip_adjustment import Stepwise, stepwise
 from analysis.orbit.calibration_parameters import OFFSET, RATE
-from analysis.orbit.forward_intersection import CheckErrors
+from analysis.orbit.forward_intersection import CheckErrors, ThirdDifference, third_difference
 from analysis.orbit.null_space import RankError
-from analysis.orbit.third_difference import ThirdDifference, third_difference
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread

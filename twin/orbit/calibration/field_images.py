@@ -17,11 +17,17 @@ from scenes.yaml.errors import KeyPath
 from twin.orbit.calibration.observations import FieldPoints, PassData
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PatchPoints, PointsError, measure_points
-from twin.orbit.images.imaged_ground import BEYOND
+from twin.orbit.images.image_points import (
+    BEYOND,
+    POINTS_REMEDY,
+    MatchedPoints,
+    PatchPoints,
+    PointsError,
+    measure_points,
+)
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import Patch, PatchError, fly_patch, imaged_lines
-from twin.orbit.images.point_judgement import LineJudgement, judged, true_ground
+from twin.orbit.images.point_report import LineJudgement, judged, true_ground
 from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.run.procedure import Advance, BenchError
 from twin.run.random_streams import stream

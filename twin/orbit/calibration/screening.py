@@ -15,10 +15,10 @@ import numpy as np
 from scipy.stats import chi2, siegelslopes
 
 from analysis.block.reweighting import REJECT
-from analysis.calibration.adjustment import Adjustment
-from analysis.calibration.plausibility import FarPointsError
+from analysis.calibration.adjustment import Adjustment, FarPointsError
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import Rays, misclosure
+from analysis.statistics import robust_variance
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, Rejected
 from twin.orbit.calibration.campaign_adjustment import simultaneous
@@ -71,7 +71,7 @@ def mislabelled(campaign: Campaign, one: FieldPass) -> tuple[dict[str, np.ndarra
         def size(rays: Rays, miss: np.ndarray, fits: list[Any] = fits) -> np.ndarray:
             return np.hypot(*(miss[:, k] - fits[k][1] - fits[k][0] * rays.image[:, 1] for k in (0, 1)))
 
-        scatter = np.sqrt(_variance(size(known, miss) ** 2))
+        scatter = np.sqrt(robust_variance(size(known, miss) ** 2))
         limit = max(_FAR_SCATTERS * scatter, _FAR_SIGMAS * campaign.noise.image)
         wrong[name][control] = size(known, miss) > limit
         if name in one.check:
@@ -172,23 +172,17 @@ def _factors(found: Adjustment, kept: _Kept) -> dict[tuple[str, str], float]:
     own: dict[tuple[str, str], float] = {}
     while len(own) < len(squares):
         # the worst first: its residuals are no measure of the others
-        rest = {key: _variance(row) for key, row in squares.items() if key not in own and len(row)}
+        rest = {key: robust_variance(row) for key, row in squares.items() if key not in own and len(row)}
         if not rest:
             break
-        common = max(_variance(np.concatenate([squares[key] for key in rest])), 1.0)
+        common = max(robust_variance(np.concatenate([squares[key] for key in rest])), 1.0)
         beyond = {k: (v / common - 1.0) * np.sqrt(len(squares[k])) / _MEDIAN_SPREAD for k, v in rest.items()}
         worst = max(beyond, key=lambda k: beyond[k])
         if beyond[worst] <= _OWN_SIGMAS:
-            factor = float(np.sqrt(_variance(np.concatenate([squares[key] for key in rest]))))
+            factor = float(np.sqrt(robust_variance(np.concatenate([squares[key] for key in rest]))))
             return own | (dict.fromkeys(rest, factor) if factor > _SETTLED else {})
         own[worst] = float(np.sqrt(rest[worst]))
     return own
-
-
-def _variance(squares: np.ndarray) -> float:
-    """Variance of residuals from their squared lengths (n,), by the median."""
-    # median of chi-square with two degrees of freedom is 2 ln 2; the tails are what robust weights are for
-    return float(np.median(squares) / (2.0 * np.log(2.0)))
 
 
 def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> Campaign:

@@ -20,7 +20,7 @@ from twin.orbit.measured.measurement_tables import COLUMNS, image_covariance, re
 from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.orbit.measured.platform_files import Conventions, PlatformReadings, clock_of, read_platform
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings
-from twin.orbit.measured.text_file import first_lines
+from twin.orbit.measured.xml_file import first_lines
 
 if TYPE_CHECKING:
     from scenes.specs.measured.orbit_data import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from optics.geometry.pose import rotation_matrix
-from optics.numerics.spans import in_span
+from optics.numerics.array_math import in_span
 from scenes.yaml.errors import InputError, Problem
 from twin.orbit.conventions.pass_readings import LineClock, PassConventions, PassReadings
 from twin.orbit.flight.earth import Earth, east_north_up

@@ -11,16 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.orbit.forward_intersection import CalibratedLine
 from twin.orbit.export.rational_polynomial import axis_sigma
-from twin.orbit.flight.corrected_lines import corrected_line
 from twin.orbit.flight.earth import east_north_up
-from twin.orbit.flight.line_camera import LineCamera
+from twin.orbit.flight.line_camera import LineCamera, corrected_line
 from twin.orbit.flight.sensor import Sensor
 
-Array = NDArray[np.float64]
 _STEPS = (1e-7, 1e-7, 1e-7, 1e-6)
 """Half steps of d_alpha, d_beta, d_gamma (rad) and d_f (m): centimetres on the ground, over which it is linear to 1e-7
 and its coordinates are rounded to 1e-9 m."""

@@ -4,6 +4,9 @@ software, with their images where there are any.
 The camera is the laboratory's and the way the measured one, as the user of the images knows them; or, where asked for,
 both as they truly are. An instrument's cameras can be those that its monitor has estimated in orbit. The scene of a
 DIMAP file is as that file tells it.
+
+What is told of the worth of exported models: their errors on the ground by what is uncertain of camera and way, how
+control points correct the polynomials, and how a product's own polynomials agree with its rigorous model.
 """
 
 from __future__ import annotations
@@ -16,30 +19,135 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tifffile
+from numpy.typing import NDArray
 
 from analysis.orbit.forward_intersection import CalibratedLine
+from analysis.orbit.image_correction import Kind
 from optics.numerics.frozen_map import FrozenMap
 from scenes.kinds.file_kinds import kind_of
 from scenes.models.instrument_builder import build_instrument
+from scenes.specs.measured.pass_files import GroundFileSpec
 from scenes.specs.orbit.setup import AngleSetup, SimulateSetup, resolve_angle, resolve_simulate
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.orbit.angle.angle_flight import angle_camera, fly
 from twin.orbit.export.estimated_change import EstimatedChange, GroundSigma, ground_sigma
+from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty
 from twin.orbit.export.line_scanner import LineScanner, line_scanner
-from twin.orbit.export.quality import Quality
+from twin.orbit.export.polynomial_control import ControlledPolynomial
 from twin.orbit.export.rational_polynomial import RationalPolynomial
-from twin.orbit.flight.corrected_lines import calibrated_lines, corrected_line
-from twin.orbit.flight.line_camera import LineCamera
+from twin.orbit.flight.line_camera import LineCamera, calibrated_lines, corrected_line
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.images.simulate_run import fly_simulation
 from twin.orbit.measured.dimap_sensor import DimapScene, read_scene
+from twin.orbit.measured.ground_files import GroundFile, read_ground_points
+from twin.orbit.measured.xml_file import text_lines
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.run_folder import read_manifest
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """Control points with their places in images.
+
+    Attributes:
+        file: that they are from.
+        read: what it holds; places count from the centre of the first pixel.
+        kind: of the correction that they determine.
+    """
+
+    file: str
+    read: GroundFile
+    kind: Kind
+
+
+@dataclass(frozen=True, eq=False)
+class Wishes:
+    """What is asked for beside the models.
+
+    Attributes:
+        uncertainty: of camera and way; None for no map.
+        control: points that correct the polynomials; None for none.
+    """
+
+    uncertainty: CameraUncertainty | None = None
+    control: ControlPoints | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Controlled:
+    """A line's polynomials after control.
+
+    Attributes:
+        names: (N,) of the points.
+        polynomial: before, after, and what is between.
+    """
+
+    names: NDArray[np.object_]
+    polynomial: ControlledPolynomial
+
+
+@dataclass(frozen=True)
+class ProductPolynomial:
+    """Rational polynomials that came with a product, against its rigorous model, over the image and the heights that
+    the polynomials cover; polynomials minus rigorous.
+
+    Attributes:
+        file: where they are from.
+        mean_line, mean_sample: mean difference, pixels.
+        rms_line, rms_sample: root mean square about the mean, pixels.
+        most: largest of all differences, pixels.
+        heights: lowest and highest ground that the polynomials cover, metres.
+    """
+
+    file: str
+    mean_line: float
+    mean_sample: float
+    rms_line: float
+    rms_sample: float
+    most: float
+    heights: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Quality:
+    """What the models of an export are worth.
+
+    Attributes:
+        maps: line, or `together` for points that all lines intersect -> errors on the ground; empty where nobody asked.
+        control: line -> how control points corrected its polynomials.
+        products: line -> polynomials that came with it.
+    """
+
+    maps: Mapping[str, AccuracyMap]
+    control: Mapping[str, Controlled]
+    products: Mapping[str, ProductPolynomial]
+
+
+def read_control(path: Path, kind: Kind) -> ControlPoints:
+    """Control points of a .gcp file of the Ames Stereo Pipeline.
+
+    Args:
+        path: of it; without a header `# WKT:` its latitudes and longitudes are those of WGS 84, heights above it.
+        kind: of the correction.
+
+    Raises:
+        InputError: it cannot be read, or has no places in images.
+    """
+    if path.suffix.lower() != ".gcp":
+        raise InputError(Issue("not a .gcp file", str(path), allowed="control points with places in images, .gcp"))
+    stated = any("WKT:" in line for line in text_lines(path, "a .gcp file") if line.lstrip().startswith("#"))
+    spec = GroundFileSpec(file=str(path), crs=None if stated else "EPSG:4979")
+    found = read_ground_points(spec, Path())
+    if not found.images:
+        allowed = "after the sigmas of each point: image, column, row, two sigmas"
+        raise InputError(Issue("control points without places in images", str(path), allowed=allowed))
+    return ControlPoints(str(path), found, kind)
+
 
 READS = ("orbit_simulate", "orbit_angle")
 """Kinds of files that say a camera and its way."""

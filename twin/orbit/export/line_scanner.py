@@ -23,11 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from analysis.arrays import Array
 from twin.orbit.flight.earth import EQUATORIAL_RADIUS, FLATTENING, tai_of
 from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.flight.sensor import Sensor
-
-Array = NDArray[np.float64]
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 _TICK = 2.0**-20

@@ -7,13 +7,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.orbit.image_correction import ImageCorrection, Kind, image_correction
 from twin.orbit.export.rational_polynomial import RationalPolynomial, axis_sigma
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
 
-Array = NDArray[np.float64]
 _STEP = 10.0
 """Metres on the ground of a derivative: polynomials are straight to 1e-9 over it."""
 _GRID = (21, 21, 7)

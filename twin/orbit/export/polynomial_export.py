@@ -12,12 +12,10 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.export.export_report import FOLDER
-from twin.orbit.export.export_run import no_bands
-from twin.orbit.export.quality import Controlled, Quality, Wishes
+from twin.orbit.export.export_run import Controlled, Quality, Wishes, no_bands
 from twin.orbit.export.quality_run import controlled_line
 from twin.orbit.export.quality_sections import CONTROL, control_section, quality_answers, quality_warnings
-from twin.orbit.export.rational_polynomial import RationalPolynomial
-from twin.orbit.export.rpc_files import is_rpc, read_rpc
+from twin.orbit.export.rational_polynomial import RationalPolynomial, is_rpc, read_rpc
 from twin.run.artefact import Table
 from twin.run.quantity import Quantity, Record
 from twin.run.report import Report, answer

@@ -11,12 +11,19 @@ import numpy as np
 from analysis.orbit.image_correction import LEAST_POINTS
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text
-from twin.orbit.export.export_run import Export, ExportedLine, SceneSource
+from twin.orbit.export.export_run import (
+    Controlled,
+    ControlPoints,
+    Export,
+    ExportedLine,
+    ProductPolynomial,
+    Quality,
+    SceneSource,
+    Wishes,
+)
 from twin.orbit.export.ground_accuracy import AccuracyMap, maps_of
 from twin.orbit.export.polynomial_control import controlled, polynomial_correction
-from twin.orbit.export.quality import Controlled, ControlPoints, ProductPolynomial, Quality, Wishes
-from twin.orbit.export.rational_polynomial import RationalPolynomial
-from twin.orbit.export.rpc_files import read_rpc
+from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.dimap_sensor import DimapScene
 

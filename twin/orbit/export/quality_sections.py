@@ -7,10 +7,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.orbit.export.export_run import Export
+from twin.orbit.export.export_run import Controlled, Export, ProductPolynomial, Quality
 from twin.orbit.export.ground_accuracy import TOGETHER, AccuracyMap
 from twin.orbit.export.polynomial_control import residual_sigma
-from twin.orbit.export.quality import Controlled, ProductPolynomial, Quality
 from twin.run import svg
 from twin.run.artefact import Cell, SvgFigure, Table, significant
 from twin.run.quantity import Quantity, Record

@@ -20,7 +20,7 @@ from twin.sensors.charge_transfer import Collection
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from scenes.specs.orbit.jitter import JitterSpec
+    from scenes.specs.orbit.flight import JitterSpec
 
 JITTER_STREAM = 2**31
 """Number of the random stream of jitter among those of a pass; far from those that are counted."""

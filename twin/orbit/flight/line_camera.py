@@ -4,6 +4,11 @@ Body frame (the instrument's base): X forward, Z toward the scene, Y = Z x X. A 
 direction, because the chief rays of a mirror camera do not meet in one exact point. Both are smooth functions of the
 pixel and are kept as Chebyshev series over the line: exact for an ideal projection with distortion, which is a
 polynomial, and for a traced line as good as the trace.
+
+Lines of an instrument after changes that its on-board monitor has estimated.
+
+What a change does to the looks of a line is `analysis.orbit.forward_intersection.CalibratedLine.corrected`, which also
+corrects lines that are intersected; here the corrected looks go back into the line that a sensor flies with.
 """
 
 from __future__ import annotations
@@ -14,14 +19,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from analysis.arrays import Array
+from analysis.orbit.forward_intersection import CalibratedLine
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.geometry.tree import State
+from optics.numerics.array_math import in_span
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.spans import in_span
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
@@ -29,13 +36,11 @@ from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE
 from scenes.specs.orbit.three_line_camera import CcdSpec, LineCameraSpec, ThreeLineCameraSpec
+from twin.monitor.truth import LineSight
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import OrbitCalibrationSpec
     from scenes.specs.orbit.simulate import OrbitSimulateSpec
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -467,3 +472,43 @@ def _chopped(coefficients: np.ndarray) -> np.ndarray:
     size = np.max(np.abs(coefficients), axis=-1)
     used = np.flatnonzero(size > _NOISE * np.max(size))
     return coefficients[: used[-1] + 1]
+
+
+def calibrated_line(line: LineCamera, axes: np.ndarray, principal_distance: float) -> CalibratedLine:
+    """A traced line in the analysis's form.
+
+    Args:
+        line: of one CCD.
+        axes: (3, 3) columns X, Y, Z of its camera in the body, about which changes count.
+        principal_distance: of it, metres.
+    """
+    return CalibratedLine(line.pixels, line.directions, line.origins, axes, principal_distance)
+
+
+def calibrated_lines(
+    lines: Mapping[str, LineCamera], instrument: Instrument, backend: Backend
+) -> dict[str, CalibratedLine]:
+    """Lines of an instrument as its calibration knows them, by camera.
+
+    Args:
+        lines: of the unperturbed instrument, as `twin.orbit.flight.line_camera.traced_line_cameras` finds them.
+        instrument: that is unperturbed.
+        backend: where to trace.
+    """
+    sight = LineSight(instrument, backend)
+    distance = sight.truth([{}]).principal_distance
+    return {name: calibrated_line(line, sight.axes[name], distance[name]) for name, line in lines.items()}
+
+
+def corrected_line(line: LineCamera, calibrated: CalibratedLine, change: ArrayLike) -> LineCamera:
+    """A line after a change.
+
+    Args:
+        line: as it was calibrated.
+        calibrated: the same line, by `calibrated_lines`.
+        change: (4,) d_alpha, d_beta, d_gamma (rad) and d_f (m) since then.
+
+    Raises:
+        ValueError: another shape, numbers that are not finite, no principal distance left.
+    """
+    return replace(line, directions=calibrated.corrected(change).directions)

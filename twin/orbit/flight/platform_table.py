@@ -10,16 +10,16 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, KroghInterpolator
 from scipy.spatial.transform import Rotation
 
-from optics.numerics.physical_error import UnphysicalError
-from optics.numerics.spans import in_span
+from analysis.arrays import Array
+from optics.numerics.array_math import in_span
+from optics.numerics.invariants import UnphysicalError
 from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.trajectory import Attitude, Trajectory, readings
 
-Array = NDArray[np.float64]
 Interpolation = Literal["spline", "lagrange"]
 
 _SPLINE_ERROR = 1e-3

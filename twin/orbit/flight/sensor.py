@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from optics.numerics.spans import in_span
+from optics.numerics.array_math import in_span
 from twin.orbit.flight import light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects, aberrated, turned_with_earth

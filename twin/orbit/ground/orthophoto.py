@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 import numpy as np
 from scipy.ndimage import gaussian_filter, spline_filter
 
-from twin.orbit.ground.grid import GroundFrame, SplineGrid, correlated_field
-from twin.orbit.ground.terrain import Terrain
+from twin.orbit.ground.grid import GroundFrame, SplineGrid, Terrain, correlated_field
 from twin.orbit.ground.texture import Extent, apparent, reflectance
 from twin.run.random_streams import stream
 

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from twin.orbit.ground.grid import SplineGrid, fractal_field
-from twin.orbit.ground.terrain import Terrain
+from twin.orbit.ground.grid import SplineGrid, Terrain, fractal_field
 from twin.run.random_streams import stream
 
 if TYPE_CHECKING:

@@ -20,14 +20,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.ground.grid import GroundFrame
+from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.orthophoto import Control, make_control
-from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import apparent, around, reflectance
 from twin.orbit.images import pushbroom
-from twin.orbit.images.imaged_ground import ImagedGround, LineFrame
+from twin.orbit.images.image_points import ImagedGround, LineFrame
 from twin.orbit.images.jitter_exposure import collected
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
 from twin.orbit.images.pushbroom import BORDER, LookMap, PushbroomScene, Window

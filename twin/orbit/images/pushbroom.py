@@ -19,11 +19,10 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy import fft
 
-from optics.numerics.physical_error import PhysicalError, UnphysicalError
+from optics.numerics.invariants import PhysicalError, UnphysicalError
 from optics.numerics.threads import cores, one_blas_thread
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.ground.grid import GroundFrame
-from twin.orbit.ground.terrain import Terrain
+from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.texture import Extent
 from twin.orbit.images.jitter_exposure import exposures, steady
 from twin.orbit.images.line_optics import ImageMotion, LineOptics

@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from analysis.statistics import robust_sigma
 from analysis.units import ARCSEC
 from twin.orbit.jitter.jitter_run import JitterRun, PassJitter
 from twin.run import svg
 
-_COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN)
 _MOST = 4000
 _SIGMAS = 5.0
 
@@ -25,7 +25,8 @@ def _disparity_figure(run: JitterRun, one: PassJitter) -> Figure:
     step = max(len(seconds) // _MOST, 1)
     for axes, column, words in zip(panels, moved.T, ("along the line", "along the track"), strict=True):
         axes.plot(seconds[::step], column[::step], ".", color=svg.BLUE, ms=2.5)
-        middle, spread = np.median(column), 1.4826 * np.median(np.abs(column - np.median(column)))
+        middle = np.median(column)
+        spread = robust_sigma(column - middle)
         axes.set_ylim(middle - _SIGMAS * spread, middle + _SIGMAS * spread)
         axes.set_ylabel(f"{words} [px]")
     panels[1].set_xlabel(f"time of the sight by {pair[0]}, before {pair[1]} [s]")

@@ -25,8 +25,16 @@ from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Maps
-from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PatchPoints, PointsError, measure_points
-from twin.orbit.images.imaged_ground import BEYOND, ImagedGround, LineFrame
+from twin.orbit.images.image_points import (
+    BEYOND,
+    POINTS_REMEDY,
+    ImagedGround,
+    LineFrame,
+    MatchedPoints,
+    PatchPoints,
+    PointsError,
+    measure_points,
+)
 from twin.orbit.images.pushbroom import Window
 from twin.orbit.images.simulate_numbers import POINTS
 from twin.orbit.measured.geotiff import LARGEST_PART

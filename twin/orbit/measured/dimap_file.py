@@ -25,21 +25,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from analysis.arrays import Array
+from optics.numerics.array_math import in_span
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.spans import in_span
 from scenes.yaml.errors import InputError, Issue, names_text, shown
 from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.measured import platform_readings
 from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
-from twin.orbit.measured.text_file import readings, require_rising
-from twin.orbit.measured.xml_file import Element, read_xml
-
-Array = NDArray[np.float64]
+from twin.orbit.measured.xml_file import Element, read_xml, readings, require_rising
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
 """Products with a rigorous model."""

@@ -15,13 +15,13 @@ import erfa
 import numpy as np
 
 from analysis.units import ARCSEC
-from optics.numerics.spans import in_span
+from optics.numerics.array_math import in_span
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, TIME
 from twin.orbit.flight.earth import DAY, celestial_pole, tai_of
 from twin.orbit.measured.clock import FIRST_DAY, LAST_DAY, calendar, calendar_reading, tai_minus_utc
-from twin.orbit.measured.text_file import first_lines, numbers, text_lines
+from twin.orbit.measured.xml_file import first_lines, numbers, text_lines
 
 WHAT = "a table of Earth orientation: finals2000A or C04 as the IERS gives them, or CSV"
 _RATE_STEP = 1.0

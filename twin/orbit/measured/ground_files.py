@@ -17,7 +17,7 @@ from scenes.yaml.units import ANGLE, DISTANCE, LENGTH
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.measured.datum import Datum, Geoid
 from twin.orbit.measured.pass_measurements import ROLES, GroundPoints
-from twin.orbit.measured.text_file import numbers, text_lines
+from twin.orbit.measured.xml_file import numbers, text_lines
 
 if TYPE_CHECKING:
     from scenes.specs.measured.pass_files import GroundFileSpec

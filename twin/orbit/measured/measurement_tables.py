@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import level_covariance
-from optics.numerics.spans import in_span
+from optics.numerics.array_math import in_span
 from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec
 from scenes.specs.measured.orbit_data_setup import DATA_FILE
 from scenes.specs.measured.pass_files import PlatformFilesSpec
@@ -30,8 +31,6 @@ from twin.orbit.measured.map_part import MOST_HEIGHT
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_readings import platform_of
 from twin.run.procedure import Advance, silent
-
-Array = NDArray[np.float64]
 
 _FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
 """Metres, m/s, seconds and lines beyond which nothing is meant; below them sums of squares do not overflow."""

@@ -19,8 +19,7 @@ from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, 
 from twin.orbit.measured import platform_readings
 from twin.orbit.measured.clock import Readings, known_scale
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, Segment, known_frame
-from twin.orbit.measured.text_file import numbers, readings, require_rising, text_lines
-from twin.orbit.measured.xml_file import parsed_xml
+from twin.orbit.measured.xml_file import numbers, parsed_xml, readings, require_rising, text_lines
 
 _COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")
 

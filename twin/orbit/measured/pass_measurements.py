@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from analysis.arrays import Array
 from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable
 
-Array = NDArray[np.float64]
 ROLES = ("control", "check", "tie")
 """Roles of ground points: their coordinates are used; they only test the result; they are not known."""
 

@@ -14,7 +14,7 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from optics.numerics.spans import in_span
+from optics.numerics.array_math import in_span
 from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
@@ -26,7 +26,7 @@ from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoc
 from twin.orbit.measured.dimap_file import is_dimap, read_dimap
 from twin.orbit.measured.earth_orientation import EarthOrientation, TableRotation
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
-from twin.orbit.measured.text_file import first_lines, require_rising
+from twin.orbit.measured.xml_file import first_lines, require_rising
 
 if TYPE_CHECKING:
     from scenes.specs.measured.orbit_data import LineTimesFileSpec

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from scenes.specs.measured.orbit_data import ConventionsSpec
 from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.yaml.csv_table import Table
@@ -125,8 +126,6 @@ def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
         found = f"length {length[row]:.6g}"
         raise InputError(Issue("not a quaternion of a rotation", file, lines[row], (), found, "length 1"))
 
-
-Array = NDArray[np.float64]
 
 _LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
 """Metres from the Earth's centre: of satellites that map the Earth."""

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from analysis.chi_square import chance_beyond, limit_of
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import Jump
@@ -27,6 +26,7 @@ from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
+from analysis.statistics import chance_beyond, limit_of
 from analysis.units import ARCSEC
 from optics.geometry.tree import State, compose
 from optics.numerics.frozen_map import FrozenMap

@@ -16,9 +16,8 @@ import numpy as np
 from analysis.orbit.forward_intersection import check_errors, intersect_pair
 from scenes.specs.orbit.scene import ControlSpec, LineImageSpec
 from scenes.specs.resolved import target_band
-from twin.orbit.flight.corrected_lines import corrected_line
 from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.orbit.flight.line_camera import LineCamera
+from twin.orbit.flight.line_camera import LineCamera, corrected_line
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.images.image_points import POINTS_REMEDY, PointsError, tie_points
 from twin.orbit.images.line_optics import LineOptics

@@ -18,14 +18,13 @@ from scipy.stats import norm
 from analysis.monitor import control_loop
 from analysis.monitor.control_loop import DECAYING, LimitCycle, Margins
 from analysis.monitor.disturbances import FALSE_ALARM
-from analysis.monitor.unseen_motions import UnseenMode, floor, unseen_modes
+from analysis.monitor.model_fit import UnseenMode, floor, unseen_modes
+from optics.numerics.array_math import number_of
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.spans import number_of
 from scenes.specs.orbit.monitor import PARAMETERS
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.flight.corrected_lines import calibrated_line
-from twin.orbit.flight.line_camera import LineCamera
+from twin.orbit.flight.line_camera import LineCamera, calibrated_line
 from twin.orbit.monitoring import closed_loop
 from twin.orbit.monitoring.closed_loop import FOCUS_FIELDS, Corrector, LoopCourse, LoopModel, defocus
 from twin.orbit.monitoring.line_images import ImagedPair, imaged_pair

@@ -7,10 +7,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
+from analysis.monitor.model_fit import UnseenMode
 from analysis.monitor.monitoring import PER_SI
-from analysis.monitor.unseen_motions import UnseenMode
 from scenes.specs.course import moment
 from twin.orbit.monitoring.line_images import ImagedPair
 from twin.orbit.monitoring.loop_run import GAIN_MARGIN, PHASE_MARGIN_DEG, LoopFacts, LoopPass, LoopRun, height_rms
@@ -19,7 +19,6 @@ from twin.orbit.monitoring.pair_flight import CaseErrors, rms
 from twin.run.artefact import significant
 from twin.run.quantity import Quantity, Record
 
-Array = NDArray[np.float64]
 MOST_MOTIONS = 8
 """Motions that a mode names."""
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from analysis.monitor import disturbances
+from analysis.monitor.model_fit import UnseenMode
 from analysis.monitor.monitoring import PER_SI
-from analysis.monitor.unseen_motions import UnseenMode
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS

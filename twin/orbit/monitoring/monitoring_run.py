@@ -26,8 +26,7 @@ from scenes.specs.instrument import BASE
 from scenes.specs.orbit.monitor import PARAMETERS
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
-from twin.orbit.flight.corrected_lines import calibrated_line
-from twin.orbit.flight.line_camera import LineCamera, look_angle
+from twin.orbit.flight.line_camera import LineCamera, calibrated_line, look_angle
 from twin.orbit.monitoring.loop_run import LoopRun, run_loop
 from twin.orbit.monitoring.monitor_series import MonitorSeries, Readings, SmoothedReadings, states_of
 from twin.orbit.monitoring.pair_flight import (

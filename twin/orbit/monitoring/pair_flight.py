@@ -19,10 +19,9 @@ from optics.geometry.tree import Motion, State
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.course import moment
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.orbit.flight.corrected_lines import calibrated_line
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.orbit.flight.line_camera import LineCamera, traced_line_cameras
+from twin.orbit.flight.line_camera import LineCamera, calibrated_line, traced_line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.orbit.flight.trajectory import Trajectory

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
-from scenes.specs.study import ParetoSpec, StudySpec, ThresholdSpec
+from analysis.statistics import share_interval
+from scenes.specs.study import ParetoSpec, ThresholdSpec
 from twin.run.quantity import Quantity, Record
 from twin.study.report import study_statistics as statistics
 from twin.study.report.linear_model import Effect, LinearModel, MainEffect, linear_model, main_effects
@@ -146,7 +146,8 @@ class Requirement:
         """
         if self.bounds is None or (self.interval is None and self.count):
             return None
-        return statistics.share_interval(self.met, self.runs)[0], statistics.share_interval(self.most, self.runs)[1]
+        (low, _), (_, high) = (share_interval(met, self.runs, statistics.CONFIDENCE) for met in (self.met, self.most))
+        return low, high
 
 
 def _is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
@@ -192,7 +193,7 @@ def _counted(
     unit: str,
 ) -> Requirement:
     met, count = int(np.sum(good & known)), int(np.sum(known))
-    interval = statistics.share_interval(met, count) if runs.sampled and count else None
+    interval = share_interval(met, count, statistics.CONFIDENCE) if runs.sampled and count else None
     return Requirement(name, text, met, count, runs.count, interval, judged, unit)
 
 
@@ -351,16 +352,6 @@ class StudyAnalysis:
 
 def _swing_in_sigmas(effect: Any, std: Estimate | None) -> float:
     return float(effect.swing.value) / (2.0 * std.value) if std is not None and std.value > 0.0 else 0.0
-
-
-def summary(dataset: xr.Dataset, study: StudySpec) -> dict[str, Any]:
-    """What the report says of a study, as plain data for JSON; intervals are those of 95%.
-
-    Args:
-        dataset: as ``twin.study.study_files.make_dataset`` makes it.
-        study: as the user wrote it.
-    """
-    return STATISTICS(StudyAnalysis.of(StudyRuns.of(dataset, study)))
 
 
 def _finite(value: float | None) -> float | None:

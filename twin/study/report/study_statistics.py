@@ -344,21 +344,6 @@ def runs_for_quantile(q: float) -> int:
     return math.ceil(math.log(side) / math.log(max(q, 1.0 - q)))
 
 
-def share_interval(met: int, count: int) -> tuple[float, float]:
-    """Clopper and Pearson's interval of a share, ``met`` of ``count``.
-
-    Args:
-        met: runs that meet a requirement.
-        count: runs that were judged.
-    """
-    if count == 0:
-        return 0.0, 1.0
-    side = 0.5 * (1.0 - CONFIDENCE)
-    low = float(stats.beta.ppf(side, met, count - met + 1)) if met > 0 else 0.0
-    high = float(stats.beta.ppf(1.0 - side, met + 1, count - met)) if met < count else 1.0
-    return low, high
-
-
 def normality(values: np.ndarray) -> Normality | None:
     """Test of (n,) values; None for fewer than 20 and for constant ones."""
     if len(values) < LEAST or np.ptp(values) == 0.0:

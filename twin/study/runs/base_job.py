@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from analysis.measurement_error import MeasurementError
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import PhysicalError
+from optics.numerics.invariants import PhysicalError
 from scenes.specs.procedures import Procedure
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, shown

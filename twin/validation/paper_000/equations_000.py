@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import NearVerticalWarning, PlaneFit, fit_plane
 from analysis.units import ARCSEC
@@ -19,7 +19,6 @@ from twin.validation.checks.check import CheckResult, mean_of
 from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, setup_of, worst
 
-Array = NDArray[np.float64]
 _STEP = 1e-3
 TWIST = np.radians(10.0 / 60.0)
 """How far the forward array is turned about its line of sight for eq6.parallel, radians."""

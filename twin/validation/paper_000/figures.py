@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.orbit.angles import Sensitivity, intersection_angles, sensitivity
 from analysis.orbit.planes import Method, Strip
 from analysis.units import ARCSEC
@@ -31,7 +32,6 @@ AXES = ("x", "y", "z")
 FAR, ALIKE, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
 GREEK: Mapping[str, str] = {"alpha": "α", "beta": "β"}
 _STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
-Array = NDArray[np.float64]
 REACH = 10.0
 """Metres."""
 ELSEWHERE = (45.0, 120.0)

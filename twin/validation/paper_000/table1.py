@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import Station
 from analysis.units import ARCSEC
@@ -21,7 +22,6 @@ from twin.validation.checks.check import SIGMAS, CheckResult, Chosen
 from twin.validation.checks.group import Context, group_of, load_printed
 from twin.validation.paper_000.passes import PAIRS, TEST, Passes, planes_of, repeated, setup_of
 
-Array = NDArray[np.float64]
 PRINTED_ARCSEC = load_printed("000").numbers("table1.difference_arcsec")
 ALPHA, BETA = PRINTED_ARCSEC["alpha"], PRINTED_ARCSEC["beta"]
 POINT_SIGMA = float(np.hypot(2.0, 5.0 / 3.0))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from analysis.calibration.adjustment import Adjustment, adjust
-from analysis.calibration.stepwise import Stepwise, stepwise
+from analysis.calibration.strip_adjustment import Stepwise, stepwise
 from analysis.orbit.null_space import Combination, Gauge
 from analysis.orbit.three_line_model import BIAS, INTERIOR, Rays, misclosure, partials
 from optics.numerics.frozen_map import FrozenMap

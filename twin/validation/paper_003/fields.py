@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.third_difference import third_difference
+from analysis.orbit.forward_intersection import third_difference
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.calibration.adjustment import Adjustment
-from analysis.calibration.stepwise import Stepwise, stepwise
+from analysis.calibration.strip_adjustment import Stepwise, stepwise
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS, INTERIOR, misclosure
 from analysis.units import ARCSEC
@@ -19,8 +19,7 @@ from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
 from twin.orbit.calibration.schemes import tested, tested_before
-from twin.orbit.ground.grid import GroundFrame
-from twin.orbit.ground.terrain import Terrain
+from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import MARGIN, PushbroomScene, render_patch

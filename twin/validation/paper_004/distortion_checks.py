@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.arrays import Array
 from analysis.units import ARCSEC
 from analysis.units import MM_PER_M as MM
 from analysis.units import UM_PER_M as UM
@@ -23,7 +24,6 @@ from twin.validation.paper_004 import equations_004
 from twin.validation.paper_004.equations_004 import ACCURACY_UM, POINTS, SpotTest, evaluate_equations, rendered
 from twin.validation.paper_004.turntable_checks import FIT_RMS_ARCSEC, dividing
 
-Array = NDArray[np.float64]
 TEST = "distortion"
 SETS = load_printed("004").whole("distortion.sets")
 RAW, COMPENSATED = (np.array(load_printed("004").column(f"table2.{name}_um")) for name in ("raw", "compensated"))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 
+from analysis.arrays import Array
 from analysis.orientation.distortion_model import (
     distortion,
     principal_distance,
@@ -307,7 +308,6 @@ def rendered(tests: Sequence[SpotTest]) -> str:
     return f"{len(tests)} tests of {places} points and {sets} sets, {len(tests) * places * sets} spots rendered"
 
 
-Array = NDArray[np.float64]
 TEST = "distortion"
 
 

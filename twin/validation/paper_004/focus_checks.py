@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from analysis.arrays import Array
 from analysis.focal_plane.plane_fit import RigidMotion, fit_focal_plane
 from analysis.focal_plane.shims import ShimPlan, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
@@ -27,7 +28,6 @@ from twin.targets.target_images import TRACK
 from twin.validation.checks.check import Check, CheckResult, Chosen, mean_of
 from twin.validation.checks.group import Context, group_of, load_printed
 
-Array = NDArray[np.float64]
 MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")
 CONFOCAL_MM = load_printed("004").number("alignment.confocal_mm")
 LINE_LEVEL_ARCMIN = load_printed("004").number("alignment.line_level_arcmin")

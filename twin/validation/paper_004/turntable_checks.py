@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 from scipy.special import erfc
 from scipy.stats import norm
 
+from analysis.arrays import Array
 from analysis.turntable.angle_fits import FITS, NotConvergedError, fit
 from analysis.turntable.dividing_error import CalibrationSeries, rejection_rate
 from analysis.units import ARCSEC
@@ -23,7 +24,6 @@ from twin.run.artefact import Cell, Table
 from twin.validation.checks.check import Check, CheckResult, Chosen, median_of
 from twin.validation.checks.group import Context, group_of, load_printed
 
-Array = NDArray[np.float64]
 TEST = "turntable"
 REPEATS = load_printed("004").whole("turntable.repeats")
 REPEAT_RMS_ARCSEC = load_printed("004").number("turntable.repeat_rms_arcsec")

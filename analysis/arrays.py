@@ -1,4 +1,6 @@
-"""Results that show themselves in a few words: a ``__repr__`` of chosen fields with units, arrays by shape and range.
+"""Arrays of float64, and dataclasses of them that show themselves in a few words.
+
+`shows` gives a class a ``__repr__`` of chosen fields with units, arrays by shape and range:
 
 >>> @shows("rms [um]", "rays [um]")
 ... @dataclass
@@ -7,20 +9,29 @@
 ...     rays: np.ndarray  # metres
 >>> Spot(2e-6, np.zeros((217, 2)))
 <Spot: rms 2 um; rays 217 x 2, all 0 um>
+
+`OfStates` are results of several states, measurements or spots, whose first axis counts the states.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from math import degrees
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analysis.units import ARCSEC, MM_PER_M, UM_PER_M
 
+Array = NDArray[np.float64]
+"""Array of float64."""
+Indices = NDArray[np.intp]
+"""Array of indices."""
+Mask = NDArray[np.bool_]
+"""Array of truths."""
 PER_SI: Mapping[str, float] = {
     "mm": MM_PER_M,
     "um": UM_PER_M,
@@ -158,3 +169,48 @@ def _range(values: np.ndarray, unit: str) -> str:
         return ", none finite"
     low, high = (_number(float(v), unit) for v in (finite.min(), finite.max()))
     return _with(f", all {low}" if low == high else f", {low} to {high}", unit)
+
+
+class OfStates:
+    """Base of a dataclass whose fields are arrays of S states along the first axis.
+
+    A field may also be None, a mapping of arrays, or another result of the same states.
+    """
+
+    def at(self, states: slice) -> Self:
+        """The result of some of the states.
+
+        Args:
+            states: which, along the first axis.
+        """
+        return type(self)(**{name: _at(getattr(self, name), states) for name in _names(self)})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The result of several series of states, one after the other.
+
+        Args:
+            parts: at least one; a field is None in all of them or in none.
+        """
+        return cls(**{name: _joined([getattr(one, name) for one in parts]) for name in _names(cls)})
+
+
+def _names(result: OfStates | type[OfStates]) -> list[str]:
+    return [one.name for one in fields(cast(Any, result))]
+
+
+def _at(value: Any, states: slice) -> Any:
+    if value is None:
+        return None
+    if isinstance(value, Mapping):
+        return {name: _at(one, states) for name, one in value.items()}
+    return value.at(states) if hasattr(value, "at") else value[states]
+
+
+def _joined(values: list[Any]) -> Any:
+    first = values[0]
+    if first is None:
+        return None
+    if isinstance(first, Mapping):
+        return {name: _joined([one[name] for one in values]) for name in first}
+    return type(first).joined(values) if hasattr(first, "joined") else np.concatenate(values)

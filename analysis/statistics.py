@@ -1,18 +1,91 @@
-"""Modulus of a complex number with Gaussian noise: Rice's distribution (Rice, Bell Syst. Tech. J. 24, 46 (1945)).
+"""Distributions and scales that measurements are judged by: chi-square, shares, robust scales, and Rice's distribution.
+
+The functions of chi-square are what ``scipy.stats.chi2`` calls, to the bit, without that package's import, which is a
+tenth of a short command.
 
 A modulation is the modulus of a Fourier coefficient. Noise makes the modulus longer on average: where the signal is
-gone, sigma sqrt(pi/2) is left.
+gone, sigma sqrt(pi/2) is left (Rice, Bell Syst. Tech. J. 24, 46 (1945)).
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.special import i0e, i1e
+from numpy.typing import ArrayLike
+from scipy.special import chdtrc, chdtri, gammaln, i0e, i1e, xlogy
 
-__all__ = ["measured_bias", "rice_bias", "rice_sigma", "signal_modulus"]
+from analysis.arrays import Array
 
-Array = NDArray[np.float64]
+_NORMAL_SIZE = 1.4826
+"""Standard deviation of a normal distribution over the median of the sizes."""
+
+
+def chance_beyond(chi_square: Any, degrees: Any) -> Any:
+    """Probability of a larger chi-square.
+
+    Args:
+        chi_square: at least 0, a number or an array of any shape.
+        degrees: of freedom, likewise.
+    """
+    return chdtrc(degrees, chi_square)
+
+
+def limit_of(chance: Any, degrees: Any) -> Any:
+    """Chi-square that is exceeded with a probability.
+
+    Args:
+        chance: above 0 and at most 1, a number or an array of any shape.
+        degrees: of freedom, likewise.
+    """
+    return chdtri(degrees, chance)
+
+
+def density(chi_square: Any, degrees: Any) -> Any:
+    """Probability density.
+
+    Args:
+        chi_square: at least 0, a number or an array of any shape.
+        degrees: of freedom, likewise.
+    """
+    half = 0.5 * np.asarray(degrees, dtype=np.float64)
+    return np.exp(xlogy(half - 1.0, chi_square) - 0.5 * np.asarray(chi_square) - gammaln(half) - np.log(2.0) * half)
+
+
+def share_interval(met: int, count: int, confidence: float) -> tuple[float, float]:
+    """Return the interval of Clopper and Pearson (Biometrika 26, 404 (1934)) of a share; 0 to 1 of none.
+
+    Args:
+        met: how many of the trials succeeded.
+        count: trials.
+        confidence: with which the interval holds the share, at least.
+    """
+    if count == 0:
+        return 0.0, 1.0
+    # not at the top: this import takes longer than short commands
+    from scipy.stats import binomtest
+
+    interval = binomtest(met, count).proportion_ci(confidence, "exact")
+    return float(interval.low), float(interval.high)
+
+
+def robust_sigma(residuals: ArrayLike) -> float:
+    """Return the standard deviation of normal residuals by the median of their sizes, of which half may be wrong.
+
+    Args:
+        residuals: about their middle, of any shape.
+    """
+    return _NORMAL_SIZE * float(np.median(np.abs(residuals)))
+
+
+def robust_variance(squares: ArrayLike) -> float:
+    """Return the variance of normal residuals in a plane, in each direction, by the median: half of them may be wrong.
+
+    Args:
+        squares: of their lengths, (n,).
+    """
+    # median of chi-square with two degrees of freedom is 2 ln 2
+    return float(np.median(squares) / (2.0 * np.log(2.0)))
 
 
 def rice_bias(modulus: ArrayLike, sigma: ArrayLike) -> Array:
