@@ -2,5 +2,6 @@
 
 `adjustment` calibrates cameras (`analysis.orbit.three_line_model`), `hidden_terms` says what residuals show of terms
 that are left out, `strip_adjustment` takes the noise that image points share out of a pass by tie points, and has the
-stepwise calibration. Laws of the readings' errors, robust weights and variance components are those of `analysis.block`.
+stepwise calibration. Laws of the readings' errors, robust weights and variance components are those of
+`analysis.block`.
 """
