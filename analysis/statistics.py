@@ -75,7 +75,7 @@ def robust_sigma(residuals: ArrayLike) -> float:
     Args:
         residuals: about their middle, of any shape.
     """
-    return _NORMAL_SIZE * float(np.median(np.abs(residuals)))
+    return _NORMAL_SIZE * float(np.median(np.abs(np.asarray(residuals))))
 
 
 def robust_variance(squares: ArrayLike) -> float:
@@ -85,7 +85,7 @@ def robust_variance(squares: ArrayLike) -> float:
         squares: of their lengths, (n,).
     """
     # median of chi-square with two degrees of freedom is 2 ln 2
-    return float(np.median(squares) / (2.0 * np.log(2.0)))
+    return float(np.median(np.asarray(squares)) / (2.0 * np.log(2.0)))
 
 
 def rice_bias(modulus: ArrayLike, sigma: ArrayLike) -> Array:

@@ -1,7 +1,7 @@
 """Normal equations of a three-line calibration, the ground points and the noise that image points share eliminated.
 
 Rows are whitened by the covariance of their image point: image measurement plus what independent noise of attitude and
-station does in the image. Noise that image points share enters as unknowns z with a prior (`shared_noise`). A ground
+station does in the image. Noise that image points share enters as unknowns z with a prior (`SharedNoise`). A ground
 point meets only its own rays and its control coordinates, so that its (3, 3) block is inverted alone and the equations
 of the rest are N_yy - N_yp N_pp^-1 N_py (Schur complement). The block of z is sparse then, too; it is factorised and
 eliminated in the same way, and what is left are the equations of the unknowns x.

@@ -14,7 +14,7 @@ as a mixture over the readings between which it can have come; so sigma is wide 
 the body that may jump are then free to have done so: what the readings did not tell yet of the others cannot be found
 later, since the places of the jump are given up.
 
-A reading that is more likely bad than the first after a jump is set aside (`bad_readings`). The next one decides: what
+A reading that is more likely bad than the first after a jump is set aside (`untold_jumps`). The next one decides: what
 is known without it goes on beside what is known with it, until one of the two foretells that reading better. What is
 known meanwhile is the mixture of both.
 

@@ -5,7 +5,7 @@ Temporal variance is taken over the frames of a stack, so that neither fixed pat
 mean of each frame is taken off first, so that a lamp that drifts is not noise. Non-uniformities are spatial variances
 of the mean frames without what is left of temporal noise; a quadratic surface is the light's and is taken off first.
 
-Rounding to grey values is taken off as `rounding` has it. Where noise is less than about half a grey value, what it
+Rounding to grey values is taken off as `noise` has it. Where noise is less than about half a grey value, what it
 does depends on where between two steps the pixels stand, which stands in the sigmas.
 """
 

@@ -161,7 +161,7 @@ class Grid:
 def image(field: PupilField, x: Grid, y: Grid, single: bool = False) -> np.ndarray:
     """Irradiance on the grid of columns x and rows y by the matrix Fourier transform.
 
-    Where the pixels sample the field well, it is summed at fewer places and interpolated (``field_samples``).
+    Where the pixels sample the field well, it is summed at fewer places and interpolated (``FieldSamples``).
 
     Args:
         field: B pupils.
