@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.models.disturbances import Component, StatedMotions
-from scenes.models.drawn_motions import causes_of, correlation_root, drawn_motions
+from scenes.models.disturbances import Component, StatedMotions, correlation_root
+from scenes.models.drawn_motions import causes_of, drawn_motions
 from twin.operate.record.entries import MICRO
 from twin.run.random_streams import stream
 
