@@ -23,6 +23,7 @@ from functools import cached_property
 import numpy as np
 
 from analysis.arrays import Array, shows
+from analysis.covariance_root import covariance_root
 from analysis.measurement_error import UndeterminedError
 from analysis.statistics import chance_beyond, limit_of
 
@@ -66,16 +67,8 @@ class StatePrior:
             covariance: (M, M), SI, positive semidefinite.
             mean: (M,), SI; zero by default.
         """
-        sigma = np.sqrt(np.diagonal(covariance))
-        safe = np.where(sigma > 0.0, sigma, 1.0)
-        correlation = covariance / safe / safe[:, None]
-        if np.array_equal(correlation, np.diag(np.diagonal(correlation))):
-            root = np.diag(sigma)
-        else:
-            values, vectors = np.linalg.eigh(correlation)
-            # the symmetric root keeps motions without correlations by themselves
-            root = safe[:, None] * ((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
-        return cls(tuple(labels), np.zeros(len(sigma)) if mean is None else np.asarray(mean, np.float64), root)
+        mean = np.zeros(len(covariance)) if mean is None else np.asarray(mean, np.float64)
+        return cls(tuple(labels), mean, covariance_root(covariance))
 
     @cached_property
     def sigma(self) -> Array:
@@ -378,7 +371,8 @@ def _judged(
 ) -> StateEstimate:
     """Posterior covariance and all tests at an estimate."""
     values, vectors = np.linalg.eigh(table.T @ table)
-    root = vectors / np.sqrt(1.0 + np.clip(values, 0.0, None))
+    # the symmetric root, since states are drawn with it: eigenvectors of equal eigenvalues depend on rounding
+    root = (vectors / np.sqrt(1.0 + np.clip(values, 0.0, None))) @ vectors.T
     left = table @ root
     # to the first order this is the residual's inverse marginal covariance, times the residual about the prior's mean
     total = float(residual @ residual + unit @ unit)

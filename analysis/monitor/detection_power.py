@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.arrays import Array
+from analysis.covariance_root import covariance_root
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import UNSEEN
 from analysis.monitor.series_filter import SeriesFilter
@@ -103,9 +104,8 @@ def _found(
     step, noise, before = amounts @ spots.T, np.zeros((_DRAWS, len(spots))), np.zeros_like(informations[0])
     told, out = np.zeros((len(_SIZES), _DRAWS), bool), []
     for information, those in zip(informations, tests, strict=True):
-        values, vectors = np.linalg.eigh(information - before)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        noise, before = noise + rng.standard_normal(noise.shape) @ root.T, information
+        drawn = rng.standard_normal(noise.shape) @ covariance_root(information - before).T
+        noise, before = noise + drawn, information
         score = _SIZES[:, None, None] * (step @ information) + noise
         for away, limit in those:
             told |= np.sum((score @ away.T) ** 2, axis=2) > limit

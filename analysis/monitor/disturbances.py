@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import Array, shows
+from analysis.covariance_root import covariance_root
 from analysis.statistics import chance_beyond, density, limit_of
 
 FALSE_ALARM = 1e-3
@@ -157,10 +158,7 @@ class Disturbances:
     @cached_property
     def root(self) -> Array:
         """(M, M) with root root' = correlation: what independent numbers of unit variance make of the motions."""
-        if np.array_equal(self.correlation, np.eye(len(self.correlation))):
-            return self.correlation
-        values, vectors = np.linalg.eigh(self.correlation)
-        return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
+        return covariance_root(self.correlation)
 
     @cached_property
     def spot_covariance(self) -> Array:

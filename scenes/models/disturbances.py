@@ -143,12 +143,15 @@ class StatedMotions:
             count: how many states.
         """
         unit = rng.standard_normal((count, len(self.components)))
-        if not np.array_equal(self.correlation, np.eye(len(self.components))):
-            values, vectors = np.linalg.eigh(self.correlation)
-            # the symmetric root leaves components without correlations as they are
-            root = (vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T
-            unit = unit @ root
-        return np.asarray(unit * self.sigma)
+        return np.asarray(unit @ correlation_root(self.correlation) * self.sigma)
+
+
+def correlation_root(correlation: np.ndarray) -> np.ndarray:
+    """Symmetric root (M, M) of a correlation matrix, which changes little where the matrix does, as eigenvectors would
+    not, and leaves components without correlations as they are.
+    """
+    values, vectors = np.linalg.eigh(correlation)
+    return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
 
 
 def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotions | None:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.models.disturbances import StatedMotions
+from scenes.models.disturbances import StatedMotions, correlation_root
 from scenes.specs.disturbances import TimeLawSpec
 
 Array = NDArray[np.float64]
@@ -82,9 +82,3 @@ def causes_of(stated: StatedMotions) -> dict[str, list[int]]:
     for k, one in enumerate(stated.components):
         out.setdefault(one.cause, []).append(k)
     return out
-
-
-def correlation_root(correlation: Array) -> Array:
-    """Symmetric root of a correlation matrix."""
-    values, vectors = np.linalg.eigh(correlation)
-    return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)

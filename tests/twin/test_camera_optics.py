@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion
-from optics.numerics.invariants import UnphysicalError
+from optics.raytrace.trace import BeamMissedError
 from scenes.models.camera_model import field_direction
 from scenes.models.camera_sharpness import FieldBeams
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
@@ -71,7 +71,7 @@ def test_what_prisms_take_is_missing_in_every_table(backend, gf7_pair) -> None:
 @pytest.mark.second
 def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera) -> None:
     beams = VariedBeams(CameraOptics.alone(camera("ritchey_chretien"), backend), [(0.0, 0.0)], None, None)
-    with pytest.raises(UnphysicalError, match="a surface's edge stops light of a field"):
+    with pytest.raises(BeamMissedError, match="a surface's edge stops light of a field"):
         beams.light([{"camera/M2": Motion(shift=(0.05, 0.0, 0.0))}])
 
 

@@ -365,3 +365,4 @@ def test_readings_that_could_not_be_are_told(tmp_path: Path, monkeypatch: pytest
 def test_a_sensor_on_a_body_that_is_not_stated_to_get_warmer(tmp_path: Path) -> None:
     done = run("simulate", PLAN, tmp_path / "record", *WORDS, "--stuck", "base/forward/M7@2027-01-05T00:00:00Z")
     assert (done.exit_code, "--stuck: no such name" in done.stderr) == (2, True), done.stderr
+    assert not any(tmp_path.iterdir())

@@ -414,6 +414,7 @@ def test_a_failing_group_does_not_stop_the_others(fake, tmp_path):
         ([], "no result"),
         ([check("001.eq9").evaluate(1.0, None, "")], "does not hold"),
         ([check("001.table3.a").evaluate(1.0, None, "")] * 2, "twice"),
+        ([check(f"001.table3.{name}").evaluate(1.0, None, "") for name in "abb"], "twice"),
     ],
 )
 def test_a_group_that_answers_wrongly_has_failed(results, why, backend):

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from optics.numerics.physical_error import PhysicalError
 
 from analysis.measurement_error import UndeterminedError
 from analysis.wavefront_maps.orientation import Orientation, ReadingEvidence, tellable
 from optics.numerics.backend import Backend
 from scenes.specs.asbuilt import AsBuiltSetup
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
-from twin.asbuilt.measured_kinds import UNKNOWN_FOCUS, WavefrontReadings
+from twin.asbuilt.measured_kinds import UNKNOWN_FOCUS, MeasuredKind, WavefrontReadings
 from twin.asbuilt.wavefront_files import read_coefficients, stated_orientation
 from twin.run.artefact import Cell, Table
 from twin.run.procedure import Advance, silent
@@ -81,15 +83,13 @@ def run_check(
         data = [read_coefficients(kind, Orientation()) for kind in kinds]
     else:
         rng = np.random.default_rng(setup.test.simulate.seed if seed is None else seed)
-        true = bench.draw(rng, setup.test.simulate.law)
-        drawn = [k.drawn(k.predict(bench.view(true[None], a))[0], rng) for k, a in zip(kinds, afters, strict=True)]
+        true = _lit(bench, bench.draw(rng, setup.test.simulate.law), kinds, afters)
+        drawn = [kind.drawn(values, rng) for kind, values in zip(kinds, true, strict=True)]
         # as a file would have them that lies as it says
         undone = stated.inverse
         data = [undone.coefficients(values.reshape(-1, len(terms)), terms) for values in drawn]
     prior = bench.parameters.prior
-    mean = np.concatenate(
-        [kind.predict(bench.view(prior.mean[None], after))[0] for kind, after in zip(kinds, afters, strict=True)]
-    )
+    mean = np.concatenate(_lit(bench, prior.mean, kinds, afters))
     slope = bench.slope(prior.mean, kinds, afters) @ prior.root
     covariance = slope @ slope.T
     start = 0
@@ -105,6 +105,20 @@ def run_check(
         raise test.error(str(error), ("measurements",)) from error
     advance("readings", 1, 1)
     return OrientationCheck(setup, tuple(kind.name for kind in kinds), stated, evidence)
+
+
+def _lit(
+    bench: AsBuiltBench, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]
+) -> list[np.ndarray]:
+    """Numbers that each measurement of a state reads without errors. Raises InputError: the light is lost."""
+    out = []
+    for kind, after in zip(kinds, afters, strict=True):
+        try:
+            out.append(kind.predict(bench.view(values[None], after))[0])
+        except PhysicalError as error:
+            where = "the instrument" if after is None else f"after the move {after} the instrument"
+            raise kind.wrong(f"{where} has no light: {error}", "after", "smaller moves, or a narrower prior") from error
+    return out
 
 
 def _plain(one: Orientation) -> dict[str, Any]:

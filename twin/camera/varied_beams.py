@@ -21,7 +21,7 @@ from optics.numerics.invariants import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
+from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.edge_shadow import LitStop
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, to_terms
@@ -230,7 +230,7 @@ class VariedBeams:
             some = slice(start, start + step)
             traced, own = self._rays(states[some], None if aimed is None else aimed[some])
             if not traced[3].all():
-                raise UnphysicalError("a surface's edge stops light of a field")
+                raise BeamMissedError("a surface's edge stops light of a field")
             found.append(self._light(traced, own))
         return BeamLight(*(np.concatenate(own) for own in zip(*found, strict=True)))
 

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.arrays import Array
-from scenes.models.disturbances import Component, StatedMotions, states_of
-from scenes.models.drawn_motions import causes_of, correlation_root, drawn_motions
+from scenes.models.disturbances import Component, StatedMotions, correlation_root, states_of
+from scenes.models.drawn_motions import causes_of, drawn_motions
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.main_job.monitor_reading import MonitorReading, stated

@@ -171,6 +171,11 @@ def simulate_into(places: Places, what: Simulation, backend: Backend, advance: A
     """
     started, clock = time.time(), time.monotonic()
     plan, target = places.read(), places.folder
+    advance(CALIBRATE, 0, 1)
+    experiment = MonitorExperiment(plan.model, backend)
+    experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
+    # before there is a record, which is never altered
+    _are_stated(experiment, what)
     with ExitStack() as open_record:
         history = None
         if places.record is not None:
@@ -180,10 +185,6 @@ def simulate_into(places: Places, what: Simulation, backend: Backend, advance: A
             # requirements are checked against the instrument; those of a life were when it was simulated
             keep_plan(plan if places.complete else read_plan(places.plan, history), places.plan, history)
         folder = RunFolder(target, places.force)
-        advance(CALIBRATE, 0, 1)
-        experiment = MonitorExperiment(plan.model, backend)
-        experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
-        _are_stated(experiment, what)
         advance(CALIBRATE, 1, 1)
         found = recorded(plan, experiment, what, advance)
         if not found.readings:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from analysis.covariance_root import covariance_root
 from analysis.orbit.planes import Station, Strip
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.geometry.tree import State
@@ -446,9 +447,8 @@ def _spread(camera: LineCamera, pixel: np.ndarray) -> np.ndarray:
 def _terrain(spec: OrbitAngleSpec, place: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Heights (N,) at places along a strip, metres: a normal process with a Gaussian correlation."""
     away = (place[:, None] - place) / spec.terrain.length
-    values, vectors = np.linalg.eigh(np.exp(-0.5 * away**2))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(spec.terrain.height + spec.terrain.relief * (root @ random.standard_normal(len(place))))
+    unit = covariance_root(np.exp(-0.5 * away**2)) @ random.standard_normal(len(place))
+    return np.asarray(spec.terrain.height + spec.terrain.relief * unit)
 
 
 def _nearest(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> np.ndarray:

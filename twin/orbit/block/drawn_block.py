@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from analysis.block import block as known
 from analysis.block.processes import STEPPED, Law
+from analysis.covariance_root import covariance_root
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
 from optics.numerics.frozen_map import FrozenMap
@@ -186,8 +187,7 @@ def _cameras(
 ) -> tuple[dict[str, np.ndarray], dict[str, known.CameraKnowledge], Monitored | None]:
     """Line -> true changes (T, 4), what is expected of them, and what is known after the monitor's readings."""
     if recorded is not None:
-        values, vectors = np.linalg.eigh(recorded.covariance)
-        drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
+        drawn = covariance_root(recorded.covariance) @ random.standard_normal(len(recorded.covariance))
         changes = recorded.mean + drawn.reshape(recorded.mean.shape)
         laws = {line: change_covariance(spec.changes[line], days) for line in spec.lines}
         nothing = np.zeros((len(days), 4))
@@ -196,8 +196,7 @@ def _cameras(
     true, expected, monitored = {}, {}, {}
     for line in spec.lines:
         law = change_covariance(spec.changes[line], days)
-        values, vectors = np.linalg.eigh(law)
-        drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
+        drawn = covariance_root(law) @ random.standard_normal(len(law))
         true[line] = drawn.reshape(-1, 4)
         expected[line] = known.CameraKnowledge(np.zeros((len(days), 4)), law)
         noise = random.standard_normal(len(drawn))
