@@ -108,7 +108,7 @@ def no_heartbeat() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def calibrations_of_patched_code(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Compute instruments and calibrations of a test that patches the program, and keep none of them for other tests."""
+    """Compute instruments and calibrations of a test that patches the program, and keep none of them for others."""
     if "monkeypatch" not in request.fixturenames:
         yield
         return
