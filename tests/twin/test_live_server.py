@@ -125,19 +125,9 @@ def test_a_socket_is_refused_before_it_is_accepted(running, cookie, origin, host
 
 @pytest.mark.parametrize(
     "path",
-    [
-        "/../../etc/passwd",
-        "/%2e%2e/%2e%2e/etc/passwd",
-        "/..%2fserver.py",
-        "/page/live.js",
-        "//etc/passwd",
-        "/live.js%00",
-        "/live.js/..",
-        "/__init__.py",
-        "/%5c..%5cserver.py",
-        "/live",
-    ],
-)
+    ["/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/..%2fserver.py", "/page/live.js", "//etc/passwd",
+     "/live.js%00", "/live.js/..", "/__init__.py", "/%5c..%5cserver.py", "/live"],
+)  # fmt: skip
 def test_no_path_leads_to_a_file(running, path):
     port, _ = running
     status, _, body = ask(port, path)
