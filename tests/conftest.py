@@ -108,14 +108,13 @@ def no_heartbeat() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def calibrations_of_patched_code(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Compute the calibrations of a test that patches the program, and keep none of them for other tests."""
+    """Compute instruments and calibrations of a test that patches the program, and keep none of them for others."""
     if "monkeypatch" not in request.fixturenames:
         yield
         return
-    instrument_builder._built.cache_clear()
-    with recomputed():
+    with pytest.MonkeyPatch.context() as patch, recomputed():
+        patch.setattr(instrument_builder, "_built", cache(instrument_builder._built.__wrapped__))
         yield
-    instrument_builder._built.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -600,6 +600,7 @@ def study_folder(place: Path, kind: str, runs: int = 12) -> tuple[Plan, Path]:
     return plan, place / "run"
 
 
+@pytest.mark.second
 @extends(SAMPLERS)
 def test_a_sampler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every run gets the medians of its factors; the report names the design."""
@@ -633,6 +634,7 @@ def test_an_output_format_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     }
 
 
+@pytest.mark.second
 @extends(FORMATS)
 def test_an_output_format_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The data set as JSON: whole, in the manifest and named in the report."""

@@ -49,7 +49,7 @@ def hits(place: Path) -> str:
     return (place / "hit").read_text("utf-8") if (place / "hit").exists() else ""
 
 
-@pytest.mark.parametrize("module", ["twin.render", "scenes.lens", "analysis.mtf"])
+@pytest.mark.parametrize("module", quick(1, ["twin.render", "scenes.lens", "analysis.mtf"]))
 def test_a_module_runs_nothing_of_the_folder_where_it_is_started(tmp_path, module):
     """One of the program's own name cannot be helped: Python looks for that there before this program is found."""
     place = folder_of_traps(tmp_path, module.partition(".")[0])

@@ -21,6 +21,7 @@ from analysis.turntable.dividing_error import (
     step_kernel,
 )
 from tests.analysis.refusals import refuses
+from tests.tiers import quick
 
 ARCSEC = math.pi / 648000
 ANGLE = np.radians(np.linspace(92.0, 112.0, 41))
@@ -158,7 +159,7 @@ def slow_error(rng: np.random.Generator, reading: np.ndarray) -> np.ndarray:
     return np.asarray(size @ np.sin(waves[:, None] * reading + phase[:, None]))
 
 
-@pytest.mark.parametrize("name", ["cubic_spline", "piecewise_linear"])
+@pytest.mark.parametrize("name", quick(1, ["piecewise_linear", "cubic_spline"]))
 def test_a_gap_is_outside_and_a_missing_angle_has_a_sigma_that_holds(name: str) -> None:
     """One angle of 41 was not compared, and eight elsewhere in a row. The readings in the first gap are met by sigma,
     whose mean square is one within four sigma of its own scatter over 25 tables; those in the second are refused.

@@ -118,6 +118,7 @@ def comb(row, column, shape=SHAPE):
     return sum(share * airy(row + down, column + right, shape) for share, down, right in parts)
 
 
+@pytest.mark.second
 def test_a_shape_of_several_lobes_ends_where_it_is(monkeypatch) -> None:
     """Which lobe the first guess is on, the noise decides, and from there scoring ends on the wrong one. From two
     starts all end at the truth: 5 sigma on 24 numbers have a false alarm of 1e-5.

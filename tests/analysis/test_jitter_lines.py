@@ -108,6 +108,7 @@ def test_a_pair_is_blind_where_a_period_lies_between_its_sights(gap: float, blin
     assert beside.frequency[0] == pytest.approx(blind - 1.0, abs=0.01)
 
 
+@pytest.mark.second
 def test_two_gaps_together_see_what_each_is_blind_for() -> None:
     for frequency in (8.224, 9.766):
         found = search(Pass(((frequency, 0.5, 0.3),), GAPS).observed(2), 0.5, 12.0, RATE)

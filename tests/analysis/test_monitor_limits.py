@@ -12,6 +12,7 @@ from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.monitoring import MonitorGeometry
 from analysis.monitor.parameters import CameraCalibration
 from tests.analysis.stated_motions import correlation_of, disturbances
+from tests.tiers import quick
 
 LOOKS = (0.45, -0.09)
 
@@ -139,7 +140,7 @@ def test_rows_of_the_angle_and_of_parameters():
         assert some[-1].row[[0, 4]] == pytest.approx(first * found[0].row[0] * np.array([1.0, -1.0]))
 
 
-@pytest.mark.parametrize("cameras", [2, 1])
+@pytest.mark.parametrize("cameras", quick(1, [1, 2]))
 def test_false_alarms_and_power_of_the_chi_square(cameras):
     """1000 drawn shifts. Noise is a hundredth of the motions, so that three times them are three times the spread
     to 1e-4."""

@@ -5,11 +5,13 @@ import math
 import resource
 import zlib
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
+import yaml
 from scipy.special import ndtr
 
 from analysis.mtf.__main__ import app
@@ -338,41 +340,11 @@ def test_bars(tmp_path, frequency):
     assert (data["dark_dn"], data["bright_dn"]) == pytest.approx((50, 1050), abs=1)
 
 
-FIELDS = {"--bars": "0.5 cycles/pixel", "--dark": "0,0,9,9", "--bright": "9,9,9,9"}
-
-
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"--pitch": None}, "--pitch is missing"),
-        ({"--csv": "/proc/mtf.csv"}, "/proc/mtf.csv cannot be written"),
-        (FIELDS | {"--csv": "mtf.csv"}, "--plot and --csv are for an edge's curve"),
-        ({"--pitch": "7"}, 'not a length with its unit: write it as "7 um"'),
-        ({"--pitch": "7 furlong"}, "not a length with its unit"),
-        ({"--pitch": "-7 um"}, "must lie between 1 nm and 10 mm"),
-        ({"--roi": "10,20,64"}, "four whole numbers ROW,COLUMN,HEIGHT,WIDTH"),
-        ({"--roi": "10,20,64,640"}, "does not lie in the image of 90 rows and 110 columns"),
-        ({"--roi": "10,20,16,64"}, "too small"),
-        ({"--roi": "0,0,64,40"}, "edge"),
-        ({"--saturation": "9000"}, "pixels reach the saturation level of 9000: lower the exposure"),
-        ({"--frames": "3"}, "more than the 1 pages"),
-        ({"--plot": "mtf.jpeg"}, "must end in .png or .pdf or .svg"),
-        ({"--plot": "no/such/folder/mtf.png"}, "make it first"),
-        ({"--csv": "mtf.txt"}, "must end in .csv"),
-        ({"--bars": "0.5"}, "not a frequency with its unit"),
-        ({"--bars": "0.5 cycles/pixel"}, "needs --dark and --bright"),
-        ({"--bars": "1e300 cycles/pixel"}, "above 2 nothing can be measured"),
-        ({"--dark": "0,0,9,9"}, "belong to --bars"),
-        ({"--offset": "nan"}, "--offset nan must be a finite number"),
-        ({"--offset": "inf"}, "must be a finite number"),
-        ({"--saturation": "nan"}, "--saturation nan must be a number"),
+        *yaml.safe_load(Path(__file__).with_name("mtf_options.yaml").read_text("utf-8")),
         ({"--roi": "9" * 5000 + ",20,64,64"}, "four whole numbers"),
-        ({"--roi": "9999999999,20,64,64"}, "does not lie in the image"),
-        ({"--pitch": "1e-300 um"}, "must lie between 1 nm and 10 mm"),
-        ({"--gamma": "sgrb"}, "is not a tone curve: write srgb, or an exponent such as 2.2"),
-        ({"--gamma": "nan"}, "is not a tone curve"),
-        ({"--gamma": "0"}, "is not a tone curve"),
-        ({"--page": "1"}, "--page 1 does not exist"),
         ({"--csv": "a" * 300 + ".csv"}, "File name too long"),
     ],
 )

@@ -20,6 +20,7 @@ from tests.golden.digest import condensed, flattened, is_number
 from tests.golden.golden import FOLDER, check, golden_file
 from tests.golden.jobs import ALL, BY_NAME, Done, Printed, Runner
 from tests.golden.snapshot import Reader
+from tests.tiers import quick
 
 MANY = np.linspace(0.1, 1.0, 6000)
 IMAGE = np.arange(64, dtype=np.uint16).reshape(8, 8)
@@ -113,7 +114,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize("name", quick(8, CHANGES))
 def test_a_change_is_found(both, name) -> None:
     """Its place, and both values."""
     changes, place, told = CHANGES[name]
@@ -186,6 +187,7 @@ def numbers(name: str) -> Iterator[tuple[str, float, float]]:
             yield place, value, limit[place]
 
 
+@pytest.mark.second
 def test_a_wrong_number_is_found_wherever_it_stands() -> None:
     """Of each real number of each golden file ten times it and, if it is not small beside its standard deviation, its
     list or the counts of an image, 1 % more.

@@ -24,48 +24,24 @@ LIMIT = re.compile(r"(^|_)(MAX|MOST|LIMIT|LARGEST|LONGEST|AT_MOST|SECONDS|BYTES|
 BOUND = re.compile(r"(^|_)(most|least|limit|limits|max|min|largest|smallest|count|number|required|allowed)(_|$)")
 MATRIX = re.compile(r"(^|_)(rotations?|matrix|matrices|attitude|frames?|axes|basis|R|body_to|to_body|orientation)(_|$)")
 TURN = re.compile(r"(rotation|rotate|rotated|turned|about_axis|from_euler|rotvec|rodrigues|tilt)")
-_SWAPS = (
-    ("forward", "backward"),
-    ("left", "right"),
-    ("along", "across"),
-    ("roll", "pitch"),
-    ("line", "pixel"),
-    ("lines", "pixels"),
-    ("before", "after"),
-    ("row", "column"),
-    ("rows", "columns"),
-    ("x", "y"),
-    ("north", "east"),
-    ("latitude", "longitude"),
-)
+_SWAPS = [
+    pair.split("/")
+    for pair in """
+        forward/backward left/right along/across roll/pitch line/pixel lines/pixels before/after
+        row/column rows/columns x/y north/east latitude/longitude
+    """.split()
+]
 OTHER = dict(_SWAPS) | {right: left for left, right in _SWAPS}
 _UNITS = {"MICRO": "1e-3", "MICROMETRE": "1e-3", "NANO": "1e-6", "MILLI": "1e-6", "ARCSEC": "1.0", "DEGREE": "1.0"}
 """Name of a unit -> what another unit multiplies with."""
 _POWERS = {1e3: 1e6, 1e6: 1e3, 1e-3: 1e-6, 1e-6: 1e-3, 1e9: 1e6, 1e-9: 1e-6}
 _ANGLES = {"radians", "degrees", "deg2rad", "rad2deg"}
 FAULTS = (
-    "root lost",
-    "root added",
-    "sigma x 0.8",
-    "sigma x 1.25",
-    "variance for sigma",
-    "freedom off by one",
-    "radians for degrees",
-    "other unit",
-    "axis swapped",
-    "name swapped",
-    "transposed",
-    "rotation reversed",
-    "index off by one",
-    "first for last",
-    "boundary",
-    "warning dropped",
-    "refusal passed",
-    "check skipped",
-    "key forgets",
-    "seed reused",
-    "limit x 10",
-)
+    "root lost, root added, sigma x 0.8, sigma x 1.25, variance for sigma, freedom off by one, "
+    "radians for degrees, other unit, axis swapped, name swapped, transposed, rotation reversed, "
+    "index off by one, first for last, boundary, warning dropped, refusal passed, check skipped, "
+    "key forgets, seed reused, limit x 10"
+).split(", ")
 Found = tuple[ast.expr | ast.stmt, str, str]
 
 

@@ -209,6 +209,7 @@ def random_bodies(count: int, seed: int) -> int:
     return bodies
 
 
+@pytest.mark.second
 def test_random_bodies() -> None:
     assert random_bodies(60, 1) > 40
 

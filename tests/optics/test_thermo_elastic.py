@@ -164,6 +164,7 @@ def test_the_kinematic_support_holds_its_six_components() -> None:
     assert abs(moved[1] @ along) > 1e-3 * size  # along the line it is free
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("cells", quick(1, [4, 9, 16]))
 @pytest.mark.parametrize("aperture", [Circle(0.3, (0.0, -0.4)), Rectangle(0.3, 0.1)])
 def test_every_point_of_a_curved_face_is_found_in_its_own_cell(aperture, cells: int) -> None:

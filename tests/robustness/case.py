@@ -15,33 +15,7 @@ from scenes.specs.load import SCENES
 JOBS = Path(__file__).parents[1] / "golden/jobs"
 """Small jobs of every command, those of the golden runs."""
 
-CUTS = (
-    "twin.monitor.truth.LineSight.truth",
-    "twin.laboratory.focus_run.align",
-    "twin.laboratory.distortion_bench.DistortionBench.record",
-    "twin.laboratory.turntable_run.choose",
-    "twin.laboratory.distortion_run.choose",
-    "twin.orbit.angle.angle_run.estimated",
-    "twin.orbit.angle.measured_angle.estimated",
-    "twin.orbit.calibration.flown_campaign._simulated_points",
-    "twin.orbit.calibration.calibration_run.campaign_of",
-    "twin.orbit.calibration.field_images.Imager.measured",
-    "twin.orbit.monitoring.monitoring_run._changes",
-    "twin.orbit.images.simulate_run.fly_patch",
-    "twin.orbit.export.export_run._exported",
-    "twin.orbit.conventions.check_run._searched",
-    "twin.orbit.matching.match_run.measure_points",
-    "twin.run.cluster.local_workers",
-    "twin.study.gradient.study_gradient._Traced",
-    "twin.study.gradient.study_gradient._whole",
-    "twin.design.design_run.search",
-    "twin.design.layout_search._OneSearch.run",
-    "twin.camera.camera_run.run_camera",
-    "twin.uncertainty.coverage.run_uncertainty",
-    "twin.recover.recover_run._modelled",
-    "twin.recover.recover_run._measured",
-    "twin.live.__main__._serve",
-)
+CUTS = Path(__file__).with_name("cuts.txt").read_text("utf-8").split()
 """Functions that begin the long computations."""
 SOONER = (
     "twin.design.monitor_design.LayoutBench",

@@ -23,7 +23,7 @@ class _Plain(yaml.SafeDumper):
 
 def pair() -> dict[str, Any]:
     """The library's pair gf7 as plain data."""
-    return dict(yaml.safe_load((LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")))
+    return dict(yaml.load((LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8"), yaml.CSafeLoader))
 
 
 def hollow_pair() -> dict[str, Any]:

@@ -38,6 +38,7 @@ def test_a_file_that_says_how_another_instrument_was_built(backend, tmp_path) ->
     assert state["base/forward/M2"] == Motion(shift=(0.0, 0.0, 3e-6), pivot="centre")
 
 
+@pytest.mark.second
 def test_the_key_in_an_instruments_own_file_says_the_same(backend, tmp_path) -> None:
     words = "[forward/M2 shift z 3 um, forward/M2 rotate x 2 arcsec about centre]"
     own = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text() + f"as_built: {words}\n"

@@ -13,6 +13,7 @@ from scenes.models.clearance import LEAST_GAP, check_clearance, convex_bodies, f
 from scenes.models.obstruction import RAYS, find_obstructions
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from tests.twin.commands import replaced
 
 PAIR = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
@@ -130,6 +131,7 @@ def test_bodies_in_each_other(name, bare) -> None:
         assert separation(bodies[moved] + 0.98 * way, bodies[other]) < LEAST_GAP
 
 
+@pytest.mark.second
 def test_a_gap_below_the_least(bare) -> None:
     """10 um between rhomboid and facet are too little, 100 um are enough."""
     touching = bare(("distance: 0.5 m", "distance: 33.01 mm"))
@@ -141,7 +143,7 @@ def test_a_gap_below_the_least(bare) -> None:
     check_clearance(bare(("distance: 0.5 m", "distance: 33.1 mm")))
 
 
-@pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
+@pytest.mark.parametrize("name", quick(1, ["gf7_pair", "monitor_pair"]))
 def test_only_its_own_prisms_stand_before_a_camera(name, instrument, backend) -> None:
     """Each 180-deg prism takes some 5 % of its camera's pupil, of which its channel uses the part that the return face
     leaves; no prism stands in a monitor beam that is not its own.

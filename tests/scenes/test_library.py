@@ -116,6 +116,7 @@ def test_every_specification_is_a_value(spec: Spec) -> None:
         setattr(spec, field, None)
 
 
+@pytest.mark.second
 def test_an_equal_instrument_is_built_once_and_that_of_another_file_anew(backend, tmp_path) -> None:
     """Errors name the file that an instrument was read from, and results the order in which it names its parts."""
     first, again = (load.load_instrument("monitor_pair") for _ in range(2))

@@ -354,6 +354,7 @@ def model(backend, tmp_path_factory):
     return monitor_layouts.built(monitor_layouts.hollow_pair(), tmp_path_factory.mktemp("hollow"), backend)
 
 
+@pytest.mark.second
 def test_what_stands_in_which_beam(model, gf7_pair, backend) -> None:
     """No glass, bodies clear of each other, and nothing in a monitor beam; plates and frames of the 180-deg kind take
     less of the pupil than the glass that they stand for.

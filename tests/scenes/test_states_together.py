@@ -15,6 +15,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from tests.scenes.lens.colour_cameras import colour_camera
 from tests.scenes.test_lens_heat import LIKE_ALUMINIUM
+from tests.tiers import quick
 
 ROUNDING = 1e-13
 """Of a motion's parts that are sums of products of some ten numbers."""
@@ -35,7 +36,7 @@ def agree(one: State, other: State) -> None:
         np.testing.assert_allclose(list(motion.figure.values()), list(same.figure.values()), rtol=ROUNDING)
 
 
-@pytest.fixture(scope="module", params=["launch", "orbit"])
+@pytest.fixture(scope="module", params=quick(1, ["launch", "orbit"]))
 def stated(request, backend):
     resolved = resolve_job(JobSpec(instrument="gf7_pair", disturbances=request.param))
     built = build_instrument(resolved.instrument, resolved.cameras, backend)

@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from twin.orbit.calibration.calibration_export import files_of
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign
 
+REFUSALS: dict[str, Any] = read_yaml(Path(__file__).with_name("orbit_refusals.yaml")).data
+"""Files and jobs that are refused, and results that warn: a thousand lines, which every test of them reads here."""
 WHOLE = resolve_calibration(SCENES / ORBIT / "calibrate.yaml")
 FIELDS = ("Beijing", "Anhui")
 Table = tuple[list[str], list[list[str]]]

@@ -19,12 +19,12 @@ ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).parent
 TEXTS: dict[str, Any] = yaml.safe_load((HERE / "study_texts.yaml").read_text("utf-8"))
 STUDY: str = TEXTS["study"]
+REFUSED: dict[str, list[Any]] = yaml.safe_load((HERE / "refused_inputs.yaml").read_text("utf-8"))
 
 
 def refusals(group: str) -> list[Any]:
     """Return cases for ``parametrize``: rows of a group of refused_inputs.yaml."""
-    rows = yaml.safe_load((HERE / "refused_inputs.yaml").read_text("utf-8"))[group]
-    return [pytest.param(*row, id=str(row[-1])) for row in rows]
+    return [pytest.param(*row, id=str(row[-1])) for row in REFUSED[group]]
 
 
 def budget(folder: Path, name: str = "gf7", **changes: Any) -> ToleranceSetup:

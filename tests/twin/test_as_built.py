@@ -96,6 +96,7 @@ def test_changes_count_from_its_own_line_of_sight(backend, pair) -> None:
     np.testing.assert_allclose(change[1, :3], [1e-6, 0.0, 0.0], rtol=0.0, atol=1e-10)
 
 
+@pytest.mark.second
 def test_nothing_built_changes_nothing(backend, tmp_path) -> None:
     spec = read(tmp_path, "name: own\ndesign: gf7_pair\nas_built: {}\n")
     cameras = load_cameras(spec)

@@ -5,9 +5,11 @@ rate of 1e-6 each.
 import math
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.stats import chi2
 
 from optics.geometry.pose import rotation_vector
@@ -19,22 +21,7 @@ from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
 EARTH = Earth()
 FALSE_ALARM = 1e-6
 ARCSEC = math.pi / 648000
-ERRORS = {
-    "gps": {
-        "interval": "2 s",
-        "noise": ["1 m", "2 m", "3 m"],
-        "drift": ["4 m", "5 m", "6 m"],
-        "correlation_time": "1 min",
-        "velocity": ["1 cm/s", "2 cm/s", "3 cm/s"],
-    },
-    "star_tracker": {
-        "interval": "0.25 s",
-        "noise": ["2 arcsec", "3 arcsec", "15 arcsec"],
-        "bias": ["10 arcsec", "-20 arcsec", "30 arcsec"],
-        "thermal": {"amplitude": ["1 arcsec", "-2 arcsec", "3 arcsec"], "reference": "40 deg"},
-        "slow": {"noise": ["1 arcsec", "2 arcsec", "3 arcsec"], "interval": "10 s"},
-    },
-}
+ERRORS = yaml.safe_load(Path(__file__).with_name("attitude_errors.yaml").read_text("utf-8"))
 SPEC = ErrorsSpec.model_validate(ERRORS)
 
 

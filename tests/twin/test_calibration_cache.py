@@ -143,6 +143,7 @@ def test_every_value_of_every_input_is_part_of_the_key() -> None:
     assert len(set(keys)) == len(keys) > 300
 
 
+@pytest.mark.second
 def test_an_experiment_names_each_of_its_inputs() -> None:
     resolved = job()
     name, camera = next(iter(resolved.cameras.items()))
@@ -299,6 +300,7 @@ def test_where_the_cache_is(monkeypatch, tmp_path: Path, entry: CacheEntry) -> N
     assert entry.get(lambda: 3.0) == 3.0
 
 
+@pytest.mark.second
 def test_only_calibrations_of_the_built_instrument_are_kept(folder: Path) -> None:
     first, _ = calibrated(job())
     other = first.with_instrument(first.instrument)

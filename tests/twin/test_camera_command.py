@@ -16,6 +16,7 @@ from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.commands import invoke
+from tests.twin.study_bench import REFUSED
 from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
@@ -121,25 +122,8 @@ def test_files_that_it_takes(tmp_path) -> None:
     assert isinstance(validate(CameraSpec, read_yaml(LIBRARY / "cameras" / "gf7.yaml")), CameraSpec)
 
 
-REFUSED = [
-    (("gf8",), "no such camera or instrument; did you mean 'gf7'\\? Found 'gf8'"),
-    (("gf7_pair",), "gf7_pair: which of its cameras is meant is not said; allowed: --camera forward"),
-    (("gf7_pair", "--camera", "foreward"), "no such camera; did you mean 'forward'\\? Found 'foreward'"),
-    (("gf7", "--camera", "backward"), "gf7: --camera backward: the file holds one camera, gf7"),
-    (("gf7", "tilt"), "'tilt' has no meaning here; there is --refocus --tilt"),
-    (("gf7", "--tilt"), "--tilt goes with --refocus"),
-    (("gf7", "turn", "--refocus"), "'turn' has no meaning here; there is --refocus --tilt"),
-    (("scenes/examples/perturb.yaml",), "perturb.yaml: which of its cameras is meant is not said"),
-    (("nowhere.yaml",), "nowhere.yaml: no such file"),
-    (("ritchey_chretien", "--perturb", "M7 shift z 1 um"), "no such node"),
-    (("ritchey_chretien", "--perturb", "M2 shift z 1 arcsec"), "unit of an angle"),
-    (("ritchey_chretien", "--perturb", "M2 shift"), "not a motion of a node"),
-    (("ritchey_chretien", "--perturb", "M2 shift z 20 um", "--refocus"), "refocus"),
-]
-
-
 def test_what_it_refuses(tmp_path) -> None:
-    for words, message in REFUSED:
+    for words, message in REFUSED["cameras"]:
         result = invoke(app, *words, "--out", tmp_path / "out")
         assert result.exit_code == 2, words
         assert re.search(message, " ".join(result.stderr.split())), (words, result.stderr)

@@ -17,6 +17,7 @@ from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.commands import invoke
+from tests.twin.study_bench import REFUSED
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import TimeSeries, _warnings, run_series, series_states
 
@@ -112,43 +113,8 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
 
 COURSE = "instrument: gf7_pair\ncourse:\n  times: [0 min, 1 min]\n  temperature:\n"
 NODE = "    base/forward: "
-MOTIONS = COURSE.replace("temperature", "motion") + "    base/forward/M2: "
-BAD = {
-    "lengths": (COURSE + NODE + "{change: [0 K, 1 K, 2 K]}", 5, ("base/forward.change", "3 entries", "2, as many")),
-    "gradient": (COURSE + NODE + "{gradient: [[0 K/m, 0 K/m, 0 K/m]]}", 5, ("gradient", "1 entries")),
-    "vector": (COURSE + NODE + "{gradient: [[0 K/m, 0 K/m], [0 K/m, 0 K/m]]}", 5, ("gradient[0]", "not a list of 3")),
-    "order": (COURSE.replace("1 min", "0 s") + NODE + "{change: [0 K, 1 K]}", 3, ("times[1]", "do not ascend")),
-    "one": (COURSE.replace(", 1 min", "") + NODE + "{change: [0 K]}", 3, ("course.times", "2 to 1000 times")),
-    "many": (
-        COURSE.replace("0 min, 1 min", ", ".join(f"{k} s" for k in range(1001))) + NODE + "{change: [0 K]}",
-        3,
-        ("course.times", "1001 of them"),
-    ),
-    "unit": (
-        COURSE.replace("1 min", "1") + NODE + "{change: [0 K, 1 K]}",
-        3,
-        ("times[1]", "without a unit", "'12 min'"),
-    ),
-    "kind": (COURSE + NODE + "{change: [0 K, 1 deg]}", 5, ("change[1]", "unit of an angle")),
-    "key": (COURSE + NODE + "{chnge: [0 K, 1 K]}", 5, ("unknown key", "did you mean 'change'?")),
-    "word": (COURSE.replace("times", "time") + NODE + "{change: [0 K, 1 K]}", 3, ("did you mean 'times'?",)),
-    "times": (COURSE.replace("  times: [0 min, 1 min]\n", "") + NODE + "{change: [0 K]}", 2, ("'times' is missing",)),
-    "motions": (MOTIONS + "{shift: [0 0 1 um]}", 5, ("motion.base/forward/M2.shift", "1 entries", "2, as many")),
-    "no motion": (MOTIONS + "{pivot: centre}", 5, ("motion.base/forward/M2", "rotate, shift or scale")),
-    "pivot": (MOTIONS + "{shift: [0 0 0 um, 0 0 1 um], pivot: center}", 5, ("no such pivot", "did you mean 'centre'")),
-    "moved": (
-        COURSE.replace("temperature", "motion") + "    base: {shift: [0 0 0 um, 0 0 1 um]}",
-        5,
-        ("not allow shift",),
-    ),
-    "far": (MOTIONS + "{shift: [0 0 0 um, 0 0 30 mm]}", 4, ("at 1 min of the course", "motions of base/forward/M2")),
-    "nothing": (COURSE, 4, ("course.temperature", "nothing changes")),
-    "empty": (COURSE + NODE + "{}", 5, ("course.temperature.base/forward", "change or gradient")),
-    "detail": (COURSE + NODE + "{change: [0 K, 1 K]}\n  detail: 50 s", 6, ("course.detail", "did you mean '1 min'?")),
-    "node": (COURSE + "    base/forwards: {change: [0 K, 1 K]}", 5, ("no such node", "did you mean 'base/forward'?")),
-    "face": (COURSE + f"    {LEFT}/mirror: {{change: [0 K, 1 K]}}", 5, ("does not allow temperature",)),
-    "cold": (COURSE + NODE + "{change: [0 K, -300 K]}", 5, ("change[1]", "-6.85 K", "at 1 min", "absolute zero")),
-}
+MANY = COURSE.replace("0 min, 1 min", ", ".join(f"{k} s" for k in range(1001))) + NODE + "{change: [0 K]}"
+BAD = REFUSED["courses"] | {"many": (MANY, 3, ["course.times", "1001 of them"])}
 
 
 @pytest.mark.parametrize("case", quick(5, BAD))

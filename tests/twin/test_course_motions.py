@@ -10,6 +10,7 @@ from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
+from tests.twin.study_bench import REFUSED
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import run_series, series_states
 from twin.render import app
@@ -100,41 +101,9 @@ def test_the_course_tells_its_motions(experiment, tmp_path) -> None:
     np.testing.assert_allclose(read, true, atol=0.1 * np.ptp(true))
 
 
-BAD = {
-    "node": ((MIRROR, "base/forward/M9"), "motions.csv", 2, ("motion.base/forward/M9", "no such node", "did you mean")),
-    "head": ((",".join(HEADS), "time [min]; x"), "motions.csv", 2, ("not the head of a column", "'NODE shift z [um]'")),
-    "quantity": (("shift z", "shfit z"), "motions.csv", 2, ("no such quantity", "did you mean 'shift'?")),
-    "axis": (("shift z", "shift"), "motions.csv", 2, ("a column of shift has an axis",)),
-    "no axis": (("scale [", "scale x ["), "motions.csv", 2, ("a column of scale has no axis",)),
-    "unit": (("z [um]", "z [arcsec]"), "motions.csv", 2, ("unit of an angle", "um, mm")),
-    "twice": (("rotate x", "rotate z"), "motions.csv", 2, ("another column holds the same",)),
-    "no time": (("time [min]", f"{MIRROR} shift x [um]"), "motions.csv", 2, ("no column has the times",)),
-    "cell": (("12,3,", "12,three,"), "motions.csv", 5, (f"motion.{MIRROR}.shift[1][2]", "'three um'")),
-    "empty": (("12,3,", "12,,"), "motions.csv", 5, ("not a number with a unit",)),
-    "limit": (("12,3,", "12,3e6,"), "motions.csv", 5, ("outside the limits", "100 mm")),
-    "ragged": (("12,3,", "12,"), "motions.csv", 5, ("5 cells under 6 heads",)),
-    "order": (("30,", "3,"), "motions.csv", 6, ("times[2]", "do not ascend")),
-    "rows": ((TABLE[TABLE.index("0,0") :], ""), "motions.csv", 2, ("a row for each time",)),
-    "cold": (
-        (",-0.2", ",-300"),
-        "motions.csv",
-        6,
-        ("temperature.base/forward.change[2]", "at 30 min", "absolute zero"),
-    ),
-    "file": (("", ""), "job.yaml", 3, ("course.table", "no such file")),
-    "both": (("", ""), "job.yaml", 4, ("course.times", "the table has them")),
-    "pivot": (
-        ("", ""),
-        "job.yaml",
-        5,
-        (f"course.motion.{MIRROR}x", "does not move this node", f"did you mean '{MIRROR}'"),
-    ),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("case", REFUSED["tables_of_motions"])
 def test_a_bad_table_is_explained_with_file_and_line(case: str, tmp_path) -> None:
-    (old, new), file, line, words = BAD[case]
+    (old, new), file, line, words = REFUSED["tables_of_motions"][case]
     assert old in TABLE
     job = {
         "file": JOB.replace("motions.csv", "none.csv"),

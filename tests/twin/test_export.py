@@ -91,6 +91,7 @@ def test_a_trajectory_that_jitters_takes_more_nodes(flight) -> None:
     assert np.abs(there[1] - 0.5 - pixel).max() < 0.01
 
 
+@pytest.mark.second
 def test_a_window_is_a_part_of_the_line(flight) -> None:
     sensor = _sensor(flight, "backward", LightEffects())
     part = replace(sensor, first_line_time=float(sensor.time(np.array([500.0]))[0]), lines=300)

@@ -183,6 +183,7 @@ def test_errors_that_hide_each_other():
     assert found >= 8
 
 
+@pytest.mark.second
 def test_sound_curves_lose_no_point():
     """1300 points at a limit that one of them passes with p = 7e-4."""
     rng = np.random.default_rng(1)

@@ -7,7 +7,7 @@ from scenes.kinds.file_kinds import kind_of
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.study_bench import ROOT
 from twin.run.console import parser
-from twin.validation.registry import GROUPS, select
+from twin.validation import registry
 
 TAUGHT = (
     "twin.render twin.live twin.recover twin.lab twin.orbit twin.study twin.design twin.validate twin.compare"
@@ -49,6 +49,6 @@ def test_the_examples_of_a_help_can_be_run() -> None:
                     same = kind.command == " ".join([program, *sub])
                     assert same or (program == "twin.live" and kind.name in OPENED), example
             if "--only" in rest:
-                select(GROUPS, rest[rest.index("--only") + 1])
+                registry.select(registry.GROUPS, rest[rest.index("--only") + 1])
         for word in re.findall(r"\bscenes/(?:examples|lab|orbit|library)/[\w./-]+\w", text):
             assert (ROOT / word).exists(), word

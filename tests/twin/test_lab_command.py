@@ -10,6 +10,7 @@ import twin.lab as command
 from scenes.specs.load import LAB, LIBRARY, SCENES
 from tests.tiers import quick
 from tests.twin.commands import invoke, refused
+from tests.twin.study_bench import REFUSED
 
 run = partial(invoke, command.app)
 FOCUS = SCENES / LAB / "focus.yaml"
@@ -40,35 +41,9 @@ def write_focus(folder: Path, **changes: str) -> Path:
     return path
 
 
-# what is wrong, where it is said, and what to do about it
-BAD = {
-    "no such camera": ({"camera: gf7\n": "camera: gf8\n"}, "camera", ["no such name", "did you mean 'gf7'"]),
-    "no such mirror": ({"  M3: {figure": "  M4: {figure"}, "as_built.M4", ["M4", "M1"]),
-    "unknown key": ({"frames: 4": "frame: 4"}, "frame", ["did you mean 'frames'"]),
-    "small region": ({"region: 64": "region: 8"}, "edge.region", ["8", "32"]),
-    "narrow collimator": (
-        {"aperture: 0.8 m ": "aperture: 0.5 m "},
-        "collimator.aperture",
-        ["500 mm", "a wider collimator"],
-    ),
-    "too much light": ({"white: 60 percent": "white: 120 percent"}, "white", ["saturates", "98 percent or less"]),
-    "holes on a line": (
-        {"[60 mm, -150 mm, -30 mm]": "[-60 mm, 0 mm, -30 mm]", "    - [60 mm, 150 mm, -30 mm]\n": ""},
-        "mount.holes",
-        ["on one line", "span a plane"],
-    ),
-    "clearance": ({"clearance: 1 mm": "clearance: 1 um"}, "mount.clearance", ["slide hole_", "more clearance"]),
-    "short scan": (
-        {"reach: 1.4 mm": "reach: 0.04 mm", "step: 0.08 mm": "step: 0.015 mm"},
-        "scan.reach",
-        ["focus", "reach"],
-    ),
-}
-
-
-@pytest.mark.parametrize("name", quick(3, BAD))
+@pytest.mark.parametrize("name", quick(3, REFUSED["focus_tests"]))
 def test_bad_input(name: str, tmp_path: Path) -> None:
-    changes, key, words = BAD[name]
+    changes, key, words = REFUSED["focus_tests"][name]
     path = write_focus(tmp_path, **changes)
     line = refused(run, "focus", path, key, words)
     # the line it names is the one that holds the key

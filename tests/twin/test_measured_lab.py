@@ -307,6 +307,7 @@ def test_a_reading_in_a_gap_of_the_calibration_is_outside(folder: Path) -> None:
     assert "a held-out reading beyond the calibrated ones" in told
 
 
+@pytest.mark.second
 def test_missing_repeats_cost_only_their_own_angle(folder: Path) -> None:
     whole = turntable_of(folder).series
     head, *body = rows_of(folder / "comparisons.csv")

@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from scenes.specs.load import SCENES
 from scenes.specs.resolved import resolve_focus_test
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
+from tests.twin.study_bench import REFUSED
 from twin.lab import app
 from twin.laboratory.focus_report import focus_report
 from twin.laboratory.focus_run import align_files
@@ -114,68 +116,17 @@ def spread_out(rows: list[list[str]]) -> None:
     rows[2:] = [[*rows[1][:k], str(n), *rows[1][k + 1 :]] for n in range(3000)]
 
 
-TABLES = [
-    ("turntable", head("reading [deg]", "reading"), ":1: reading: a head without a unit; allowed: 'reading [arcsec]'"),
-    ("turntable", head("reading [deg]", "reding [deg]"), "no such column; did you mean 'reading [arcsec]'?"),
-    ("turntable", head("reading [deg]", "reading [mm]"), ":1: reading [mm]: "),
-    ("turntable", without("difference [arcsec]"), "one column has to say what the reference read; found neither"),
-    ("turntable", cell(7, "difference [arcsec]", "0,3"), ":7: difference [arcsec]: not a number; found '0,3'"),
-    ("turntable", cell(9, "difference [arcsec]", ""), ":9: difference [arcsec]: not a number"),
-    ("turntable", cell(9, "difference [arcsec]", "nan"), ":9: difference [arcsec]: not a finite number"),
-    ("turntable", cell(5, "reading [deg]", "9200"), ":5: reading [deg]: out of range"),
-    ("turntable", cell(5, "reading [deg]", "92.25"), "one repeat only of this reading"),
-    ("turntable", cell(5, "repeat", "1.5"), ":5: repeat: not a whole number"),
-    ("turntable", copied(12), ":412: repeat: the same repeat twice, first in line 12"),
-    ("turntable", numbered, ":7: position: two positions with the same readings, the other in line 2; found 1,"),
-    ("turntable", countless, ":2: too many to hold; found 5600 angles with up to 5600 repeats each"),
-    ("turntable", misplaced, ":4: reading [deg]: a reading that is nearer to those of another position"),
-    ("turntable", only(20), ":2: reading [deg]: too few different readings; found 2, allowed: 4 or more"),
-    ("turntable", only(0), "0 rows below the heads"),
-    ("turntable", scaled("difference [arcsec]", 3600.0), "the difference from the reference changes by"),
+def spoilt_by(how: list[Any]) -> Callable[[list[list[str]]], object]:
+    """A change of a table: the name of its function here and what that takes, or several of them."""
+    if isinstance(how[0], list):
+        return lambda rows: [spoilt_by(one)(rows) for one in how]
+    return globals()[how[0]](*how[1:]) if how[1:] else globals()[how[0]]
+
+
+TABLES: list[tuple[str, Callable, str | None]] = [
+    *((command, spoilt_by(how), told) for command, how, told in REFUSED["laboratory_tables"]),
     ("turntable", lambda rows: rows[5].append("1"), ":6: 4 cells under 3 heads"),
-    ("distortion", without("along [mm]"), "one column has to say where the spots are; found neither"),
-    (
-        "distortion",
-        lambda rows: [
-            head("along [mm]", "column")(rows),
-            head("sigma [um]", "column sigma")(rows),
-            head("fixed sigma [um]", "column fixed sigma")(rows),
-        ],
-        "allowed: line: {pitch: 7 um, middle: 6143.5}",
-    ),
-    ("distortion", head("along [mm]", "column"), "a sigma in lengths of places in pixels; allowed: 'column sigma'"),
-    ("distortion", head("sigma [um]", "column sigma"), "a sigma in pixels of places in lengths; allowed: 'sigma [um]'"),
-    ("distortion", without("point"), "sets of points that have no number; allowed: a column 'point' as well"),
-    ("distortion", cell(4, "sigma [um]", "-0.1"), ":4: sigma [um]: out of range; found '-0.1', allowed: at least 0"),
-    ("distortion", cell(4, "along [mm]", "inf"), ":4: along [mm]: not a finite number"),
-    ("distortion", cell(4, "set", "1"), ":4: set: the same set twice, first in line 2"),
-    ("distortion", cell(4, "set", "77"), ":4: set: a set of 1 points; allowed: 5 or more in every set"),
-    (
-        "distortion",
-        cell(4, "reading [deg]", "150"),
-        ":4: reading [deg]: outside of the calibrated readings; found 150 deg",
-    ),
-    ("distortion", scaled("along [mm]", -1.0), "angles and spot positions count in opposite senses"),
-    ("distortion", only(30), "too few points; found 3, allowed: 5 or more, over the whole field"),
-    ("distortion", crowded, "too many points; found 3001, allowed: at most 3000"),
-    ("distortion", cell(4, "point", "77"), ":4: point: one spot only of this point in a test of several sets"),
-    ("distortion", cell(3, "point", "x"), ":3: point: not a number"),
-    ("distortion", only(2), "2 rows below the heads"),
-    ("focus", head("shift [um]", "shift [arcsec]"), ":1: shift [arcsec]: "),
-    ("focus", without("sigma"), "no column 'sigma'"),
-    ("focus", cell(5, "sigma", "0"), ":5: sigma: out of range; found '0'"),
-    ("focus", cell(5, "mtf", "20"), ":5: mtf: out of range; found '20', allowed: -0.5 to 1.5"),
-    ("focus", cell(5, "edge", "allong"), ":5: edge: no such direction; did you mean 'along'?"),
-    ("focus", cell(5, "edge", "track"), None),
-    ("focus", cell(2, "x [mm]", "3"), "no row of the edge 'track', which other places have"),
-    ("focus", cell(5, "band", ""), ":5: band: an empty cell"),
-    ("focus", scaled("x [mm]", 0.0), "all places lie on X' = constant (the line CCD alone), so slope_x cannot be told"),
-    ("focus", spread_out, ":2: x [mm]: too many places; found 3001, allowed: at most 3000 places"),
-    ("focus", only(9), "3 places cannot tell|1 places cannot tell"),
-    ("focus", scaled("shift [um]", 0.0), "no best focus of"),
     ("focus", lambda rows: rows.__delitem__(slice(3, 9)), "no best focus of P"),
-    ("focus", only(4), "4 rows below the heads"),
-    ("focus", head("mtf", "MTF"), "no such column; did you mean 'mtf'?"),
 ]
 
 
@@ -194,33 +145,7 @@ def test_bad_tables(folder: Path, tmp_path: Path, command: str, spoil: Callable,
     assert not (tmp_path / "run").exists()
 
 
-FILES = [
-    ("turntable", "comparisons: comparisons.csv", "comparisons: comparison.csv", "did you mean 'comparisons.csv'?"),
-    ("turntable", "reference: 0.015 arcsec", "reference: 0.015", "a number without a unit"),
-    ("turntable", "reference: 0.015 arcsec", "referenz: 0.015 arcsec", "did you mean 'reference'?"),
-    ("turntable", "held_out: held_out.csv", "held_out: spots.csv", "no such column"),
-    ("turntable", "folds: 10", "folds: 1", "folds"),
-    (
-        "distortion",
-        "zero: 102 deg",
-        "zero: 150 deg",
-        "measured.zero: outside of the calibrated readings; found '150 deg'",
-    ),
-    ("distortion", "  zero: 102 deg", "  angle_sigma: 1 arcsec\n  zero: 102 deg", "told in one way; found both"),
-    ("distortion", "principal_distance: 5.51 m", "principal_distance: 0 m", "principal_distance"),
-    ("distortion", "held_out: held_out.csv", "held_out: measured", "no such file"),
-    ("focus", "moved: image", "moved: target", "how far the image moves with the target is not told; found 'target'"),
-    ("focus", "moved: image", "moved: images", "did you mean 'image'?"),
-    ("focus", "moved: image", "moved: image\n  per_shift: 0.08", "moved: target"),
-    ("focus", "  mtf: mtf.csv", "  mtf: mtf.csv\n  images: mtf.csv", "one table is needed; found both"),
-    ("focus", "  step: 5 um", "  step: 5 um\nshims: [5 mm, 5 mm]", "another number of shims than of holes; found 2"),
-    ("focus", "clearance: 1 mm", "clearance: 1 um", "would slide hole"),
-    ("focus", "thickness: 5 mm", "thickness: 10 um", "thicker shims|above|shims"),
-    ("focus", "    - [60 mm, -150 mm, -30 mm]\n    - [60 mm, 150 mm, -30 mm]\n", "", "holes"),
-]
-
-
-@pytest.mark.parametrize(("command", "old", "new", "told"), quick(9, FILES))
+@pytest.mark.parametrize(("command", "old", "new", "told"), quick(9, map(tuple, REFUSED["laboratory_files"])))
 def test_bad_files(folder: Path, tmp_path: Path, command: str, old: str, new: str, told: str) -> None:
     file = folder / f"{command}.yaml"
     text = file.read_text()

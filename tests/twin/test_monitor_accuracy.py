@@ -35,7 +35,7 @@ def family_state(cameras, signs):
     return state
 
 
-@pytest.fixture(scope="module", params=["gf7_pair", "monitor_pair"])
+@pytest.fixture(scope="module", params=quick(1, ["gf7_pair", "monitor_pair"]))
 def measured(request, experiment, backend):
     """(states, truth (S, 4), noise-free shifts (S, 4) px, calibration) of every camera."""
     setup = experiment(request.param)

@@ -27,6 +27,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
+from tests.twin.study_bench import refusals
 from twin.design.__main__ import app
 from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
 from twin.design.monitor_design import LAYOUTS, MonitorDesignRun, run_monitor_design
@@ -286,30 +287,7 @@ def test_a_start_that_throws_a_ghost_is_refused_with_both_bodies_and_the_line(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("change", "to", "told"),
-    [
-        ("pupil_x: [90 mm, 150 mm]", "pupil_x: [150 mm, 90 mm]", "the range ends before it begins"),
-        ("goal: {angle: 0.05 arcsec, d_f: 2 um}", "goal: {}", "what is the layout to reach?"),
-        ("goal: {angle: 0.05 arcsec, d_f: 2 um}", "goal: {angle: 0.05}", "angle"),
-        ("disturbances: [mirrors.yaml]", "disturbances: [weather]", "no such name in disturbances"),
-        ("limits: {pupil_share: 20 percent}", "limits: {mass: 20 m}", "mass"),
-        ("instrument: gf7_pair", "instrument: gf8_pair", "no such name in instruments"),
-        ("pupil_y: [0 mm, 20 mm]", "photons: [8.0e+6, 4.0e+6]", "the range ends before it begins"),
-        ("pupil_y: [0 mm, 20 mm]", "photons: [0, 4.0e+6]", "photons"),
-        ("search: {beams: 2,", "search: {starts: -1, beams: 2,", "starts"),
-        (
-            "beams: 2",
-            "beams: 2\narea_ccds: {a: {detector: monitor_cdd, pitch: 9 um, rows: 128, columns: 128}}",
-            "no such name in detectors",
-        ),
-        (
-            "beams: 2",
-            "beams: 2\nprisms: {a: {prism_180: {material: N-BK7, kind: rhomboid}, prism_0: {material: Zerodur}}}",
-            "rhomboid",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("change", "to", "told"), refusals("layouts"))
 def test_bad_input_is_told_with_its_line(tmp_path: Path, change: str, to: str, told: str) -> None:
     file = written(tmp_path, DESIGN.replace(change, to, 1))
     with pytest.raises(InputError) as error:

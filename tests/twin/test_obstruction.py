@@ -111,6 +111,7 @@ def test_shadows_on_the_stop_end_at_its_edge(chord: float) -> None:
         assert np.sum(shadows.weights * (shadows.points / turn).real) == pytest.approx(moment, abs=1e-8)
 
 
+@pytest.mark.second
 def test_batch_and_single_pupils_agree(gf7_pair, backend) -> None:
     """MTF of ``image_quality`` and of a target's path, with shadows, among states with other shadows or none."""
     model = gf7_pair.cameras[CAMERA]

@@ -337,24 +337,6 @@ def test_a_row_that_cannot_be_is_refused_and_the_others_are_taken(case: int, rec
     assert [(r["line"], r["reason"]) for r in status(record)["refused"]] == [(2, one["reason"])]
 
 
-def test_a_quaternion_of_a_turn_has_length_one(record: Path, tmp_path: Path) -> None:
-    """Within a thousandth, and is taken with length one; the scalar last."""
-    columns = "{tracker: {column: [a, b, c, d], unit: quaternion, sigma: 2 arcsec}}"
-    text = f"instrument: gf7_pair\nreadings:\n  - {{kind: attitude, files: q.csv, time: UTC, columns: {columns}}}\n"
-    cells = ["0,0,0.6,0.8", "0,0,0.6012,0.8", "0,0,0.6012,0.802", "0,0,0.598,0.798", "0,0,nan,1", "0,0,x,1"]
-    rows = "".join(f"2026-01-01T0{k}:00:00Z,{cell}\n" for k, cell in enumerate(cells))
-    result = run("ingest", record, written(tmp_path, text, {"q.csv": f"UTC,a,b,c,d\n{rows}"}), "--json")
-    (file,) = json.loads(result.stdout)["files"]
-    reasons = {one["line"]: one["reason"] for one in file["refused"]}
-    assert (file["new"], list(reasons)) == (2, [4, 5, 6, 7])
-    assert "not a quaternion of a turn" in reasons[4]
-    assert "not a quaternion of a turn" in reasons[5]
-    assert "not a finite number" in reasons[6]
-    with History(str(record)) as history:
-        found = [content_of(row)["values"] for row in history.entries("attitude")]
-    assert found == [pytest.approx([0.0, 0.0, 0.6, 0.8]), pytest.approx([0.0, 0.0, 0.60077, 0.79943], abs=1e-5)]
-
-
 def test_a_place_that_cannot_be_written_is_told(record: Path) -> None:
     below = record / FILE / "below"
     for words, code, told in (

@@ -179,6 +179,14 @@ def test_ingest_raises_alarms_once(record: Path, life: Path, tmp_path: Path) -> 
     done = run("ingest", record, tmp_path / "tm.yaml")
     assert "alarm: " not in done.stdout
     assert len(said("alarms", record)["alarms"]) == 2
+
+
+@pytest.mark.second
+def test_a_page_is_written_anew_though_nothing_came(record: Path, life: Path, tmp_path: Path) -> None:
+    run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
+    (tmp_path / "tm.yaml").write_text(TABLE)
+    (tmp_path / "t.csv").write_text("UTC,T\n2026-06-25T06:00:00Z,293.1\n")
+    assert len(said("ingest", record, tmp_path / "tm.yaml", "--report", tmp_path / "r.html")["alarms"]) == 2
     before = (tmp_path / "r.html").stat().st_mtime_ns
     assert said("ingest", record, tmp_path / "tm.yaml", "--report", tmp_path / "r.html")["alarms"] == []
     assert (tmp_path / "r.html").stat().st_mtime_ns > before

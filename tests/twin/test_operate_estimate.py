@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import binom, chi2
 
 from scenes.yaml.errors import Problem
+from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.operation_records import (
     DAY,
@@ -230,6 +231,7 @@ def test_an_event_steps_what_the_plan_says(known, tmp_path) -> None:
     assert np.all(off(estimate, life) < 5.0)
 
 
+@pytest.mark.second
 def test_sensors_that_die_or_repeat_themselves_are_named(known, tmp_path) -> None:
     """What heat does is 1.3 times the computed, one of two sensors dies, the other sticks: sigma covers."""
     stated = known[2]
@@ -459,7 +461,7 @@ def test_a_contradicted_start_stays_in_sigma(known, tmp_path) -> None:
     assert np.all(wide >= start)
 
 
-@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("together", quick(1, [True, False]))
 def test_sensors_that_disagree_together_accuse_the_prior(known, tmp_path, together: bool) -> None:
     """A cycle ten times the stated in both cameras is no fault of two sensors; in one alone it is one of its sensor."""
     plan, experiment, stated = known

@@ -84,6 +84,7 @@ def test_the_table_has_every_quantity_with_its_requirement(overview):
     assert list(table.bands.values()) == ["forward", "backward", "angle between the cameras", "ground"]
 
 
+@pytest.mark.second
 def test_motions_are_those_of_most_sigmas_with_all_causes_together(history, overview):
     made = daily_report(history, overview, end_of_day(None, overview.time))
     (section,) = (one for one in made.sections if one.name == "motions")

@@ -20,6 +20,7 @@ from scenes.specs.disturbances import TimeLawSpec
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
 from tests.twin.commands import invoke
+from tests.twin.study_bench import refusals
 from twin.operate.__main__ import app
 from twin.operate.lives import simulation_run
 from twin.operate.lives.judged_life import covered
@@ -286,23 +287,7 @@ def test_what_is_no_life_is_not_judged(
 # --- what is refused -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("--every", "6"), "--every: a number without a unit"),
-        (("--every", "0 d"), "--every: 0 d is not a time from one reading to the next"),
-        (("--days", "0"), "--days: 0 days with a reading every 6d"),
-        (("--days", "1e9"), "allowed: from 1 to 100000 readings"),
-        (("--from", "yesterday"), "--from: "),
-        (("--dead", "base"), "--dead: 'base' does not say when; write base@2027-06-01T00:00:00Z"),
-        (("--event", "safe_mod@2027-06-01T00:00:00Z"), "did you mean 'safe_mode'?"),
-        (("--coefficient-error", "30"), "--coefficient-error: a number without a unit"),
-        (("--coefficient-error", "-30%"), "--coefficient-error: -30% is below zero"),
-        (("--sensor-sigma", "0 K"), "--sensor-sigma: 0 K is no standard deviation"),
-        (("--backend", "abacus"), "unknown backend 'abacus'"),
-        (("postgresql://host/name",), "--out: a database holds no files"),
-    ],
-)
+@pytest.mark.parametrize(("words", "told"), refusals("lives"))
 def test_options_that_mean_nothing_are_told_before_anything_is_made(tmp_path: Path, words: tuple, told: str) -> None:
     place = words[0] if "://" in words[0] else tmp_path / "record"
     done = run("simulate", PLAN, place, *WORDS, *words[place == words[0] :])

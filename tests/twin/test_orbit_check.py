@@ -16,14 +16,14 @@ from scenes.specs.measured.orbit_data_setup import CheckSetup
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke
+from tests.twin.orbit_files import REFUSALS
 from twin.orbit.conventions.check_run import DECIDED, Check, _bench, _tried, run_check
 from twin.orbit.conventions.pass_readings import QUESTIONS, read_pass, singles_and_pairs
 
 run = partial(invoke, command.app)
-IMPOSSIBLE = read_yaml(Path(__file__).with_name("orbit_refusals.yaml")).data["impossible"]
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +244,7 @@ def test_a_gcp_file_without_the_images_is_refused(gcp, ground: str, images: str,
         checked(gcp, GCP, (("ground", "file"), ground), (("image_points", "file"), images))
 
 
-@pytest.mark.parametrize(("name", "old", "new", "why"), IMPOSSIBLE)
+@pytest.mark.parametrize(("name", "old", "new", "why"), REFUSALS["impossible"])
 def test_a_reading_that_cannot_be_says_why(files, tmp_path: Path, name: str, old: str, new: str, why: str) -> None:
     folder, data = files
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)

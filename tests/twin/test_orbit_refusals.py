@@ -24,11 +24,12 @@ from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resol
 from scenes.specs.measured.pass_files import GroundFileSpec, PlatformFilesSpec, RasterFileSpec, with_absolute_files
 from scenes.specs.orbit.setup import load_three_line_camera, resolve_angle, resolve_simulate
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from scenes.yaml.yaml_file import dump_yaml
 from tests.tiers import quick
 from tests.twin import dimap_bench, orbit_files
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import edited_copy, invoke, refused
+from tests.twin.orbit_files import REFUSALS
 from tests.twin.pushbroom_bench import lost
 from twin.laboratory.distortion_run import _check_angles
 from twin.orbit.angle.angle_flight import angle_camera
@@ -59,8 +60,7 @@ from twin.run.data_files import FrameFacts, tiff
 from twin.run.procedure import BenchError
 
 ROOT = Path(__file__).resolve().parents[2]
-TABLE = read_yaml(Path(__file__).with_name("orbit_refusals.yaml")).data
-JOBS = [one for job in TABLE["jobs"] for one in quick(job["quick"], [(job, *case) for case in job["cases"]])]
+JOBS = [one for job in REFUSALS["jobs"] for one in quick(job["quick"], [(job, *case) for case in job["cases"]])]
 
 
 @pytest.mark.parametrize(("job", "old", "new", "key", "words"), JOBS)
@@ -181,7 +181,7 @@ READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, dict[str, Any]],
 """What writes the good files of a kind into a folder and returns their specification, and what reads them."""
 FILES = [
     pytest.param(part, row, marks=[pytest.mark.second] if part.get("second") else [], id=f"{name}-{k}")
-    for name, part in TABLE["files"].items()
+    for name, part in REFUSALS["files"].items()
     for k, row in enumerate(part["cases"])
 ]
 

@@ -4,14 +4,13 @@ A run is what its warnings look at, with values at the edge of what needs no war
 """
 
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace as Ns
 from typing import Any
 
 import numpy as np
 import pytest
 
-from scenes.yaml.yaml_file import read_yaml
+from tests.twin.orbit_files import REFUSALS
 from twin.laboratory import distortion_report, focus_report, turntable_report
 from twin.orbit.angle import angle_report
 from twin.orbit.block import block_report
@@ -62,7 +61,6 @@ def made(value: Any) -> Any:
     return value
 
 
-TABLE = read_yaml(Path(__file__).with_name("orbit_refusals.yaml")).data
 UNTOLD = {"spec": {"errors": {"star_tracker": {"drift": None}}}}
 WARNINGS: dict[str, Callable[[Any], Any]] = {
     "block": block_report._warnings,
@@ -113,7 +111,7 @@ def any_run(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def warned(name: str, path: str = "", value: Any = None) -> list[str]:
     """Return the warnings of a run that needs none, or of one in which a value has changed."""
-    run = made(TABLE["quiet"][name])
+    run = made(REFUSALS["quiet"][name])
     if path:
         put(run, path, value)
     if name == "calibration":
@@ -128,7 +126,7 @@ def test_a_run_that_needs_no_warning_has_none(name: str) -> None:
 
 @pytest.mark.parametrize("name", WARNINGS)
 def test_every_warning_is_told_when_it_holds(name: str) -> None:
-    for path, value, words in TABLE["warnings"][name]:
+    for path, value, words in REFUSALS["warnings"][name]:
         (found,) = warned(name, path, value)
         assert words in found, path
 

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
+from tests.tiers import quick
 from tests.twin.orbit_bench import RATE, CirclePlatform, turn
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import (
@@ -74,7 +75,7 @@ def places(camera: LineCamera, count: int, seed: int) -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.parametrize("effects", EFFECTS, ids=words)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick(1, NAMES))
 def test_round_trip(cameras, trajectory, name: str, effects: LightEffects) -> None:
     model = sensor(cameras[name], effects, trajectory)
     line, pixel, height = places(model.camera, 60, 1)

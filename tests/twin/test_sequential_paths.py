@@ -39,7 +39,7 @@ STATE = {
 
 
 @pytest.mark.parametrize(
-    ("paths", "sampling"), quick(2, [(PATHS, ALL), (FEW, BALANCED), (PATHS, BALANCED), (FEW, FAINT)])
+    ("paths", "sampling"), quick(1, [(FEW, BALANCED), (PATHS, ALL), (PATHS, BALANCED), (FEW, FAINT)])
 )
 @pytest.mark.parametrize(
     ("name", "state"),
@@ -58,7 +58,7 @@ def test_paths_along_nominal_light_are_those_of_a_search(backend, instrument, na
 
 
 @pytest.mark.parametrize(
-    "sampling", [replace(ALL, roulette=0.2), Sampling(floor=0.999, second=0.5)], ids=["weak", "unlikely"]
+    "sampling", quick(1, [replace(ALL, roulette=0.2), Sampling(floor=0.999, second=0.5)]), ids=["weak", "unlikely"]
 )
 def test_what_is_not_as_usual_on_nominal_light_is_left_to_the_loop(backend, gf7_pair, sampling: Sampling) -> None:
     """Roulette among paths on their nominal way; nominal light that a floor makes likelier than it is."""

@@ -12,6 +12,7 @@ from scenes.specs.samplers import unit_cube
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from tests.tiers import quick
 from tests.twin.study_bench import STUDY, TEXTS, refusals, write_study
 from twin.live.knobs import factor_knobs
 from twin.study.gradient.study_gradient import GradientFactor
@@ -109,7 +110,7 @@ M2 = "base/forward/M2"
 
 
 @pytest.mark.parametrize("key", TEXTS["neutral"])
-@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("order", quick(1, [-1, 1]))
 def test_a_place_without_a_value_starts_where_nothing_happens(tmp_path, key, order) -> None:
     """The base of a derivative and of a knob is the job's own, whichever values the factor lists and in which order."""
     values = f"values: {str(TEXTS['neutral'][key][::order]).replace(chr(39), '')}"

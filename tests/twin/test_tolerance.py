@@ -63,6 +63,7 @@ def test_a_camera_is_that_of_the_main_program(bench: ToleranceBench, drawn: np.n
     assert values[6] == pytest.approx(abs(gamma), rel=1e-6, abs=1e-12)
 
 
+@pytest.mark.second
 def test_a_compensator_without_a_range_changes_nothing(
     bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path
 ) -> None:

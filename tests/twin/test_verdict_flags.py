@@ -86,6 +86,7 @@ def test_every_verdict_of_a_record_has_its_warning() -> None:
     assert silent == set(WARNED_ELSEWHERE)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("file", sorted(GOLDEN.glob("*.json")), ids=lambda file: file.stem)
 def test_a_result_with_a_negative_verdict_warns(file: Path) -> None:
     """The results of all commands: their files and what --json prints."""
@@ -180,6 +181,10 @@ def test_a_course_that_contradicts_its_prior_says_so(tmp_path: Path, backend) ->
     assert doubt in told.warnings
     assert numbers["warnings"] == list(told.warnings)
     assert told.verdict.startswith("The course contradicts the prior orbit or its time laws")
+
+
+@pytest.mark.second
+def test_a_course_that_keeps_to_its_prior_is_quiet(tmp_path: Path, backend) -> None:
     quiet = render_job(resolve(course(tmp_path, 0.0)), backend)
     assert isinstance(quiet, RenderRun)
     numbers = recovered_numbers(quiet)

@@ -15,7 +15,7 @@ from twin.verify.folder_state import folder_state
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("name", ["lab_turntable", "orbit_adjust", "study_lab"])
+@pytest.mark.parametrize("name", ["lab_turntable", "orbit_adjust", "study_gradient"])
 def test_a_changed_byte_is_found_and_the_run_comes_out_the_same(name, tmp_path) -> None:
     """A byte in the middle of each file, one file after the other; then the run is made again."""
     done = run(BY_NAME[name], tmp_path)
