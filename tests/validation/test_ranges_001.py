@@ -10,11 +10,11 @@ from scenes.specs.resolved import resolve_job
 from tests.validation.mutated import undrawn
 from twin.validation.checks.check import CORRECTED, REFUTED
 from twin.validation.checks.group import Context
-from twin.validation.paper_001.ranges import ranges_group
+from twin.validation.paper_001.ranges import ranges_group, show
 from twin.validation.paper_001.ranges.curves import Bench, sampled
-from twin.validation.paper_001.ranges.defocus import variant, with_return
+from twin.validation.paper_001.ranges.defocus import FieldPoint, variant, with_return
 from twin.validation.paper_001.ranges.ranges_group import GROUP
-from twin.validation.paper_001.ranges.turns import EDGE_PX, WIDE_PX, motion_of, single_range
+from twin.validation.paper_001.ranges.turns import BOX, CORNERS, EDGE_PX, WIDE_PX, joint_states, motion_of, single_range
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -63,6 +63,35 @@ def test_larger_ccds_read_the_same_positions(bench, wide):
     assert wide.positions([{}]) == pytest.approx(bench.positions([{}]), abs=1e-4)
     # where beams are traced from the middles of the CCDs, pixels: coma of the edge against the middle
     assert np.abs(bench.traced([{}])).max() < 0.1
+
+
+def test_the_box_just_keeps_the_spots_on_the_area_ccds(bench):
+    """At the worst of its corners, by the trace; a seventh more and one leaves it."""
+    camera = bench.cameras[0]
+    middle = 0.5 * (np.array(bench.experiment.path.shape) - 1)
+    half = middle.min() - EDGE_PX
+    origin, traced = bench.positions([{}]), bench.traced([{}])
+    for share, stays in ((1.0, True), (1.15, False)):
+        moved = bench.traced(joint_states(bench, {camera: share * CORNERS * BOX})) - traced
+        assert bool(np.max(np.abs(origin + moved - middle)) <= half) is stays
+
+
+def test_the_figure_over_the_field_shows_readings_over_truth_less_one(monkeypatch):
+    """In per cent over degrees, each number at its field."""
+    rng = np.random.default_rng(3)
+    gains = [{form: 1.0 + 0.01 * rng.normal(size=4) for form in (show.PRINTED, show.CORRECTED)} for _ in range(3)]
+    points = [FieldPoint(np.radians(f), 2.0, g, np.zeros(4)) for f, g in zip((0.0, 0.6, 1.2), gains, strict=True)]
+    monkeypatch.setattr(show, "to_svg", lambda figure: figure)
+    (axes,) = show.field_svg(points).axes
+    law, *lines = [line for line in axes.get_lines() if len(line.get_xdata()) > 2]
+    degrees = law.get_xdata()
+    assert (degrees.min(), degrees.max()) == pytest.approx((0.0, 1.2))
+    base = gains[0][show.CORRECTED][1]
+    np.testing.assert_allclose(law.get_ydata(), 100 * (base * np.cos(np.pi / 180 * degrees) ** 2 - 1), atol=1e-9)
+    shown = [(show.PRINTED, 1), *((show.CORRECTED, k) for k in (1, 0, 2, 3))]
+    for line, (form, k) in zip(lines, shown, strict=True):
+        np.testing.assert_allclose(line.get_xdata(), [0.0, 0.6, 1.2], atol=1e-12)
+        np.testing.assert_allclose(line.get_ydata(), [100 * (g[form][k] - 1) for g in gains], atol=1e-12)
 
 
 def test_an_unknown_kind_of_return_is_refused(bench):
