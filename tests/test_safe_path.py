@@ -31,7 +31,9 @@ def folder_of_traps(place: Path, *spared: str) -> Path:
 
 def started(place: Path, *words: str, here: str = "") -> subprocess.CompletedProcess[str]:
     """Python with these words in a folder; this checkout's packages are on its path, as installed ones are."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    # after it comes what measures which lines a test runs, where something does
+    paths = [str(ROOT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     environment.pop("PYTHONSAFEPATH", None)
     return subprocess.run([sys.executable, *words], cwd=here or place, env=environment, capture_output=True, text=True)
 

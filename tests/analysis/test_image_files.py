@@ -102,6 +102,12 @@ def test_what_is_not_grey_is_told(tmp_path):
     assert ImageFile.open(path).header.turned == "orientation 3"
     cv2.imwrite(str(tmp_path / "a.png"), np.dstack([FRAMES[0]] * 3))
     refuses(ImageError, "3 colours", read, tmp_path / "a.png")
+    for planes in ("contig", "separate"):
+        stored = FRAMES if planes == "separate" else np.moveaxis(FRAMES, 0, -1)
+        tifffile.imwrite(path, stored, photometric="rgb", planarconfig=planes)
+        refuses(ImageError, "3 colours", read, path)
+        grey = ImageFile.open(path).read({"a": Region(0, 1, 20, 30)})["a"]
+        np.testing.assert_allclose(grey[0], np.tensordot([0.2126, 0.7152, 0.0722], FRAMES[:, :, 1:], 1), rtol=1e-12)
 
 
 def test_fits_primary_extension_cube_and_scaling(tmp_path):

@@ -102,5 +102,12 @@ def test_observability_outside_a_small_family():
     assert turn.explained == pytest.approx(1 - (residual @ residual) / (white[:, 2] @ white[:, 2]), rel=1e-6, abs=1e-9)
     cosines = [white[:, 2] @ white[:, j] / np.linalg.norm(white[:, 2]) / np.linalg.norm(white[:, j]) for j in (0, 1)]
     assert turn.cosine == pytest.approx(cosines[int(np.argmax(np.abs(cosines)))], rel=1e-9)
+    assert turn.nearest == NAMES[int(np.argmax(np.abs(cosines)))]
+    # two of a family are each other's nearest, at the same angle; one alone has none
+    one, two = report.motions[:2]
+    assert (one.nearest, two.nearest) == ("shift y", "shift x")
+    assert one.cosine == two.cosine
+    (alone, *_) = observability(NAMES, SPOTS, PARAMETERS, SIZES, COVARIANCE, [0]).motions
+    assert (alone.nearest, alone.cosine) == (None, 0.0)
     assert any("leaves a residual" in line for line in report.statements)
     refuses(ValueError, "positive scales", observability, NAMES, SPOTS, PARAMETERS, SIZES[:2], COVARIANCE, [0])

@@ -2,6 +2,7 @@
 
 import pytest
 
+from optics.materials.dispersion import FORMULAS, CatalogueGlass
 from optics.materials.glass import FUSED_SILICA, GLASSES, N_BK7, ZERODUR, air_index, glass
 from optics.materials.material import MATERIALS, material
 
@@ -17,6 +18,50 @@ def test_catalogue_index_and_abbe_number(name: str, nd: float, abbe: float, tole
     assert entry.index(D_LINE) == pytest.approx(nd, abs=tolerance)
     got = (entry.index(D_LINE) - 1) / (entry.index(F_LINE) - entry.index(C_LINE))
     assert got == pytest.approx(abbe, rel=2e-3)
+
+
+UV, IR, W2 = (1.2, 0.09), (0.9, 9.0), 0.36
+"""A glass with resonances at 0.3 and 3 um, n^2 = 1 + 1.2 w^2 / (w^2 - 0.09) + 0.9 w^2 / (w^2 - 9), at w = 0.6 um."""
+
+
+def low(count: int) -> list[float]:
+    """Factors of w^-2, w^-4 ... of the first resonance, a geometric series; the last stands for its rest, too."""
+    terms = [UV[0] * UV[1] ** k for k in range(1, count + 1)]
+    return [*terms[:-1], terms[-1] / (1 - UV[1] / W2)]
+
+
+def high(count: int) -> list[float]:
+    """Those of w^2, w^4 ... of the second."""
+    terms = [-IR[0] / IR[1] ** k for k in range(1, count + 1)]
+    return [*terms[:-1], terms[-1] / (1 - W2 / IR[1])]
+
+
+HALVES, FIRST = (0.5 * UV[0], UV[1]) * 2, 1 + UV[0]
+FAR, WAVE = 1.0 / (W2 - 0.028), W2**0.5
+COEFFICIENTS = {
+    1: (FIRST, *high(1), *low(4)),
+    2: (*HALVES, *IR),
+    3: (1.4, 0.1 / FAR, 0.02 / FAR**2, -3e-3 / W2, 4e-4 / W2**2, -5e-5 / W2**3),
+    4: (IR[0], UV[0], UV[1] ** 0.5, IR[0] * IR[1], IR[1] ** 0.5),
+    5: (1.5, 0.02 * WAVE, 0.003 * WAVE**3.5),
+    6: (*HALVES, 0.4, IR[1], IR[0] - 0.4, IR[1]),
+    7: (FIRST, UV[0] * UV[1], UV[1], -high(1)[0]),
+    8: (1.0, *UV, -high(1)[0]),
+    9: (1.0, *UV, *IR),
+    10: (FIRST, *high(1), *low(6)),
+    11: (*HALVES, 0.4, IR[1], 0.3, IR[1], IR[0] - 0.7, IR[1]),
+    12: (FIRST, high(3)[0], *low(4), *high(3)[1:]),
+    13: (FIRST, *high(2), *low(6)),
+}
+OTHERS = {3: 1.4 + 0.1 + 0.02 - 3e-3 + 4e-4 - 5e-5, 5: 1.5 + 0.02 + 0.003}
+"""Indices by the formulas of n and not of its square: each coefficient has its power of the wavelength taken out."""
+
+
+@pytest.mark.parametrize("number", FORMULAS)
+def test_every_formula_of_the_catalogues_describes_one_glass(number: int) -> None:
+    index = OTHERS.get(number, (1 + UV[0] * W2 / (W2 - UV[1]) + IR[0] * W2 / (W2 - IR[1])) ** 0.5)
+    own = CatalogueGlass("G", number, (*COEFFICIENTS[number], *[0.0] * 6), 300e-9, 2e-6)
+    assert own(600e-9) == pytest.approx(index, rel=1e-12)
 
 
 def test_dn_dt_of_bk7_as_its_data_sheet_states_it() -> None:

@@ -158,6 +158,8 @@ def test_bar_group_has_half_of_its_period_bright() -> None:
     [
         (lambda: image_of(pinhole(1e-3), guard=1e-4), "enlarge the guard"),
         (lambda: image_of(pinhole(1e-5), cutoff=0.0), "cutoff must be positive"),
+        (lambda: image_of(pinhole(1e-5), guard=0.0), "guard must be positive"),
+        (lambda: image_of(pinhole(1e-5), guard=np.inf), "guard must be positive"),
         (lambda: image_of(pinhole(1e-5), transfer=lambda fx, fy: np.nan * fx), "finite number"),
     ],
 )

@@ -285,7 +285,7 @@ UNITS = {
     "quality.cameras.forward.wfe_rms_waves_focus_removed.1": "waves",
     "block.cameras.scene.d_alpha_arcsec_sigma_before": "arcsec", "block.cameras.scene.d_f_um_true": "um",
     "simulate.lines.drift_px_per_line": "", "optics.nyquist_per_mm": "1/mm", "turntable.rejected": "", "x.m": "",
-    "optics.plate_scale_arcsec_per_mm_sigma": "arcsec/mm", "orbit.velocity_m_per_s": "m/s",
+    "defocus_um.centre": "um", "optics.plate_scale_arcsec_per_mm_sigma": "arcsec/mm", "orbit.velocity_m_per_s": "m/s",
 }  # fmt: skip
 
 

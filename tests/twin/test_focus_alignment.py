@@ -6,6 +6,7 @@ Seeds are fixed, so that a test passes or fails for good. Every chi-square test 
 import csv
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import FocusSetup, resolve_focus, resolve_focus_test
+from twin.laboratory import focus_scan
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_report import focus_report as report
@@ -168,6 +170,45 @@ def test_rows_with_gross_errors_are_named_and_do_not_count(tmp_path):
     assert abs(piston_pull(run)) < 4.0
     assert run.chi_square[0] < 1.3 * run.chi_square[1]
     assert f"{len(named)} rows do not count" in " ".join(report(run).warnings)
+
+
+def scanned(best, search, misled=0.0, seen=lambda mtf: (mtf, SIGMA)):
+    """Scan of one site whose best focus is at a move of the target, um; the first look around is misled by so much."""
+
+    def attempt(number, edge, shift, take):
+        mtf = abs(through_focus(shift + misled * (take < 1000), best))
+        return *seen(mtf), np.zeros((1, 1, 1), np.uint16), "too dark"
+
+    plan = SimpleNamespace(depth=0.6, points=9, step=20.0, reach=400.0)
+    site = SimpleNamespace(band="P", field=0.5, nominal_per_shift=dict.fromkeys(focus_scan.DIRECTIONS, 1.0))
+    bench = SimpleNamespace(setup=SimpleNamespace(test=SimpleNamespace(scan=plan)), sites=[site])
+    bench.geometric_zero = lambda band: 145.0
+    (found,) = focus_scan.scan(SimpleNamespace(bench=bench, attempt=attempt), search=search)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("best", "search", "misled", "scans"),
+    [(31.0, False, 0.0, 1), (-40.0, True, 120.0, 2), (40.0, True, -120.0, 2), (300.0, False, 0.0, 2)],
+)
+def test_a_peak_that_the_first_scan_misses_is_looked_for_again(best, search, misled, scans):
+    """From the highest point of a flank, or over the whole reach where nothing was looked at before."""
+    found = scanned(best, search, misled)
+    assert found.defocus == pytest.approx(best, abs=1.0)
+    assert found.take == 1000 * scans
+
+
+@pytest.mark.parametrize(
+    ("best", "seen", "said"),
+    [
+        (-500.0, lambda mtf: (mtf, SIGMA), "of P at field 0.5 is not inside the scan: most contrast at the lower end"),
+        (500.0, lambda mtf: (mtf, SIGMA), "most contrast at the upper end"),
+        (0.0, lambda mtf: (0.0, np.inf), "cannot be measured anywhere through focus in P at field 0.5: too dark"),
+    ],
+)
+def test_a_peak_that_is_not_there_is_refused(best, seen, said):
+    with pytest.raises(BenchError, match=said):
+        scanned(best, True, seen=seen)
 
 
 def test_errors_that_hide_each_other():

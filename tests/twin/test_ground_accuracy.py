@@ -80,6 +80,16 @@ def test_a_map_of_known_covariances() -> None:
     assert even.ce90 == pytest.approx([2.0 * np.sqrt(2.0 * np.log(10.0)), np.nan], nan_ok=True)
 
 
+@pytest.mark.parametrize("name", ["position", "attitude", "interior", "scale", "image", "height"])
+def test_what_is_not_stated_is_exact(name) -> None:
+    one = CameraUncertainty.of(**{name: 3.0})
+    assert np.all((one.platform == one.platform.T) & np.isin(one.platform, [0.0, 9.0]))
+    found = [np.diag(part) for part in (one.platform[:3, :3], one.platform[3:, 3:], one.interior[:2, :2])]
+    found += [one.interior[2:, 2], np.diag(one.image), np.array([one.height**2])]
+    names = ["position", "attitude", "interior", "scale", "image", "height"]
+    assert [set(part) for part in found] == [{9.0} if other == name else {0.0} for other in names]
+
+
 @pytest.mark.second
 def test_draws_of_a_wrong_camera_have_the_stated_covariance(sensors) -> None:
     """600 drawn errors of everything at one point: a covariance of N draws is right to sqrt(2 / N), 5.8 %."""

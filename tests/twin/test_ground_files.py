@@ -10,11 +10,13 @@ import rasterio
 from rasterio.transform import from_origin
 
 from scenes.specs.measured.pass_files import GroundFileSpec, RasterFileSpec
+from scenes.yaml.errors import Problem
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.simulate_report import map_facts
+from twin.orbit.measured.datum import Geoid
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
 from twin.orbit.measured.map_part import UserMap
 from twin.run.data_files import tiff
@@ -110,6 +112,22 @@ def test_heights_above_a_geoid(tmp_path: Path, ending: str) -> None:
     low = np.floor(lon)
     east = -20.0 * ((low + 1.0 - lon) * np.cos(np.radians(low)) + (lon - low) * np.cos(np.radians(low + 1.0)))
     np.testing.assert_allclose(height - PLACES[:, 2], 0.1 * (90.0 - lat) + east, rtol=0, atol=1e-5)
+
+
+def test_a_geoid_of_a_region_reaches_to_its_outermost_nodes(tmp_path: Path) -> None:
+    """Its values at all nodes, bilinear between them, and no place beyond them."""
+    values = np.random.default_rng(2).uniform(-40.0, 40.0, (3, 5)).astype("f4")
+    how = {"driver": "GTiff", "width": 5, "height": 3, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(tmp_path / "n.tif", "w", transform=from_origin(9.75, 51.25, 0.5, 0.5), **how) as file:
+        file.write(values, 1)
+    geoid = Geoid.read(tmp_path / "n.tif")
+    lon, lat = np.meshgrid(10.0 + 0.5 * np.arange(5), 51.0 - 0.5 * np.arange(3))
+    np.testing.assert_allclose(geoid(lon, lat), values, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(geoid(lon - 360.0, lat), values, rtol=0, atol=1e-5)
+    assert geoid([11.75], [50.75]) == pytest.approx(np.mean(values[:2, 3:]), abs=1e-5)
+    for away in ((9.999, 50.5), (12.001, 50.5), (11.0, 51.001), (11.0, 49.999)):
+        with pytest.raises(Problem, match="beyond the grid of the geoid"):
+            geoid(*away)
 
 
 # --- maps -------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from tests.twin.commands import invoke
 from tests.twin.operate_bench import COUNT, DAY, EVIL, HOUR, StandIn, filled, lived, monitor_entry
 from tests.twin.policed_page import breaches
 from tests.twin.record_bench import START, given, made
+from twin.operate import daily_report as daily
 from twin.operate.__main__ import app
 from twin.operate.daily_report import _warnings, daily_report, end_of_day, report_html, state_table
 from twin.operate.estimate.alarms import percent
@@ -127,6 +128,19 @@ def test_what_a_reader_has_to_know_is_told_and_nothing_else() -> None:
         "sensors that are not in order: body1 (stuck), body2 (dead)",
     )
     assert said(0, 3, "")[1] == "3 alarms wait for an acknowledgement; the newest: alarm 0"
+
+
+def test_of_many_rows_the_newest_are_shown_and_all_can_be_taken_away() -> None:
+    """Forty on the page: the first of a table, which begins with the newest, and the last of what changed."""
+    for count in (40, 41):
+        rows = [[k] for k in range(count)]
+        table = daily._newest("jumps", "Jumps", "In UTC.", ("k",), rows)
+        assert table.rows == rows[:40]
+        assert table.full is None or table.full.rows == rows
+        assert table.caption == ("In UTC." if count == 40 else "The newest 40 of 41. In UTC.")
+    changes = [SimpleNamespace(time=START + k * HOUR, text=f"change {k}", again=k == 5) for k in range(50)]
+    section = daily._changed_section(SimpleNamespace(changed=lambda begin, end: changes), START, START + 3 * DAY)
+    assert [one.split(": ")[1] for one in section.artefacts[0].points] == [f"change {k}" for k in range(10, 50)]
 
 
 @pytest.mark.parametrize(("within", "count"), [(0, 10), (10, 10), (800, 1272), (1, 3), (0, 0)])

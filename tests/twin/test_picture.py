@@ -3,6 +3,7 @@
 import json
 import re
 from functools import partial
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -102,6 +103,30 @@ def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
 
 
 # --- how they look ----------------------------------------------------------------------------------------------------
+
+
+class Seeded(Exception):
+    """The number that a sampler is started with."""
+
+
+def test_no_two_groups_of_pixels_share_their_samples():
+    """Nor do two seeds, nor the samples of matt surfaces and of all else; a group has the same ones again."""
+
+    def start(first: int, samples: int, seed: int) -> tuple[int, int]:
+        def stop(number: int, count: int) -> None:
+            raise Seeded(number, count)
+
+        studio = object.__new__(Studio)
+        studio._mi = SimpleNamespace(load_dict=lambda _: SimpleNamespace(seed=stop))
+        with pytest.raises(Seeded) as caught:
+            studio.light(np.arange(first, first + 6), samples, seed)
+        return caught.value.args
+
+    groups = [(0, 2, 1), (0, 2, 2), (0, 4, 1), (6, 2, 1)]
+    numbers = [start(*group) for group in groups]
+    assert len({number for number, _ in numbers}) == len(groups)
+    assert [count for _, count in numbers] == [12, 12, 24, 12]
+    assert [start(*group) for group in groups] == numbers
 
 
 # --- Mitsuba's variants -----------------------------------------------------------------------------------------------

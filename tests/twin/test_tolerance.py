@@ -22,6 +22,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.run_folder import RunFolderError
 from twin.study.runs.plan import Plan
 from twin.tolerance import allocation, given_warnings, merit_models, samples, tolerance_run
+from twin.tolerance.adjustments import Adjustments
 from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
 from twin.tolerance.monitor_merit import Merit
@@ -124,6 +125,25 @@ def test_ranges_steps_and_errors_are_kept(backend, tmp_path) -> None:
     # the turn follows the rounded focus, then gets its error; without it it would be the best for that focus
     calm = bench.try_out(x * bench.sizes, np.zeros((6, 2)))
     np.testing.assert_allclose(made.moves[:, 1] - calm.moves[:, 1], errors[:, 1] * np.radians(1.0 / 3600.0), rtol=1e-3)
+
+
+def test_each_adjustment_is_the_best_for_those_made_before_it() -> None:
+    """Against least squares of what is left: a whole step, a move with an error, and one that takes up what it can."""
+    rng = np.random.default_rng(4)
+    slope, start, errors = rng.normal(size=(20, 4, 3)), rng.normal(size=(20, 4)), rng.normal(size=(20, 3))
+    steps, accuracies = np.array([0.4, 0.0, 0.0]), np.array([0.0, 0.3, 0.0])
+    adjustments = Adjustments(np.full(3, 50.0), steps, accuracies, slope[0])
+
+    def best(residual: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        return -np.linalg.lstsq(columns, residual, rcond=None)[0]
+
+    moves = rng.normal(size=(20, 3))
+    made = adjustments.made(slope, start + np.einsum("src,sc->sr", slope, moves), moves, errors)
+    for one, zero, begin, error, found in zip(slope, start, moves, errors, made, strict=True):
+        first = 0.4 * np.round(begin[0] / 0.4)
+        second = best(zero + one[:, :1] @ [first], one[:, 1:])[0] + 0.3 * error[1]
+        third = best(zero + one[:, :2] @ [first, second], one[:, 2:])[0]
+        assert found == pytest.approx([first, second, third], rel=1e-6, abs=1e-6)
 
 
 def test_models_and_limits_hold_against_exact_traces(bench: ToleranceBench, drawn: np.ndarray) -> None:

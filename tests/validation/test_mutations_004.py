@@ -24,8 +24,8 @@ from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_run import align
 from twin.validation import registry
-from twin.validation.checks.check import FAILED
-from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks
+from twin.validation.checks.check import FAILED, Chosen, InputRange
+from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -92,6 +92,23 @@ def test_adjustments_turn_and_shift_the_line_about_the_middle_of_the_mount():
     assert second < 0.01 * np.abs(moved[:2]).max()
     np.testing.assert_allclose(moved[:3], (turn * np.cross(axes, -centre))[:, :2], rtol=0, atol=second)
     np.testing.assert_allclose(moved[3:], (shift * axes)[:, :2], rtol=0, atol=1e-15)
+
+
+@pytest.mark.second
+def test_inputs_as_they_are_chosen_give_what_is_measured(turned, monkeypatch):
+    """What a row says of other inputs begins with the number that it has with these."""
+
+    def at_once(self, holds, agrees):
+        return InputRange(self.name, self.response(1.0), self.unit, None, None, agrees)
+
+    monkeypatch.setattr(Chosen, "range", at_once)
+    ids = "004.sensitivity.angle,004.table2.accuracy,004.table2.compensation,004.turntable.repeat"
+    monkeypatch.setattr(turntable_checks, "FAST_TABLES", 20)
+    results = run_checks(select(GROUPS, ids), load_backend("llvm"), 1, fast=True).results
+    assert len(results) == 4
+    for result in results:
+        assert result.inputs
+        assert [one.value for one in result.inputs] == pytest.approx([result.measured] * len(result.inputs), rel=1e-9)
 
 
 # ---- broken formulas ----

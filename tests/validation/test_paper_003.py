@@ -2,13 +2,18 @@
 tables say, and, marked slow, all of them.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from analysis.orbit.forward_intersection import CheckErrors
+from analysis.units import ARCSEC
 from optics.numerics.backend import load_backend
 from tests.validation.mutated import undrawn
 from twin.validation import registry
 from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, median_of
+from twin.validation.checks.group import Context
 from twin.validation.paper_003 import fields, flights, model, rendered
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
@@ -80,6 +85,35 @@ def test_marks_that_cannot_be_told_apart_are_refused():
     assert rendered._matched(near, at, ground).tolist() == [[5.0], [4.0]]
     with pytest.raises(ValueError, match="two marks in the image are nearest to one"):
         rendered._matched((np.array([1.0, 99.0]), np.array([1.0, 99.0])), at, ground)
+
+
+def test_the_worst_field_counts_in_what_images_give(monkeypatch):
+    """Of two fields, one worse in plan and one in height, after and not before they are calibrated."""
+    names = [*model.FREE_INTERIOR, *model.ROLL_PITCH, "yaw"]
+
+    def field(name, check, before, after, error):
+        errors = (CheckErrors(np.zeros((check, 3)), *rms, check) for rms in (before, after))
+        own = dict.fromkeys(names, error)
+        way = SimpleNamespace(rounds=9)
+        return rendered.FromImages(name, 20, check, way, None, own, 1e-12 * np.eye(len(names)), *errors)
+
+    both = field("A", 8, (90.0, 70.0), (2.0, 5.0), 1e-6), field("B", 50, (80.0, 60.0), (3.0, 4.0), 3e-6)
+    monkeypatch.setattr(rendered, "measured", lambda *_: None)
+    monkeypatch.setattr(rendered, "calibrated", lambda _: both)
+    ids = [f"003.model.{name}" for name in ("bias", "interior", "plan", "height")]
+    context = Context(None, 1, frozenset(ids), CHECKS, fast=True)
+    results = {r.id: r for r in model._rendered(context, np.random.SeedSequence(1))}
+    assert [results[name].measured for name in ids] == pytest.approx([3e-6 / ARCSEC, 3.0, 3.0, 5.0])
+    # of n errors in one direction the rms is known to a share of sqrt(1 / 2n), of 3n independent unknowns likewise
+    sigmas = 1e-6 / ARCSEC / np.sqrt(4.0), 1.0 / np.sqrt(2.0 * len(model.FREE_INTERIOR)), 3.0 / 10.0, 5.0 / 4.0
+    assert [results[name].sigma for name in ids] == pytest.approx(sigmas)
+    assert "50 check points of B" in results[ids[2]].how
+    assert "80 m before" in results[ids[2]].how
+    assert "8 check points of A" in results[ids[3]].how
+    assert "70 m before" in results[ids[3]].how
+    (table,) = context.artefacts
+    assert [row[3:] for row in table.rows[len(names) - 2 : len(names)]] == [(1e-6 / ARCSEC, 1e-6 / ARCSEC)] * 2
+    assert table.rows[len(names)][3:] == pytest.approx((3.0, 1.0))
 
 
 def test_median_knows_its_scatter():

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from analysis.turntable.angle_fits import FITS, NotConvergedError, fit
 from optics.numerics.backend import load_backend
 from tests.tiers import quick
 from twin.validation import registry
@@ -108,6 +109,22 @@ def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, 
     assert limits.high is not None
     assert judged(0.93 * limits.high) == REPRODUCED
     assert judged(1.1 * limits.high) != REPRODUCED
+
+
+def test_the_network_is_judged_as_the_other_fits_are(monkeypatch):
+    """Straight lines in its place miss the held-out readings by what straight lines miss; one that fails, by any."""
+    spec = turntable_checks.resolve_turntable(turntable_checks.TEST).test
+    monkeypatch.setattr(turntable_checks, "fit", lambda name, *series: fit("piecewise_linear", *series))
+    found = turntable_checks.fit_table(spec, 3).held_out
+    assert set(found) == set(FITS)
+    assert found["network"] == pytest.approx(found["piecewise_linear"], rel=1e-9)
+
+    def failing(*_):
+        raise NotConvergedError("network")
+
+    monkeypatch.setattr(turntable_checks, "fit", failing)
+    again = turntable_checks.fit_table(spec, 3).held_out
+    assert again == {**found, "network": float("inf")}
 
 
 @pytest.mark.parametrize("tilt", [0.0, 1e-3])

@@ -1,5 +1,7 @@
 """Range studies of paper 001's formulas: limits, kinds of return, and rows that turn with a broken formula."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,11 +12,11 @@ from scenes.specs.resolved import resolve_job
 from tests.validation.mutated import undrawn
 from twin.validation.checks.check import CORRECTED, REFUTED
 from twin.validation.checks.group import Context
-from twin.validation.paper_001.ranges import ranges_group
-from twin.validation.paper_001.ranges.curves import Bench, sampled
-from twin.validation.paper_001.ranges.defocus import variant, with_return
+from twin.validation.paper_001.ranges import ranges_group, show
+from twin.validation.paper_001.ranges.curves import FORMS, Bench, Curves, sampled
+from twin.validation.paper_001.ranges.defocus import FieldPoint, PupilStudy, variant, with_return
 from twin.validation.paper_001.ranges.ranges_group import GROUP
-from twin.validation.paper_001.ranges.turns import EDGE_PX, WIDE_PX, motion_of, single_range
+from twin.validation.paper_001.ranges.turns import BOX, CORNERS, EDGE_PX, WIDE_PX, joint_states, motion_of, single_range
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -63,6 +65,73 @@ def test_larger_ccds_read_the_same_positions(bench, wide):
     assert wide.positions([{}]) == pytest.approx(bench.positions([{}]), abs=1e-4)
     # where beams are traced from the middles of the CCDs, pixels: coma of the edge against the middle
     assert np.abs(bench.traced([{}])).max() < 0.1
+
+
+def test_the_box_just_keeps_the_spots_on_the_area_ccds(bench):
+    """At the worst of its corners, by the trace; a seventh more and one leaves it."""
+    camera = bench.cameras[0]
+    middle = 0.5 * (np.array(bench.experiment.path.shape) - 1)
+    half = middle.min() - EDGE_PX
+    origin, traced = bench.positions([{}]), bench.traced([{}])
+    for share, stays in ((1.0, True), (1.15, False)):
+        moved = bench.traced(joint_states(bench, {camera: share * CORNERS * BOX})) - traced
+        assert bool(np.max(np.abs(origin + moved - middle)) <= half) is stays
+
+
+def test_the_figure_over_the_field_shows_readings_over_truth_less_one(monkeypatch):
+    """In per cent over degrees, each number at its field."""
+    rng = np.random.default_rng(3)
+    gains = [{form: 1.0 + 0.01 * rng.normal(size=4) for form in (show.PRINTED, show.CORRECTED)} for _ in range(3)]
+    points = [FieldPoint(np.radians(f), 2.0, g, np.zeros(4)) for f, g in zip((0.0, 0.6, 1.2), gains, strict=True)]
+    monkeypatch.setattr(show, "to_svg", lambda figure: figure)
+    (axes,) = show.field_svg(points).axes
+    law, *lines = [line for line in axes.get_lines() if len(line.get_xdata()) > 2]
+    degrees = law.get_xdata()
+    assert (degrees.min(), degrees.max()) == pytest.approx((0.0, 1.2))
+    base = gains[0][show.CORRECTED][1]
+    np.testing.assert_allclose(law.get_ydata(), 100 * (base * np.cos(np.pi / 180 * degrees) ** 2 - 1), atol=1e-9)
+    shown = [(show.PRINTED, 1), *((show.CORRECTED, k) for k in (1, 0, 2, 3))]
+    for line, (form, k) in zip(lines, shown, strict=True):
+        np.testing.assert_allclose(line.get_xdata(), [0.0, 0.6, 1.2], atol=1e-12)
+        np.testing.assert_allclose(line.get_ydata(), [100 * (g[form][k] - 1) for g in gains], atol=1e-12)
+
+
+def test_the_figure_of_defocus_shows_false_readings_beside_the_theory(monkeypatch):
+    """A ray at a height h moves by z h / f over a defocus of z, which reads as an angle of z h / f^2."""
+    rng = np.random.default_rng(4)
+    offset = np.array([[-0.2, 0.0], [0.1, 0.0], [0.0, 0.1], [0.0, -0.3], [0.0, 0.0]])
+    slope, size = 1e6 * rng.normal(size=(5, 4)), np.array([1e-5, 1e-4, 1e-3])
+    curves = Curves(size, {f"{name} claimed": rng.uniform(0.1, 9.0, 3) for name in show.turns.NAMES})
+    monkeypatch.setattr(show, "to_svg", lambda figure: figure)
+    study = PupilStudy(offset, slope, np.zeros((4, 2)), np.zeros(4))
+    left, right = show.defocus_svg(study, curves, (5.0, 6.0)).axes
+    for axis, (f, sign) in enumerate(((5.0, -1.0), (6.0, 1.0))):
+        theory, marks = left.get_lines()[2 * axis : 2 * axis + 2]
+        # mm, and seconds of arc per um
+        np.testing.assert_allclose(theory.get_ydata(), sign * 1e-9 * theory.get_xdata() / f**2 * 206264.806, rtol=1e-8)
+        here = offset[:, 1 - axis] == 0.0
+        np.testing.assert_allclose(marks.get_xdata(), 1e3 * offset[here, axis], atol=1e-12)
+        np.testing.assert_allclose(marks.get_ydata(), 1e-6 * slope[here, axis], rtol=1e-12)
+    for line, name in zip(right.get_lines()[1:], ("d_beta", "d_alpha", "d_gamma", "d_f"), strict=True):
+        np.testing.assert_allclose(line.get_xdata(), [10.0, 100.0, 1000.0], rtol=1e-12)
+        np.testing.assert_array_equal(line.get_ydata(), curves.value[f"{name} claimed"])
+
+
+def test_the_figure_of_single_changes_shows_errors_and_limits_in_its_units(monkeypatch):
+    """Arcsec, and mm of the principal distance; one per cent is one per cent of what is drawn below it."""
+    rng, size = np.random.default_rng(5), np.geomspace(1.0, 1000.0, 6)
+    parts = [{form: np.stack([size * up, rng.normal(size=6)], axis=-1) for form in FORMS} for up in (1.0, 2000.0)]
+    one = SimpleNamespace(raw=parts[0], raw_traced=parts[1], lost=3e6, window=500.0)
+    monkeypatch.setattr(show, "to_svg", lambda figure: figure)
+    panels = show.singles_svg(dict.fromkeys(show.turns.NAMES, (one,))).axes
+    for axes, per, fine in zip(panels, (1.0, 1.0, 1.0, 1e-3), (0.1, 0.1, 0.1, 0.04), strict=True):
+        percent, limit, *rest = axes.get_lines()
+        np.testing.assert_allclose(percent.get_xdata(), [per, 3e6 * per])
+        np.testing.assert_allclose(percent.get_ydata(), 0.01 * percent.get_xdata())
+        assert limit.get_ydata()[0] == pytest.approx(fine)
+        drawn = next(line for line in rest if len(line.get_xdata()) == 12)
+        found = per * np.concatenate([part[show.PRINTED] for part in parts])
+        np.testing.assert_allclose(drawn.get_xydata(), np.abs(found), rtol=1e-12)
 
 
 def test_an_unknown_kind_of_return_is_refused(bench):

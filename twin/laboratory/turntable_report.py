@@ -334,9 +334,9 @@ def turntable_report(run: TurntableRun) -> Report:
     sigma = float(np.sqrt(np.mean(run.compensation.sigma(run.series.angle) ** 2))) / ARCSEC
     names = {"common": "an offset common to all readings", "smooth": "what the fit misses between its points"}
     names["white"] = "what changes from reading to reading"
-    size = {part: parts[f"{part}_arcsec"] for part in names}
-    worst = max(size, key=lambda part: size[part])
-    limit = names[worst] if size[worst] > _noise(run) else "the noise of the calibration"
+    size = {name: parts[f"{part}_arcsec"] for part, name in names.items()}
+    size["the noise of the calibration"] = _noise(run)
+    limit = max(size, key=lambda name: size[name])
     span = float(np.ptp(run.series.mean)) / ARCSEC
     missed = data["fits"][chosen]["heldout_rms_arcsec"]
     judged = "" if missed is None else f" and misses held-out angles by {missed:.3f} arcsec RMS"

@@ -205,6 +205,9 @@ def heated(folder: Path, fixture: Fixture) -> Read:
     meshlane.Mesh(numbers, cells).write(folder / "none.vtu")
     for name, level in (("cold", -280.0), ("hot", 2500.0)):
         meshlane.Mesh(numbers, cells, point_data={"a": level + numbers[:, 0]}).write(folder / f"{name}.vtu")
+    far = numbers.copy()
+    far[[3, 11], [0, 1]] = 100.0, -100.01  # metres: just allowed, and just not
+    meshlane.Mesh(far, cells, point_data=data).write(folder / "far.vtu")
     few = [("vertex", np.arange(3)[:, None])]
     meshlane.Mesh(numbers[:3], few, point_data={"a": numbers[:3, 0]}).write(folder / "few.vtu")
     (folder / "text.vtu").write_text("no mesh\n", "utf-8")

@@ -48,7 +48,7 @@ class CameraUncertainty:
     platform: Array
     interior: Array
     image: Array
-    height: float = 0.0
+    height: float
 
     @classmethod
     def of(

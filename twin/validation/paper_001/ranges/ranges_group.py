@@ -162,7 +162,7 @@ def _joint(context: Context, data: dict[str, object]) -> Iterator[CheckResult]:
     show.joint_shown(context, corners, found, data)
     geometry = bench.geometry(bench.cameras[0])
     setup = (
-        f"{trials} random states of both cameras, all four uniform in ±(4″, 4″, 24″, 0.95 mm), through "
+        f"{trials} random states of both cameras, all four uniform in {turns.BOX_TEXT}, through "
         f"{bench.frames} noisy frames each; reading = K · true + constant by least squares."
     )
     explained = _box_limits(geometry)
@@ -171,7 +171,7 @@ def _joint(context: Context, data: dict[str, object]) -> Iterator[CheckResult]:
         diagonal = [found.mean(form, name, name) for form in (JOINT, FORM)]
         how = (
             f"{16 * len(corners.images.size)} noise-free images of both cameras at the 16 corners of boxes "
-            "±(4″, 4″, 24″, 0.95 mm) times a size, 1 of which just fills the area CCDs; beyond that traced spots; "
+            f"{turns.BOX_TEXT} times a size, 1 of which just fills the area CCDs; beyond that traced spots; "
             f"this limit is known from {whence}. Corrected factors: {corners.text(turns.key(FORM, name))}; with the "
             f"two calibrated gradients: {corners.text(turns.key(CALIBRATED, name))}. {setup} Its diagonal: "
             f"{diagonal[0][0]:.4f} by Table 1, {diagonal[1][0]:.4f} corrected; it leaves "

@@ -51,7 +51,7 @@ def singles_svg(ranges: Mapping[str, Sequence[turns.Range]]) -> str:
             low, high = first.raw[PRINTED][0, 0] * per, first.lost * per
             axes.axvspan(0.85 * low, min(r.window for r in both) * per, color=LIGHT, alpha=0.55, lw=0)
             grid = np.array([low, high])
-            axes.plot(grid, 0.01 * grid, "--", color=GREY, lw=1.0)
+            axes.plot(grid, 0.1 * grid, "--", color=GREY, lw=1.0)
             axes.axhline(turns.FINE[name] * per, color=INK, lw=1.0, ls=":")
             if turns.CLAIMED[name] != turns.FINE[name]:
                 axes.axhline(turns.CLAIMED[name] * per, color=INK, lw=1.0, ls="-.")
@@ -97,7 +97,7 @@ def joint_svg(corners: turns.Corners, forms: Sequence[str]) -> str:
             limit = f"{turns.CLAIMED[name] * _scale(name)[0]:g} {_scale(name)[1]}"
             axes.set_ylabel(f"worst error of {SYMBOLS[name]} / {limit}")
         for axes in panels[2:]:
-            axes.set_xlabel("size of the box, times ±(4″, 4″, 24″, 0.95 mm)")
+            axes.set_xlabel(f"size of the box, times {turns.BOX_TEXT}")
         panels[0].legend(loc="lower right")
         return to_svg(figure)
 
@@ -318,13 +318,13 @@ def joint_shown(context: Context, corners: turns.Corners, found: turns.Separatio
         "joint",
         "All four changes at once",
         f"Readings of {found.trials} random states regressed on the true changes, mean of both cameras. Box: "
-        "how many times ±(4″, 4″, 24″, 0.95 mm) may be taken until the error at any of its 16 corners passes the "
+        f"how many times {turns.BOX_TEXT} may be taken until the error at any of its 16 corners passes the "
         "limit.",
         heads,
         rows,
     )
     data["all_at_once"] = {
-        "box_half_widths": {"d_alpha_arcsec": 4.0, "d_beta_arcsec": 4.0, "d_gamma_arcsec": 24.0, "d_f_um": 950.0},
+        "box_half_widths": {f"{n}_{turns.UNITS[n]}": float(turns.BOX[k]) for k, n in enumerate(turns.NAMES)},
         "gain": {form: [[found.mean(form, r, c)[0] for c in turns.NAMES] for r in turns.NAMES] for form in FORMS},
         "gain_sigma": {form: [[found.mean(form, r, c)[1] for c in turns.NAMES] for r in turns.NAMES] for form in FORMS},
         "gain_units": [f"{turns.UNITS[r]} per {turns.UNITS[c]}" for r in turns.NAMES for c in turns.NAMES],
@@ -334,7 +334,7 @@ def joint_shown(context: Context, corners: turns.Corners, found: turns.Separatio
     context.figure(
         "joint-figure",
         "All four changes at once: the worst of 16 corners over the size of the box",
-        "1 on the horizontal axis is ±(4″, 4″, 24″, 0.95 mm), which just keeps the spots on the area CCDs. Marks: "
+        f"1 on the horizontal axis is {turns.BOX_TEXT}, which just keeps the spots on the area CCDs. Marks: "
         "images; lines: exact trace, until an aperture cuts a beam.",
         joint_svg(corners, (JOINT, CORRECTED, CALIBRATED)),
     )

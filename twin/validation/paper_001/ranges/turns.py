@@ -49,6 +49,7 @@ _Raw = dict[str, list[np.ndarray]]
 KINDS = ("1 %", "fine", "claimed")
 BOX = np.array([4.0, 4.0, 24.0, 950.0])
 """Half widths in d_alpha, d_beta, d_gamma (arcsec) and d_f (um): all at once, the spots just stay on the area CCD."""
+BOX_TEXT = f"±({BOX[0]:g}″, {BOX[1]:g}″, {BOX[2]:g}″, {1e-3 * BOX[3]:g} mm)"
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=4)))
 _joint_FAR = 200.0
 
