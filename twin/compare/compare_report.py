@@ -201,8 +201,6 @@ def _picture(first: np.ndarray, second: np.ndarray, names: tuple[str, str], titl
 
 PROGRAM = "twin.compare"
 KIND = "compare"
-ARRAYS = ("nc", "tiff")
-"""Endings of files that hold arrays."""
 
 
 @dataclass(frozen=True)
@@ -289,8 +287,8 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
         InputError: they are of two kinds, or a file cannot be read.
     """
     if reference.kind != other.kind:
-        found = f"{reference.kind} and {other.kind}"
-        raise InputError(Issue("runs of two kinds", str(other.folder), found=found, allowed="runs of one command"))
+        kinds = f"{reference.kind} and {other.kind}"
+        raise InputError(Issue("runs of two kinds", str(other.folder), found=kinds, allowed="runs of one command"))
     inputs = [
         InputDifference(key, reference.inputs.get(key), other.inputs.get(key))
         for key in dict.fromkeys((*reference.inputs, *other.inputs))
@@ -298,9 +296,10 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
     ]
     names = dict.fromkeys((*reference.manifest.sha256, *other.manifest.sha256))
     results = [name for name in names if difference.ending(name) == "json" and "/" not in name]
-    left_out = () if sigmas is None else ("tiff",)
-    images = [name for name in names if difference.ending(name) in {*ARRAYS} - {*left_out}]
-    count, numbers, arrays = 0, [], []
+    images = [name for name in names if difference.ending(name) in (("nc", "tiff") if sigmas is None else ("nc",))]
+    count = 0
+    numbers: list[NumberDifference] = []
+    arrays: list[ArrayDifference] = []
     for name in (*results, *images):
         found = difference.file_difference(name, reference.file(name), other.file(name))
         count += found.common_arrays

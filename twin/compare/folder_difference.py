@@ -216,8 +216,8 @@ def array_difference(file: str, name: str, here: np.ndarray | None, there: np.nd
         there: the second.
     """
     if here is None or there is None or here.shape != there.shape:
-        shapes = [None if array is None else tuple(array.shape) for array in (here, there)]
-        return ArrayDifference(file, name, *shapes)
+        first, second = (None if array is None else array.shape for array in (here, there))
+        return ArrayDifference(file, name, first, second)
     numeric = all(np.issubdtype(array.dtype, np.number) for array in (here, there))
     one, two = (array.astype(np.float64 if numeric else str) for array in (here, there))
     unlike = (one != two) & ~(np.isnan(one) & np.isnan(two)) if numeric else one != two

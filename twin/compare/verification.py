@@ -127,9 +127,10 @@ def file_state(name: str, old: Path, new: Path, elsewhere: bool) -> FileState:
     """
     if not (old.is_file() and new.is_file()):
         return FileState(name, GONE if old.is_file() else NEW)
-    why = LEFT_OUT_FILES.get(difference.ending(name)) or LEFT_OUT_FILES.get(name, "")
-    if why:
-        return FileState(name, SAME if old.read_bytes() == new.read_bytes() else LEFT_OUT, why=why)
+    if old.read_bytes() == new.read_bytes():
+        return FileState(name, SAME)
+    if why := LEFT_OUT_FILES.get(name) or LEFT_OUT_FILES.get(difference.ending(name)):
+        return FileState(name, LEFT_OUT, why=why)
     try:
         return judged(difference.file_difference(name, old, new), elsewhere)
     except InputError as error:
@@ -167,8 +168,9 @@ def _number(one: NumberDifference, elsewhere: bool) -> Quantity:
 def _array(one: ArrayDifference, drawn: bool, elsewhere: bool) -> Quantity:
     name = one.name or "pixels"
     if one.share is None:
-        shapes = ["none" if s is None else f"shape {' x '.join(map(str, s))}" for s in (one.shape, one.other_shape)]
-        return Quantity(name, *shapes)
+        shapes = (one.shape, one.other_shape)
+        old, new = ("none" if s is None else f"shape {' x '.join(map(str, s))}" for s in shapes)
+        return Quantity(name, old, new)
     key = f"{name}[{', '.join(map(str, one.where))}]" if one.where else name
     if one.largest is None or one.peak is None:
         return Quantity(key, _short(one.reference), _short(one.other))
