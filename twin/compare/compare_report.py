@@ -1,4 +1,4 @@
-"""What differs between runs, for a reader: tables of inputs and results, the images side by side."""
+"""The differences between runs, for a reader: tables of inputs and results, the images side by side."""
 
 from __future__ import annotations
 
@@ -360,7 +360,7 @@ class Comparison:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What tells the folders apart, shortest first: their names, or their paths where two have one name."""
+        """Names that distinguish the folders: their own, or their paths where two have one name."""
         names = [run.folder.resolve().name for run in self.runs]
         return tuple(names if len(set(names)) == len(names) else [str(run.folder) for run in self.runs])
 

@@ -42,7 +42,7 @@ LEFT_OUT = frozenset(
 STATEMENTS = frozenset(("verdict", "warnings"))
 """Sentences at the top of a result that follow from its numbers."""
 NAMES = ("name", "motion", "label", "field", "path", "time_s")
-"""Keys by which an entry of a list is told from the others, in this order."""
+"""Keys that distinguish the entries of a list, the first that does."""
 NOISE = "noise"
 """Name of a sigma that more frames lower."""
 _SERIES = 12
@@ -195,7 +195,7 @@ def content_difference(name: str, reference: Content, other: Content) -> FileDif
         if not (key in one and key in two and _same(one[key], two[key]))
     ]
     pairs = {key: (reference.arrays.get(key), other.arrays.get(key)) for key in (*reference.arrays, *other.arrays)}
-    arrays = [found for key, pair in pairs.items() if (found := array_difference(name, key, *pair)) is not None]
+    arrays = [off for key, pair in pairs.items() if (off := array_difference(name, key, *pair)) is not None]
     here, there = reference.statements, other.statements
     statements = [
         NumberDifference(name, key, here.get(key), there.get(key))
@@ -304,7 +304,7 @@ def _sort(key: str) -> str:
 
 
 _PLACE = re.compile(r"\[(?:\[[^\]]*\]|[^\[\]])*\]")
-"""What follows a list's name in a key: the number of an entry, or what tells it from the others."""
+"""The part of a key after a list's name: the number of an entry, or what distinguishes it."""
 
 
 def _scales(*contents: Mapping[str, Leaf]) -> dict[str, float]:
@@ -349,9 +349,9 @@ def plain(data: Any) -> Content:
     """Content of nested plain data."""
     statements = {key: data[key] for key in STATEMENTS if key in data} if isinstance(data, Mapping) else {}
     rest = {key: value for key, value in data.items() if key not in statements} if isinstance(data, Mapping) else data
-    found = dict(leaves(rest))
-    arrays = {key: value for key, value in found.items() if isinstance(value, np.ndarray)}
-    return Content({key: value for key, value in found.items() if key not in arrays}, arrays, statements)
+    values = dict(leaves(rest))
+    arrays = {key: value for key, value in values.items() if isinstance(value, np.ndarray)}
+    return Content({key: value for key, value in values.items() if key not in arrays}, arrays, statements)
 
 
 def leaves(data: Any, key: str = "", series: bool = True) -> Iterator[tuple[str, Any]]:
@@ -360,7 +360,7 @@ def leaves(data: Any, key: str = "", series: bool = True) -> Iterator[tuple[str,
     Args:
         data: mappings and lists.
         key: of it; keys of what is in it follow.
-        series: whether long lists of numbers are given whole, as arrays.
+        series: whether long lists of numbers come whole, as arrays.
     """
     if isinstance(data, Mapping):
         for name, value in data.items():
@@ -387,9 +387,9 @@ def _as_array(data: Sequence[Any]) -> np.ndarray | None:
 def _entry_names(data: Sequence[Any]) -> list[str]:
     """Names that tell the entries of a list apart, so that an entry that is put in moves no other."""
     for name in NAMES:
-        found = [str(entry[name]) for entry in data if isinstance(entry, Mapping) and name in entry]
-        if len(found) == len(data) and len(set(found)) == len(found):
-            return found
+        labels = [str(entry[name]) for entry in data if isinstance(entry, Mapping) and name in entry]
+        if len(labels) == len(data) and len(set(labels)) == len(labels):
+            return labels
     return [str(k) for k in range(len(data))]
 
 
@@ -472,7 +472,7 @@ def _text(content: bytes, drawn: bool = False) -> Content:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
         return Content({}, {"bytes": np.frombuffer(content, np.uint8)}, {})
-    numbers = np.array([float(found) for found in _NUMBER.findall(text)])
+    numbers = np.array([float(number) for number in _NUMBER.findall(text)])
     return Content({"text": _NUMBER.sub("#", text)}, {"numbers": numbers}, {}, drawn)
 
 

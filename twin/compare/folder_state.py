@@ -69,7 +69,7 @@ def folder_state(folder: Path) -> FolderState:
     except OSError as error:
         raise InputError(Issue(f"cannot be read: {error.strerror}", str(error.filename or folder))) from None
     inputs = {name: _as_read(Path(name), known) for name, known in manifest.inputs.items()}
-    changed, gone = (tuple(name for name, found in inputs.items() if found == what) for what in ("changed", "gone"))
+    changed, gone = (tuple(name for name, now in inputs.items() if now == what) for what in ("changed", "gone"))
     state = FolderState(folder, manifest, (), (), (), changed, gone)
     whole = manifest.digest == run_folder.seal(written) and content == run_folder.json_text(written).encode()
     if state.sealed and not whole:

@@ -137,20 +137,20 @@ def file_state(name: str, old: Path, new: Path, elsewhere: bool) -> FileState:
         return FileState(name, DIFFERENT, why=error.issues[0].problem)
 
 
-def judged(found: FileDifference, elsewhere: bool = False) -> FileState:
-    """Judge whether a file differs by rounding; where nothing is found only the way in which it is packed differs.
+def judged(compared: FileDifference, elsewhere: bool = False) -> FileState:
+    """Judge whether a file differs by rounding; where nothing differs only the way in which it is packed differs.
 
     Args:
-        found: its differences; sentences count where nothing else differs.
+        compared: its differences; sentences count where nothing else differs.
         elsewhere: see `file_state`.
     """
-    every = [*(_number(one, elsewhere) for one in found.numbers)]
-    every += [_array(one, found.drawn, elsewhere) for one in found.arrays]
+    every = [*(_number(one, elsewhere) for one in compared.numbers)]
+    every += [_array(one, compared.drawn, elsewhere) for one in compared.arrays]
     if not every:
-        every = [Quantity(one.key, _short(one.reference), _short(one.other)) for one in found.statements]
+        every = [Quantity(one.key, _short(one.reference), _short(one.other)) for one in compared.statements]
     every.sort(key=lambda one: (one.rounding, -(math.inf if one.relative is None else one.relative)))
     state = DIFFERENT if any(not one.rounding for one in every) else ROUNDED if every else SAME
-    return FileState(found.file, state, tuple(every[:SHOWN]), len(every))
+    return FileState(compared.file, state, tuple(every[:SHOWN]), len(every))
 
 
 def _number(one: NumberDifference, elsewhere: bool) -> Quantity:
@@ -321,7 +321,7 @@ def repeat_chunk(state: FolderState) -> Repetition:
     entry = store.entries[sorted(store.entries)[len(store.entries) // 2]]
     runs = [number for block in entry.range for number in plan.block(block)]
     config, backend = plan.setup.to_yaml(), state.manifest.backend or "llvm"
-    blocks = tuple(tuple(some) for some in plan.runs_of(entry.range))
+    blocks = tuple(tuple(block) for block in plan.runs_of(entry.range))
     made = BlockResult.joined(
         task.evaluate(task.Task(config, provenance.source_digest(), backend, entry.first, blocks))
     )
@@ -349,7 +349,7 @@ def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileS
     name = "study.nc"
     try:
         kept = difference.content_of(folder / name, name).arrays
-        told = read_json(folder / "study.json")
+        stored = read_json(folder / "study.json")
     except InputError as error:
         return (FileState(name, DIFFERENT, why=error.issues[0].problem),)
     data = make_dataset(plan, whole)
@@ -358,7 +358,7 @@ def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileS
     again = summary(data, plan)
     arrays = (name, difference.Content({}, held, {}), difference.Content({}, made, {}))
     # the data set is the chunks', and the summary that of the data set
-    numbers = ("study.json", difference.plain({key: told.get(key) for key in again}), difference.plain(again))
+    numbers = ("study.json", difference.plain({key: stored.get(key) for key in again}), difference.plain(again))
     return [judged(difference.content_difference(*pair)) for pair in (arrays, numbers)]
 
 
@@ -454,7 +454,7 @@ class Verification:
                         "state": one.state,
                         "quantities": one.count,
                         "why": one.why,
-                        "differ_most": [asdict(found) for found in one.quantities],
+                        "differ_most": [asdict(quantity) for quantity in one.quantities],
                     }
                     for one in made.files
                 ],
@@ -465,7 +465,7 @@ class Verification:
         }
 
     def lines(self) -> list[str]:
-        """What a reader should know beside the verdict."""
+        """Return what a reader should know beside the verdict, line by line."""
         state, out = self.state, []
         if not state.sealed:
             out.append("the manifest has no checksum of itself: it is of an older version")
@@ -476,10 +476,10 @@ class Verification:
                 continue
             count = f", {one.count} quantities" if one.count else ""
             out.append(f"{one.file}: {one.state}{count}{f', {one.why}' if one.why else ''}")
-            for found in one.quantities[:NAMED]:
-                size = "" if found.relative is None else f", {found.relative:.2g} of it"
-                sigma = "" if found.in_sigma is None else f", {found.in_sigma:.2g} sigma"
-                out.append(f"    {found.key}: {found.old!r} then, {found.new!r} now{size}{sigma}")
+            for quantity in one.quantities[:NAMED]:
+                size = "" if quantity.relative is None else f", {quantity.relative:.2g} of it"
+                sigma = "" if quantity.in_sigma is None else f", {quantity.in_sigma:.2g} sigma"
+                out.append(f"    {quantity.key}: {quantity.old!r} then, {quantity.new!r} now{size}{sigma}")
         return out
 
 
@@ -490,7 +490,7 @@ def expected_time(state: FolderState) -> str:
 
 def _largest(files: Sequence[FileState]) -> str:
     """Return the largest differences of numbers, relative and over sigma, in words."""
-    numbers = [found for one in files for found in one.quantities if not one.drawn and found.relative is not None]
-    relative = max((found.relative or 0.0 for found in numbers), default=0.0)
-    in_sigma = max((found.in_sigma or 0.0 for found in numbers), default=0.0)
+    numbers = [one for file in files if not file.drawn for one in file.quantities]
+    relative = max((one.relative or 0.0 for one in numbers), default=0.0)
+    in_sigma = max((one.in_sigma or 0.0 for one in numbers), default=0.0)
     return f"{relative:.2g} of them" + (f" and {in_sigma:.2g} sigma" if in_sigma else "")

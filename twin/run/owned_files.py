@@ -95,14 +95,14 @@ def foreign_files(folder: Path, listed: Mapping[str, str] | None, study: bool | 
     for name, check in (*(listed or {}).items(), *(_account(folder) if study else ())):
         known.setdefault(name, set()).add(check)
 
-    def own(name: str) -> bool:
+    def ours(name: str) -> bool:
         if (listed is not None and name == MANIFEST) or (study and _AT_WORK.fullmatch(name)):
             return True
         if name in known:
             return is_as_written(folder / name, known[name])
         return study and name == STUDY_STATE  # the last file of a study that was being removed
 
-    return [name for name in every_file(folder) if not own(name)]
+    return [name for name in every_file(folder) if not ours(name)]
 
 
 def is_as_written(place: Path, checksums: Collection[str]) -> bool:
@@ -235,10 +235,10 @@ def sweep(folder: Path, replaced: Callable[[Path, Path], bool] = lambda former, 
             returns whether it did.
     """
     try:
-        found = {(m["name"], m["token"]) for path in folder.iterdir() if (m := _NAME.fullmatch(path.name))}
+        names = {(m["name"], m["token"]) for path in folder.iterdir() if (m := _NAME.fullmatch(path.name))}
     except OSError:  # a folder that cannot be read is told of when it is written to
         return
-    for name, token in sorted(found):
+    for name, token in sorted(names):
         places = _beside(folder / name, token)
         with suppress(OSError):  # not ours to remove; it stays for who may
             if any(place.lstat().st_uid != os.getuid() for place in places.values() if os.path.lexists(place)):

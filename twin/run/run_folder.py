@@ -264,7 +264,7 @@ class Manifest(BaseModel):
     gradient: bool = False
     again: list[str] = []
     started_in: str = ""
-    versions: Annotated[dict[str, str], AfterValidator(lambda found: _ours(found))]
+    versions: Annotated[dict[str, str], AfterValidator(lambda named: _ours(named))]
     provenance: Provenance | None = None
     backend: str = ""
     seed: int = 0
@@ -284,10 +284,10 @@ class Manifest(BaseModel):
     digest: Checksum | None = None
 
 
-def _ours(found: dict[str, str]) -> dict[str, str]:
-    if "space-camera-twin" not in found:
+def _ours(named: dict[str, str]) -> dict[str, str]:
+    if "space-camera-twin" not in named:
         raise ValueError("made by another program")
-    return found
+    return named
 
 
 class FilesOfRun(Protocol):
@@ -324,13 +324,13 @@ def write_manifest(folder: FilesOfRun, program: str, started: float, seconds: fl
     }
     if unknown := sorted(entries.keys() - Manifest.model_fields.keys()):
         raise ValueError(f"no fact of a manifest: {', '.join(unknown)}")
-    told = {key: entries[key] for key in Manifest.model_fields if key in entries}
-    folder.write_json(MANIFEST, {**told, "digest": seal(told)})
+    manifest = {key: entries[key] for key in Manifest.model_fields if key in entries}
+    folder.write_json(MANIFEST, {**manifest, "digest": seal(manifest)})
 
 
-def seal(told: Mapping[str, Any]) -> str:
+def seal(manifest: Mapping[str, Any]) -> str:
     """SHA-256 of what a manifest says but for its ``digest``: of its JSON with sorted keys and without blanks."""
-    content = {key: value for key, value in told.items() if key != "digest"}
+    content = {key: value for key, value in manifest.items() if key != "digest"}
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
