@@ -1,6 +1,6 @@
-"""Whose the files in and beside a run's or study's folder are.
+"""The owner of each file in and beside the folder of a run or study.
 
-In the folder checksums tell: a file that somebody has changed is theirs. Beside it stand hidden names of a folder that
+In the folder checksums decide: a file that somebody has changed is theirs. Beside it are hidden names of a folder that
 is being made or replaced, ``.NAME.TOKEN.partial`` (a run that is being written), ``.NAME.TOKEN.old`` (what it replaces)
 and ``.NAME.TOKEN.lock``, which the process holds locked as long as it lives. The lock is the operating system's and
 ends with the process, however that ends; so a name without a held lock is nobody's. A study that is to replace a
@@ -287,6 +287,6 @@ def locked(place: Path, certain: bool = False) -> int | None:
             if certain or isinstance(error, BlockingIOError):
                 os.close(lock)
                 return None
-        if place.exists() and os.path.samestat(os.fstat(lock), place.stat()):
+        if os.fstat(lock).st_nlink:
             return lock
         os.close(lock)  # its owner has removed it meanwhile
