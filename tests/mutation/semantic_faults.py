@@ -18,7 +18,7 @@ WARNING = re.compile(r"(warn|doubt|caution|caveat|remark|notice|complaint|unsure
 KEY = re.compile(r"(^|_)(key|digest|fingerprint|identity|checksum|token)(_|$)")
 SEED = re.compile(r"(^|_)(seeds?|stream|default_rng|SeedSequence|spawn_key|entropy)($|_)")
 CHECK = re.compile(
-    r"^_?(fsync|sync|flock|take_lock|lock|require|refuse|check|verify|guard|validate|ensure|limit|reject|forbid)(_|$)"
+    r"^_?(fsync|sync|flock|locked|lock|require|refuse|check|verify|guard|validate|ensure|limit|reject|forbid)(_|$)"
 )
 LIMIT = re.compile(r"(^|_)(MAX|MOST|LIMIT|LARGEST|LONGEST|AT_MOST|SECONDS|BYTES|HOURS|TIMEOUT)(_|$)")
 BOUND = re.compile(r"(^|_)(most|least|limit|limits|max|min|largest|smallest|count|number|required|allowed)(_|$)")

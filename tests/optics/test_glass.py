@@ -1,8 +1,8 @@
 """Glasses and materials against data sheets and handbooks."""
 
 import pytest
-
 from optics.materials.dispersion import FORMULAS, CatalogueGlass
+
 from optics.materials.glass import FUSED_SILICA, GLASSES, N_BK7, ZERODUR, air_index, glass
 from optics.materials.material import MATERIALS, material
 

@@ -30,7 +30,7 @@ from twin.operate.lives.simulation_run import take_files
 from twin.operate.record.entries import MICRO, micros
 from twin.operate.record.history import History, content_of, initialised
 from twin.operate.record.telemetry import WITHIN
-from twin.verify.__main__ import app as verify
+from twin.verify import app as verify
 
 PLAN = EXAMPLES / "operation.yaml"
 START = micros("2027-01-01T00:00:00Z")

@@ -32,8 +32,7 @@ from tests.twin import record_bench, replacing, study_bench
 from tests.twin.commands import invoke
 from twin.operate.__main__ import app
 from twin.run import durable, owned_files
-from twin.run.kept_work import KeptWork
-from twin.run.run_folder import RunFolder, RunFolderError, read_manifest, remove_replaced, write_manifest
+from twin.run.run_folder import KeptWork, RunFolder, RunFolderError, read_manifest, remove_replaced, write_manifest
 from twin.study.runs.base_job import BlockResult
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.plan import Plan
@@ -324,7 +323,7 @@ def plant(fault: str) -> None:
             partial = file[0].with_name(f".{file[0].name}.01234567.partial")
             partial.write_bytes(file[1])
             partial.replace(file[0])
-            durable._sync_file(file[0])
+            durable.sync_file(file[0])
 
         durable._write_one = write_one
     elif fault == "no lock":

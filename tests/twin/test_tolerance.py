@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from twin.tolerance.adjustments import Adjustments
 
 from scenes.specs.job import checked_nodes
 from scenes.specs.load import LIBRARY
@@ -22,7 +23,6 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.run_folder import RunFolderError
 from twin.study.runs.plan import Plan
 from twin.tolerance import allocation, given_warnings, merit_models, samples, tolerance_run
-from twin.tolerance.adjustments import Adjustments
 from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
 from twin.tolerance.monitor_merit import Merit

@@ -19,6 +19,22 @@ from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED, write_study
 from twin.compare.__main__ import app as compare_app
+from twin.compare.folder_state import folder_state
+from twin.compare.verification import (
+    DIFFERENT,
+    GONE,
+    LEFT_OUT,
+    NEW,
+    REDRAWN,
+    ROUNDED,
+    SAME,
+    CannotRepeat,
+    FileState,
+    file_state,
+    obstacle,
+    redrawn,
+    repeat_chunk,
+)
 from twin.run.data_files import FrameFacts, netcdf, preview_png, tiff
 from twin.run.owned_files import MANIFEST
 from twin.run.run_folder import RunFolder, write_manifest
@@ -28,20 +44,7 @@ from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.runs.study_folder import StudyFolder
 from twin.study.study_files import write_data
-from twin.verify.__main__ import app
-from twin.verify.file_difference import (
-    DIFFERENT,
-    GONE,
-    LEFT_OUT,
-    NEW,
-    REDRAWN,
-    ROUNDED,
-    SAME,
-    FileDifference,
-    file_difference,
-)
-from twin.verify.folder_state import folder_state
-from twin.verify.verification import CannotRepeat, obstacle, of_rounded, repeat_chunk
+from twin.verify import app
 
 
 @pytest.fixture
@@ -204,7 +207,7 @@ def test_numbers_that_no_run_gave_are_found(study) -> None:
 def json_pair(tmp_path: Path, old: object, new: object):
     for name, data in (("old.json", old), ("new.json", new)):
         (tmp_path / name).write_text(json.dumps(data))
-    return file_difference("numbers.json", tmp_path / "old.json", tmp_path / "new.json", False)
+    return file_state("numbers.json", tmp_path / "old.json", tmp_path / "new.json", False)
 
 
 @pytest.mark.parametrize("case", REFUSED["compared"])
@@ -222,17 +225,17 @@ def test_terms_are_held_against_the_terms_beside_them(tmp_path) -> None:
     assert json_pair(tmp_path, *alone).state == DIFFERENT
     for name, value in (("one", 1.0), ("two", 1.0 + 1e-8)):
         (tmp_path / name).write_text(json.dumps({"a": value}))
-    states = [file_difference("a.json", tmp_path / "one", tmp_path / "two", where).state for where in (False, True)]
+    states = [file_state("a.json", tmp_path / "one", tmp_path / "two", where).state for where in (False, True)]
     assert states == [DIFFERENT, ROUNDED]
 
 
 def test_pictures_of_rounded_numbers_are_no_other_results() -> None:
-    rounded, drawn = FileDifference("a.json", ROUNDED), FileDifference("a.svg", DIFFERENT)
-    assert [one.state for one in of_rounded([rounded, drawn])] == [ROUNDED, REDRAWN]
-    same = FileDifference("a.json", SAME)
-    assert [one.state for one in of_rounded([same, drawn])] == [SAME, DIFFERENT]
-    other = FileDifference("b.csv", DIFFERENT)
-    assert [one.state for one in of_rounded([rounded, other, drawn])] == [ROUNDED, DIFFERENT, DIFFERENT]
+    rounded, drawn = FileState("a.json", ROUNDED), FileState("a.svg", DIFFERENT)
+    assert [one.state for one in redrawn([rounded, drawn])] == [ROUNDED, REDRAWN]
+    same = FileState("a.json", SAME)
+    assert [one.state for one in redrawn([same, drawn])] == [SAME, DIFFERENT]
+    other = FileState("b.csv", DIFFERENT)
+    assert [one.state for one in redrawn([rounded, other, drawn])] == [ROUNDED, DIFFERENT, DIFFERENT]
 
 
 def test_a_difference_names_key_old_and_new(tmp_path) -> None:
@@ -249,7 +252,7 @@ def test_a_difference_names_key_old_and_new(tmp_path) -> None:
 def pair(tmp_path: Path, ending: str, old: bytes, new: bytes, elsewhere: bool = False):
     for name, content in (("old", old), ("new", new)):
         (tmp_path / name).write_bytes(content)
-    return file_difference(f"a/b.{ending}", tmp_path / "old", tmp_path / "new", elsewhere)
+    return file_state(f"a/b.{ending}", tmp_path / "old", tmp_path / "new", elsewhere)
 
 
 def test_frames_are_the_same_to_the_bit_but_on_another_processor(tmp_path) -> None:
@@ -303,8 +306,8 @@ def test_tables_pictures_and_texts(tmp_path) -> None:
     assert pair(tmp_path, "svg", drawing.encode(), drawing.replace("2.5", "2.6").encode()).state == DIFFERENT
     assert pair(tmp_path, "svg", drawing.encode(), drawing.replace(">f<", ">g<").encode()).state == DIFFERENT
     assert pair(tmp_path, "html", b"made on Monday", b"made on Tuesday").state == LEFT_OUT
-    assert file_difference("a.json", tmp_path / "old", tmp_path / "none", False).state == GONE
-    assert file_difference("a.json", tmp_path / "none", tmp_path / "old", False).state == NEW
+    assert file_state("a.json", tmp_path / "old", tmp_path / "none", False).state == GONE
+    assert file_state("a.json", tmp_path / "none", tmp_path / "old", False).state == NEW
 
 
 # the command

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from tests.golden.jobs import BY_NAME, ROOT, SET, UNSET, run
+from twin.compare.folder_state import folder_state
 from twin.run.owned_files import MANIFEST
-from twin.verify.folder_state import folder_state
 
 
 @pytest.mark.second

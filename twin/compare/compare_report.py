@@ -1,7 +1,8 @@
-"""What differs between runs, for a reader: tables of inputs and results, the images side by side."""
+"""The differences between runs, for a reader: tables of inputs and results, the images side by side."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,19 +11,14 @@ from typing import Any
 import numpy as np
 
 from scenes.yaml.errors import InputError, Issue
-from twin.compare.run_differences import (
-    NOISE,
-    ArrayDifference,
-    Differences,
-    Leaf,
-    RunResults,
-    differences,
-    images_of,
-    is_sigma,
-    read_run,
-)
+from scenes.yaml.units import split_quantity, unit_ratio
+from scenes.yaml.yaml_file import read_yaml
+from twin.compare import folder_difference as difference
+from twin.compare.folder_difference import NOISE, ArrayDifference, Leaf, NumberDifference, is_sigma
 from twin.run.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, significant
+from twin.run.owned_files import MANIFEST
 from twin.run.report import Report, Section, answer
+from twin.run.run_folder import Manifest, read_manifest
 from twin.run.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
 
 MOST_BARS = 30
@@ -89,9 +85,7 @@ def _warnings(comparison: Comparison) -> tuple[str, ...]:
     return tuple(dict.fromkeys(out))
 
 
-def _artefacts(
-    reference: RunResults, run: RunResults, found: Differences, names: tuple[str, str], k: int
-) -> tuple[Artefact, ...]:
+def _artefacts(reference: Run, run: Run, found: Differences, names: tuple[str, str], k: int) -> tuple[Artefact, ...]:
     out: list[Artefact] = []
     if found.inputs:
         rows: list[list[Cell]] = [[one.key, _text(one.reference), _text(one.other)] for one in found.inputs]
@@ -158,9 +152,7 @@ def _changes(found: Differences, names: tuple[str, str], k: int) -> SvgFigure | 
     return SvgFigure(f"changes-{k}", "Results that have a sigma", caption, drawn)
 
 
-def _pictures(
-    reference: RunResults, run: RunResults, found: Differences, names: tuple[str, str], k: int
-) -> list[Artefact]:
+def _pictures(reference: Run, run: Run, found: Differences, names: tuple[str, str], k: int) -> list[Artefact]:
     """Images of both runs and their difference: the mean over all but the last two axes."""
     out: list[Artefact] = []
     for array in found.arrays:
@@ -168,10 +160,8 @@ def _pictures(
             continue
         if len(out) == _MOST_IMAGES:
             break
-        pair = [images_of(one, array) for one in (reference, run)]
-        if any(one is None for one in pair):
-            continue
-        for label, first, second in _views(array, *(np.asarray(one, dtype=np.float64) for one in pair)):
+        files = [difference.content_of(one.folder / array.file, array.file) for one in (reference, run)]
+        for label, first, second in _views(*(file.arrays[array.name].astype(np.float64) for file in files)):
             if len(out) == _MOST_IMAGES:
                 break
             title = " ".join(filter(None, (array.file, array.name, label)))
@@ -182,7 +172,7 @@ def _pictures(
     return out
 
 
-def _views(array: ArrayDifference, first: np.ndarray, second: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
+def _views(first: np.ndarray, second: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Means of frames; of further axes (state, channel) each place by itself that differs."""
     if first.ndim <= 3:
         axes = tuple(range(first.ndim - 2))
@@ -214,6 +204,140 @@ PROGRAM = "twin.compare"
 KIND = "compare"
 
 
+@dataclass(frozen=True)
+class InputDifference:
+    """A key of config.yaml with different values.
+
+    Attributes:
+        key: ``job.perturb.base/forward/M2.shift[2]``.
+        reference, other: both values; None where there is none.
+    """
+
+    key: str
+    reference: Leaf
+    other: Leaf
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """One run against the reference.
+
+    Attributes:
+        inputs: keys of config.yaml.
+        numbers: results that are not the same to the tolerance.
+        arrays: images that are not the same to the tolerance of their peak.
+        compared: how many numbers and arrays both runs have.
+    """
+
+    inputs: tuple[InputDifference, ...]
+    numbers: tuple[NumberDifference, ...]
+    arrays: tuple[ArrayDifference, ...]
+    compared: int
+
+    @property
+    def same(self) -> bool:
+        """Whether no result differs."""
+        return not self.numbers and not self.arrays
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run folder with its manifest and the keys and values of its config.yaml."""
+
+    folder: Path
+    manifest: Manifest
+    inputs: Mapping[str, Leaf]
+
+    @property
+    def kind(self) -> str:
+        """Kind of the run: its program, and the kind of a test."""
+        return " ".join(filter(None, (self.manifest.program, self.manifest.test)))
+
+    def file(self, name: str) -> Path | None:
+        """Return a file of the run, None where it has none of that name."""
+        return self.folder / name if name in self.manifest.sha256 else None
+
+
+def read_run(folder: Path) -> Run:
+    """Read the manifest and config.yaml of a run folder.
+
+    Raises:
+        InputError: it is none, or config.yaml cannot be read.
+    """
+    manifest = read_manifest(folder)
+    if manifest is None:
+        problem = "no such folder" if not folder.is_dir() else f"not a run folder: it has no {MANIFEST} of a run"
+        raise InputError(Issue(problem, str(folder), allowed="a folder that a command of the twin has written"))
+    config = read_yaml(folder / "config.yaml").data if "config.yaml" in manifest.sha256 else {}
+    return Run(folder, manifest, dict(difference.leaves(config, series=False)))
+
+
+def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -> Differences:
+    """Compare two runs of one kind.
+
+    Args:
+        reference: the first.
+        other: the second.
+        rtol: numbers that agree to this part of the larger one are the same, and elements of arrays to this part of the
+            array's peak.
+        sigmas: where a number has a sigma in both runs, differences within so many of them do not count; sigmas
+            themselves and recorded frames, in which the noise is another draw, are then left out. None holds all to
+            ``rtol``.
+
+    Raises:
+        InputError: they are of two kinds, or a file cannot be read.
+    """
+    if reference.kind != other.kind:
+        kinds = f"{reference.kind} and {other.kind}"
+        raise InputError(Issue("runs of two kinds", str(other.folder), found=kinds, allowed="runs of one command"))
+    inputs = [
+        InputDifference(key, reference.inputs.get(key), other.inputs.get(key))
+        for key in dict.fromkeys((*reference.inputs, *other.inputs))
+        if not _same_input(reference.inputs.get(key), other.inputs.get(key))
+    ]
+    names = dict.fromkeys((*reference.manifest.sha256, *other.manifest.sha256))
+    results = [name for name in names if difference.ending(name) == "json" and "/" not in name]
+    images = [name for name in names if difference.ending(name) in (("nc", "tiff") if sigmas is None else ("nc",))]
+    count = 0
+    numbers: list[NumberDifference] = []
+    arrays: list[ArrayDifference] = []
+    for name in (*results, *images):
+        found = difference.file_difference(name, reference.file(name), other.file(name))
+        count += found.common_arrays
+        arrays += [one for one in found.arrays if not _same_array(one, rtol)]
+        if name in results:
+            count += found.common_numbers
+            numbers += [one for one in found.numbers if not _same_number(one, rtol, sigmas)]
+    return Differences(tuple(inputs), tuple(numbers), tuple(arrays), count)
+
+
+def _same_input(here: Leaf, there: Leaf) -> bool:
+    """Return whether two inputs are the same, also as 3 um and 0.003 mm."""
+    if here == there and type(here) is type(there):
+        return True
+    one, two = split_quantity(here), split_quantity(there)
+    if one is None or two is None:
+        return difference.is_number(here) and difference.is_number(there) and here == there
+    try:
+        return math.isclose(one[0] * unit_ratio(one[1], two[1]), two[0], rel_tol=1e-15)
+    except ValueError:
+        return False
+
+
+def _same_number(one: NumberDifference, rtol: float, sigmas: float | None) -> bool:
+    if sigmas is not None and is_sigma(one.key):
+        return True
+    if one.difference is None:  # of which both are None one is no key of its file
+        return one.reference == one.other and one.reference is not None
+    if math.isclose(float(one.reference or 0), float(one.other or 0), rel_tol=rtol):
+        return True
+    return sigmas is not None and one.sigma is not None and abs(one.difference) <= sigmas * one.sigma
+
+
+def _same_array(one: ArrayDifference, rtol: float) -> bool:
+    return one.finite and (one.largest or 0.0) <= rtol * (one.peak or 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Runs of one kind beside each other.
@@ -225,7 +349,7 @@ class Comparison:
         sigmas: differences within so many sigma do not count, None where all do.
     """
 
-    runs: tuple[RunResults, ...]
+    runs: tuple[Run, ...]
     found: tuple[Differences, ...]
     rtol: float
     sigmas: float | None
@@ -237,7 +361,7 @@ class Comparison:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What tells the folders apart, shortest first: their names, or their paths where two have one name."""
+        """Names that distinguish the folders: their own, or their paths where two have one name."""
         names = [run.folder.resolve().name for run in self.runs]
         return tuple(names if len(set(names)) == len(names) else [str(run.folder) for run in self.runs])
 
@@ -265,10 +389,10 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
                 "compared": found.compared,
                 "inputs": [vars(one) for one in found.inputs],
                 "numbers": [
-                    {**vars(one), "difference": _finite(one.difference), "in_sigma": _finite(one.in_sigma)}
+                    {**_values(one, _NUMBER), "difference": _finite(one.difference), "in_sigma": _finite(one.in_sigma)}
                     for one in found.numbers
                 ],
-                "arrays": [vars(one) for one in found.arrays],
+                "arrays": [_values(one, _ARRAY) for one in found.arrays],
             }
         )
     return {
@@ -279,6 +403,14 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
         "sigmas": comparison.sigmas,
         "others": others,
     }
+
+
+_NUMBER = ("file", "key", "reference", "other", "sigma", "sigma_of")
+_ARRAY = ("file", "name", "shape", "other_shape", "largest", "rms", "peak", "share")
+
+
+def _values(of: object, keys: Sequence[str]) -> dict[str, Any]:
+    return {key: getattr(of, key) for key in keys}
 
 
 def _finite(value: float | None) -> float | None:

@@ -92,7 +92,7 @@ def monitor(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    from twin.run.kept_work import KeptWork
+    from twin.run.run_folder import KeptWork
 
     count = cores() if workers is None else workers
     procedure = PROCEDURES["design monitor"]

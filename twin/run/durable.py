@@ -13,7 +13,7 @@ import os
 import secrets
 import signal
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -31,38 +31,34 @@ _NOT_FOR_FOLDERS = (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF)
 """What file systems that know no fsync of a folder answer, those of a network for instance."""
 
 
-def _sync_file(place: Path) -> None:
-    """Write a file's content through to the disk. Raises OSError."""
-    file = os.open(place, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+def _sync(place: Path, kind: int) -> None:
+    file = os.open(place, os.O_RDONLY | kind | os.O_CLOEXEC)
     try:
         os.fsync(file)
+    except OSError as error:
+        if kind != os.O_DIRECTORY or error.errno not in _NOT_FOR_FOLDERS:
+            raise
     finally:
         os.close(file)
 
 
+def sync_file(place: Path) -> None:
+    """Write a file's content through to the disk. Raises OSError."""
+    _sync(place, os.O_NOFOLLOW)
+
+
 def sync_folder(place: Path) -> None:
     """Write the names in a folder through to the disk. Raises OSError."""
-    folder = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(folder)
-    except OSError as error:
-        if error.errno not in _NOT_FOR_FOLDERS:
-            raise
-    finally:
-        os.close(folder)
+    _sync(place, os.O_DIRECTORY)
 
 
 def sync_tree(place: Path) -> None:
     """Write a folder with all that is below it through to the disk, the files first, itself last. Raises OSError."""
-    folders, files = [], []
-    for folder, _, names in os.walk(place):
-        folders.append(Path(folder))
-        files += [path for path in (Path(folder) / name for name in names) if not path.is_symlink()]
+    tree = [(Path(folder), names) for folder, _, names in os.walk(place)]
+    files = [folder / name for folder, names in tree for name in names if not (folder / name).is_symlink()]
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        for _ in pool.map(_sync_file, files):
-            pass
-        for _ in pool.map(sync_folder, folders[1:]):
-            pass
+        list(pool.map(sync_file, files))
+        list(pool.map(sync_folder, [folder for folder, _ in tree[1:]]))
     sync_folder(place)
 
 
@@ -75,13 +71,11 @@ def make_folders(place: Path) -> list[Path]:
     Raises:
         OSError: one cannot be made.
     """
-    made: list[Path] = []
     missing = [folder for folder in (place, *place.parents) if not folder.exists()]
     for folder in reversed(missing):
         folder.mkdir(exist_ok=True)
-        made.insert(0, folder)
         sync_folder(folder.parent)
-    return made
+    return missing
 
 
 def write_safely(place: Path, content: bytes) -> None:
@@ -105,11 +99,10 @@ def write_all_safely(files: Iterable[tuple[Path, bytes]]) -> None:
     Raises:
         OSError: the disk is full, or gone; some may be there.
     """
-    given = list(files)
+    every = list(files)
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        for _ in pool.map(_write_one, given):
-            pass
-    for folder in {place.parent for place, _ in given}:
+        list(pool.map(_write_one, every))
+    for folder in {place.parent for place, _ in every}:
         sync_folder(folder)
 
 
@@ -186,6 +179,16 @@ def ending_signals() -> tuple[signal.Signals, ...]:
 
 
 @contextmanager
+def _handled(asked: Iterable[int], handler: Callable[[int, object], None]) -> Iterator[None]:
+    before = {number: signal.signal(number, handler) for number in asked}
+    try:
+        yield
+    finally:
+        for number, former in before.items():
+            signal.signal(number, former)
+
+
+@contextmanager
 def exit_on_terminate() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the program as an exception, as Ctrl-C does, so that a half-written run folder is
     removed. The exception that leaves the block is the signal's whatever became of it on its way: compiled modules turn
@@ -203,34 +206,24 @@ def exit_on_terminate() -> Iterator[None]:
         if len(got) == 1:  # a second one must not break off the clearing up
             raise SystemExit(128 + number)
 
-    asked = ending_signals()
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        asked = (*asked, signal.SIGINT)
-    before = {number: signal.signal(number, leave) for number in asked}
-    try:
-        yield
-    except BaseException as error:
-        if got:
-            raise (KeyboardInterrupt() if got[0] == signal.SIGINT else SystemExit(128 + got[0])) from error
-        raise
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    interrupt = (signal.SIGINT,) if signal.getsignal(signal.SIGINT) is signal.default_int_handler else ()
+    with _handled((*ending_signals(), *interrupt), leave):
+        try:
+            yield
+        except BaseException as error:
+            if got:
+                raise (KeyboardInterrupt() if got[0] == signal.SIGINT else SystemExit(128 + got[0])) from error
+            raise
 
 
 @contextmanager
 def ending_later() -> Iterator[None]:
-    """Ctrl-C and signals that ask to end are heeded when the block is over, of what cannot be broken off."""
+    """Heed Ctrl-C and signals that ask to end when the block is over, of what cannot be broken off."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     got: list[int] = []
-    asked = (signal.SIGINT, *ending_signals())
-    before = {number: signal.signal(number, lambda number, frame: got.append(number)) for number in asked}
-    try:
+    with _handled((signal.SIGINT, *ending_signals()), lambda number, frame: got.append(number)):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    for heard in got:
-        signal.raise_signal(heard)
+    for number in got:
+        signal.raise_signal(number)

@@ -1,6 +1,6 @@
-"""Whose the files in and beside a run's or study's folder are.
+"""The owner of each file in and beside the folder of a run or study.
 
-In the folder checksums tell: a file that somebody has changed is theirs. Beside it stand hidden names of a folder that
+In the folder checksums decide: a file that somebody has changed is theirs. Beside it are hidden names of a folder that
 is being made or replaced, ``.NAME.TOKEN.partial`` (a run that is being written), ``.NAME.TOKEN.old`` (what it replaces)
 and ``.NAME.TOKEN.lock``, which the process holds locked as long as it lives. The lock is the operating system's and
 ends with the process, however that ends; so a name without a held lock is nobody's. A study that is to replace a
@@ -16,12 +16,10 @@ import os
 import re
 import secrets
 import shutil
-import stat
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
 
 from twin.run import durable
 
@@ -47,8 +45,6 @@ _AT_WORK = re.compile(
     + durable.PARTIAL_NAME
 )
 """What a study keeps for itself; chunks have their checksums in their index."""
-_BY_NAME = re.compile(rf"{re.escape(STUDY_STATE)}|config\.yaml|report\.html|study\.(nc|csv|parquet|json)")
-"""What studies wrote that kept no account of it."""
 _LAST = (MANIFEST, STUDY_STATE, WRITTEN)
 """They say whose all else is."""
 
@@ -95,20 +91,23 @@ def foreign_files(folder: Path, listed: Mapping[str, str] | None, study: bool | 
     study = is_study(folder) if study is None else study
     if listed is None and not study:
         return None
-    known = set(listed.items()) if listed is not None else set()
-    account = _account(folder) if study else None
-    known |= account or set()
-    names = {name for name, _ in known}
+    known: dict[str, set[str]] = {}
+    for name, check in (*(listed or {}).items(), *(_account(folder) if study else ())):
+        known.setdefault(name, set()).add(check)
 
-    def own(name: str) -> bool:
+    def ours(name: str) -> bool:
         if (listed is not None and name == MANIFEST) or (study and _AT_WORK.fullmatch(name)):
             return True
-        if name not in names:
-            return study and listed is None and account is None and _BY_NAME.fullmatch(name) is not None
-        place = folder / name
-        return place.is_file() and not place.is_symlink() and (name, digest(place)) in known
+        if name in known:
+            return is_as_written(folder / name, known[name])
+        return study and name == STUDY_STATE  # the last file of a study that was being removed
 
-    return [name for name in every_file(folder) if not own(name)]
+    return [name for name in every_file(folder) if not ours(name)]
+
+
+def is_as_written(place: Path, checksums: Collection[str]) -> bool:
+    """Whether a file, and no link or folder, has one of these SHA-256. Raises OSError."""
+    return place.is_file() and not place.is_symlink() and digest(place) in checksums
 
 
 def digest(place: Path) -> str:
@@ -117,13 +116,13 @@ def digest(place: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _account(folder: Path) -> set[tuple[str, str]] | None:
-    """Names and checksums of what a study has written, None where it keeps no account of it."""
+def _account(folder: Path) -> list[tuple[str, str]]:
+    """Names and checksums of the files that an unfinished study has written."""
     try:
         lines = (folder / WRITTEN).read_text("utf-8").splitlines()
     except (OSError, ValueError):
-        return None
-    return {(name, check) for check, _, name in (line.partition(" ") for line in lines)}
+        return []
+    return [(name, check) for check, _, name in (line.partition(" ") for line in lines)]
 
 
 def remove_files(folder: Path, kept: set[str]) -> None:
@@ -174,6 +173,10 @@ def successor(target: Path) -> Path:
     return target.with_name(f".{target.name}.next")
 
 
+def _beside(target: Path, token: str) -> dict[str, Path]:
+    return {ending: target.with_name(f".{target.name}.{token}.{ending}") for ending in (PARTIAL, OLD, LOCK)}
+
+
 class Unfinished:
     """Hidden names beside ``target`` that are this process's own until ``close``.
 
@@ -185,85 +188,44 @@ class Unfinished:
     """
 
     def __init__(self, target: Path) -> None:
-        self._target = target
-        self._token, self._lock = self._locked()
-
-    def _locked(self) -> tuple[str, TextIO]:
-        while True:
-            token = secrets.token_hex(4)
-            place = self._beside(token, LOCK)
-            lock = place.open("x", encoding="utf-8")
-            # whoever sweeps the folder between these lines takes the file for one that a killed process left
-            if (
-                take_lock(lock) is not False
-                and place.exists()
-                and os.path.samestat(os.fstat(lock.fileno()), place.stat())
-            ):
-                return token, lock
-            lock.close()
-
-    def _beside(self, token: str, ending: str) -> Path:
-        return self._target.with_name(f".{self._target.name}.{token}.{ending}")
+        lock = None
+        while lock is None:  # whoever sweeps the folder may hold the lock of a new file for a moment
+            self._names = _beside(target, secrets.token_hex(4))
+            lock = locked(self._names[LOCK])
+        self._lock = lock
 
     def path(self, ending: str) -> Path:
         """The hidden name with that ending, PARTIAL or OLD."""
-        return self._beside(self._token, ending)
+        return self._names[ending]
 
     def close(self) -> None:
         """Give the names up; nothing is to stand under them any more."""
-        self._beside(self._token, LOCK).unlink(missing_ok=True)
-        self._lock.close()
+        self._names[LOCK].unlink(missing_ok=True)
+        os.close(self._lock)
 
 
 @contextmanager
 def scratch(stem: str) -> Iterator[Path]:
-    """A folder of this user alone for what ends with the block, where the system has such. What killed processes left
-    of theirs under this name goes first; what belongs to a live one, or to somebody else, is not touched.
+    """A folder of this user alone for what ends with the block, where the system has such. What killed processes of
+    this user left there goes first.
 
     Raises:
         OSError: it cannot be made.
     """
-    above = Path(tempfile.gettempdir())
-    for left in above.glob(f"{stem}-*.{LOCK}"):
-        with suppress(OSError):  # somebody else's, or gone meanwhile
-            _clear_scratch(left)
-    while True:
-        folder = above / f"{stem}-{secrets.token_hex(8)}"
-        place = _lock_of(folder)
-        lock = os.open(place, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        # whoever clears up between these lines takes the file for one that a killed process left
-        if take_lock(lock) is not False and place.exists():
-            break
-        os.close(lock)
+    target = Path(tempfile.gettempdir()) / stem
+    sweep(target.parent)
+    names = Unfinished(target)
+    folder = names.path(PARTIAL)
     try:
         folder.mkdir(mode=0o700)
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        place.unlink(missing_ok=True)
-        os.close(lock)
+        names.close()
 
 
-def _lock_of(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name}.{LOCK}")
-
-
-def _clear_scratch(place: Path) -> None:
-    """Remove a folder of `scratch` whose lock nobody holds. Raises OSError."""
-    lock = os.open(place, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    try:
-        about, folder = os.fstat(lock), place.with_suffix("")
-        if about.st_uid != os.getuid() or not stat.S_ISREG(about.st_mode) or not take_lock(lock):
-            return
-        if folder.is_dir() and not folder.is_symlink() and folder.lstat().st_uid == os.getuid():
-            shutil.rmtree(folder)
-        place.unlink(missing_ok=True)
-    finally:
-        os.close(lock)
-
-
-def sweep(folder: Path, replaced: Callable[[Path, Path], bool]) -> None:
-    """Clear away what dead processes left in ``folder``; what belongs to a live one is not touched.
+def sweep(folder: Path, replaced: Callable[[Path, Path], bool] = lambda former, new: False) -> None:
+    """Clear away what dead processes of this user left in ``folder``; what belongs to a live one is not touched.
 
     What was half written is removed. What was to be replaced is put back when nothing has taken its place.
 
@@ -273,48 +235,58 @@ def sweep(folder: Path, replaced: Callable[[Path, Path], bool]) -> None:
             returns whether it did.
     """
     try:
-        found = {(m["name"], m["token"]) for path in folder.iterdir() if (m := _NAME.fullmatch(path.name))}
+        names = {(m["name"], m["token"]) for path in folder.iterdir() if (m := _NAME.fullmatch(path.name))}
     except OSError:  # a folder that cannot be read is told of when it is written to
         return
-    for name, token in sorted(found):
-        places = {ending: folder / f".{name}.{token}.{ending}" for ending in (PARTIAL, OLD, LOCK)}
-        try:
-            lock = places[LOCK].open("r+", encoding="utf-8")
-        except FileNotFoundError:
-            lock = None
-        except OSError:  # somebody else's, or no file at all
-            continue
-        try:
-            if lock is None or take_lock(lock):
-                _clear(folder / name, places, replaced)
-        except OSError:  # not ours to remove; it stays for who may
-            pass
-        finally:
-            if lock is not None:
-                lock.close()
+    for name, token in sorted(names):
+        places = _beside(folder / name, token)
+        with suppress(OSError):  # not ours to remove; it stays for who may
+            if any(place.lstat().st_uid != os.getuid() for place in places.values() if os.path.lexists(place)):
+                continue
+            if (lock := locked(places[LOCK], certain=True)) is not None:
+                try:
+                    _clear(folder / name, places, replaced)
+                finally:
+                    os.close(lock)
 
 
 def _clear(target: Path, places: dict[str, Path], replaced: Callable[[Path, Path], bool]) -> None:
-    if places[PARTIAL].is_dir() and not places[PARTIAL].is_symlink():
-        if (places[PARTIAL] / MANIFEST).exists() and target.exists() and not places[OLD].exists():
+    partial, former = places[PARTIAL], places[OLD]
+    if partial.is_dir() and not partial.is_symlink():
+        if (partial / MANIFEST).exists() and target.exists() and not former.exists():
             # complete: it has changed places with the target, or was about to
-            places[PARTIAL].rename(places[OLD])
+            partial.rename(former)
         else:
-            shutil.rmtree(places[PARTIAL])
-    if places[OLD].is_dir() and not places[OLD].is_symlink():
-        if not (target.exists() or target.is_symlink()):
-            places[OLD].rename(target)
-        elif not replaced(places[OLD], target):
+            shutil.rmtree(partial)
+    if former.is_dir() and not former.is_symlink():
+        if not os.path.lexists(target):
+            former.rename(target)
+        elif not replaced(former, target):
             return
     places[LOCK].unlink(missing_ok=True)
 
 
-def take_lock(lock: TextIO | int) -> bool | None:
-    """Lock a file and return whether that was done: False when another process has it, None where none can be had."""
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True
+def locked(place: Path, certain: bool = False) -> int | None:
+    """Open a file, made where it is missing, and lock it.
+
+    Args:
+        place: of the file.
+        certain: also None where the file system has no locks.
+
+    Returns:
+        The open file; None when another process has it.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    while True:
+        lock = os.open(place, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if certain or isinstance(error, BlockingIOError):
+                os.close(lock)
+                return None
+        if os.fstat(lock).st_nlink:
+            return lock
+        os.close(lock)  # its owner has removed it meanwhile

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -16,8 +17,8 @@ from typing import Annotated, Any, Protocol
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from twin.run import owned_files
-from twin.run.durable import ending_later, make_folders, put_in_place, sync_folder, sync_tree
-from twin.run.owned_files import MANIFEST as MANIFEST
+from twin.run.durable import PARTIAL_NAME, ending_later, make_folders, put_in_place, sync_folder, sync_tree
+from twin.run.owned_files import MANIFEST
 from twin.run.provenance import Checksum, Provenance, versions
 
 _WAITING = f".{MANIFEST}{owned_files.PARTIAL}"
@@ -43,11 +44,7 @@ class Numbered:
     def free(self) -> Path:
         """Return the first that does not exist now."""
         every = (self.folder / f"{self.stem}-{number:03d}" for number in count(1))
-        return next(path for path in every if not _taken(path) and not owned_files.successor(path).exists())
-
-
-def _taken(path: Path) -> bool:
-    return path.exists() or path.is_symlink()
+        return next(path for path in every if not os.path.lexists(path) and not owned_files.successor(path).exists())
 
 
 def chosen(out: Path | None, stem: str) -> Path | Numbered:
@@ -90,7 +87,7 @@ class RunFolder:
 
     def _check_target(self) -> None:
         target = self.target
-        if not _taken(target):
+        if not os.path.lexists(target):
             return
         if not target.is_dir() or target.is_symlink():
             raise RunFolderError(f"output {target} exists and is not a folder; choose another with --out")
@@ -117,11 +114,10 @@ class RunFolder:
             self._unfinished = owned_files.Unfinished(self.target)
             self.path = self._unfinished.path(owned_files.PARTIAL)
             self.path.mkdir()
-        except OSError as error:
+        except BaseException as error:
             self._remove()
-            raise RunFolderError(f"cannot make the output folder {self.target}: {reason(error)}") from error
-        except BaseException:
-            self._remove()
+            if isinstance(error, OSError):
+                raise RunFolderError(f"cannot make the output folder {self.target}: {reason(error)}") from error
             raise
         return self
 
@@ -131,13 +127,11 @@ class RunFolder:
             try:
                 self._publish()
                 return
-            except OSError as failure:
+            except BaseException as failure:
                 self._remove()
-                raise RunFolderError(
-                    f"cannot put the output folder {self.target} in place: {reason(failure)}"
-                ) from failure
-            except BaseException:
-                self._remove()
+                if isinstance(failure, OSError):
+                    text = f"cannot put the output folder {self.target} in place: {reason(failure)}"
+                    raise RunFolderError(text) from failure
                 raise
         self._remove()
         if isinstance(error, OSError):
@@ -148,11 +142,9 @@ class RunFolder:
         if self._unfinished is not None:
             shutil.rmtree(self._unfinished.path(owned_files.PARTIAL), ignore_errors=True)
             self._unfinished.close()
-        for parent in self._made_parents:
-            try:
+        with suppress(OSError):  # somebody else has put something there
+            for parent in self._made_parents:
                 parent.rmdir()
-            except OSError:  # somebody else has put something there
-                break
 
     def _publish(self) -> None:
         assert self._unfinished is not None
@@ -193,8 +185,7 @@ class RunFolder:
 
     def write_text(self, name: str, text: str) -> None:
         """Write a UTF-8 text file."""
-        place = self._place(name)
-        place.write_text(text, encoding="utf-8")
+        self._place(name).write_text(text, encoding="utf-8")
 
     def write_bytes(self, name: str, content: bytes | memoryview) -> None:
         """Write a binary file; contents that lie in a file themselves are not held in memory."""
@@ -220,11 +211,7 @@ class RunFolder:
 
     def checksums(self) -> dict[str, str]:
         """SHA-256 of every file written so far, by path relative to the folder."""
-        out = {}
-        for file in sorted(self.path.rglob("*")):
-            if file.is_file():
-                out[file.relative_to(self.path).as_posix()] = owned_files.digest(file)
-        return out
+        return {name: owned_files.digest(self.path / name) for name in owned_files.every_file(self.path)}
 
 
 def json_text(data: Any) -> str:
@@ -277,7 +264,7 @@ class Manifest(BaseModel):
     gradient: bool = False
     again: list[str] = []
     started_in: str = ""
-    versions: Annotated[dict[str, str], AfterValidator(lambda found: _ours(found))]
+    versions: Annotated[dict[str, str], AfterValidator(lambda named: _ours(named))]
     provenance: Provenance | None = None
     backend: str = ""
     seed: int = 0
@@ -297,10 +284,10 @@ class Manifest(BaseModel):
     digest: Checksum | None = None
 
 
-def _ours(found: dict[str, str]) -> dict[str, str]:
-    if "space-camera-twin" not in found:
+def _ours(named: dict[str, str]) -> dict[str, str]:
+    if "space-camera-twin" not in named:
         raise ValueError("made by another program")
-    return found
+    return named
 
 
 class FilesOfRun(Protocol):
@@ -337,13 +324,13 @@ def write_manifest(folder: FilesOfRun, program: str, started: float, seconds: fl
     }
     if unknown := sorted(entries.keys() - Manifest.model_fields.keys()):
         raise ValueError(f"no fact of a manifest: {', '.join(unknown)}")
-    told = {key: entries[key] for key in Manifest.model_fields if key in entries}
-    folder.write_json(MANIFEST, {**told, "digest": seal(told)})
+    manifest = {key: entries[key] for key in Manifest.model_fields if key in entries}
+    folder.write_json(MANIFEST, {**manifest, "digest": seal(manifest)})
 
 
-def seal(told: Mapping[str, Any]) -> str:
+def seal(manifest: Mapping[str, Any]) -> str:
     """SHA-256 of what a manifest says but for its ``digest``: of its JSON with sorted keys and without blanks."""
-    content = {key: value for key, value in told.items() if key != "digest"}
+    content = {key: value for key, value in manifest.items() if key != "digest"}
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
@@ -357,11 +344,7 @@ def altered(folder: Path, manifest: Manifest) -> list[str]:
     Raises:
         OSError: one cannot be read.
     """
-    return [name for name, known in manifest.sha256.items() if not _is_as_written(folder / name, known)]
-
-
-def _is_as_written(place: Path, known: str) -> bool:
-    return place.is_file() and not place.is_symlink() and owned_files.digest(place) == known
+    return [name for name, known in manifest.sha256.items() if not owned_files.is_as_written(folder / name, {known})]
 
 
 def read_manifest(folder: Path) -> Manifest | None:
@@ -416,7 +399,7 @@ def remove_run(old: Path, new: Path) -> None:
     others = unlisted(old)
     for name in owned_files.every_file(old) if others is None else others:
         place = new / name
-        while _taken(place):
+        while os.path.lexists(place):
             place = place.with_name(f"{place.name}.kept")
         place.parent.mkdir(parents=True, exist_ok=True)
         (old / name).rename(place)
@@ -439,3 +422,82 @@ def remove_replaced(old: Path, new: Path) -> bool:
 def reason(error: OSError) -> str:
     """Why a file cannot be, in a few words; HDF5 puts a page into strerror."""
     return os.strerror(error.errno) if error.errno else str(error)
+
+
+_KEPT = re.compile(
+    rf"{re.escape(owned_files.STUDY_LOCK)}|trials\.txt"
+    rf"|[^/]+/(of\.txt|(chunks/)?{PARTIAL_NAME}|chunks/(index\.txt|[0-9]+\.npz(\.corrupt)?))"
+)
+"""Files that commands keep there."""
+
+
+class KeptWork:
+    """Context manager over the folder ``OUT.ENDING``, in which a command keeps its work beside its run folder for
+    ``--resume``, and which nobody else uses until the block ends.
+
+    Without ``--out`` a command that runs beside another one of the same name takes ``STEM.2.ENDING``, and so on. Files
+    that no command of this program keeps there are never removed; a folder that holds some is refused.
+
+    Args:
+        out: the run folder that the user chose, None for one below ``runs``.
+        stem: name of the run folder where the user chose none.
+        ending: what is kept, ``samples`` for instance.
+        resume: go on with what is there; else it is removed first.
+    """
+
+    def __init__(self, out: Path | None, stem: str, ending: str, resume: bool) -> None:
+        self._first = Path("runs") / stem if out is None else out
+        self._chosen, self._ending, self._resume = out is not None, ending, resume
+        self._place: Path | None = None
+        self._lock: int | None = None
+
+    def __enter__(self) -> KeptWork:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let others use the folder."""
+        if self._lock is not None:
+            os.close(self._lock)
+
+    def begin(self) -> Path:
+        """Make or take up the folder, and return it.
+
+        Raises:
+            RunFolderError: another command uses the folder that the user chose, it holds files of somebody else, or it
+                cannot be made.
+        """
+        try:
+            for number in count(1):
+                place = self._first.with_name(f"{self._first.name}{'' if number == 1 else f'.{number}'}.{self._ending}")
+                self._refuse_others(place)
+                make_folders(place)
+                self._lock = owned_files.locked(place / owned_files.STUDY_LOCK)
+                if self._lock is not None:
+                    break
+                if self._chosen:
+                    text = f"{place} is in use by another command; wait until it has ended, or choose another --out"
+                    raise RunFolderError(text)
+            self._place = place
+            if not self._resume:
+                owned_files.remove_files(place, {owned_files.STUDY_LOCK})
+        except OSError as error:
+            raise RunFolderError(f"cannot use {place}: {reason(error)}") from error
+        return place
+
+    def finish(self) -> None:
+        """Remove what was kept: its results stand in the run folder."""
+        if self._place is not None:
+            others = {name for name in owned_files.every_file(self._place) if not _KEPT.fullmatch(name)}
+            owned_files.remove_files(self._place, others)
+
+    def _refuse_others(self, place: Path) -> None:
+        if not os.path.lexists(place):
+            return
+        if place.is_symlink() or not place.is_dir():
+            raise RunFolderError(f"{place} is in the way of what is kept for --resume; choose another --out")
+        names = owned_files.every_file(place)
+        known = owned_files.STUDY_LOCK in names
+        if others := [name for name in names if not (known and _KEPT.fullmatch(name))]:
+            named = owned_files.first_names(others)
+            text = f"{place} holds files that this program did not write: {named}; move it, or choose another --out"
+            raise RunFolderError(text)

@@ -72,7 +72,7 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    from twin.run.kept_work import KeptWork
+    from twin.run.run_folder import KeptWork
 
     def resolve() -> ToleranceSetup:
         setup: ToleranceSetup = read_for(PROGRAM, file, Named("scenes.specs.tolerance:resolve_tolerance"))

@@ -17,8 +17,8 @@ from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.run import cli, durable
 
 if TYPE_CHECKING:  # what computes is imported when it is needed
-    from twin.verify.folder_state import FolderState
-    from twin.verify.verification import Repetition
+    from twin.compare.folder_state import FolderState
+    from twin.compare.verification import Repetition
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -65,8 +65,8 @@ def main(
     errors = Console(stderr=True)
     silent = as_json or quiet
     with cli.explained(errors), durable.exit_on_terminate():
-        from twin.verify.folder_state import folder_state
-        from twin.verify.verification import CannotRepeat, Verification, expected_time, obstacle, repeat_chunk
+        from twin.compare import verification
+        from twin.compare.folder_state import folder_state
 
         if files and (every or keep is not None):
             raise cli.InputErrorText("--files makes nothing again, so --all and --keep have no meaning with it")
@@ -76,16 +76,16 @@ def main(
         if every and not state.is_study:
             raise cli.InputErrorText("--all is for studies; of other runs everything is made again anyway")
         chunk = state.is_study and not every and keep is None
-        why, made = "" if files else obstacle(state), None
+        why, made = "" if files else verification.obstacle(state), None
         if not files and not why:
             if not silent:
-                text = "one chunk of the study" if chunk else f"the run, which took {expected_time(state)}"
+                text = "one chunk of the study" if chunk else f"the run, which took {verification.expected_time(state)}"
                 errors.print(f"making again {text}", markup=False, highlight=False, soft_wrap=True)
             try:
-                made = repeat_chunk(state) if chunk else _whole(state, keep, silent)
-            except CannotRepeat as error:
+                made = verification.repeat_chunk(state) if chunk else _whole(state, keep, silent)
+            except verification.CannotRepeat as error:
                 why = str(error)
-        done = Verification(state, made, why)
+        done = verification.Verification(state, made, why)
     with to_stdout(errors):
         if as_json:
             print_json(done.numbers())
@@ -99,8 +99,8 @@ def main(
 
 
 def _whole(state: FolderState, keep: Path | None, silent: bool) -> Repetition:
+    from twin.compare.verification import repeat
     from twin.run.owned_files import scratch
-    from twin.verify.verification import repeat
 
     if keep is not None:
         return repeat(state, keep, silent)

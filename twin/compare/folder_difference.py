@@ -1,0 +1,504 @@
+"""The difference of two run folders, file by file: numbers with their sigmas, texts, arrays and images.
+
+Files are read by what they are, not by who wrote them. What names a time, a duration or a version is left out.
+`file_difference` names every number, text and array that is not the same to the bit; ``twin.compare`` and
+``twin.verify`` decide which of these count.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+
+from scenes.kinds.file_kinds import kind_of
+from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.input_file import why_unreadable
+from scenes.yaml.json_file import parse_json
+from scenes.yaml.spec import validate
+from scenes.yaml.yaml_file import parse_yaml
+from twin.run.data_files import read_netcdf
+
+Leaf = float | int | str | bool | None
+LEFT_OUT = frozenset(
+    (
+        *("seconds", "worker_seconds", "runs_computed", "states_per_second", "wall_time_s", "started_unix_s"),
+        *("fingerprint", "sha256", "versions", "schema", "reference_frames"),
+    )
+)
+"""Keys of results that say how the run was done, not what it gave."""
+STATEMENTS = frozenset(("verdict", "warnings"))
+"""Sentences at the top of a result that follow from its numbers."""
+NAMES = ("name", "motion", "label", "field", "path", "time_s")
+"""Keys that distinguish the entries of a list, the first that does."""
+NOISE = "noise"
+"""Name of a sigma that more frames lower."""
+_SERIES = 12
+"""Numbers of a list from which it is compared as an array."""
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """The content of a file.
+
+    Attributes:
+        numbers: key -> number or text.
+        arrays: name -> array.
+        statements: sentences that follow from the numbers.
+        drawn: whether it is a picture.
+    """
+
+    numbers: Mapping[str, Leaf]
+    arrays: Mapping[str, np.ndarray]
+    statements: Mapping[str, Any]
+    drawn: bool = False
+
+
+@dataclass(frozen=True)
+class NumberDifference:
+    """A number or text with different values.
+
+    Attributes:
+        file: in the run folder, ``recovered.json``.
+        key: in the file, which ends in its unit.
+        reference, other: both values; None where there is none.
+        sigma: standard deviation of the difference of two independent measurements, from both files' sigmas; None
+            where they state none.
+        sigma_of: the ``noise`` of the images alone, or ``stated``; empty without a sigma.
+        scale: largest number of its sort in both files.
+    """
+
+    file: str
+    key: str
+    reference: Leaf
+    other: Leaf
+    sigma: float | None = None
+    sigma_of: str = ""
+    scale: float = 0.0
+
+    @property
+    def difference(self) -> float | None:
+        """Other minus reference, None unless both are numbers."""
+        if is_number(self.reference) and is_number(self.other):
+            return float(self.other) - float(self.reference)  # type: ignore[arg-type]
+        return None
+
+    @property
+    def in_sigma(self) -> float | None:
+        """The difference over its sigma."""
+        return None if self.difference is None or not self.sigma else self.difference / self.sigma
+
+
+@dataclass(frozen=True)
+class ArrayDifference:
+    """An image, or another array, with different values.
+
+    Attributes:
+        file: in the run folder.
+        name: of the variable; empty for an image.
+        shape, other_shape: of the reference's and of the other, None where there is none.
+        largest: absolute difference at most; None unless both are numbers of one shape.
+        rms: of the difference.
+        peak: largest absolute value of the reference.
+        share: of the elements that differ; None where the shapes do.
+        where: index of the element that differs most.
+        reference, other: its values.
+        depth: bytes of an element of an unsigned array, 0 for others.
+    """
+
+    file: str
+    name: str
+    shape: tuple[int, ...] | None
+    other_shape: tuple[int, ...] | None
+    largest: float | None = None
+    rms: float | None = None
+    peak: float | None = None
+    share: float | None = None
+    where: tuple[int, ...] = ()
+    reference: Leaf = None
+    other: Leaf = None
+    depth: int = 0
+
+    @property
+    def finite(self) -> bool:
+        """Whether the element that differs most is a number in both."""
+        return self.largest is not None and math.isfinite(float(self.other or 0) - float(self.reference or 0))
+
+
+@dataclass(frozen=True, eq=False)
+class FileDifference:
+    """All that is not the same to the bit in a file of two run folders.
+
+    Attributes:
+        file: in the run folders.
+        numbers: numbers and texts.
+        arrays: images and other arrays.
+        statements: sentences that follow from the numbers.
+        common_numbers, common_arrays: how many are in both; of a file with the same bytes that is no JSON 0 and 1.
+        drawn: whether it is a picture.
+    """
+
+    file: str
+    numbers: tuple[NumberDifference, ...] = ()
+    arrays: tuple[ArrayDifference, ...] = ()
+    statements: tuple[NumberDifference, ...] = ()
+    common_numbers: int = 0
+    common_arrays: int = 1
+    drawn: bool = False
+
+
+def file_difference(name: str, reference: Path | None, other: Path | None) -> FileDifference:
+    """Compare a file of two run folders.
+
+    Args:
+        name: in the run folders.
+        reference: the file in the first folder, None where it has none.
+        other: in the second.
+
+    Raises:
+        InputError: one cannot be read.
+    """
+    if reference is not None and other is not None and _same_bytes(reference, other):
+        if ending(name) != "json":
+            return FileDifference(name)
+        content = content_of(reference, name)
+        return FileDifference(name, common_numbers=len(content.numbers), common_arrays=len(content.arrays))
+    contents = [Content({}, {}, {}) if path is None else content_of(path, name) for path in (reference, other)]
+    return content_difference(name, *contents)
+
+
+def content_difference(name: str, reference: Content, other: Content) -> FileDifference:
+    """Compare two contents.
+
+    Args:
+        name: of the file.
+        reference: the first.
+        other: the second.
+    """
+    one, two = reference.numbers, other.numbers
+    scales = _scales(one, two)
+    numbers = [
+        NumberDifference(name, key, one.get(key), two.get(key), *sigma_of(one, two, key), scales.get(_sort(key), 0.0))
+        for key in dict.fromkeys((*one, *two))
+        if not (key in one and key in two and _same(one[key], two[key]))
+    ]
+    pairs = {key: (reference.arrays.get(key), other.arrays.get(key)) for key in (*reference.arrays, *other.arrays)}
+    arrays = [off for key, pair in pairs.items() if (off := array_difference(name, key, *pair)) is not None]
+    here, there = reference.statements, other.statements
+    statements = [
+        NumberDifference(name, key, here.get(key), there.get(key))
+        for key in dict.fromkeys((*here, *there))
+        if here.get(key) != there.get(key)
+    ]
+    common = (len(one.keys() & two.keys()), len(reference.arrays.keys() & other.arrays.keys()))
+    return FileDifference(name, tuple(numbers), tuple(arrays), tuple(statements), *common, reference.drawn)
+
+
+def array_difference(file: str, name: str, here: np.ndarray | None, there: np.ndarray | None) -> ArrayDifference | None:
+    """Compare two arrays; None where they are the same to the bit.
+
+    Args:
+        file: that they are in.
+        name: of both.
+        here: the first, of any shape; None where there is none.
+        there: the second.
+    """
+    if here is None or there is None or here.shape != there.shape:
+        first, second = (None if array is None else array.shape for array in (here, there))
+        return ArrayDifference(file, name, first, second)
+    numeric = all(np.issubdtype(array.dtype, np.number) for array in (here, there))
+    one, two = (array.astype(np.float64 if numeric else str) for array in (here, there))
+    unlike = (one != two) & ~(np.isnan(one) & np.isnan(two)) if numeric else one != two
+    if not unlike.any():
+        return None
+    share = float(unlike.mean())
+    if not numeric:
+        where = tuple(int(k) for k in np.argwhere(unlike)[0])
+        texts = (str(one[where]), str(two[where]))
+        return ArrayDifference(file, name, here.shape, there.shape, share=share, where=where, **_pair(*texts))
+    finite = np.isfinite(one) & np.isfinite(two)
+    delta = np.zeros_like(one)
+    with np.errstate(over="ignore"):  # numbers at the end of the range differ by infinity
+        np.subtract(two, one, out=delta, where=finite)
+    largest = float(np.max(np.abs(delta), initial=0.0))
+    scale = largest if 1e150 < largest < np.inf else 1.0  # whose squares are beyond the range
+    rms = scale * float(np.sqrt(np.mean((delta / scale) ** 2)))
+    peak = float(np.max(np.abs(one), where=np.isfinite(one), initial=0.0))
+    worst = np.where(unlike & ~finite, np.inf, np.abs(delta))
+    where = tuple(int(k) for k in np.unravel_index(int(np.argmax(worst)), worst.shape))
+    values = _pair(one[where].item(), two[where].item())
+    depth = here.dtype.itemsize if here.dtype.kind == "u" else 0
+    return ArrayDifference(file, name, here.shape, there.shape, largest, rms, peak, share, where, depth=depth, **values)
+
+
+def _pair(reference: Leaf, other: Leaf) -> dict[str, Any]:
+    return {"reference": reference, "other": other}
+
+
+def _same_bytes(one: Path, two: Path) -> bool:
+    try:
+        return one.read_bytes() == two.read_bytes()
+    except OSError as error:
+        raise InputError(Issue(f"cannot be read: {error.strerror}", str(error.filename))) from None
+
+
+def ending(name: str) -> str:
+    """Return a file's ending in small letters, without the dot."""
+    return name.rpartition(".")[2].lower()
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a number and no truth value."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _same(here: Any, there: Any) -> bool:
+    both_nan = isinstance(here, float) and isinstance(there, float) and math.isnan(here) and math.isnan(there)
+    return both_nan or (here == there and type(here) is type(there))
+
+
+def is_sigma(key: str) -> bool:
+    """Whether a key holds the standard deviation of another number, or what correcting by it leaves."""
+    last = key.rpartition(".")[2]
+    return last == "sigma" or last.endswith(("_sigma", "_sigma_noise")) or last.startswith(("sigma_", "left_"))
+
+
+def sigma_of(reference: Mapping[str, Leaf], other: Mapping[str, Leaf], key: str) -> tuple[float | None, str]:
+    """Return the sigma of the difference of two numbers and what it is of: of the noise of both runs, from
+    ``x_sigma_noise`` beside them in both runs, else as stated, from ``x_sigma`` or ``sigma``. The error of an
+    estimator by the motions is the same in runs of the same motions, and does not scatter between them.
+
+    Args:
+        reference: key -> value of the first file.
+        other: of the second.
+        key: of the numbers.
+    """
+    head, dot, last = key.rpartition(".")
+    for name in (f"{last}_sigma_noise", f"{last}_sigma", *(("sigma",) if last == "value" else ())):
+        both: list[Any] = [numbers.get(f"{head}{dot}{name}") for numbers in (reference, other)]
+        if all(map(is_number, both)):
+            return math.hypot(*map(float, both)), NOISE if name.endswith(NOISE) else "stated"
+    return None, ""
+
+
+def _sort(key: str) -> str:
+    """Return what numbers of one sort have in common: a table's column; the key's last name that is one, as of Zernike
+    terms by their titles ``zernike_waves``.
+    """
+    if key.startswith("row "):
+        return key.partition(", ")[2]
+    names = _PLACE.sub("", key).split(".")
+    return next((name for name in reversed(names) if name.isidentifier()), key)
+
+
+_PLACE = re.compile(r"\[(?:\[[^\]]*\]|[^\[\]])*\]")
+"""The part of a key after a list's name: the number of an entry, or what distinguishes it."""
+
+
+def _scales(*contents: Mapping[str, Leaf]) -> dict[str, float]:
+    """Return the largest number of each sort, beside which others may be zero but for rounding."""
+    out: dict[str, float] = {}
+    for numbers in contents:
+        for key, value in numbers.items():
+            if isinstance(value, float) and math.isfinite(value):
+                name = _sort(key)
+                out[name] = max(out.get(name, 0.0), abs(value))
+    return out
+
+
+# what is in a file
+
+
+def content_of(path: Path, name: str) -> Content:
+    """Read a file by what it is.
+
+    Args:
+        path: the file.
+        name: in the run folder, whose ending says what it is; others are texts.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        content = path.read_bytes()
+        if ending(name) == "json":
+            return plain(parse_json(content.decode("utf-8"), str(path)))
+        return READERS.get(ending(name), _text)(content)
+    except InputError:
+        raise
+    # readers of spoilt files fail in ways that cannot be foreseen
+    except Exception as error:
+        kind = {"nc": "netCDF"}.get(ending(name), ending(name).upper())
+        problem = f"cannot be read as a {kind} file: {why_unreadable(error)}"
+        raise InputError(Issue(problem, str(path), allowed="the file as the run wrote it")) from None
+
+
+def plain(data: Any) -> Content:
+    """Content of nested plain data."""
+    statements = {key: data[key] for key in STATEMENTS if key in data} if isinstance(data, Mapping) else {}
+    rest = {key: value for key, value in data.items() if key not in statements} if isinstance(data, Mapping) else data
+    values = dict(leaves(rest))
+    arrays = {key: value for key, value in values.items() if isinstance(value, np.ndarray)}
+    return Content({key: value for key, value in values.items() if key not in arrays}, arrays, statements)
+
+
+def leaves(data: Any, key: str = "", series: bool = True) -> Iterator[tuple[str, Any]]:
+    """Keys and values of nested data, without those of `LEFT_OUT`.
+
+    Args:
+        data: mappings and lists.
+        key: of it; keys of what is in it follow.
+        series: whether long lists of numbers come whole, as arrays.
+    """
+    if isinstance(data, Mapping):
+        for name, value in data.items():
+            if name not in LEFT_OUT:
+                yield from leaves(value, f"{key}.{name}" if key else str(name), series)
+    elif isinstance(data, list):
+        if series and len(data) > _SERIES and (array := _as_array(data)) is not None:
+            yield key, array
+            return
+        names = _entry_names(data)
+        for k, value in enumerate(data):
+            yield from leaves(value, f"{key}[{names[k]}]", series)
+    else:
+        yield key, data
+
+
+def _as_array(data: Sequence[Any]) -> np.ndarray | None:
+    try:
+        return np.asarray([[math.nan] if value is None else value for value in data], dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+
+
+def _entry_names(data: Sequence[Any]) -> list[str]:
+    """Names that tell the entries of a list apart, so that an entry that is put in moves no other."""
+    for name in NAMES:
+        labels = [str(entry[name]) for entry in data if isinstance(entry, Mapping) and name in entry]
+        if len(labels) == len(data) and len(set(labels)) == len(labels):
+            return labels
+    return [str(k) for k in range(len(data))]
+
+
+def _yaml(content: bytes) -> Content:
+    """Comments, layout and the choice of units are the user's, and not the run's."""
+    file = parse_yaml(content.decode("utf-8"))
+    kind = kind_of(file.data)
+    if kind is not None:
+        with suppress(InputError):  # a config.yaml holds such a file under a key
+            return plain(validate(kind.model, file).plain())
+    return plain(file.data)
+
+
+def _csv(content: bytes) -> Content:
+    rows = list(csv.reader(io.StringIO(content.decode("utf-8"))))
+    heads = rows[0] if rows else []
+    cells = {
+        f"row {k}, {heads[c] if c < len(heads) else c + 1}": _cell(cell)
+        for k, row in enumerate(rows[1:], 2)
+        for c, cell in enumerate(row)
+    }
+    return Content({**{f"head {c + 1}": head for c, head in enumerate(heads)}, **cells}, {}, {})
+
+
+def _cell(text: str) -> Leaf:
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+def _netcdf(content: bytes) -> Content:
+    data = read_netcdf(content)
+    arrays = {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
+    attributes = {name: value for name, value in data.attrs.items() if isinstance(value, str | float)}
+    numbers = {f"attribute {name}": value for name, value in attributes.items() if name not in LEFT_OUT}
+    return Content(numbers, arrays, {})
+
+
+def _tiff(content: bytes) -> Content:
+    return Content({}, {"": np.asarray(tifffile.imread(io.BytesIO(content)))}, {})
+
+
+def _fits(content: bytes) -> Content:
+    from astropy.io import fits
+
+    arrays: dict[str, np.ndarray] = {}
+    with fits.open(io.BytesIO(content)) as units:
+        for k, unit in enumerate(units):
+            name, columns = unit.name or f"unit {k}", () if unit.data is None else unit.data.dtype.names
+            if columns is None:
+                arrays[name] = np.asarray(unit.data)
+            else:
+                arrays |= {f"{name} {column}": np.asarray(unit.data[column]) for column in columns}
+    return Content({}, arrays, {})
+
+
+def _parquet(content: bytes) -> Content:
+    import pandas as pd
+
+    table = pd.read_parquet(io.BytesIO(content))
+    return Content({}, {str(name): table[name].to_numpy() for name in table.columns}, {})
+
+
+def _png(content: bytes) -> Content:
+    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ValueError("no PNG")
+    return Content({}, {"": pixels}, {}, drawn=True)
+
+
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_IDENTIFIER = re.compile(r"""(\bid="|url\(#|href="#)[^")]*""")
+"""Identifiers of an SVG are checksums of what they name."""
+
+
+def _text(content: bytes, drawn: bool = False) -> Content:
+    """Words and numbers of a text; of anything else the bytes."""
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        return Content({}, {"bytes": np.frombuffer(content, np.uint8)}, {})
+    numbers = np.array([float(number) for number in _NUMBER.findall(text)])
+    return Content({"text": _NUMBER.sub("#", text)}, {"numbers": numbers}, {}, drawn)
+
+
+def _drawing(content: bytes) -> Content:
+    return _text(_IDENTIFIER.sub(r"\1", content.decode("utf-8")).encode(), drawn=True)
+
+
+def _scene(content: bytes) -> Content:
+    """The JSON of a GLB, and the numbers of its geometry."""
+    length = struct.unpack_from("<I", content, 12)[0]
+    scene = plain(json.loads(content[20 : 20 + length]))
+    binary = content[20 + length + 8 :]
+    geometry = np.frombuffer(binary, "<f4", len(binary) // 4)
+    return Content(scene.numbers, {**scene.arrays, "geometry": geometry}, {}, drawn=True)
+
+
+READERS: dict[str, Callable[[bytes], Content]] = {
+    "yaml": _yaml,
+    "csv": _csv,
+    "nc": _netcdf,
+    "tiff": _tiff,
+    "tif": _tiff,
+    "fits": _fits,
+    "parquet": _parquet,
+    "png": _png,
+    "svg": _drawing,
+    "glb": _scene,
+}
+"""Ending of a file -> what reads it."""

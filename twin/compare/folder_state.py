@@ -1,0 +1,188 @@
+"""A run folder against its manifest, and the machine and program that made it against those here."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from scenes.yaml.errors import InputError, Issue
+from twin.run import run_folder
+from twin.run.owned_files import MANIFEST, PARTIAL, STUDY_LOCK, STUDY_STATE, digest, every_file
+from twin.run.provenance import Provenance
+from twin.run.run_folder import Manifest
+from twin.study.runs.chunk_store import FOLDER, examined
+from twin.study.runs.study_folder import PROGRAM as STUDY
+
+
+@dataclass(frozen=True)
+class FolderState:
+    """A run folder against its manifest.
+
+    Attributes:
+        folder: of the run.
+        manifest: of the run.
+        changed: files that are not as the run wrote them.
+        missing: files of the run that are gone.
+        additional: files that the run did not write.
+        inputs_changed: files outside the folder that the run read and that hold something else now.
+        inputs_gone: those that are not there any more.
+    """
+
+    folder: Path
+    manifest: Manifest
+    changed: tuple[str, ...]
+    missing: tuple[str, ...]
+    additional: tuple[str, ...]
+    inputs_changed: tuple[str, ...]
+    inputs_gone: tuple[str, ...]
+
+    @property
+    def whole(self) -> bool:
+        """Whether the folder holds what the run left, and nothing else."""
+        return not (self.changed or self.missing or self.additional)
+
+    @property
+    def sealed(self) -> bool:
+        """Whether the manifest has a checksum of itself; one that says where it was made has."""
+        return self.manifest.digest is not None or self.manifest.provenance is not None
+
+    @property
+    def is_study(self) -> bool:
+        """Whether it is of a study's runs, which has chunks."""
+        return self.manifest.program == STUDY and not self.manifest.gradient
+
+
+def folder_state(folder: Path) -> FolderState:
+    """Look at every file of a run folder.
+
+    Raises:
+        InputError: it is none, or the run in it is not finished.
+    """
+    manifest = _manifest(folder)
+    content = (folder / MANIFEST).read_bytes()
+    written = json.loads(content)
+    try:
+        wrong = run_folder.altered(folder, manifest)
+    except OSError as error:
+        raise InputError(Issue(f"cannot be read: {error.strerror}", str(error.filename or folder))) from None
+    inputs = {name: _as_read(Path(name), known) for name, known in manifest.inputs.items()}
+    changed, gone = (tuple(name for name, now in inputs.items() if now == what) for what in ("changed", "gone"))
+    state = FolderState(folder, manifest, (), (), (), changed, gone)
+    whole = manifest.digest == run_folder.seal(written) and content == run_folder.json_text(written).encode()
+    if state.sealed and not whole:
+        wrong.append(MANIFEST)
+    known = {MANIFEST, *manifest.sha256}
+    if state.is_study:
+        chunks = examined(folder)
+        wrong += chunks.damaged
+        known |= {name for name in every_file(folder) if name.startswith(f"{FOLDER}/")} - set(chunks.unlisted)
+        if not chunks.damaged and sum(chunk.runs for chunk in chunks.whole) != manifest.runs:
+            wrong.append(f"{FOLDER}/index.txt")
+        if (folder / STUDY_LOCK).exists():
+            known.add(STUDY_LOCK)
+            wrong += [STUDY_LOCK] if (folder / STUDY_LOCK).stat().st_size else []
+    missing = {name for name in wrong if not os.path.lexists(folder / name)}
+    additional = tuple(name for name in every_file(folder) if name not in known)
+    return replace(
+        state, changed=tuple(sorted({*wrong} - missing)), missing=tuple(sorted(missing)), additional=additional
+    )
+
+
+def _as_read(place: Path, known: str) -> str:
+    """Return whether an input is gone or changed; empty where it is as the run read it."""
+    if not place.is_file():
+        return "gone"
+    try:
+        return "" if digest(place) == known else "changed"
+    except OSError:
+        return "changed"
+
+
+def _manifest(folder: Path) -> Manifest:
+    """Return the manifest of a finished run.
+
+    Raises:
+        InputError: there is none, with what the folder is instead.
+    """
+    manifest = run_folder.read_manifest(folder)
+    if manifest is not None:
+        return manifest
+    remedy = "the folder of a finished run, as a command of the twin leaves it"
+    broken = folder.name.startswith(".") and folder.name.endswith(f".{PARTIAL}")
+    if not folder.is_dir():
+        issue = Issue("is not a folder" if folder.exists() else "no such folder", str(folder), allowed=remedy)
+    elif (folder / MANIFEST).exists():
+        text = "is not the manifest of a run, or is damaged: nothing tells what the folder held"
+        issue = Issue(text, str(folder / MANIFEST), allowed="a copy of it, or the run made again")
+    elif (folder / STUDY_STATE).exists():
+        allowed = "the same twin.study command with --resume, then verify it"
+        issue = Issue("a study that is not finished", str(folder), allowed=allowed)
+    elif broken:
+        text = "a run that was broken off, or is still being written"
+        issue = Issue(text, str(folder), allowed="the run folder that its command names when it ends")
+    else:
+        issue = Issue(f"not a run folder: it has no {MANIFEST} of a run", str(folder), allowed=remedy)
+    raise InputError(issue)
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Differences between where a run was made and where it was repeated.
+
+    Attributes:
+        program: the source, or packages: other numbers may be meant.
+        processor: what rounds otherwise, and nothing more: processor, linear algebra, C library.
+        known: whether the manifest says where the run was made.
+    """
+
+    program: tuple[str, ...]
+    processor: tuple[str, ...]
+    known: bool
+
+
+def elsewhere(manifest: Manifest, here: Provenance | None, now: Mapping[str, str]) -> Elsewhere:
+    """Compare where a run was made with where it was repeated.
+
+    Args:
+        manifest: of the run.
+        here: where it was repeated.
+        now: versions that repeated it.
+    """
+    program, made = _changes(manifest.versions, now), manifest.provenance
+    if made is None or here is None:
+        return Elsewhere((*program,), (), False)
+    program = [*_changes({"source": made.source[:12]}, {"source": here.source[:12]}), *program]
+    program += _changes(made.packages, here.packages)
+    kernels, others = _kernels(made), _kernels(here)
+    common = kernels.keys() & others.keys()
+    processor = _changes(_machine(made), _machine(here))
+    processor += [
+        f"{library} with kernels for {kernels[library]} then, {others[library]} now"
+        for library in sorted(common)
+        if kernels[library] != others[library]
+    ]
+    return Elsewhere((*program,), (*processor,), True)
+
+
+def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    names = [name for name in sorted({*then, *now}) if then.get(name) != now.get(name)]
+    return [f"{name} {then.get(name, 'none')} then, {now.get(name, 'none')} now" for name in names]
+
+
+def _machine(where: Provenance) -> dict[str, str]:
+    """Return what rounds numbers but for kernels; no number depends on how many threads there are."""
+    settings = [f"{key}={value}" for key, value in where.settings.items() if not key.endswith("THREADS")]
+    return {
+        "processor": where.processor,
+        "instructions": ", ".join(where.simd) or "none",
+        "C library": where.libc,
+        "settings": ", ".join(settings) or "none",
+    }
+
+
+def _kernels(where: Provenance) -> dict[str, str]:
+    """Library of linear algebra -> processor that its sums are for."""
+    return {f"{one.name} {one.version}": one.kernels for one in where.blas}
