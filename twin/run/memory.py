@@ -1,8 +1,8 @@
 """Memory that a command may take, and the refusal of a job that needs more before anything of it is computed.
 
-A job that can need more than 2 GiB is estimated when it starts, from its numbers of pixels, frames, rays, points and runs
-alone (`require_memory`, `twin.monitor.monitor_memory`). Estimates are of the largest resident memory above that of the
-started program, and within a factor of 1.5 of what is used (tests/limits).
+A job that can need more than 2 GiB is estimated when it starts, from its numbers of pixels, frames, rays, points and
+runs alone (`require_memory`, `twin.monitor.monitor_memory`). Estimates are of the largest resident memory above that of
+the started program, and within a factor of 1.5 of what is used (tests/limits).
 """
 
 from __future__ import annotations
@@ -195,11 +195,9 @@ def require_memory(
     if need <= room:
         return
     most = largest(lambda number: started + lower.bytes(number) <= room, lower.number, lower.least - 1)
-    more = (
-        f"a larger {own_key}"
-        if own < free
-        else f"more memory (the environment variable {LIMIT}, as 8 GB, says how much may be taken)"
-    )
+    more = f"more memory (the environment variable {LIMIT}, as 8 GB, says how much may be taken)"
+    if own < free:
+        more = f"a larger {own_key}"
     raise lower.owner.error(
         f"this needs about {amount_text(need)} of memory,{f' {of_it},' if of_it else ''} and "
         f"{amount_text(min(own, free))} may be taken",

@@ -185,7 +185,7 @@ def fly_patch(
 class _Size:
     """The lines and pixels of a patch, which stand in a file that is not known here."""
 
-    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> PatchError:  # noqa: ARG002
+    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> PatchError:
         return PatchError(f"{problem}; {found} lines or pixels, allowed: {allowed}", "size")
 
 
