@@ -162,11 +162,7 @@ BEYOND: dict[str, tuple[str, str, str, str]] = {
     "lab focus": (f"{LAB}/focus.yaml", "frames: 4\n>frames: 9000\n|region: 64>region: 256", "frames", "frames"),
     "lab distortion": (f"{LAB}/distortion.yaml", "points: 55 >points: 900 |sets: 10 >sets: 900 ", "sets", "sets"),
     "orbit adjust": (f"{ORBIT}/adjust.yaml", "tie: 120>tie: 900000", "points.tie", "tie points"),
-    "orbit calibrate": (
-        f"{ORBIT}/calibrate_images.yaml",
-        "  lines: 400>  lines: 9000|  pixels: 400>  pixels: 8000",
-        *("images.patches", "lines and pixels"),
-    ),
+    "orbit calibrate": (f"{ORBIT}/calibrate_strip.yaml", "ties: 300>ties: 5000", "strip.ties", "tie points"),
     "orbit simulate": (
         f"{ORBIT}/simulate.yaml",
         "lines: 1000, pixels: 1000>lines: 9000, pixels: 9000",
