@@ -165,7 +165,7 @@ BEYOND: dict[str, tuple[str, str, str, str]] = {
     "orbit calibrate": (f"{ORBIT}/calibrate_strip.yaml", "ties: 300>ties: 5000", "strip.ties", "tie points"),
     "orbit simulate": (
         f"{ORBIT}/simulate.yaml",
-        "lines: 1000, pixels: 1000>lines: 9000, pixels: 9000",
+        "lines: 1000, pixels: 1000>lines: 5000, pixels: 5000",
         *("patch", "lines and pixels"),
     ),
     "tolerance": (f"{EXAMPLES.name}/tolerance_gf7.yaml", "samples: 1000>samples: 9000000", "samples", "samples"),

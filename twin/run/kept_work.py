@@ -52,8 +52,10 @@ class KeptWork:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Let others use the folder."""
+        """Let others use the folder; one that nothing was kept in yet, when a bad file was told, goes."""
         if self._lock is not None:
+            if kind is not None and self._place and owned_files.every_file(self._place) == [owned_files.STUDY_LOCK]:
+                self.finish()
             self._lock.close()
 
     def begin(self) -> Path:
