@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 LARGEST_GROUND = 40_000.0
 """Metres: side of the ground of one patch; against input that asks for more than the memory holds."""
-_PIXEL, _SAMPLE = 150.0, 97.0
+_PIXEL, _SAMPLE = 150.0, 47.0
 """Bytes per pixel of the image of a line, and per sample of the ground's texture."""
 
 
