@@ -18,12 +18,10 @@ from scenes.yaml.named import Named
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.run import cli
 from twin.run.command import Result, run_command
-from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.resolved import ResolvedJob
-    from twin.run.cost import Cost
 
 RESOLVE = Named("scenes.specs.resolved:resolve")
 
@@ -112,16 +110,11 @@ def main(
 
         return run_render(resolved, session, frames, seed, picture)
 
-    def cost(resolved: ResolvedJob) -> Cost:
-        model: Cost = MODELS["render"](resolved, frames)
-        return model
-
     run_command(
         job.stem,
         cli.Options(out, seed, backend, force, as_json, quiet, strict=strict),
         lambda: read_for("twin.render", job, RESOLVE),
         work,
-        cost,
     )
 
 

@@ -142,8 +142,6 @@ def _run(
     errors: Console,
 ) -> Validation:
     from optics.numerics.backend import load_backend
-    from twin.run.command import tell_cost
-    from twin.run.command_costs import MODELS
     from twin.run.provenance import program_digest
     from twin.validation.runner import rough_seconds, run_checks
     from twin.validation.validation_report import write_validation
@@ -158,7 +156,8 @@ def _run(
     tracer = load_backend(backend)
     program_digest()  # of the files that compute, which may be others when the checks end
     total = rough_seconds(selections, fast)
-    tell_cost(MODELS["validate"](selections, fast), errors, quiet=False)
+    if total > cli.LONG:
+        errors.print(f"note: this takes about {cli.time_text(total)}", highlight=False)
     with Progress(*columns, console=errors, disable=not errors.is_terminal, transient=True) as bar:
         task = bar.add_task("start", total=total)
 

@@ -17,17 +17,6 @@ from scenes.yaml.named import Named
 
 
 @dataclass(frozen=True)
-class Brief:
-    """Why a command takes little memory and time whatever its file says: nothing is said of it beforehand.
-
-    Attributes:
-        reason: a sentence, for people.
-    """
-
-    reason: str
-
-
-@dataclass(frozen=True)
 class Procedure:
     """A test, of whose run a command makes a report and a study takes the numbers.
 
@@ -42,8 +31,6 @@ class Procedure:
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
         report: run -> `twin.run.report.Report`.
         export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
-        cost: set-up -> `twin.run.cost.Cost`, what a run takes of memory and time; of a test that never takes much
-            `Brief`, with the reason.
         files: kinds of file that it reads; their command is known from the list.
         varied: whether a study can vary it.
         judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
@@ -59,7 +46,6 @@ class Procedure:
     numbers: Any
     report: Any
     export: Any = None
-    cost: Any = None
     files: tuple[FileKind, ...] = ()
     varied: bool = False
     judged: bool = True
@@ -69,7 +55,7 @@ class Procedure:
 
     def __post_init__(self) -> None:
         """Functions that are given by name are imported when they are called."""
-        for name in ("resolve", "run", "numbers", "report", "export", "cost"):
+        for name in ("resolve", "run", "numbers", "report", "export"):
             if isinstance(path := getattr(self, name), str):
                 object.__setattr__(self, name, Named(path))
 
@@ -99,7 +85,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.resolved:resolve_focus_test",
         run="twin.laboratory.focus_run:run_focus",
         numbers="twin.laboratory.focus_numbers:focus_numbers",
-        cost="twin.laboratory.laboratory_cost:focus_cost",
         report="twin.laboratory.focus_report:focus_report",
         export="twin.laboratory.export:export_focus",
         files=(
@@ -128,7 +113,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.resolved:resolve_distortion_test",
         run="twin.laboratory.distortion_run:run_distortion",
         numbers="twin.laboratory.distortion_numbers:DISTORTION",
-        cost="twin.laboratory.laboratory_cost:distortion_cost",
         report="twin.laboratory.distortion_report:distortion_report",
         export="twin.laboratory.export:export_distortion",
         files=(
@@ -163,7 +147,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.resolved:resolve_turntable_test",
         run="twin.laboratory.turntable_run:run_turntable_test",
         numbers="twin.laboratory.turntable_numbers:TURNTABLE",
-        cost="twin.laboratory.laboratory_cost:turntable_cost",
         report="twin.laboratory.turntable_report:turntable_report",
         export="twin.laboratory.export:export_turntable",
         files=(
@@ -193,7 +176,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.adjust_setup:resolve_any_adjust",
         run="twin.operate.operated_block:run_operated_block",
         numbers="twin.orbit.block.block_numbers:BLOCK",
-        cost="twin.orbit.block.block_cost:block_cost",
         report="twin.orbit.block.block_report:block_report",
         files=(
             FileKind(
@@ -229,7 +211,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_any_angle",
         run="twin.orbit.angle.measured_angle:run_angle_test",
         numbers="twin.orbit.angle.angle_numbers:angle_numbers",
-        cost="twin.orbit.angle.angle_cost:angle_cost",
         report="twin.orbit.angle.angle_report:angle_report",
         export="twin.orbit.angle.measured_angle:angle_exported",
         files=(
@@ -267,7 +248,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_any_calibration",
         run="twin.orbit.calibration.calibration_run:run_calibration",
         numbers="twin.orbit.calibration.calibration_numbers:CALIBRATION",
-        cost="twin.orbit.calibration.calibration_cost:calibration_cost",
         report="twin.orbit.calibration.calibration_report:calibration_report",
         export="twin.orbit.calibration.calibration_export:exported",
         files=(
@@ -304,7 +284,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_check",
         run="twin.orbit.conventions.check_run:run_check",
         numbers="twin.orbit.conventions.check_numbers:CHECK",
-        cost="twin.orbit.conventions.check_cost:check_cost",
         report="twin.orbit.conventions.check_report:check_report",
         export="twin.orbit.conventions.check_run:exported",
         files=(
@@ -336,7 +315,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_any_jitter",
         run="twin.orbit.jitter.jitter_run:run_jitter",
         numbers="twin.orbit.jitter.jitter_numbers:JITTER",
-        cost="twin.orbit.jitter.jitter_cost:jitter_cost",
         report="twin.orbit.jitter.jitter_report:jitter_report",
         export="twin.orbit.jitter.jitter_run:exported",
         files=(
@@ -374,7 +352,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_match",
         run="twin.orbit.matching.match_run:run_match",
         numbers="twin.orbit.matching.match_run:MATCH",
-        cost="twin.orbit.matching.match_cost:match_cost",
         report="twin.orbit.matching.match_report:match_report",
         export="twin.orbit.matching.match_run:exported",
         files=(
@@ -403,7 +380,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.orbit.setup:resolve_monitor",
         run="twin.orbit.monitoring.monitoring_run:run_monitor",
         numbers="twin.orbit.monitoring.monitoring_numbers:monitor_numbers",
-        cost=Brief("A reading takes half a second at most; more memory than there is the monitor itself refuses."),
         report="twin.orbit.monitoring.monitoring_report:monitor_report",
         files=(
             FileKind(
@@ -433,7 +409,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.orbit.setup:resolve_simulate",
         run="twin.orbit.images.simulate_run:run_simulation",
         numbers="twin.orbit.images.simulate_numbers:SIMULATE",
-        cost="twin.orbit.images.simulate_cost:simulation_cost",
         report="twin.orbit.images.simulate_report:simulation_report",
         export="twin.orbit.calibration.calibration_export:simulation_exported",
         files=(
@@ -461,7 +436,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.models.camera_design:resolve_design",
         run="twin.design.design_run:run_design",
         numbers="twin.design.design_run:DESIGN",
-        cost="twin.design.design_cost:camera_design_cost",
         report="twin.design.design_report:design_report",
         files=(
             FileKind(
@@ -491,7 +465,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.models.monitor_layout:resolve_monitor_design",
         run="twin.design.monitor_design:run_monitor_design",
         numbers="twin.design.monitor_design:LAYOUTS",
-        cost="twin.design.design_cost:monitor_design_cost",
         report="twin.design.monitor_report:monitor_design_report",
         files=(
             FileKind(
@@ -509,7 +482,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.asbuilt:resolve_asbuilt",
         run="twin.asbuilt.asbuilt_run:run_asbuilt",
         numbers="twin.asbuilt.asbuilt_run:ASBUILT",
-        cost="twin.asbuilt.asbuilt_cost:asbuilt_cost",
         report="twin.asbuilt.asbuilt_report:asbuilt_report",
         files=(
             FileKind(
@@ -537,7 +509,6 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.asbuilt:resolve_asbuilt",
         run="twin.asbuilt.orientation_check:run_check",
         numbers="twin.asbuilt.orientation_check:ORIENTATION",
-        cost=Brief("Sixteen readings of each wavefront, of which there are two hundred at most, are compared."),
         report="twin.asbuilt.orientation_check:check_report",
         judged=False,
         about="""

@@ -1,9 +1,8 @@
 """``python -m tests.limits.measured COMMAND ARGUMENTS``: a command in a process of its own, and what it took.
 
 The last line of stdout is JSON: exit code, seconds of the processor (also those of processes that it started and
-waited for, by themselves) and of the clock, bytes at most above those of the imported program, bytes that a monitor's
-job was estimated to take, bytes and seconds of one core that the command was said to take before it started (0 where
-nothing was), by the mean of the machine's paces before and after it, and these paces.
+waited for, by themselves) and of the clock, bytes at most above those of the imported program, and bytes that a
+monitor's job was estimated to take (0 where nothing was).
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import resource
 import sys
 import time
 from pathlib import Path
-from statistics import mean
 from typing import Any
 
 BEFORE = {"twin.render": "twin.main_job.render_command", "twin.study": "twin.study.study_command"}
@@ -30,7 +28,6 @@ def resident(what: str) -> int:
 def taken(command: str, arguments: list[str]) -> dict[str, Any]:
     """What the command takes."""
     from twin.monitor.monitor_memory import MonitorSize
-    from twin.run import cost
 
     app = importlib.import_module(command if command != "twin.study" else "twin.study.__main__").app
     if command in BEFORE:
@@ -42,14 +39,6 @@ def taken(command: str, arguments: list[str]) -> dict[str, Any]:
         return estimates[-1]
 
     MonitorSize.bytes = remembered  # type: ignore[method-assign]
-    said, required = [cost.Cost(0.0, 0.0)], cost.require_memory
-
-    def checked(asked: cost.Cost) -> None:
-        said.append(asked)
-        required(asked)
-
-    cost.require_memory = checked
-    paces = [cost.pace()]
     start, clock, processor = resident("VmRSS"), time.monotonic(), time.process_time()
     code: Any = 0
     try:
@@ -64,10 +53,7 @@ def taken(command: str, arguments: list[str]) -> dict[str, Any]:
     seconds = {"clock": time.monotonic() - clock, "processor": time.process_time() - processor}
     seconds["others"] = others.ru_utime + others.ru_stime
     used = resident("VmHWM") - start
-    # a machine that others use as well changes its pace meanwhile
-    paces.append(cost.pace())
-    told = {"told_bytes": said[-1].bytes, "told_seconds": said[-1].seconds * mean(paces), "paces": paces}
-    return {"code": code, **seconds, "used": used, "estimated": estimates[-1], **told}
+    return {"code": code, **seconds, "used": used, "estimated": estimates[-1]}
 
 
 if __name__ == "__main__":

@@ -1,24 +1,31 @@
-"""Memory is estimated before anything is computed: what does not fit is refused with the number that does."""
+"""Memory is estimated before anything is computed: what does not fit is refused with the number that does; from the
+command line at file, line and key.
+"""
 
 from __future__ import annotations
 
+import importlib
 import math
 import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import tifffile
 
 from optics.numerics.backend import Backend
-from scenes.specs.load import EXAMPLES
+from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.limits.extremes import STUDIES_BEYOND, Extreme
+from tests.twin.commands import files, invoke
 from twin.main_job.render_job import render_job
 from twin.monitor import monitor_memory
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import MonitorSize, require_memory
-from twin.run import cost, memory
+from twin.run import memory
+from twin.run.console import PROGRAMS
 from twin.run.memory import LIMIT, amount_text, free_memory, largest
 from twin.sensors.area_detector import ReadNoise
 from twin.study.runs.plan import require_study_memory, study_bytes
@@ -69,8 +76,8 @@ def experiment(backend: Backend) -> MonitorExperiment:
 @pytest.fixture
 def nothing_is_ordinary(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small jobs are refused, too."""
-    for module in (cost, monitor_memory):
-        monkeypatch.setattr(module, "ORDINARY", 0.0)
+    monkeypatch.setattr(memory, "ORDINARY", 0.0)
+    monkeypatch.setattr(memory, "taken_already", lambda: 0.0)
 
 
 @pytest.mark.usefixtures("nothing_is_ordinary")
@@ -84,7 +91,6 @@ def nothing_is_ordinary(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_what_would_fit_is_told(changes, key, unit, experiment, monkeypatch) -> None:
     """The number that is told fits, and the next one does not."""
-    monkeypatch.setattr(monitor_memory, "taken_already", lambda: 0.0)
     resolved, detector = experiment.resolved, replace(experiment.detector, noise=(ReadNoise(1.0),))
     size = replace(experiment.size(), **changes)
     limit = f"{0.5e-6 * (size.bytes(detector) + experiment.size().bytes(detector)):.0f} MB"
@@ -107,7 +113,6 @@ def test_what_would_fit_is_told(changes, key, unit, experiment, monkeypatch) -> 
 @pytest.mark.usefixtures("nothing_is_ordinary")
 def test_frames_are_counted_before_anything_is_rendered(experiment, backend, monkeypatch) -> None:
     monkeypatch.setenv(LIMIT, "350 MB")
-    monkeypatch.setattr(monitor_memory, "taken_already", lambda: 0.0)
     done: list[str] = []
     monkeypatch.setattr(experiment, "detector", replace(experiment.detector, noise=(ReadNoise(1.0),)))
     with pytest.raises(InputError, match="10000 frames of area CCDs") as caught:
@@ -139,6 +144,7 @@ def test_a_large_ccd_is_refused_wherever_an_instrument_is_used(tmp_path, backend
 
 def test_runs_of_a_study_are_counted(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv(LIMIT, "1 GB")
+    monkeypatch.setattr(memory, "taken_already", lambda: 0.0)
     setup = resolve_study(STUDIES_BEYOND["ten million runs"].write(tmp_path))
     with pytest.raises(InputError, match=r"this needs about [\d.]+ GB of memory, and 1 GB may be taken") as caught:
         require_study_memory(setup)
@@ -150,3 +156,80 @@ def test_runs_of_a_study_are_counted(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv(LIMIT, "900 GB")
     with pytest.raises(InputError, match=r"4 GB may be taken; .*, or a larger limits\.memory"):
         require_study_memory(setup)
+
+
+BEYOND: dict[str, tuple[str, str, str, str]] = {
+    "lab focus": (f"{LAB}/focus.yaml", "frames: 4\n>frames: 9000\n|region: 64>region: 256", "frames", "frames"),
+    "lab distortion": (f"{LAB}/distortion.yaml", "points: 55 >points: 900 |sets: 10 >sets: 900 ", "sets", "sets"),
+    "orbit adjust": (f"{ORBIT}/adjust.yaml", "tie: 120>tie: 900000", "points.tie", "tie points"),
+    "orbit calibrate": (f"{ORBIT}/calibrate_strip.yaml", "ties: 300>ties: 5000", "strip.ties", "tie points"),
+    "orbit simulate": (
+        f"{ORBIT}/simulate.yaml",
+        "lines: 1000, pixels: 1000>lines: 5000, pixels: 5000",
+        *("patch", "lines and pixels"),
+    ),
+    "tolerance": (f"{EXAMPLES.name}/tolerance_gf7.yaml", "samples: 1000>samples: 9000000", "samples", "samples"),
+    "asbuilt estimate": (
+        f"{EXAMPLES.name}/asbuilt_gf7.yaml",
+        "prior: assembled>draws: 99000\nprior: assembled",
+        *("draws", "draws"),
+    ),
+}
+"""Command -> a file of ``scenes``, what stands there for what, the key that is named then, and the number's unit."""
+
+
+def check_refused(done: object, file: Path | None, key: str, unit: str, folder: Path) -> None:
+    """Exit code 2 with file, line, key and the number that fits; nothing was written."""
+    assert done.exit_code == 2, done.output  # type: ignore[attr-defined]
+    said = " ".join(done.stderr.split())  # type: ignore[attr-defined]
+    assert re.search(rf"{re.escape(key)}: .*this needs about [\d.]+ GB of memory, and 1 GB may be taken", said), said
+    assert re.search(rf"allowed: at most \d+ {unit}, or more memory", said), said
+    if file is not None:
+        assert re.search(rf"{re.escape(file.name)}:\d+: {re.escape(key)}", said), said
+    assert files(folder) == ({file.name} if file is not None else set())
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_more_memory_than_there_is_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place, edits, key, unit = BEYOND[name]
+    text = (SCENES / place).read_text("utf-8")
+    for old, new in (edit.split(">") for edit in edits.split("|")):
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    file = tmp_path / "test.yaml"
+    file.write_text(text, "utf-8")
+    monkeypatch.setenv(LIMIT, "1 GB")
+    program, _, command = name.partition(" ")
+    module = PROGRAMS[program][0]
+    app = importlib.import_module(module if module == "twin.lab" else f"{module}.__main__").app
+    done = invoke(app, *([command] if command else []), file, "--out", tmp_path / "run")
+    check_refused(done, file, key, unit, tmp_path)
+
+
+def test_a_long_life_is_refused_by_its_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from twin.operate.__main__ import app
+
+    monkeypatch.setenv(LIMIT, "1 GB")
+    words = ("--from", "2027-01-01T00:00:00Z", "--days", "4000", "--every", "1h")
+    done = invoke(app, "simulate", EXAMPLES / "operation.yaml", *words, "--out", tmp_path / "run")
+    check_refused(done, None, "--every", "readings", tmp_path)
+
+
+def test_a_long_series_of_frames_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the headers of the files, before any frame is read."""
+    from twin.recover.__main__ import app
+
+    tifffile.imwrite(tmp_path / "frames.tiff", np.zeros((3, 600, 600), np.uint16), photometric="minisblack")
+    times = ", ".join(f"{k} min" for k in range(20))
+    geometry = "{principal_distance: 5.5 m, separation: 0.2 m, pitch: 5 um}"
+    each = f"{{before: frames.tiff, after: [{', '.join(['[frames.tiff]'] * 20)}]}}"
+    file = tmp_path / "measurement.yaml"
+    file.write_text(
+        f"geometry: {{a: {geometry}}}\ndetector: monitor_ccd\nexposure: 10 ms\ntemplate: measured\n"
+        f"times: [{times}]\nframes: {{a/left: {each}, a/right: {each}}}\n",
+        "utf-8",
+    )
+    monkeypatch.setenv(LIMIT, "1 GB")
+    done = invoke(app, file, "--out", tmp_path / "run")
+    (tmp_path / "frames.tiff").unlink()
+    check_refused(done, file, "times", "times", tmp_path)

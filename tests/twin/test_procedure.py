@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from tests.twin.test_blurred_cameras import gf7_with
 from twin.run import cli, reference_frames
 from twin.run.artefact import PngFigure, SvgFigure, Table
 from twin.run.cli import heartbeat
-from twin.run.command import add_test
+from twin.run.command import add_test, progress_shown
 from twin.run.procedure import Advance, BenchError
 from twin.run.quantity import plain_data
 from twin.run.report import Report, Section, answer
@@ -164,7 +165,14 @@ def test_progress_is_told_where_there_is_no_terminal(run: Callable, tmp_path: Pa
     path = tmp_path / "level.yaml"
     path.write_text(FILE, "utf-8")
     measured = LEVEL.run
-    slow = replace(LEVEL, run=lambda *given: (given[3]("read", 2, 5), time.sleep(0.4), measured(*given))[-1])
+
+    def read(*given: Any) -> Any:
+        for done in (0, 2):
+            given[3]("read", done, 5)
+            time.sleep(0.35)
+        return measured(*given)
+
+    slow = replace(LEVEL, run=read)
     monkeypatch.setattr(sys.modules[__name__], "LEVEL", slow)
     said = run("level", path, "--out", tmp_path / "run").stderr.splitlines()
     assert len(said) >= 3
@@ -173,6 +181,19 @@ def test_progress_is_told_where_there_is_no_terminal(run: Callable, tmp_path: Pa
     assert "progress: read: 2 of 5, 0 s so far, about 1 s left" in said
     for option in ("--quiet", "--json"):
         assert run("level", path, "--out", tmp_path / option.strip("-"), option).stderr == ""
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_work_that_takes_long_says_so_once_by_its_first_pieces(silent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(cli, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    said = io.StringIO()
+    with progress_shown(Console(file=said), silent) as advance:
+        for part, first, total in (("passes", 20, 120), ("fit", 0, 10)):
+            for done in range(first, first + 5):
+                advance(part, done, total)
+                now[0] += 4.0
+    assert said.getvalue() == ("" if silent else "note: passes: about 7 min left\n")
 
 
 def test_a_terminal_shows_progress_itself() -> None:

@@ -15,6 +15,7 @@ from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.tolerance import MeritSpec, amount_text
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
 from twin.asbuilt.next_step import Advice, advice
+from twin.run.memory import Lowered, require_memory
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.run.random_streams import stream
@@ -29,6 +30,8 @@ _INSTRUMENT, _POSTERIOR, _PRIOR, _MOVE, _MADE = range(5)
 """Random streams."""
 ALONG = tuple((float(x), 0.0) for x in np.linspace(-1.0, 1.0, 11))
 """Fields over which the wavefront is shown."""
+_DRAW = 7e4
+"""Bytes of a draw, with its states of the prior, of the posterior and after the next move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +101,13 @@ def run_asbuilt(
         advance: shows how far it is.
 
     Raises:
-        InputError: names that do not exist, files without data, or measurements that contradict each other.
+        InputError: names that do not exist, files without data, measurements that contradict each other, or more memory
+            than there is.
     """
     test = setup.test
     seed = test.seed if seed is None else seed
     advance("state", 0, 4)
+    require_memory(Lowered(test, ("draws",), test.draws, "draws", lambda draws: draws * _DRAW, 20))
     bench = AsBuiltBench(setup, backend)
     true = None
     if test.simulate is None:

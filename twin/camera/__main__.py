@@ -107,7 +107,7 @@ def main(
         return finished(session, KIND, shown, CAMERA(run), config=config, program=PROGRAM, again=again)
 
     stem = file.stem if camera is None else f"{file.stem}-{camera}"
-    run_command(stem, Options(out, None, backend, force, as_json, quiet), resolve, work, None)
+    run_command(stem, Options(out, None, backend, force, as_json, quiet), resolve, work)
 
 
 if __name__ == "__main__":

@@ -67,7 +67,7 @@ def main(
         facts = {"config": dump_yaml(config), "again": (PROGRAM, *map(str, runs), *limits), "given": tuple(runs)}
         return finished(session, KIND, report, numbers(comparison), backend="", program=PROGRAM, **facts)
 
-    run_command("compare", Options(out, None, "llvm", force, as_json, quiet), lambda: None, work, None)
+    run_command("compare", Options(out, None, "llvm", force, as_json, quiet), lambda: None, work)
 
 
 if __name__ == "__main__":

@@ -78,7 +78,7 @@ def main(
         return finished(session, KIND, export_report(done), done.numbers(), backend="", program=PROGRAM, **facts)
 
     stem = f"{run.resolve().name}-files"
-    run_command(stem, Options(out, None, "llvm", force, as_json, quiet), read, work, None)
+    run_command(stem, Options(out, None, "llvm", force, as_json, quiet), read, work)
 
 
 if __name__ == "__main__":

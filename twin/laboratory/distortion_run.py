@@ -38,6 +38,7 @@ from twin.laboratory.measured_readings import (
 )
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import usable_fits
+from twin.run.memory import Lowered, require_memory
 from twin.run.procedure import Advance, BenchError, silent
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
@@ -48,6 +49,8 @@ WIDEST = np.radians(40.0)
 """Angle from the middle of the line beyond which a reading is a mistake; the model's tangents end at 45 deg."""
 _EXACT = 1e-9
 """Metres: stands for the noise of the truth, whose estimates do not depend on it."""
+_GREY, _SPOT_PIXEL = 2.0, 33.0
+"""Bytes per pixel of a frame, and of the mean image of a spot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,4 +387,7 @@ def run_distortion(
         advance("read and fit", 0, 1)
         return measure_files(setup.test, seed)
     assert isinstance(setup, DistortionSetup)
+    test = setup.test
+    each = test.points * test.window**2 * (test.frames * _GREY + _SPOT_PIXEL)
+    require_memory(Lowered(test, ("sets",), test.sets, "sets", lambda sets: sets * each))
     return measure(DistortionBench.build(setup, backend, advance), seed, advance)

@@ -18,6 +18,7 @@ from analysis.focal_plane.plane_fit import FocalPlaneFit, LineLevel, Observabili
 from analysis.focal_plane.shims import Mount, ShimError, ShimPlan, shim_plan
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.numerics.backend import Backend
+from optics.numerics.threads import cores
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.targets.target_image import TooNarrowError
@@ -27,12 +28,15 @@ from twin.laboratory import focus_scan
 from twin.laboratory.focus_bench import BudgetLine, FocusBench
 from twin.laboratory.focus_scan import NyquistMtf, Recorder, SiteScan, Standing
 from twin.laboratory.measured_focus import FocusReadings, read_focus
+from twin.run.memory import Lowered, require_memory
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.targets.target_images import TRACK
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)
+_GREY, _EDGE_PIXEL = 2.0, 57.0
+"""Bytes per pixel of a frame that is kept, and of one of an edge while it is exposed and measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,6 +259,7 @@ def run_focus(setup: ExperimentSetup[Any], backend: Backend, seed: int, advance:
         return align_files(setup.test, seed, advance)
     assert isinstance(setup, FocusSetup)
     mount_of(setup.test)
+    _require_memory(setup)
     try:
         bench = FocusBench(setup, backend, advance)
     except TooNarrowError as error:
@@ -263,6 +268,14 @@ def run_focus(setup: ExperimentSetup[Any], backend: Backend, seed: int, advance:
         raise BenchError(str(error), ("as_built",), "a camera whose whole beam gets through") from error
     _check_light(bench)
     return align(bench, seed, advance)
+
+
+def _require_memory(setup: FocusSetup) -> None:
+    """See whether the frames in focus, and those of one edge in each thread, fit into the memory."""
+    test = setup.test
+    series = 2 * test.rounds * len(setup.camera.bands) * len(test.fields)  # of edges in two directions
+    each = test.edge.region**2 * (series * _GREY + cores() * _EDGE_PIXEL)
+    require_memory(Lowered(test, ("frames",), test.frames, "frames", lambda frames: frames * each))
 
 
 def align_files(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silent) -> FocusRun:

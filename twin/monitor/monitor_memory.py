@@ -18,9 +18,9 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.spec import Spec
 from twin.monitor.image_sampling import NodeClasses
-from twin.run.cost import ORDINARY, Lowered, beyond
+from twin.run import memory
 from twin.run.frame_store import IN_MEMORY, kept_bytes
-from twin.run.memory import amount_text, free_memory, taken_already
+from twin.run.memory import STARTED, Lowered, amount_text
 from twin.sensors.area_detector import EmvaDetector
 
 CHUNK = 25
@@ -50,10 +50,6 @@ def pieces(count: int, each: int) -> Iterator[slice]:
         yield slice(start, min(start + size, count))
 
 
-STARTED = 290e6
-"""Memory of a job of any size until its spots are measured, beside the imported program: kernels, their compiler, and
-what the heap keeps of arrays that are freed; bytes.
-"""
 DRAWN = 410e6
 """Memory of a job while it is drawn and written, which is most of the memory of a small one; bytes."""
 _PIXEL = 380.0
@@ -168,13 +164,10 @@ def require_memory(resolved: ResolvedJob, size: MonitorSize, detector: EmvaDetec
     Raises:
         InputError: it does not; at the key of what takes most, with the number that would fit.
     """
-    free, there, need = free_memory(), min(taken_already(), STARTED), size.bytes(detector)
-    if need <= max(ORDINARY, free + there):
-        return
     parts = size.parts(detector)
     worst = max(parts, key=lambda name: parts[name])
     what, lower = _lowered(resolved, size, worst, detector)
-    raise beyond(need, free, lower, there, f"{amount_text(parts[worst])} of it {what}")
+    memory.require_memory(lower, started=0.0, of_it=f"{amount_text(parts[worst])} of it {what}")
 
 
 def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str, detector: EmvaDetector) -> tuple[str, Lowered]:

@@ -13,7 +13,6 @@ from twin.operate.lives.simulate import FOLDER, LIFE, TELEMETRY
 from twin.operate.record.run_readings import CONFIG
 from twin.run.cli import InputErrorText, Options
 from twin.run.command import Result, finished, run_command
-from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
 
 KIND = "judged"
@@ -55,9 +54,7 @@ def judge_life(place: Path, truth: Path | None, options: Options) -> None:
         report = judged_report(life, plan.model.instrument.name)
         return finished(session, KIND, report, numbers, program="twin.operate", **facts)
 
-    run_command(
-        "judged", options, resolve, work, lambda plan: MODELS["operate judge"](plan, len(_truth(known)["times_us"]))
-    )
+    run_command("judged", options, resolve, work)
 
 
 def _truth(file: Path) -> dict[str, Any]:

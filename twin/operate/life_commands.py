@@ -73,15 +73,13 @@ def simulate(
         check_backend(backend)
         from optics.numerics.backend import load_backend
         from twin.operate.lives.simulation_run import Places, simulate_into, simulation
-        from twin.run.command import progress_shown, tell_cost
-        from twin.run.command_costs import MODELS
+        from twin.run.command import progress_shown
 
         options = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}
         options |= {"--coefficient-error": coefficient_error, "--sensor-sigma": sensor_sigma}
         several = {"--sensor": sensor or [], "--dead": dead or [], "--stuck": stuck or [], "--event": event or []}
         what = simulation(options, several, seed)
         places = Places(plan, record, out, truth, force)
-        tell_cost(MODELS["operate simulate"](places.read(), what), errors, as_json or quiet)
         with progress_shown(errors, as_json or quiet) as advance:
             done = simulate_into(places, what, load_backend(backend), advance)
         place = done["record"] or done["files"]

@@ -252,7 +252,7 @@ def export(
         return finished(session, "export", shown, numbers, program=PROGRAM, **facts)
 
     stem = source.resolve().name if os.path.isdir(source) else source.stem
-    run_command(f"{stem}-export", Options(out, seed, backend, force, as_json, quiet), resolve, work, None)
+    run_command(f"{stem}-export", Options(out, seed, backend, force, as_json, quiet), resolve, work)
 
 
 def _sigma(name: str, given: str | float | None, option: str) -> float:

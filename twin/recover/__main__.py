@@ -16,7 +16,6 @@ from scenes.kinds.file_kinds import read_for
 from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Strict
 from twin.run.command import Result, finished, run_command
-from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
@@ -81,7 +80,6 @@ def main(
         Options(out, None, backend, force, as_json, quiet, strict=strict),
         lambda: read_for(PROGRAM, measurement, Named("scenes.specs.measured.monitor_frames:resolve_measurement")),
         work,
-        MODELS["recover"],
     )
 
 

@@ -23,11 +23,14 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.measured.monitor_frames import AFTER, BEFORE, MeasurementSetup, MeasurementSpec, per_channel
 from scenes.yaml.errors import InputError, Issue, KeyPath
 from scenes.yaml.spec import Spec
-from twin.run.frame_store import PART, frame_room, let_go
+from twin.run.frame_store import IN_MEMORY, PART, frame_room, let_go
+from twin.run.memory import Lowered, require_memory
 
 _OTHER_FILES = "frames that were recorded one by one, each named once: the right files of before and after"
 NOMINAL, PERTURBED = "nominal", "perturbed"
 """Notes that the main job leaves in its frames."""
+_GREY, _MAPS = 2.0, 77.0
+"""Bytes per pixel of a frame, and of the maps of a state: of the search, of the fits and of their covariance."""
 
 
 def repeated_frames(test: Spec, channels: Sequence[ChannelFrames]) -> list[Issue]:
@@ -207,6 +210,7 @@ def read_measurement(
     Raises:
         InputError: files that cannot be read or do not fit; one issue for each channel.
     """
+    _require_memory(setup.test)
     out: list[ChannelFrames] = []
     issues: list[Issue] = []
     for number, name in enumerate(setup.channels):
@@ -218,6 +222,26 @@ def read_measurement(
     if issues:
         raise InputError(*issues)
     return tuple(out)
+
+
+def _require_memory(test: MeasurementSpec) -> None:
+    """See whether the frames that are kept, and the maps of every state, fit into the memory, by the headers of one
+    file of each channel and state. One that cannot be read is told in its place.
+    """
+    assert not isinstance(test.frames, str)
+    if test.times is None:
+        return
+    each = 0.0
+    for files in test.frames.values():
+        after = test.states(files)[0]
+        try:
+            head = ImageFile.open(Path(after[0]), choose="").header
+        except (ImageError, OSError):
+            continue
+        pixels = head.rows * head.columns
+        frames = pixels * len(head.pages) * len(after) * _GREY
+        each += pixels * _MAPS + (frames if frames <= IN_MEMORY else 0.0)
+    require_memory(Lowered(test, ("times",), len(test.times), "times", lambda times: (1 + times) * each))
 
 
 def _channel(

@@ -163,6 +163,12 @@ def heartbeat(console: Console, says: Callable[[], str], silent: bool, seconds: 
         thread.join()  # no line comes after the block
 
 
+LONG = 300.0
+"""Seconds of work above which it is said once how long it takes."""
+_TELLING = 5.0
+"""Seconds of a part that tell its pace: the first ones also compile."""
+
+
 @dataclass
 class Standing:
     """How far a piece of work is; ``advance`` is what it calls."""
@@ -171,19 +177,30 @@ class Standing:
     done: int = 0
     total: int = 1
     begun: float = field(default_factory=time.monotonic)
+    before: int = 0
 
     def advance(self, part: str, done: int, total: int) -> None:
         """So many of so many parts of this are done."""
         if part != self.part:
-            self.begun = time.monotonic()
+            self.begun, self.before = time.monotonic(), done
         self.part, self.done, self.total = part, done, total
 
+    @property
+    def left(self) -> float:
+        """Seconds that the part still takes, by the pieces that were done since it began; 0 where none tells it."""
+        spent, pieces = time.monotonic() - self.begun, self.done - self.before
+        return spent * (self.total - self.done) / pieces if pieces > 0 else 0.0
+
+    @property
+    def long(self) -> bool:
+        """Whether the part still takes long, as far as it can be told."""
+        return time.monotonic() - self.begun > _TELLING and self.left > LONG
+
     def __str__(self) -> str:
-        spent = time.monotonic() - self.begun
         text = f"{self.part}: {self.done} of {self.total}" if self.total > 1 else self.part
-        text += f", {time_text(spent)} so far"
-        if 0 < self.done < self.total:
-            text += f", about {time_text(spent * (self.total - self.done) / self.done)} left"
+        text += f", {time_text(time.monotonic() - self.begun)} so far"
+        if self.left:
+            text += f", about {time_text(self.left)} left"
         return text
 
 

@@ -17,13 +17,12 @@ from rich.markup import escape
 from rich.progress import Progress, TaskID
 
 from scenes.kinds.file_kinds import read_for
-from scenes.specs.procedures import PROCEDURES, Brief, Procedure
+from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run import cli, durable
 from twin.run.procedure import Advance, Session, performed
 
 if TYPE_CHECKING:
-    from twin.run.cost import Cost
     from twin.run.report import Report
     from twin.run.run_folder import RunFolder
 
@@ -74,7 +73,6 @@ def run_command(
     options: cli.Options,
     resolve: Callable[[], Given],
     work: Callable[[Given, Session], Result],
-    cost: Callable[[Given], Cost] | None,
 ) -> None:
     """Read what is asked for, do it in a run folder and print what it gave.
 
@@ -83,8 +81,6 @@ def run_command(
         options: what the user chose.
         resolve: reads the files and checks what is asked for. Raises InputError, InputErrorText.
         work: computes and writes all files of the run folder, the manifest last. Raises InputError.
-        cost: what that takes of memory and time, the command's entry in `twin.run.command_costs`; None where it never
-            takes much.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
@@ -93,8 +89,6 @@ def run_command(
     with cli.explained(errors):
         cli.check_backend(options.backend)
         given = resolve()
-        if cost is not None:
-            tell_cost(cost(given), errors, options.quiet)
         # a bad file is told before these are imported
         from optics.numerics.backend import load_backend
         from twin.run import provenance, run_folder
@@ -122,51 +116,41 @@ def run_command(
         cli.end_strictly(errors, result.numbers)
 
 
-def tell_cost(cost: Cost, errors: Console, quiet: bool) -> None:
-    """Say what a command takes before it starts, where it is much.
-
-    Args:
-        cost: of the command.
-        errors: where it is said.
-        quiet: nothing is said.
-
-    Raises:
-        InputError: more memory than there is.
-    """
-    from twin.run.cost import require_memory, told
-
-    require_memory(cost)
-    text = "" if quiet else told(cost, cli.time_text)
-    if text:
-        errors.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
-
-
 @contextmanager
 def progress_shown(errors: Console, silent: bool) -> Iterator[Advance]:
     """Inside the block a terminal shows how far each part of the work is and how long it still takes; elsewhere a line
-    now and then says it.
+    now and then says it. Of a part that takes long it is said once in any case.
 
     Args:
         errors: where it is shown.
         silent: whether nothing shall be.
     """
     standing, hidden = cli.Standing(), silent or not errors.is_terminal
+
+    def say(text: str) -> None:
+        if not silent:
+            errors.print(text, markup=False, highlight=False, soft_wrap=True)
+
     with (
         Progress(*cli.progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
         cli.heartbeat(errors, standing.__str__, silent),
     ):
-        yield _advance(bar, standing)
+        yield _advance(bar, standing, say)
 
 
-def _advance(bar: Progress, standing: cli.Standing) -> Advance:
+def _advance(bar: Progress, standing: cli.Standing, say: Callable[[str], None]) -> Advance:
     """Shows every part of the work as a line, from its beginning on."""
     parts: dict[str, TaskID] = {}
+    long: set[str] = set()
 
     def advance(part: str, done: int, total: int) -> None:
         if part not in parts:
             parts[part] = bar.add_task(part, total=total)
         bar.update(parts[part], completed=done, total=total)
         standing.advance(part, done, total)
+        if part not in long and standing.long:
+            long.add(part)
+            say(f"note: {part}: about {cli.time_text(standing.left)} left")
 
     return advance
 
@@ -259,8 +243,7 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
         return replace(done, problem=problem)
 
     name = f"{program} {command}"
-    cost = None if isinstance(procedure.cost, Brief) else procedure.cost
-    run_command(file.stem, options, lambda: read_for(name, file, procedure.resolve), work, cost)
+    run_command(file.stem, options, lambda: read_for(name, file, procedure.resolve), work)
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:

@@ -1,19 +1,22 @@
 """Memory that a command may take, and the refusal of a job that needs more before anything of it is computed.
 
-Each subject estimates what a job will take from its numbers of pixels, frames, rays and runs alone
-(`twin.monitor.monitor_memory`, `twin.study.runs.plan`). Estimates are of the largest resident memory above that
-of the started program, and within a factor of 1.5 of what is used (tests/limits).
+A job that can need more than 2 GiB is estimated when it starts, from its numbers of pixels, frames, rays, points and
+runs alone (`require_memory`, `twin.monitor.monitor_memory`). Estimates are of the largest resident memory above that of
+the started program, and within a factor of 1.5 of what is used (tests/limits).
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import resource
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
-from scenes.yaml.errors import InputError, Issue, shown
+from scenes.yaml.errors import InputError, Issue, KeyPath, shown
 
 LIMIT = "TWIN_MEMORY"
 """Environment variable with the memory that a command may take, as ``8 GB`` or ``500 MB``, in place of what is free."""
@@ -22,6 +25,15 @@ _AMOUNT = re.compile(r"\s*(?P<number>[0-9]{1,6}(\.[0-9]{1,3})?)\s*(?P<unit>MB|GB
 _UNITS = {"MB": 1e6, "GB": 1e9}
 _FREE, _PAGES = Path("/proc/meminfo"), Path("/proc/self/statm")
 _GROUP, _GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
+
+ORDINARY = 600e6
+"""A job that needs no more is never refused, bytes: what is free changes while other processes start, and what a study
+gives must not depend on that.
+"""
+STARTED = 290e6
+"""Memory of a job of any size beside the imported program: kernels, their compiler, what draws a report, and what the
+heap keeps of arrays that are freed; bytes.
+"""
 
 
 def free_memory() -> float:
@@ -113,6 +125,11 @@ def taken_already() -> float:
     return max(_own(1) - PROGRAM, 0.0)
 
 
+def amount_text(number: float) -> str:
+    """An amount of memory for people: ``3.1 GB``, ``420 MB``."""
+    return f"{1e-9 * number:.3g} GB" if number >= 1e9 else f"{1e-6 * number:.3g} MB"
+
+
 def largest(fits: Callable[[int], bool], most: int, least: int = 0) -> int:
     """The largest whole number that fits, below one that does not.
 
@@ -128,6 +145,63 @@ def largest(fits: Callable[[int], bool], most: int, least: int = 0) -> int:
     return low
 
 
-def amount_text(number: float) -> str:
-    """An amount of memory for people: ``3.1 GB``, ``420 MB``."""
-    return f"{1e-9 * number:.3g} GB" if number >= 1e9 else f"{1e-6 * number:.3g} MB"
+class Owner(Protocol):
+    """Where a number stands: a file's part (`Spec`), or the options of a command."""
+
+    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> Exception:
+        """The error that says what is wrong with it, for the caller to raise."""
+        ...
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """A number of a file or an option with which a job takes less memory.
+
+    Attributes:
+        owner, key: the file or the options, and where in it the number stands.
+        number: as it is.
+        unit: of the number, in words.
+        bytes: memory with another number.
+        least: that it may be.
+    """
+
+    owner: Owner
+    key: KeyPath
+    number: int
+    unit: str
+    bytes: Callable[[int], float]
+    least: int = 1
+
+
+def require_memory(
+    lower: Lowered, started: float = STARTED, of_it: str = "", own: float = math.inf, own_key: str = ""
+) -> None:
+    """See whether a job fits into the memory that is free, and into what its own file lets it have.
+
+    Args:
+        lower: the number that decides most of the job's memory.
+        started: bytes beside what ``lower`` counts.
+        of_it: how much of the memory is for what, as a part of the message.
+        own: bytes that the job's own file lets it have.
+        own_key: where the file says so.
+
+    Raises:
+        InputError, InputErrorText: it does not; at the key or option, with the number that fits.
+    """
+    free = free_memory()
+    # kernels of an earlier job are not free any more, and are taken over
+    room = min(own, max(ORDINARY, free + min(taken_already(), STARTED)))
+    need = started + lower.bytes(lower.number)
+    if need <= room:
+        return
+    most = largest(lambda number: started + lower.bytes(number) <= room, lower.number, lower.least - 1)
+    more = f"more memory (the environment variable {LIMIT}, as 8 GB, says how much may be taken)"
+    if own < free:
+        more = f"a larger {own_key}"
+    raise lower.owner.error(
+        f"this needs about {amount_text(need)} of memory,{f' {of_it},' if of_it else ''} and "
+        f"{amount_text(min(own, free))} may be taken",
+        lower.key,
+        found=lower.number,
+        allowed=f"at most {most} {lower.unit}, or {more}" if most >= lower.least else more,
+    )

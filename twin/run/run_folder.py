@@ -454,9 +454,11 @@ class KeptWork:
     def __enter__(self) -> KeptWork:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Let others use the folder."""
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Let others use the folder; where a bad input ends the command before anything was kept, remove it."""
         if self._lock is not None:
+            if kind is not None and self._place and owned_files.every_file(self._place) == [owned_files.STUDY_LOCK]:
+                self.finish()
             os.close(self._lock)
 
     def begin(self) -> Path:

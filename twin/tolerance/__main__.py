@@ -17,7 +17,6 @@ from scenes.kinds.file_kinds import read_for
 from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
 from twin.run.command import Result, finished, run_command
-from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
@@ -91,7 +90,7 @@ def main(
         return finished(session, "tolerance", tolerance_report(run), TOLERANCE(run), program=PROGRAM, **facts)
 
     with KeptWork(out, file.stem, "samples", resume) as kept:
-        run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work, MODELS["tolerance"])
+        run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work)
         kept.finish()
 
 

@@ -15,9 +15,10 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec
 from scenes.specs.load import is_path
-from scenes.specs.tolerance import AllocationSpec, ToleranceSetup, amount_text
+from scenes.specs.tolerance import AllocationSpec, ToleranceBudgetSpec, ToleranceSetup, amount_text
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
+from twin.run.memory import Lowered, require_memory
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
@@ -42,6 +43,10 @@ EXACT = 4
 """Cameras in which the derivatives of the monitor are traced."""
 NEAR_MODEL = 0.05
 """Share by which a model's quantile may differ from the samples' without a warning."""
+_PAIR, _DRAWN, _SHOWN, _MODELLED = 6.6e3, 32.0, 120.0, 40.0
+"""Bytes of two numbers that vary together, by which the merits are modelled to the second order; of each camera, of a
+number that varies, of a merit or compensator in the tables, and of a merit of the models.
+"""
 
 
 @dataclass(frozen=True)
@@ -152,7 +157,8 @@ def run_tolerance(
         force: who draws the cameras; this process alone by default.
 
     Raises:
-        InputError: names that do not exist, or a designed camera without the light that is asked.
+        InputError: names that do not exist, a designed camera without the light that is asked, or more memory than
+            there is.
         RunFolderError, IncompleteError, ProgramFault, ClusterError: as ``draw_samples``.
     """
     test, force = setup.test, force or Workforce()
@@ -164,6 +170,7 @@ def run_tolerance(
 
     force = replace(force, warn=warn)
     seed = test.seed if seed is None else seed
+    _require_memory(test)
     bench = ToleranceBench(setup, backend)
     given = given_warnings(setup, bench)
     found = sensitivities(bench, advance)
@@ -222,6 +229,14 @@ def _missed(bench: ToleranceBench, samples: Samples) -> dict[str, float]:
     if bench.monitor is None or not known.size:
         return {}
     return bench.monitor.missed(_amounts(bench, samples, known), _states(bench, samples, known))
+
+
+def _require_memory(test: ToleranceBudgetSpec) -> None:
+    numbers = sum(max(1, len(one.spectrum)) for one in test.tolerances.values())
+    merits = len(test.merits)
+    camera = numbers * _DRAWN + (merits + len(test.compensators)) * _SHOWN + merits * _MODELLED
+    pairs = numbers**2 * _PAIR
+    require_memory(Lowered(test, ("samples",), test.samples, "samples", lambda count: pairs + count * camera, 20))
 
 
 def _require_light(setup: ToleranceSetup, found: Sensitivities) -> None:

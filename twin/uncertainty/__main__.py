@@ -14,12 +14,10 @@ import typer
 
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, Strict
 from twin.run.command import Result, finished, run_command
-from twin.run.command_costs import MODELS
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.resolved import ResolvedJob
-    from twin.run.cost import Cost
 
 PROGRAM, KIND = "twin.uncertainty", "uncertainty"
 _MOST_STATES = 100_000
@@ -84,10 +82,6 @@ def main(
         chosen = resolved.job.render.seed if seed is None else seed
         return resolved.with_render(resolved.frames, chosen)
 
-    def cost(resolved: ResolvedJob) -> Cost:
-        model: Cost = MODELS["uncertainty"](resolved, states)
-        return model
-
     def work(resolved: ResolvedJob, session: Session) -> Result:
         from twin.run.provenance import checks_in
         from twin.uncertainty.coverage import run_uncertainty
@@ -102,7 +96,7 @@ def main(
         facts |= {"seed": run.seed if states else None, "checks": (*run.images.told(), *checks_in(numbers))}
         return finished(session, KIND, uncertainty_report(run), numbers, program=PROGRAM, **facts)
 
-    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet, strict=strict), resolve, work, cost)
+    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet, strict=strict), resolve, work)
 
 
 if __name__ == "__main__":

@@ -36,8 +36,8 @@ HALF_WIDTHS = tuple(float(np.sqrt(2.0 * gammaincinv(0.5, level))) for level in L
 """Half widths of the intervals in standard deviations of a normal error."""
 FALSE = 1e-2
 """Chance that any of all counts falls out of its limits though every sigma is right."""
-CHUNK = 32
-"""States that are rendered at once; the numbers do not depend on it."""
+CHUNK, _PIXELS = 32, 10_000_000
+"""States, and pixels of their images, that are rendered at once, some 2 GB; the numbers do not depend on it."""
 STATES = "random states"
 _DRAWN, _DETECTOR, _BEFORE, _AFTER = 9, 10, 11, 12
 """Numbers of the random streams of the states, of their detectors and of the noise before and after."""
@@ -171,11 +171,12 @@ def run_states(
         return _exposed(experiment, photons, frames, seed, numbers)
 
     estimators = applicable(experiment.cameras, disturbances)
+    chunk = max(1, min(CHUNK, _PIXELS // experiment.nominal_photons.size))
     # what cannot be measured is left out, and counted by the difference to what is drawn
-    how = Observing(record, experiment.resolved.job.analysis.centroid, CHUNK, leave=lambda number, why: None)
-    for first in range(0, count, CHUNK):
+    how = Observing(record, experiment.resolved.job.analysis.centroid, chunk, leave=lambda number, why: None)
+    for first in range(0, count, chunk):
         advance(STATES, first, count)
-        states = states_of(amounts[first : first + CHUNK], stated.components, experiment.thermal)
+        states = states_of(amounts[first : first + chunk], stated.components, experiment.thermal)
         place = experiment.path.coarse_trace(states).place
         kept = np.flatnonzero(np.all(np.abs(place) <= half, axis=(0, 2)))
         # streams of its own for each state, whichever others were lost

@@ -12,7 +12,6 @@ from typing import Any
 from optics.numerics.backend import Backend
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.artefact import Artefact
-from twin.run.cost import Cost
 from twin.run.provenance import versions
 from twin.validation.checks.check import VERDICTS, CheckResult, Verdict
 from twin.validation.checks.group import CheckGroup, Context
@@ -121,11 +120,6 @@ class Validation:
 def rough_seconds(selections: Sequence[Selection], fast: bool = False) -> float:
     """About how long these groups take."""
     return sum(selection.group.rough_seconds(fast) for selection in selections)
-
-
-def validation_cost(selections: Sequence[Selection], fast: bool = False) -> Cost:
-    """What these groups take; of memory what an instrument takes, which is little."""
-    return Cost(0.0, rough_seconds(selections, fast))
 
 
 def run_checks(

@@ -11,7 +11,7 @@ from typing import Any
 
 from optics.numerics.backend import Backend
 from scenes.specs.operation import EVENTS, OperationSetup, read_operation
-from scenes.yaml.errors import Problem, unknown
+from scenes.yaml.errors import KeyPath, Problem, unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, SCALE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
@@ -26,6 +26,7 @@ from twin.operate.record.taking import Taken
 from twin.operate.record.telemetry import read_table_file, read_telemetry, tables_of
 from twin.run.cli import InputErrorText
 from twin.run.durable import write_safely
+from twin.run.memory import Lowered, require_memory
 from twin.run.procedure import WRITE, Advance
 from twin.run.reference_frames import described
 from twin.run.run_folder import Numbered, RunFolder, chosen, json_text, write_manifest
@@ -36,6 +37,8 @@ NO_TRUTH = "none"
 """In place of the truth's file: it is not written."""
 MOST = 100_000
 """Readings of the monitor in one life: some hours, and a gigabyte of results."""
+_READING = 2e5
+"""Bytes of a reading: of numbers that are kept beside its frames."""
 DAY = 86_400.0
 
 
@@ -153,6 +156,13 @@ def _known(option: str, name: str, names: Collection[str]) -> None:
         raise InputErrorText(f"{option}: {one_line(unknown('no such name', name, sorted(names)))}")
 
 
+class _Options:
+    """Options of the command."""
+
+    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> InputErrorText:
+        return InputErrorText(f"{key[0]}: {problem}; {found} readings, allowed: {allowed}")
+
+
 def simulate_into(places: Places, what: Simulation, backend: Backend, advance: Advance) -> dict[str, Any]:
     """Simulate a life, write its files and take them into a record, which is made where there is none.
 
@@ -166,11 +176,14 @@ def simulate_into(places: Places, what: Simulation, backend: Backend, advance: A
         What was done, as plain data.
 
     Raises:
-        InputErrorText: a record that holds readings already, or is not of simulated ones; an unknown body.
+        InputErrorText: a record that holds readings already, or is not of simulated ones; an unknown body; more memory
+            than there is.
         InputError, RunFolderError, NotARecord, RecordFailed: of the plan, the instrument, the folder, the record.
     """
     started, clock = time.time(), time.monotonic()
     plan, target = places.read(), places.folder
+    readings = len(what.times)
+    require_memory(Lowered(_Options(), ("--every",), readings, "readings", lambda count: count * _READING))
     advance(CALIBRATE, 0, 1)
     experiment = MonitorExperiment(plan.model, backend)
     experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first

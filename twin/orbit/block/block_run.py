@@ -22,12 +22,16 @@ from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import measured_block
 from twin.orbit.block.pass_knowledge import MonitorSource
+from twin.run.memory import Lowered, require_memory
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
+    from scenes.specs.orbit.adjust import OrbitAdjustSpec
 
 _LEAST_CHECK = 2
+_OBSERVED = 3e3
+"""Bytes per image point of a block that is drawn and adjusted."""
 Rejected = tuple[tuple[str, str], ...]
 DATUM_ALARM = 1e-3
 """Chance below which a common shift of the control points is told."""
@@ -151,6 +155,7 @@ def run_adjustment(
         block, places = measured_block(setup, advance, monitor)
         known = _Known(places, block.points.covariance, {})
     else:
+        _require_memory(setup.test)
         drawn = draw_block(setup, np.random.SeedSequence(seed), monitor)
         block = drawn.block
         known = _Known(drawn.ground, np.zeros((len(drawn.ground), 3, 3)), drawn.change)
@@ -186,6 +191,15 @@ def run_adjustment(
         _cameras(found, known),
         (where, errors, sigma),
         rejected or found.rejected(),
+    )
+
+
+def _require_memory(spec: OrbitAdjustSpec) -> None:
+    """See whether a block, each of whose points all scenes may see, fits into the memory."""
+    points = spec.points
+    scenes, others = len(spec.passes) * len(spec.lines), points.control + points.check
+    require_memory(
+        Lowered(spec, ("points", "tie"), points.tie, "tie points", lambda ties: (ties + others) * scenes * _OBSERVED, 0)
     )
 
 

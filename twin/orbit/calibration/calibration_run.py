@@ -19,6 +19,7 @@ from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
+from scenes.specs.orbit.calibration import LEAST_TIES
 from twin.orbit.calibration.camera_drift import Monitoring, monitored
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, drift_looked_for, gauge_of, simultaneous
@@ -47,11 +48,13 @@ from twin.orbit.calibration.schemes import (
 from twin.orbit.calibration.screening import require_labelled, screened
 from twin.orbit.calibration.strip import Strips, strips_adjusted
 from twin.orbit.measured.measurement_tables import read_measurements
+from twin.run.memory import Lowered, require_memory
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.measured.orbit_data_setup import AnyCalibration
+    from scenes.specs.orbit.setup import CalibrationSetup
 
 _EVEN = 1e-3
 """Largest deviation of an interval between readings from their median interval, relative, for even times."""
@@ -59,6 +62,8 @@ _LEAST_EVEN = 5
 """Readings that third differences take."""
 STEPWISE_TOLERANCE = 1e-3
 """Largest last step of a round of the stepwise solution, in sigmas."""
+_TIE = 1.7e5
+"""Bytes per tie point of a strip, in each line and field, with the splines that it determines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +229,17 @@ def _what_to_do(error: ValueError, measured: bool) -> tuple[tuple[str, ...], str
     return ("errors",), "errors that an adjustment can take, and more points"
 
 
+def _require_memory(setup: CalibrationSetup) -> None:
+    """See whether the adjustments of all strips, which take the most, fit into the memory."""
+    test, strip = setup.test, setup.test.strip
+    if strip is not None:
+        each = len(setup.camera.lines) * len(test.fields) * _TIE
+        require_memory(Lowered(test, ("strip", "ties"), strip.ties, "tie points", lambda ties: ties * each, LEAST_TIES))
+
+
 def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
+    if not isinstance(setup, MeasuredCalibrationSetup):
+        _require_memory(setup)
     shown, others = np.random.SeedSequence(seed).spawn(2)
     campaign = source_of(setup, shown, advance)
     parts = 6 + len(campaign.passes)

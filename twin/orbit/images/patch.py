@@ -13,7 +13,8 @@ errors are the truth.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -24,20 +25,24 @@ from optics.numerics.invariants import PhysicalError
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.orthophoto import Control, make_control
-from twin.orbit.ground.texture import apparent, around, reflectance
+from twin.orbit.ground.texture import Extent, apparent, around, reflectance
 from twin.orbit.images import pushbroom
 from twin.orbit.images.image_points import ImagedGround, LineFrame
 from twin.orbit.images.jitter_exposure import collected
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
 from twin.orbit.images.pushbroom import BORDER, LookMap, PushbroomScene, Window
+from twin.run.memory import Lowered, require_memory
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.scene import ControlSpec, GroundSpec
+    from scenes.yaml.errors import KeyPath
 
 LARGEST_GROUND = 40_000.0
-"""Metres: side of the ground of one patch, against input that asks for more than the memory holds."""
+"""Metres: side of the ground of one patch; against input that asks for more than the memory holds."""
+_PIXEL, _SAMPLE = 150.0, 47.0
+"""Bytes per pixel of the image of a line, and per sample of the ground's texture."""
 
 
 class PatchError(PhysicalError, ValueError):
@@ -127,6 +132,7 @@ def fly_patch(
     control: ControlSpec,
     seed: np.random.SeedSequence,
     oversampling: int = 3,
+    advance: Callable[[int], None] = lambda done: None,
 ) -> Patch:
     """Image a patch of ground with every line.
 
@@ -140,10 +146,11 @@ def fly_patch(
         control: of the orthophoto and the elevation model.
         seed: of the ground, of the control's errors and of the frames' noise.
         oversampling: samples of the ground along each side of a pixel.
+        advance: told of how many lines the images are made.
 
     Raises:
         PatchError: a line does not see the patch within its image, terrain that hides a part of itself, or a patch too
-            large.
+            large for the ground or the memory.
     """
     for_terrain, for_ground, for_control, for_frames = (stream(seed, k) for k in range(4))
     frame = GroundFrame(*place)
@@ -163,13 +170,34 @@ def fly_patch(
         except pushbroom.SteepTerrainError as error:
             raise PatchError(f"{name}: {error}", "terrain", name) from error
     extent = around(extents)
+    _require_memory(len(lines), size, extent, ground.texture.spacing)
     seen = apparent(reflectance(extent, ground.texture, for_ground), terrain, ground.light)
     scene = PushbroomScene(frame, terrain, seen)
     images = {}
     for k, (name, one) in enumerate(lines.items()):
         images[name] = _recorded(one, scene, windows[name], looks[name], oversampling, stream(for_frames, k))
+        advance(k + 1)
     known = make_control(frame, extent, terrain, ground.texture, control, for_ground, for_control)
     return Patch(frame, FrozenMap(images), known, terrain)
+
+
+class _Size:
+    """The lines and pixels of a patch, which stand in a file that is not known here."""
+
+    def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> PatchError:
+        return PatchError(f"{problem}; {found} lines or pixels, allowed: {allowed}", "size")
+
+
+def _require_memory(count: int, size: tuple[int, int], extent: Extent, spacing: float) -> None:
+    """See whether the images of so many lines, and the texture of the ground that they see, fit into the memory."""
+    lines, pixels = size
+    texture = math.prod(len(axis) for axis in extent.axes(spacing))
+    each = count * _PIXEL + texture / (lines * pixels) * _SAMPLE
+
+    def needed(most: int) -> float:
+        return min(lines, most) * min(pixels, most) * each
+
+    require_memory(Lowered(_Size(), (), max(size), "lines and pixels", needed, 16))
 
 
 def imaged_lines(

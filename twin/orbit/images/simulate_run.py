@@ -116,23 +116,27 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
     Raises:
         BenchError: no such orbit, a patch that a line cannot image, points that cannot be measured.
     """
-    advance("images", 0, 1)
     spec, root = setup.test, np.random.SeedSequence(seed)
     flight = fly_simulation(setup, seed)
     optics = optics_of(setup.camera, spec.lines, spec.line_time, setup.detectors)
     lines = imaged_lines(flight.sensors, flight.users, optics, stream(root, 1))
     looking = _sensor(line_cameras(flight.truth)[spec.patch.line], flight.trajectory, flight.earth, spec)
     place = _place(looking, spec)
-    patch = spec.patch
+    size, parts = (spec.patch.lines, spec.patch.pixels), len(lines) + 1
+
+    def imaged(count: int) -> None:
+        advance("images", count, parts)
+
+    imaged(0)
     try:
         done = fly_patch(
-            lines, place, (patch.lines, patch.pixels), spec.ground, spec.control, stream(root, 2), spec.oversampling
+            lines, place, size, spec.ground, spec.control, stream(root, 2), spec.oversampling, advance=imaged
         )
     except PatchError as error:
         key, remedy = _REMEDIES[error.part]
         raise BenchError(str(error), key, remedy) from error
     points = _points(done, spec)
-    advance("images", 1, 1)
+    imaged(parts)
     return Simulation(
         **vars(flight), setup=setup, seed=seed, lines=FrozenMap(lines), place=place, patch=done, points=points
     )

@@ -42,6 +42,7 @@ from twin.orbit.measured.map_part import MapPart, UserMap
 from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table, read_platform
+from twin.run.memory import Lowered, require_memory
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.quantity import Quantity, Record
 
@@ -54,6 +55,8 @@ _BORDER = 5
 """Places along each side of an image that are followed to the ground."""
 _SPARE = 300.0
 """Metres of map about what the images show, beside the reach: camera and platform are wrong by as much."""
+_PIXEL = 30.0
+"""Bytes per pixel of an image, with the part of the maps that it shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +109,7 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
     photo = UserMap.open(spec.orthophoto, folder)
     dem = UserMap.open(spec.dem, folder, heights=True)
     sensors = {name: _sensor(spec, name, cameras[name], path, times[name], light) for name in spec.images}
-    images = {name: _image(one, name, sensors[name], folder) for name, one in spec.images.items()}
+    images = {name: _image(one, name, sensors[name], folder, len(sensors)) for name, one in spec.images.items()}
     limits = dem.limits()
     frame, ends = _extent(spec, images, limits)
     maps = Maps(photo.part(frame, ends), dem.part(frame, ends, heights=True))
@@ -152,11 +155,11 @@ def _sensor(
         raise spec.lines.error(problem, ("file",), allowed="times within those of orbit and attitude") from None
 
 
-def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path) -> LineFrame:
-    """The image, with columns along the line's pixels."""
+def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, count: int) -> LineFrame:
+    """The image, one of so many, with columns along the line's pixels."""
     path = folder / spec.file
     part = spec.window
-    frame = _read_image(path, spec)
+    frame = _read_image(path, spec, count)
     row, column = (0, 0) if part is None else (part.row, part.column)
     rows, columns = frame.shape
     first_line = spec.first_line + row
@@ -180,8 +183,8 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path) -> 
     return LineFrame(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
 
 
-def _read_image(path: Path, spec: LineImageFileSpec) -> np.ndarray:
-    """Grey values (rows, columns) of the image, or of its window."""
+def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
+    """Grey values (rows, columns) of the image, or of its window; so many alike have to fit into the memory."""
     from twin.orbit.measured.geotiff import opened
 
     file, part = str(path), spec.window
@@ -202,6 +205,9 @@ def _read_image(path: Path, spec: LineImageFileSpec) -> np.ndarray:
             raise InputError(
                 spec.issue("too large an image to be matched at once", ("window",), found=found, allowed=allowed)
             )
+        key = ("file",) if part is None else ("window", "rows")
+        unit = "rows in a `window`" if part is None else "rows"
+        require_memory(Lowered(spec, key, rows, unit, lambda n: n * columns * count * _PIXEL, 32))
         values = np.asarray(source.read(spec.band, window=Part(column, row, columns, rows)))
     if values.dtype.kind not in "uif":
         raise InputError(Issue("values that are no grey values", file, found=str(values.dtype), allowed="real numbers"))

@@ -318,7 +318,7 @@ def run_gradient(file: Path, options: cli.Options) -> None:
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
     """
-    command.run_command(f"{file.stem}-gradient", options, lambda: read_for(PROGRAM, file, resolve_study), _work, None)
+    command.run_command(f"{file.stem}-gradient", options, lambda: read_for(PROGRAM, file, resolve_study), _work)
 
 
 def _work(setup: StudySetup, session: procedure.Session) -> command.Result:

@@ -14,7 +14,7 @@ from scenes.yaml.errors import InputError, KeyPath, Problem
 from scenes.yaml.spec import validate
 from scenes.yaml.units import with_unit
 from scenes.yaml.yaml_file import YamlFile
-from twin.run.cost import Cost, Lowered, require_memory
+from twin.run.memory import Lowered, require_memory
 from twin.study.runs.base_job import Run, leaf, with_values
 from twin.study.runs.sampling import Scaling, draw, extremes, number_of, ratios, run_count, scaled
 from twin.study.runs.setup import StudySetup
@@ -215,7 +215,8 @@ def study_bytes(setup: StudySetup, runs: int) -> float:
 
 
 def require_study_memory(setup: StudySetup) -> None:
-    """See whether the results of all runs fit into the memory that is free and that the study may use.
+    """See whether the results of all runs fit into the memory that is free and that the study may use. How long they
+    take a first block of runs tells before the others begin (`twin.study.runs.engine`).
 
     Args:
         setup: the study.
@@ -223,16 +224,7 @@ def require_study_memory(setup: StudySetup) -> None:
     Raises:
         InputError: they do not; with the number of runs that would.
     """
-    require_memory(study_cost(setup), setup.study.limits.bytes, "limits.memory")
-
-
-def study_cost(setup: StudySetup) -> Cost:
-    """What the process that keeps the results takes of memory. Of the time a first block of runs tells more than a
-    model could, before the others begin (`twin.study.runs.engine`).
-
-    Args:
-        setup: the study.
-    """
     study, runs = setup.study, run_count(setup.study)
     key: KeyPath = ("factors",) if study.design.kind == GRID else ("design", "runs")
-    return Cost(study_bytes(setup, runs), 0.0, Lowered(study, key, runs, "runs", lambda n: study_bytes(setup, n)))
+    lower = Lowered(study, key, runs, "runs", lambda n: study_bytes(setup, n))
+    require_memory(lower, started=0.0, own=study.limits.bytes, own_key="limits.memory")
