@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from optics.numerics.physical_error import PhysicalError
 
 from analysis.measurement_error import UndeterminedError
 from analysis.wavefront_maps.orientation import Orientation, ReadingEvidence, tellable
 from optics.numerics.backend import Backend
+from optics.numerics.invariants import PhysicalError
 from scenes.specs.asbuilt import AsBuiltSetup
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.measured_kinds import UNKNOWN_FOCUS, MeasuredKind, WavefrontReadings
