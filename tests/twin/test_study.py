@@ -255,7 +255,7 @@ def test_a_real_scheduler_with_two_workers(done, tmp_path) -> None:
 @pytest.mark.second
 def test_killed_workers_and_commands_lose_nothing(tmp_path) -> None:
     """A worker is killed and replaced, then the command itself; gone on with, every byte is as if nobody had killed."""
-    path = write_study(tmp_path, ("runs: 100", "runs: 160"))
+    path = write_study(tmp_path, ("runs: 100", "runs: 300"))
     folder, whole = tmp_path / "run", tmp_path / "whole"
     process = start(path, "--out", folder, "--workers", 2)
     try:
