@@ -15,7 +15,7 @@ import numpy as np
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.sag_terms import XYPolynomial
-from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
+from optics.geometry.surface import GridFigure, SummedFigure, Surface, ZernikeFigure
 from optics.raytrace.assembly import Interaction
 from scenes.lens.camera_writer import rounded
 from scenes.lens.prescription import LensSurface, Prescription, facing, polynomial_of
@@ -144,7 +144,7 @@ def _shape(lens: Prescription, given: LensSurface) -> tuple[str, list[str]]:
         )
     shape = given.surface
     conic = [f"CONI {_number(shape.conic)}"] if shape.conic else []
-    if isinstance(shape.figure, GridFigure):
+    if isinstance(shape.figure, GridFigure | SummedFigure):
         raise _cannot(lens, given, "a figure on a grid", "Zernike terms")
     if isinstance(shape.figure, ZernikeFigure) and any(shape.figure.terms.values()):
         if shape.terms:

@@ -135,7 +135,7 @@ def start_beams(setup: MonitorDesignSetup) -> Layout:
         places = [sorted((c.field, c.pupil_offset, c.spread) for c in them.values()) for them in (own, made_again)]
         if len(own) != len(made_again) or not np.allclose(_flat(places[0]), _flat(places[1]), atol=1e-12):
             problem = f"the channels of {camera} are not those of {first}, mirrored"
-            raise setup.test.error(problem, ("instrument",), found=start.name, allowed="an instrument whose are")
+            raise setup.test.error(problem, ("instrument",), found=start.name, allowed="the same beams, mirrored")
     return tuple(beams)
 
 

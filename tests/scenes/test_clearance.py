@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from optics.geometry.pose import rotation_matrix
 from scenes.models import instrument_builder, obstruction
 from scenes.models.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, remedy, separation
+from scenes.models.instrument_model import MisplacedError
 from scenes.models.obstruction import RAYS, find_obstructions
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
 from scenes.yaml.errors import InputError
@@ -75,6 +76,15 @@ def test_reference_instruments_have_room(name, instrument) -> None:
     for solid in model.solids:  # the hull has the body's own middle
         middle = bodies[solid.path].mean(axis=0)
         assert np.linalg.norm(middle - model.assembly.nominal_pose(solid.path).translation) < 1.5
+
+
+def test_beams_wider_than_the_optics_can_lead_are_refused(instrument, backend, monkeypatch) -> None:
+    pair = instrument("gf7_pair")
+    obstruction.check_beams(pair, backend)
+    monkeypatch.setattr(obstruction, "_WHOLE", 1e3 * obstruction._WHOLE)
+    with pytest.raises(MisplacedError, match="light of the monitor does not get to its return faces") as caught:
+        obstruction.check_beams(pair, backend)
+    assert caught.value.key == ("monitor",)
 
 
 @pytest.fixture

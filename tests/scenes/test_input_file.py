@@ -19,6 +19,7 @@ from scenes.yaml.csv_table import Column, Table, read_table, table_text
 from scenes.yaml.errors import InputError, Issue, nearest, shown
 from scenes.yaml.finish_files import read_bsdf
 from scenes.yaml.input_file import read_bytes, read_text
+from scenes.yaml.json_file import parse_json
 from scenes.yaml.units import ANGLE, LENGTH
 from scenes.yaml.yaml_file import YamlFile, dump_yaml, parse_yaml, read_yaml
 
@@ -238,8 +239,9 @@ def test_too_many_values_are_refused_where_they_begin(monkeypatch: pytest.Monkey
 
 def test_tabs_and_signs_of_units_are_texts() -> None:
     assert parse_yaml('note: "a\\tb\\nc µ ″"').data == {"note": "a\tb\nc µ ″"}
-    with pytest.raises(InputError, match="nested too deeply"):
-        parse_yaml("[" * 500_000)
+    for parse in (parse_yaml, parse_json):
+        with pytest.raises(InputError, match="nested too deeply"):
+            parse("[" * 500_000, "x")
 
 
 def test_error_gives_the_first_issue_and_all_of_them() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import meshlane
@@ -18,6 +19,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import DeformationSpec
 from scenes.specs.load import load_camera, load_instrument, load_job
 from scenes.specs.resolved import resolve
+from scenes.yaml import node_table
 from scenes.yaml.errors import InputError
 from scenes.yaml.node_table import read_nodes
 from tests.tiers import quick
@@ -281,6 +283,17 @@ def test_a_mesh_says_what_a_table_says(tmp_path, nodes, gf7_pair, ending: str) -
         load_job(deformed(tmp_path, place.name))
     with pytest.raises(InputError, match="no such vectors"):
         read_nodes(place, unit="mm", field="displacement")
+    place.unlink()  # after the job was read
+    with pytest.raises(InputError, match="no such file"):
+        read_nodes(place, unit="mm")
+
+
+def test_a_mesh_whose_reader_does_not_end_is_refused(tmp_path, monkeypatch) -> None:
+    (tmp_path / "m1.vtu").touch()
+    monkeypatch.setattr(node_table, "LONGEST_READING", 0.01)
+    monkeypatch.setattr(meshlane, "read", lambda *_, **__: time.sleep(0.5))
+    with pytest.raises(InputError, match="meshlane does not come to an end with this mesh"):
+        read_nodes(tmp_path / "m1.vtu", unit="mm")
 
 
 def test_the_job_knows_the_table_that_it_was_read_with(tmp_path, nodes) -> None:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from optics.geometry.aperture import Circle, Edge
 from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
-from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
+from optics.geometry.surface import GridFigure, SummedFigure, Surface, ZernikeFigure
 from optics.geometry.tree import Motion
 from optics.materials.glass import N_BK7
 from optics.raytrace.system import assemble
@@ -29,11 +29,12 @@ from scenes.lens.zemax_writer import zemax_text
 from scenes.models.camera_model import collimated, derive_camera, field_direction
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.camera import CameraSpec
-from scenes.specs.load import EXAMPLES, load_camera, load_instrument
+from scenes.specs.load import EXAMPLES, SCENES, load_camera, load_instrument
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.lens.files import BATOID, SINGLET, TMA
+from tests.scenes.refusals.tables import changed
 from tests.tiers import quick
 
 ROUNDING = 1e-12
@@ -172,6 +173,12 @@ CURVE = XYPolynomial(x2=1e-3)
     [
         (
             Surface(-0.1, figure=GRID),
+            "a figure on a grid",
+            "cannot carry this: a figure on a grid",
+            "which a camera's file",
+        ),
+        (
+            Surface(-0.1, figure=SummedFigure(ERROR, GRID)),
             "a figure on a grid",
             "cannot carry this: a figure on a grid",
             "which a camera's file",
@@ -338,7 +345,7 @@ def test_the_command(tmp_path: Path, backend) -> None:
 
 
 @pytest.mark.second
-def test_the_command_writes_a_perturbed_camera(tmp_path: Path) -> None:
+def test_the_command_writes_a_perturbed_camera(tmp_path: Path, instrument) -> None:
     job = tmp_path / "job.yaml"
     job.write_text(JOB, "utf-8")
     for name in ("a.zmx", "a.yaml"):
@@ -346,6 +353,27 @@ def test_the_command_writes_a_perturbed_camera(tmp_path: Path) -> None:
         assert code == 0, said
     moved = read_zemax(tmp_path / "a.zmx")
     assert moved.surfaces[1].pose.translation[2] == pytest.approx(-2.01593047747168 + 30e-6, abs=1e-14)
+    # nodes bend a mirror by Zernike terms and a grid
+    mirror = instrument("gf7_pair").assembly.elements["forward/M1"]
+    x0, x1, y0, y1 = mirror.aperture.bounds
+    x, y = map(np.ravel, np.meshgrid(np.linspace(x0 - 0.01, x1 + 0.01, 24), np.linspace(y0 - 0.01, y1 + 0.01, 20)))
+    nodes = np.stack([x, y, mirror.surface.sag(x, y), 0.0 * x, 0.0 * x, 2e-8 * np.sin(9.0 * x) * np.cos(7.0 * y)], -1)
+    head = "x [m],y [m],z [m],dx [m],dy [m],dz [m]"
+    np.savetxt(tmp_path / "m1.csv", nodes, delimiter=",", header=head, comments="")
+    own = "@mirrors.M1.sag => {zernike: {radius: 400 mm, Z5: 1 nm}}"
+    for name, file, change in (
+        ("camera", "cameras/gf7", own),
+        ("pair", "instruments/gf7_pair", "@cameras.forward.camera => ./camera.yaml"),
+    ):
+        text = (SCENES / f"library/{file}.yaml").read_text("utf-8")
+        (tmp_path / f"{name}.yaml").write_text(changed(text, change), "utf-8")
+    for name, camera, problem in (
+        ("gf7_pair", "gf7", "a figure on a grid"),
+        ("./pair.yaml", tmp_path / "camera.yaml", "Zernike terms of a sag beside a figure on a grid"),
+    ):
+        job.write_text(f"instrument: {name}\nperturb: {{base/forward/M1: {{deformation: m1.csv}}}}\n", "utf-8")
+        code, said = run("write", camera, "--perturbed", job, "--camera", "forward", "--out", tmp_path / "b.zmx")
+        assert (code, problem in " ".join(said.split())) == (2, True), said
 
 
 def test_what_a_zemax_file_cannot_hold_is_refused(tmp_path: Path, backend) -> None:

@@ -15,22 +15,24 @@ from scenes.lens.camera_reader import camera_of
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import own_glasses, read_catalogue
 from scenes.lens.zemax_reader import read_zemax
+from scenes.models.camera_design import resolve_design
 from scenes.models.camera_model import build_camera_under_test, derive_camera
 from scenes.models.disturbances import motions_of_spec, stated_motions
 from scenes.models.instrument_builder import build_instrument
+from scenes.models.monitor_layout import resolve_monitor_design
 from scenes.models.scenery import measured_finishes
 from scenes.schema import MODELS
 from scenes.specs import load
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import checked_nodes
-from scenes.specs.measured.adjust_setup import resolve_adjust
+from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_measured_adjust
 from scenes.specs.measured.monitor_frames import read_frame_table, resolve_measurement
 from scenes.specs.measured.orbit_data_setup import resolve_match
 from scenes.specs.operation import read_operation
 from scenes.specs.orbit import setup as orbit_setup
 from scenes.specs.orbit.flight import ErrorsSpec, OrbitSpec
 from scenes.specs.perturbation import NodeInfo
-from scenes.specs.resolved import resolve, resolve_focus
+from scenes.specs.resolved import resolve, resolve_distortion, resolve_focus
 from scenes.specs.spectrum import SpectrumSpec
 from scenes.specs.study import StudySpec
 from scenes.yaml.csv_table import Column, read_table
@@ -41,6 +43,7 @@ from scenes.yaml.spec import Spec, validate
 from scenes.yaml.units import ANGLE, LENGTH
 from scenes.yaml.yaml_file import read_yaml
 from tests.scenes.lens.colour_cameras import colour_camera
+from tests.scenes.refusals.tables import changed, good
 from tests.scenes.test_finish_tables import bsdf_text
 from twin.monitor.monitor_experiment import MonitorExperiment
 
@@ -87,7 +90,8 @@ angle, monitor, simulate = map(
     _plain, (orbit_setup.resolve_angle, orbit_setup.resolve_monitor, orbit_setup.resolve_simulate)
 )
 calibration, jitter, adjust = map(_plain, (orbit_setup.resolve_calibration, orbit_setup.resolve_jitter, resolve_adjust))
-match = _plain(resolve_match)
+match, measured_adjust = _plain(resolve_match), _plain(resolve_measured_adjust)
+resolved, focus_setup, distortion = _plain(resolve), _plain(resolve_focus), _plain(resolve_distortion)
 zemax, codev = _plain(read_zemax), _plain(read_codev)
 batoid = _plain(lambda path: read_batoid(path, 650e-9))
 
@@ -147,7 +151,7 @@ def stated_job(folder: Path, fixture: Fixture) -> Read:
 
 
 def experiment(folder: Path, fixture: Fixture) -> Read:
-    """A job's state, with tables of temperatures from 20 degC to others on both sides of a mirror."""
+    """A job's state and what it states to move; tables with temperatures from 20 degC to others across a mirror."""
     backend = fixture("backend")
     places = [(x, y, z) for x in (-300, -9, 9, 300) for y in (-500, -100) for z in (-20, 20)]
     for name, low, high in (("hot", 20, 130), ("cold", -273, 20)):
@@ -156,9 +160,26 @@ def experiment(folder: Path, fixture: Fixture) -> Read:
 
     def read(path: Path) -> object:
         resolved = resolve(path)
-        return MonitorExperiment(resolved, backend).state(resolved.job)
+        experiment = MonitorExperiment(resolved, backend)
+        return experiment.state(resolved.job), experiment.stated
 
     return read
+
+
+def layout_search(folder: Path, fixture: Fixture) -> Read:
+    """A search for a layout; beside it an instrument as built, and one of which nothing is stated to move."""
+    (folder / "built.yaml").write_text(good("as built"), "utf-8")
+    (folder / "still.yaml").write_text(good("room in an instrument").replace("disturbances: orbit\n", ""), "utf-8")
+    return resolve_monitor_design
+
+
+def camera_design(folder: Path, fixture: Fixture) -> Read:
+    """An optimisation of a camera; one with a mirror that is turned beside it."""
+    camera = changed(
+        (load.SCENES / "library/cameras/gf7.yaml").read_text("utf-8"), "@mirrors.M1.rotate => [0 deg, 1 arcsec, 0 deg]"
+    )
+    (folder / "tilted.yaml").write_text(camera, "utf-8")
+    return resolve_design
 
 
 def of_a_job(folder: Path, fixture: Fixture) -> Read:
@@ -167,21 +188,23 @@ def of_a_job(folder: Path, fixture: Fixture) -> Read:
     return lambda path: resolve(folder / "job.yaml")
 
 
-def payload(folder: Path, fixture: Fixture) -> Read:
-    """A three-line camera of a simulated pass."""
-    orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
-    (folder / "test.yaml").write_text(
-        f"name: small\ncamera: own.yaml\norbit: {orbit}\npatch: {{pixel: 6000}}\n", "utf-8"
-    )
-    return lambda path: orbit_setup.resolve_simulate(folder / "test.yaml")
+PAYLOAD_TESTS = {
+    "simulate": "patch: {pixel: 6000}\nperturb: {nadir: {principal_distance: 10 um}}\n",
+    "angle": "strips: {points: 3, first: 0, last: 11999}\n",
+    "jitter": "points: {count: 100, duration: 8 s}\nsearch: {highest: 6 Hz}\n",
+}
 
 
-def payload_angle(folder: Path, fixture: Fixture) -> Read:
-    """A three-line camera of an angle test."""
-    orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
-    strips = "{points: 3, first: 0, last: 11999}"
-    (folder / "test.yaml").write_text(f"name: small\ncamera: own.yaml\norbit: {orbit}\nstrips: {strips}\n", "utf-8")
-    return lambda path: orbit_setup.resolve_angle(folder / "test.yaml")
+def payload(kind: str) -> Callable[[Path, Fixture], Read]:
+    """A three-line camera of a test in orbit."""
+
+    def reader(folder: Path, fixture: Fixture) -> Read:
+        orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
+        text = f"name: small\ncamera: own.yaml\norbit: {orbit}\n{PAYLOAD_TESTS[kind]}"
+        (folder / "test.yaml").write_text(text, "utf-8")
+        return lambda path: getattr(orbit_setup, f"resolve_{kind}")(folder / "test.yaml")
+
+    return reader
 
 
 def filter_table(folder: Path, fixture: Fixture) -> Read:

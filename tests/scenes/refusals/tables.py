@@ -47,7 +47,7 @@ def changed(text: str, changes: str) -> str:
     """Return the good file's text with changes."""
     for change in changes.split(" && "):
         old, _, new = (" " + change).partition(" => ")
-        old, new = (one.replace("\\n", "\n").replace("\\t", "\t") for one in (old[1:], new))
+        old, new = (one.replace("\\n", "\n").replace("\\t", "\t").replace("␁", "\1") for one in (old[1:], new))
         if old.startswith("@"):
             text = with_key(text, old[1:].split("."), new)
         elif old.startswith("^"):
