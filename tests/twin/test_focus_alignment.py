@@ -28,7 +28,7 @@ from twin.laboratory.focus_report import focus_report as report
 from twin.laboratory.focus_run import FocusRun, SimulatedFocus, align, align_files, line_turn, mount_of, plan_shims
 from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, in_focus, scan
 from twin.run.procedure import BenchError
-from twin.targets.target_images import DIRECTIONS
+from twin.targets.target_images import DIRECTIONS, TRACK
 
 FILE = SCENES / LAB / "focus.yaml"
 ARCMIN = np.pi / 180 / 60
@@ -119,7 +119,7 @@ def test_a_bench_without_light_names_what_takes_it(monkeypatch, lost, key, remed
 
 
 class Blurred:
-    """A recorder that sees no edge anywhere, or one whose contrast is the same at all places near the middle."""
+    """A recorder that sees no edge anywhere, or along the line a peak and along the track a contrast without end."""
 
     def __init__(self, seen: bool) -> None:
         site = SimpleNamespace(band="P", field=0.5, nominal_per_shift=dict.fromkeys(DIRECTIONS, 1.0))
@@ -131,7 +131,8 @@ class Blurred:
     def measure(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray]:
         if not self.seen:
             raise EdgeError("no edge")
-        return 0.2 if abs(shift) < 90e-6 else 0.1, 0.01, np.zeros((1, 1, 1), np.uint16)
+        mtf = 0.2 + 300.0 * shift if edge == TRACK else 0.2 - abs(shift) / 5e-3
+        return mtf, 0.01, np.zeros((1, 1, 1), np.uint16)
 
     attempt = Recorder.attempt
 
