@@ -241,6 +241,11 @@ def test_maps_and_tables_hold_the_same(backend, tmp_path, name) -> None:
     of_maps, of_table = (values.reshape(2, 8) for values in bench.data())
     np.testing.assert_allclose(of_maps, wanted, atol=0.01 * np.abs(wanted).max())
     np.testing.assert_allclose(of_table, wanted, atol=1e-15)
+    (tmp_path / "sphere").mkdir()
+    (sphere,) = written_maps(tmp_path / "sphere", lies.coefficients(reference[None], tuple(range(4, 12))), lies)
+    measured = {"maps": {**stated, "maps": maps, "reference": f"sphere/{sphere}"}}
+    (less,) = bench_of(backend, tmp_path, {"wavefronts": measured}, simulate=None).data()
+    np.testing.assert_allclose(less.reshape(2, 8), of_maps, atol=0.01 * np.abs(wanted).max())
     fits.PrimaryHDU(np.zeros((50, 50)), fits.Header({"BUNIT": "nm"})).writeto(tmp_path / "small.fits")
     measured = {"maps": {**stated, "maps": maps, "reference": "small.fits"}}
     with pytest.raises(InputError, match="the reference has another number of points"):

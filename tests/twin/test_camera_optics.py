@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion
+from optics.numerics.invariants import UnphysicalError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.camera_model import field_direction
 from scenes.models.camera_sharpness import FieldBeams
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
+from twin.camera import varied_beams
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.cut_wavefront import RAYS_ACCURACY
 from twin.camera.field_maps import through_focus
@@ -69,10 +71,26 @@ def test_what_prisms_take_is_missing_in_every_table(backend, gf7_pair) -> None:
 
 
 @pytest.mark.second
-def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera) -> None:
-    beams = VariedBeams(CameraOptics.alone(camera("ritchey_chretien"), backend), [(0.0, 0.0)], None, None)
+def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera, monkeypatch) -> None:
+    optics = CameraOptics.alone(camera("ritchey_chretien"), backend)
+    beams = VariedBeams(optics, [(0.0, 0.0)], None, None)
     with pytest.raises(BeamMissedError, match="a surface's edge stops light of a field"):
         beams.light([{"camera/M2": Motion(shift=(0.05, 0.0, 0.0))}])
+    # more terms than places at which the light is known
+    with pytest.raises(UnphysicalError, match="800 Zernike terms are not independent"):
+        beams.zernike_rows(800)
+    monkeypatch.setattr(varied_beams, "RESIDUAL", 0.0)
+    with pytest.raises(varied_beams.RoughError, match=r"polynomials do not follow: they leave \S+ waves"):
+        VariedBeams(optics, [(0.0, 0.0)], None, None)
+    rays = VariedBeams._rays
+
+    def cut(self, *states):
+        (*light, alive), aimed = rays(self, *states)
+        return (*light, np.zeros_like(alive)), aimed
+
+    monkeypatch.setattr(VariedBeams, "_rays", cut)
+    with pytest.raises(varied_beams.CutError, match="cut by what is not the stop"):
+        VariedBeams(optics, [(0.0, 0.0)], None, None)
 
 
 def test_fields_are_shares_of_the_half_field(gf7, gf7_alone) -> None:

@@ -23,7 +23,7 @@ from tests.scenes.refusals.tables import good
 from tests.twin.commands import edited_copy, invoke, refused
 from tests.twin.study_bench import TEXTS, refusals
 from twin.design.__main__ import app
-from twin.design.design_run import HELD_BY, _held_text
+from twin.design.design_run import HELD_BY, _held_text, run_design
 from twin.design.layout_bench import BeamFacts
 from twin.design.search_workers import Journal
 from twin.run.run_folder import RunFolderError
@@ -55,6 +55,16 @@ def test_constraints_that_contradict_the_camera(tmp_path, envelope: str, clearan
         key,
         ("no prescription near the start holds all constraints", remedy),
     )
+
+
+def test_a_camera_without_light_is_no_start(tmp_path, backend) -> None:
+    """The beam passes beside a ball of 50 mm in place of its secondary: told with the camera's file and mirrors."""
+    text = good("cassegrain out of focus").replace("radius: -0.8 m, conic: -2.77777777777778", "radius: -50 mm")
+    (tmp_path / "axis.yaml").write_text(text, "utf-8")
+    file, text = tmp_path / "away.yaml", TEXTS["short"].format(envelope="101 percent", vary="M2: [conic]")
+    file.write_text(text.replace("camera: gf7", "camera: axis.yaml"), "utf-8")
+    with pytest.raises(InputError, match=r"axis\.yaml:\d+: mirrors: no beams to design with come through"):
+        run_design(resolve_design(file), backend)
 
 
 @pytest.mark.second

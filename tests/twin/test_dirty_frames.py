@@ -126,6 +126,18 @@ def test_the_noise_of_a_subtracted_level_is_that_of_the_light(bench, monkeypatch
     assert told == ["subtracted level"] * 6
 
 
+def test_too_little_of_a_spot_is_refused(bench):
+    """Saturated to where its flanks are faint, it would have a sigma many times as large."""
+    template, detector, noise = bench
+    drawn = draw(template, detector, (), 5)
+    lost = np.unravel_index(np.argsort(drawn.after.mean(axis=0), axis=None)[-150:], template.shape)
+    drawn.after[:, *lost] = 0
+    with one_blas_thread():
+        work = measurement(drawn, template, noise)
+        (issue,) = work.search() or work.measure()
+    assert "too much of the spot is missing" in issue.problem, issue
+
+
 def test_dark_frames_with_a_level_do_not_go_with_frames_without(bench):
     template, detector, noise = bench
     drawn = draw(template, detector, (), 1)

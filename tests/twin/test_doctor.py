@@ -5,7 +5,9 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
@@ -123,6 +125,10 @@ def test_every_check_says_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(probe, "ULPS", -1.0)
     with pytest.raises(RuntimeError, match="the kernel's results differ from numpy's by"):
         probe.kernel()
+    dark = SimpleNamespace(set_variant=str, load_dict=dict, render=lambda *words, **how: np.zeros((16, 16, 1)))
+    monkeypatch.setitem(sys.modules, "mitsuba", dark)
+    with pytest.raises(RuntimeError, match=r"radiance 1 was rendered as 0 \.\. 0"):
+        probe.render()
     monkeypatch.setattr(doctor, "run_probe", fail)
     assert (doctor._probe("kernel", [], str).status, doctor._gpu().status) == ("failed", "note")
     for found, status in (({"available": False}, "note"), ({"version": "12", "compute_capability": "9.0"}, "ok")):

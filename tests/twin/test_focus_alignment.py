@@ -14,17 +14,21 @@ from scipy.stats import chi2
 
 from analysis.focal_plane.plane_fit import RigidMotion
 from analysis.focal_plane.through_focus import focus_vertex, outlying_points
+from analysis.mtf.edge_location import EdgeError
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.aim import AimError
+from optics.targets.target_image import TooNarrowError
 from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import FocusSetup, resolve_focus, resolve_focus_test
-from twin.laboratory import focus_scan
+from twin.laboratory import focus_run
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_report import focus_report as report
 from twin.laboratory.focus_run import FocusRun, SimulatedFocus, align, align_files, line_turn, mount_of, plan_shims
-from twin.laboratory.focus_scan import VERTEX_ERROR
+from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, in_focus, scan
 from twin.run.procedure import BenchError
+from twin.targets.target_images import DIRECTIONS, TRACK
 
 FILE = SCENES / LAB / "focus.yaml"
 ARCMIN = np.pi / 180 / 60
@@ -95,6 +99,56 @@ def test_what_cannot_be_done_names_the_key(bench) -> None:
     with pytest.raises(BenchError, match=r"hole 1 would get -0\.5") as caught:
         plan_shims(low, mount_of(bench.setup.test), np.full(4, 0.45e-3))
     assert caught.value.key == ("mount", "thickness")
+
+
+@pytest.mark.parametrize(
+    ("lost", "key", "remedy"),
+    [
+        (TooNarrowError("the beam is 598 mm wide"), ("collimator", "aperture"), "a wider collimator"),
+        (AimError("no ray"), ("as_built",), "a camera whose whole beam gets through"),
+    ],
+)
+def test_a_bench_without_light_names_what_takes_it(monkeypatch, lost, key, remedy) -> None:
+    def built(*words: object) -> None:
+        raise lost
+
+    monkeypatch.setattr(focus_run, "FocusBench", built)
+    with pytest.raises(BenchError, match=str(lost)) as caught:
+        focus_run.run_focus(reduced(), None, 1)  # type: ignore[arg-type]
+    assert (caught.value.key, caught.value.remedy) == (key, remedy)
+
+
+class Blurred:
+    """A recorder that sees no edge anywhere, or along the line a peak and along the track a contrast without end."""
+
+    def __init__(self, seen: bool) -> None:
+        site = SimpleNamespace(band="P", field=0.5, nominal_per_shift=dict.fromkeys(DIRECTIONS, 1.0))
+        test = SimpleNamespace(scan=reduced().test.scan)
+        setup = SimpleNamespace(test=test)
+        self.bench = SimpleNamespace(sites=[site], setup=setup, geometric_zero=lambda band: 1e-4)
+        self.seen = seen
+
+    def measure(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray]:
+        if not self.seen:
+            raise EdgeError("no edge")
+        mtf = 0.2 + 300.0 * shift if edge == TRACK else 0.2 - abs(shift) / 5e-3
+        return mtf, 0.01, np.zeros((1, 1, 1), np.uint16)
+
+    attempt = Recorder.attempt
+
+
+@pytest.mark.parametrize(
+    ("seen", "sought", "told", "key"),
+    [
+        (True, scan, "no best focus of P at field 0.5", ("scan",)),
+        (False, scan, "anywhere through focus in P at field 0.5: no edge", ("edge",)),
+        (False, in_focus, "after the alignment in P at field 0.5: no edge", ("misset", "chips")),
+    ],
+)
+def test_edges_that_show_no_focus_name_the_site_and_the_key(seen, sought, told, key) -> None:
+    with pytest.raises(BenchError, match=told) as caught:
+        sought(Blurred(seen))
+    assert caught.value.key == key
 
 
 EXAMPLES = Path(__file__).parents[2] / "scenes" / "lab" / "measured"
@@ -180,10 +234,10 @@ def scanned(best, search, misled=0.0, seen=lambda mtf: (mtf, SIGMA)):
         return *seen(mtf), np.zeros((1, 1, 1), np.uint16), "too dark"
 
     plan = SimpleNamespace(depth=0.6, points=9, step=20.0, reach=400.0)
-    site = SimpleNamespace(band="P", field=0.5, nominal_per_shift=dict.fromkeys(focus_scan.DIRECTIONS, 1.0))
+    site = SimpleNamespace(band="P", field=0.5, nominal_per_shift=dict.fromkeys(DIRECTIONS, 1.0))
     bench = SimpleNamespace(setup=SimpleNamespace(test=SimpleNamespace(scan=plan)), sites=[site])
     bench.geometric_zero = lambda band: 145.0
-    (found,) = focus_scan.scan(SimpleNamespace(bench=bench, attempt=attempt), search=search)
+    (found,) = scan(SimpleNamespace(bench=bench, attempt=attempt), search=search)
     return found
 
 

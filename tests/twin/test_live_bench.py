@@ -257,7 +257,7 @@ def test_an_unknown_knob_names_the_nearest(bench):
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("view", ["wavefront", "spot", "mtf", "focus"])
+@pytest.mark.parametrize("view", ["wavefront", "spot", "mtf", "focus", "target"])
 def test_pictures_of_a_camera(bench, view):
     pictures = CameraPictures(bench.twin.experiment)
     assert pictures.draw(view, "forward", 0.5, bench.twin.state, 1, 1).startswith("<svg")

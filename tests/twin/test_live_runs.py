@@ -18,6 +18,7 @@ from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.orbit.setup import resolve_angle, resolve_monitor
 from scenes.specs.resolved import resolve, resolve_camera, resolve_turntable
 from scenes.yaml.errors import InputError
+from twin.live.camera_pictures import _with_targets
 from twin.live.live_bench import LiveBench
 from twin.live.messages import MOST_FRAMES, AskedState
 from twin.live.recording import job_text
@@ -178,6 +179,23 @@ def frames_beside(folder: Path) -> Path:
             (folder / "frames" / f"{channel}_{when}.tiff").write_bytes(b"")
     text = "instrument: gf7_pair\nframes: frames\ndisturbances: launch\nexposure: 20 ms\n"
     return written(folder, text, "measurement.yaml")
+
+
+def test_a_run_of_a_study_that_cannot_be_built_names_the_factor(tmp_path, monkeypatch):
+    written(tmp_path, JOB)
+    file = str(written(tmp_path, STUDY, "study.yaml"))
+    assert "despace" in read_source(file, 0).scalars
+    place = ("job", "perturb", "base/forward/M2", "shift", 2)
+    too_far = [(place, "9 parsec")]
+    monkeypatch.setattr("twin.live.source.base_with", lambda setup, scalars: with_values(setup.base, too_far))
+    with pytest.raises(InputError, match=r"study\.yaml:4: factors\.despace.*(at job\.perturb.*of the base)"):
+        read_source(file, 0)
+
+
+def test_targets_are_imaged_by_cameras_with_line_ccds():
+    assert _with_targets(read_source("gf7_pair").resolved).line_detectors
+    with pytest.raises(ValueError, match=r"no targets can be imaged: .*this camera describes none"):
+        _with_targets(read_source("cassegrain").resolved)
 
 
 def test_a_measurement_opens_its_instrument_as_designed(tmp_path):

@@ -18,11 +18,12 @@ pytest.importorskip("websockets.sync.client", reason="the extra `live` is not in
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
-from twin.live.__main__ import TOKEN
+from twin.live.__main__ import TOKEN, _serve
 from twin.live.clients import BAD_MESSAGES, Client, Goodbye
 from twin.live.computer import CannotStart, ComputerLost
 from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
 from twin.live.server import LiveServer
+from twin.run.cli import InputErrorText
 from twin.serving.guard import BadToken, Guard, new_token
 from twin.serving.server import listen
 
@@ -476,6 +477,15 @@ def test_a_computer_that_cannot_be_started_again_ends_the_server_with_the_reason
     threading.Timer(0.5, computer.kill).start()
     with pytest.raises(CannotStart, match="no such file"):
         server.run(listening)
+
+
+def test_an_instrument_that_cannot_be_built_is_told_by_the_command(monkeypatch):
+    def start(*words: object) -> None:
+        raise CannotStart("job.yaml: no such file")
+
+    monkeypatch.setattr("twin.live.computer.Computer.start", start)
+    with pytest.raises(InputErrorText, match=r"job\.yaml: no such file"):
+        _serve("job.yaml", None, "127.0.0.1", 0, True, "llvm", (), None)
 
 
 def test_the_server_ends_when_the_last_page_is_closed(monkeypatch):

@@ -3,6 +3,7 @@
 Filter and smoother of a series are those of the main job's course.
 """
 
+import errno
 import shutil
 import struct
 import zlib
@@ -21,6 +22,7 @@ from PIL import Image
 
 from analysis.images.image_file import recorded
 from analysis.spots.noise import NoiseModel
+from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State
 from scenes.specs.job import JobSpec
 from scenes.specs.measured.monitor_frames import resolve_measurement
@@ -33,8 +35,9 @@ from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import TimeSeries, run_series, series_states
-from twin.recover import measured_frames
+from twin.recover import measured_frames, recover_run
 from twin.recover.__main__ import app
+from twin.recover.channel_measurement import ChannelMeasurement
 from twin.recover.measured_frames import ChannelFrames, StateFrames, order_warnings
 from twin.recover.recover_report import recover_numbers, recover_report
 from twin.recover.recover_run import RecoverRun, run_recover
@@ -439,6 +442,37 @@ def test_files_that_are_no_raw_frames_are_refused(tmp_path):
     ):
         with pytest.raises(InputError, match=told):
             measured_frames._stacked(test, tuple(str(tmp_path / name) for name in names), ("frames",))
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_spots_that_cannot_be_measured_name_their_frames(run, images, backend, monkeypatch, plain):
+    """Clean frames are measured together, state by state; others channel by channel."""
+
+    def lost(*words, **how):
+        raise SpotError({1 if plain else 0: "it is dark"})
+
+    monkeypatch.setattr(recover_run, "recover", lost)
+    monkeypatch.setattr(ChannelMeasurement, "_position", lost)
+    monkeypatch.setattr(ChannelMeasurement, "plain", plain)
+    with pytest.raises(InputError, match="it is dark") as caught:
+        measured(images.parent, HEAD + "frames: images\n", backend, run)
+    keys = [channel.key for channel in run.experiment.path.channels]
+    issues = caught.value.issues
+    expected = [keys[1]] if plain else [key for key in keys for _ in range(2)]
+    assert [issue.problem.split()[3] for issue in issues] == expected
+    assert all(issue.allowed and "images" in issue.problem for issue in issues)
+
+
+def test_a_file_that_the_disk_does_not_give_is_told(tmp_path, monkeypatch):
+    def broken(image):
+        raise OSError(errno.EIO, "Input/output error")
+
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((30, 30), np.uint16), photometric="minisblack")
+    test = SimpleNamespace(error=lambda text, key, allowed=None: InputError(Issue(text, allowed=allowed)))
+    measured_frames._stacked(test, (str(tmp_path / "a.tif"),), ("frames",))
+    monkeypatch.setattr(measured_frames.ImageFile, "pages", broken)
+    with pytest.raises(InputError, match=r"a\.tif: Input/output error; allowed: a file that can be read"):
+        measured_frames._stacked(test, (str(tmp_path / "a.tif"),), ("frames",))
 
 
 TIMES = ("0 min", "12 min", "0.5 h", "50 min")

@@ -205,6 +205,24 @@ def test_without_pyarrow_parquet_is_refused_with_what_to_do(run, tmp_path, monke
     assert files(tmp_path) == set()
 
 
+def test_frames_that_do_not_come_back_are_not_handed_out(tmp_path, monkeypatch) -> None:
+    """Every file is read back before the folder appears."""
+    frames, other = np.arange(8, dtype=np.uint16).reshape(2, 2, 2), np.zeros((2, 2, 2), np.uint16)
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_bytes("images/a.tiff", tiff(frames, FrameFacts()))
+        write_manifest(folder, "twin.lab", 0.0, 1.0, test="focus")
+    options = ("--tables", "none", "--quiet", "--out")
+    assert invoke(app, tmp_path / "run", *options, tmp_path / "good").exit_code == 0
+    np.testing.assert_array_equal(fits.getdata(tmp_path / "good/images/a.fits"), frames)
+    monkeypatch.setattr(
+        "twin.export.export_run.frames_fits",
+        lambda recorded, cards: frames_fits(replace(recorded, frames=other), cards),
+    )
+    with pytest.raises(RuntimeError, match=r"images/a\.fits does not hold what was put into it"):
+        invoke(app, tmp_path / "run", *options, tmp_path / "bad")
+    assert not (tmp_path / "bad").exists()
+
+
 # --- the command -----------------------------------------------------------------------------------------
 
 

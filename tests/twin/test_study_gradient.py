@@ -1,14 +1,18 @@
 """The Jacobian of a study: AD against differences, against images, what is written, and what is refused."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from optics.raytrace.aim import AimError
+from scenes.yaml.errors import InputError, Issue
 from tests.twin.study_bench import TEXTS, refusals, write_study
 from twin.study.__main__ import app
-from twin.study.gradient.study_gradient import AD, TRACED, WHOLE, study_gradient
+from twin.study.gradient import study_gradient
+from twin.study.gradient.study_gradient import AD, TRACED, WHOLE
 from twin.study.runs.setup import resolve_study
 
 AGREEMENT = 1e-6
@@ -66,7 +70,7 @@ def test_readings_by_posterior_are_differentiated(tmp_path, backend):
     path = write_study(tmp_path, text=TEXTS["of_stated"])
     job = tmp_path / "job.yaml"
     job.write_text(job.read_text("utf-8") + "perturb: {base/forward/M2: {shift: 0 0 1 um}}\n", "utf-8")
-    found = study_gradient(resolve_study(path), backend)
+    found = study_gradient.study_gradient(resolve_study(path), backend)
     assert found.method[8:10].tolist() == [[AD, TRACED]] * 2
     assert found.method[10:].tolist() == [[WHOLE] * 2] * 2
     assert found.worst < AGREEMENT
@@ -94,6 +98,29 @@ def test_what_has_no_derivative_is_refused(tmp_path, old, new, words):
     assert result.exit_code == 2, result.output
     assert words in result.output
     assert not (tmp_path / "out").exists()
+
+
+def test_what_a_factor_takes_names_the_factor(tmp_path, monkeypatch):
+    """A step beside the base that loses the light, and a base whose motion no body has."""
+
+    def lost(*words):
+        raise AimError("no ray")
+
+    def unknown(*words):
+        raise InputError(Issue("no such node", key=("job", "perturb", "base/forward/M2", "shift", 2)))
+
+    setup = resolve_study(write_study(tmp_path, text=TEXTS["gradient"]))
+    traced = SimpleNamespace(
+        setup=setup, maker=SimpleNamespace(base=None), backend=None, _job=lambda factor, step: None, _outcomes=lost
+    )
+    told = r"study\.yaml:\d+: factors\.warmth: the factor cannot be varied by 0\.5 \S+ about the base: no ray"
+    with pytest.raises(InputError, match=told):
+        study_gradient._Traced._values(traced, None, study_gradient.GradientFactor.of(setup, "warmth"), 0.5, [])
+    monkeypatch.setattr(study_gradient, "MonitorExperiment", lambda *words: None)
+    monkeypatch.setattr(study_gradient, "Chain", lambda *words: None)
+    monkeypatch.setattr(study_gradient, "_state", unknown)
+    with pytest.raises(InputError, match=r"factors\.m2z.*no such node \(at job\.perturb"):
+        study_gradient._Traced.fill(traced, None)
 
 
 @pytest.mark.second
