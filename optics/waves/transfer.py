@@ -84,6 +84,7 @@ def polychromatic_transfer(
     Raises:
         ValueError: other shapes, numbers that are not finite, weights that are negative or all zero, wavelengths that
             are not positive, or other numbers of pupils and wavelengths.
+        UnphysicalError: an image so blurred that it takes more than ``MOST_NODES``.
     """
     frequency, defocus = np.asarray(frequency, float), np.asarray(defocus, float)
     if frequency.ndim != 2 or frequency.shape[1] != 2 or defocus.ndim != 1:
@@ -115,6 +116,10 @@ def _band(wavelengths: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.
 
 LEAST_ALONG = 8
 """Nodes on the chords for a constant phase: the amplitude is nearly even."""
+
+MOST_NODES = 2**20
+"""Nodes for one frequency, beyond which an image is so far from sharp that no MTF is asked for: its phase runs over
+hundreds of waves, and a merit of a few such frequencies would take a quarter of an hour."""
 
 LEAST_ACROSS = 13
 """Nodes across the chords for a constant phase: their length goes through half a period of a sine."""
@@ -199,6 +204,11 @@ def _pieces(
         room = min(_NODES_AT_ONCE, _AT_ONCE // layers) // count
         most = order[start : start + max(1, room // LEAST_ACROSS)]
         rows = nodes_for(float(np.max(across[most])), LEAST_ACROSS)
+        if rows * count > MOST_NODES:
+            raise UnphysicalError(
+                f"a transfer function takes {rows * count:.2g} nodes at a frequency (at most {MOST_NODES:.2g}): the "
+                "image is blurred by hundreds of waves"
+            )
         some = most[: max(1, room // rows)]
         yield used[some], rows, count
         start += len(some)

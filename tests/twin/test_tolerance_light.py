@@ -180,9 +180,12 @@ def test_light_of_a_band_takes_as_many_wavelengths_as_it_needs(backend: Backend,
     assert alone[0] < 0.8 * values[0]
 
 
-def test_a_blurred_camera_has_no_mtf_for_tolerances(backend: Backend, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"merits\.mtf: the MTF of the designed camera is not settled"):
-        ToleranceBench(budget(tmp_path, colour_camera("achromat", "[400 nm, 1000 nm]")), backend)
+@pytest.mark.parametrize(
+    ("changes", "why"), [({"spectrum": "[400 nm, 1000 nm]"}, ""), ({"image": "300 mm"}, ": a transfer function takes")]
+)
+def test_a_blurred_camera_has_no_mtf_for_tolerances(backend: Backend, tmp_path: Path, changes: dict, why: str) -> None:
+    with pytest.raises(InputError, match=rf"merits\.mtf: the MTF of the designed camera is not settled{why}"):
+        ToleranceBench(budget(tmp_path, colour_camera("achromat", **changes)), backend)
 
 
 @pytest.mark.second
