@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from analysis.turntable.angle_fits import RESTARTS
+from analysis.turntable.angle_network import RESTARTS
 from optics.numerics.threads import cores
 from scenes.specs.resolved import DistortionSetup, FocusSetup, TurntableSetup
 from twin.run.cost import Cost, Lowered
