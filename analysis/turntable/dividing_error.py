@@ -40,7 +40,7 @@ from scipy.stats import beta, chi2, norm
 from analysis.arrays import Array
 from analysis.measurement_error import UndeterminedError
 from analysis.turntable import angle_fits
-from analysis.turntable.angle_fits import NotConvergedError
+from analysis.turntable.angle_network import NotConvergedError
 
 FEWEST = 3
 """Fewest readings of which one can be rejected: two readings deviate by the same amount."""

@@ -11,8 +11,9 @@ import pytest
 from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import minimize
 
-from analysis.turntable import angle_fits
-from analysis.turntable.angle_fits import FITS, NotConvergedError, angles_left, cross_validate, fewest, fit
+from analysis.turntable import angle_network
+from analysis.turntable.angle_fits import FITS, angles_left, cross_validate, fewest, fit
+from analysis.turntable.angle_network import NotConvergedError
 from analysis.turntable.dividing_error import CalibrationSeries, choose
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
@@ -69,7 +70,7 @@ def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.M
     """Central differences of weights found by BFGS from a loss that is written down here; more decay than in use, so
     that the minimum is sharp enough for differences.
     """
-    monkeypatch.setattr(angle_fits, "DECAY", 0.1)
+    monkeypatch.setattr(angle_network, "DECAY", 0.1)
     rng = np.random.default_rng(11)
     n, h = 15, 4
     x, y, weight = np.linspace(-5.0, 5.0, n), rng.standard_normal(n), rng.uniform(0.5, 2.0, n)
@@ -80,7 +81,7 @@ def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.M
     def trained(value: np.ndarray, start: np.ndarray) -> np.ndarray:
         def loss(z: np.ndarray) -> np.ndarray:
             decay = np.sum(z[:h] ** 2) + np.sum(z[2 * h : 3 * h] ** 2)
-            return np.asarray(0.5 * np.sum(weight * (output(z, x) - value) ** 2) + 0.5 * angle_fits.DECAY * decay)
+            return np.asarray(0.5 * np.sum(weight * (output(z, x) - value) ** 2) + 0.5 * angle_network.DECAY * decay)
 
         def slope(theta: np.ndarray) -> np.ndarray:
             """By complex step, exact to rounding."""
@@ -93,7 +94,7 @@ def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.M
         coefs_=[theta[None, :h], theta[2 * h : 3 * h, None]], intercepts_=[theta[h : 2 * h], theta[-1:]]
     )
     at = np.linspace(-5.0, 5.0, 23)
-    told = angle_fits.gradient(net, at) @ angle_fits.response(net, x, y, weight)
+    told = angle_network.gradient(net, at) @ angle_network.response(net, x, y, weight)
     step = 1e-4
     for i in (2, 7, 12):
         change = np.where(np.arange(n) == i, step, 0.0)
@@ -149,7 +150,7 @@ def test_unknown_fit_and_outside_of_the_points() -> None:
 
 
 def test_network_that_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(angle_fits, "MOST_ITERATIONS", 2)
+    monkeypatch.setattr(angle_network, "MOST_ITERATIONS", 2)
     refuses(NotConvergedError, "none of 4 trainings", fit, "network", ANGLE, wave(ANGLE), 0.1)
     series = CalibrationSeries(ANGLE, wave(ANGLE)[:, None] + np.random.default_rng(1).normal(0.0, 0.1, (41, 5)))
     choice = choose(series, names=("network", "cubic_spline"))

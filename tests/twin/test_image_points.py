@@ -20,7 +20,7 @@ from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.screening import screened
 from twin.orbit.images import image_points
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
-from twin.orbit.images.point_report import judged, true_ground
+from twin.orbit.images.point_judgement import judged, true_ground
 from twin.orbit.images.simulate_run import Simulation, run_simulation
 
 SIMULATE, CALIBRATE = (SCENES / ORBIT / f"{name}.yaml" for name in ("simulate", "calibrate_images"))

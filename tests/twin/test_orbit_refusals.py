@@ -44,7 +44,7 @@ from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
-from twin.orbit.images.point_report import true_ground
+from twin.orbit.images.point_judgement import true_ground
 from twin.orbit.images.simulate_run import run_simulation
 from twin.orbit.jitter.sights import SightsError, sights_of
 from twin.orbit.matching.match_run import run_match

@@ -12,10 +12,10 @@ from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
-from twin.camera.camera_plots import layout_figure
 from twin.camera.camera_run import CameraRun, built_text, perturbed_text, refocus_text, verdict
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, unstated_shadows
+from twin.camera.layout_plot import layout_figure
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
 from twin.run.report import Report, Section, answer
 from twin.run.svg import look, to_svg

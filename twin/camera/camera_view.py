@@ -157,7 +157,7 @@ class CameraView(CameraOptics, Pictured):
     def plot(self) -> Figure:
         """The layout as designed with rays of three fields, in the plane of symmetry and from above."""
         # it draws with what the reports draw with
-        from twin.camera.camera_plots import layout_figure
+        from twin.camera.layout_plot import layout_figure
 
         with look("layout"):
             return layout_figure(self.model, self.path.backend)

@@ -24,7 +24,7 @@ from twin.orbit.calibration.latitude import LatitudeFit
 from twin.orbit.calibration.schemes import FieldErrors, Repeatability, Repeats, SchemeMeans, meets
 from twin.orbit.calibration.screening import ground_sample, meeting_of
 from twin.orbit.calibration.strip import Strips
-from twin.orbit.images.point_report import LineJudgement
+from twin.orbit.images.point_judgement import LineJudgement
 from twin.run.quantity import Quantity, Record
 
 # --- errors at check points, by scheme -------------------------------------------------------------------

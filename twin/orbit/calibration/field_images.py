@@ -27,7 +27,7 @@ from twin.orbit.images.image_points import (
 )
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import Patch, PatchError, fly_patch, imaged_lines
-from twin.orbit.images.point_report import LineJudgement, judged, true_ground
+from twin.orbit.images.point_judgement import LineJudgement, judged, true_ground
 from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.run.procedure import Advance, BenchError
 from twin.run.random_streams import stream

@@ -22,7 +22,8 @@ from twin.orbit.calibration.field_images import Screening
 from twin.orbit.calibration.influences import SURPRISE, DatumRow, LightRow
 from twin.orbit.calibration.screening import ground_sample, meeting_of
 from twin.orbit.images.image_points import BEYOND
-from twin.orbit.images.point_report import WRONG, points_png
+from twin.orbit.images.point_judgement import WRONG
+from twin.orbit.images.point_report import points_png
 from twin.run.artefact import Cell, PngFigure, SvgFigure, Table
 from twin.run.quantity import Quantity, Record
 from twin.run.report import Section

@@ -19,7 +19,7 @@ from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.ground.orthophoto import Raster
-from twin.orbit.images import point_report
+from twin.orbit.images import point_judgement
 from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints
 from twin.orbit.images.patch import LineImage, Patch
 from twin.orbit.images.simulate_run import Simulation
@@ -172,13 +172,13 @@ def georeference_data(run: Simulation) -> dict[str, Any]:
     return {"orthophoto": GEOREFERENCE(control.orthophoto), "dem": GEOREFERENCE(control.dem)}
 
 
-def _errors(one: point_report.LineJudgement) -> list[list[float | None]]:
+def _errors(one: point_judgement.LineJudgement) -> list[list[float | None]]:
     return [[float(v) if np.isfinite(v) else None for v in row] for row in one.error]
 
 
-JUDGED: Record[point_report.LineJudgement] = Record(
+JUDGED: Record[point_judgement.LineJudgement] = Record(
     "Points of one sort in one line against the truth; RMS and mean of those that are not wrong.",
-    *(Quantity(key, attrgetter(key)) for key in point_report.counts_of(())),
+    *(Quantity(key, attrgetter(key)) for key in point_judgement.counts_of(())),
     Quantity("rms_lines_px", lambda one: one.rms[0], "root mean square error along the track"),
     Quantity("rms_pixels_px", lambda one: one.rms[1], "root mean square error along the line"),
     Quantity("mean_lines_px", lambda one: one.mean[0], "mean error along the track"),
@@ -189,8 +189,8 @@ JUDGED: Record[point_report.LineJudgement] = Record(
 )
 TRUE_POINTS: Record[tuple[Patch, MatchedPoints]] = Record(
     "True places of what the points of one sort show, in the order of points.csv.",
-    Quantity("itrs_m", lambda of: point_report.true_ground(*of), "ITRS"),
-    Quantity("lines", lambda of: point_report.judged(*of), "every line that was searched", record=JUDGED),
+    Quantity("itrs_m", lambda of: point_judgement.true_ground(*of), "ITRS"),
+    Quantity("lines", lambda of: point_judgement.judged(*of), "every line that was searched", record=JUDGED),
 )
 
 

@@ -12,7 +12,8 @@ from scipy.special import erfc
 from scipy.stats import norm
 
 from analysis.arrays import Array
-from analysis.turntable.angle_fits import FITS, NotConvergedError, fit
+from analysis.turntable.angle_fits import FITS, fit
+from analysis.turntable.angle_network import NotConvergedError
 from analysis.turntable.dividing_error import CalibrationSeries, rejection_rate
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread

@@ -1,0 +1,128 @@
+"""A camera's layout with rays: side view in the plane of symmetry, and from above."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from optics.geometry.aperture import Circle
+from optics.numerics.backend import Backend
+from scenes.models.camera_model import IMAGE, CameraModel
+from twin.camera.camera_optics import INSIDE
+from twin.camera.first_order_data import obstacles, ray_paths
+from twin.run.artefact import plain
+from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, new_figure, plain_axes
+
+_END_COLOURS = (BLUE, GREEN, VERMILION)
+"""Colours of the negative end of the field, its middle, its positive end."""
+
+_BEFORE = 0.16
+"""Share of the layout's length that is drawn of the light before it."""
+
+_VIEWS = ((1, "y", "Side view, in the plane of symmetry"), (0, "x", "Top view, along the line"))
+
+
+def layout_figure(model: CameraModel, backend: Backend) -> Figure:
+    """Chief and marginal rays of three fields in both views, mirrors, stop and focal plane, to one scale."""
+    boxes = [_extent(model, backend, axis) for axis, _, _ in _VIEWS]
+    low, high = min(b[0] for b in boxes), max(b[1] for b in boxes)
+    heights = [b[3] - b[2] for b in boxes]
+    scale = 9.6 / (high - low)  # inches of the page per metre
+    figure = new_figure(min(scale * sum(heights) + 1.5, 12.0))
+    axes = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": heights})
+    for one, (axis, name, title), box in zip(axes, _VIEWS, boxes, strict=True):
+        _view(one, model, backend, axis, low)
+        one.set_xlim(low, high)
+        one.set_ylim(box[2], box[3])
+        one.set_aspect("equal")
+        one.set_title(title, loc="left")
+        one.set_ylabel(f"{name} [m]")
+        plain_axes(one)
+    axes[1].set_xlabel("z along the parent axis [m]")
+    return figure
+
+
+def _fields(axis: int) -> list[tuple[float, float]]:
+    """Three fields in the plane of a view."""
+    return [(s, 0.0) if axis == 0 else (0.0, s) for s in (-1.0, 0.0, 1.0)]
+
+
+def _rays(model: CameraModel, backend: Backend, axis: int) -> np.ndarray:
+    """Chief, lower and upper marginal ray of three fields, (1 + K, 3, 3, 3)."""
+    stop = np.zeros((3, 2))
+    stop[1:, axis] = -INSIDE, INSIDE
+    return ray_paths(model, backend, _fields(axis), stop).points
+
+
+def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, float, float, float]:
+    """Least and largest z and transverse coordinate of a view, with room about them."""
+    rays = _rays(model, backend, axis)
+    points = rays[1:]
+    z = points[..., 2]
+    length = float(np.ptp(z))
+    room = 0.05 * length
+    first = float(z.min()) - _BEFORE * length
+    across = np.concatenate([points[..., axis], _begun(rays, first)[:1, ..., axis]])
+    return (first, float(z.max()) + 2.0 * room, float(across.min()) - room, float(across.max()) + room)
+
+
+def _begun(points: np.ndarray, first: float) -> np.ndarray:
+    """Rays (1 + K, ..., 3) that begin at z = first."""
+    start, then = points[0], points[1]
+    share = (first - start[..., 2:]) / (then - start)[..., 2:]
+    return np.concatenate([(start + share * (then - start))[None], points[1:]])
+
+
+def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: float) -> None:
+    points = _begun(_rays(model, backend, axis), first)
+    half = np.degrees((model.spec.field.x, model.spec.field.y)[axis])
+    for share, colour in zip((-1.0, 0.0, 1.0), _END_COLOURS, strict=True):
+        axes.plot([], [], color=colour, label=f"field {plain(share * half)}\N{DEGREE SIGN}")
+    axes.plot([], [], color=GREY, ls=(0, (5, 2)), lw=1.0, label="chief ray")
+    axes.plot([], [], color=GREY, lw=0.7, label="marginal rays")
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, borderaxespad=0.1, fontsize=7.5)
+    for k, colour in enumerate(_END_COLOURS):
+        for ray, width in ((1, 0.7), (2, 0.7), (0, 1.0)):
+            line = points[:, k, ray]
+            style = (0, (5, 2)) if ray == 0 else "-"
+            axes.plot(line[:, 2], line[:, axis], color=colour, lw=width, ls=style, alpha=0.9)
+    edges = obstacles(model)
+    for name in (*model.mirrors, IMAGE):
+        edge, pose = edges.get(name, model.apertures.get(name)), model.image_body
+        assert edge is not None
+        low, high = edge.bounds[2 * axis], edge.bounds[2 * axis + 1]
+        other = edge.centre[1 - axis]
+        across = np.linspace(low, high, 80)
+        x, y = (across, np.full(80, other)) if axis == 0 else (np.full(80, other), across)
+        if name == IMAGE:
+            z = np.zeros(80)
+            drawn = pose.apply(np.stack([x, y, z], axis=-1))
+        else:
+            drawn = model.mirror_pose(name).apply(np.stack([x, y, model.surfaces[name].sag(x, y)], axis=-1))
+        if name not in edges and name != IMAGE and model.spec.mirrors[name].light == "passes":  # nothing stands there
+            axes.plot(drawn[:, 2], drawn[:, axis], color=GREY, lw=0.8, ls=(0, (1, 2)), zorder=3)
+        else:
+            axes.plot(drawn[:, 2], drawn[:, axis], color=INK, lw=2.6, solid_capstyle="butt", zorder=3)
+        _label(axes, model, name, drawn[:, [2, axis]], axis)
+    axes.axhline(0.0, color=LIGHT, lw=0.7, ls=(0, (8, 3, 2, 3)), zorder=0)
+
+
+def _label(axes: Axes, model: CameraModel, name: str, drawn: np.ndarray, axis: int) -> None:
+    text = "focal plane" if name == IMAGE else f"{name}, stop" if name == model.spec.stop else name
+    # beyond the end that is farther from the axis; from above all ends are alike, and neighbours take turns
+    turn = name == IMAGE or model.mirrors.index(name) == 0
+    end = drawn[int(np.argmax(np.abs(drawn[:, 1])))] if axis == 1 else drawn[-1 if turn else 0]
+    up = 1 if end[1] >= np.mean(drawn[:, 1]) else -1
+    right = isinstance(model.apertures.get(name), Circle) or name == IMAGE
+    axes.annotate(
+        text,
+        (float(end[0]), float(end[1])),
+        (-4 if right else 4, 4 * up),
+        textcoords="offset points",
+        ha="right" if right else "left",
+        va="bottom" if up > 0 else "top",
+        color=INK,
+        fontsize=8.5,
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8},
+    )
