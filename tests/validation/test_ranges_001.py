@@ -1,5 +1,7 @@
 """Range studies of paper 001's formulas: limits, kinds of return, and rows that turn with a broken formula."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -11,8 +13,8 @@ from tests.validation.mutated import undrawn
 from twin.validation.checks.check import CORRECTED, REFUTED
 from twin.validation.checks.group import Context
 from twin.validation.paper_001.ranges import ranges_group, show
-from twin.validation.paper_001.ranges.curves import Bench, sampled
-from twin.validation.paper_001.ranges.defocus import FieldPoint, variant, with_return
+from twin.validation.paper_001.ranges.curves import FORMS, Bench, Curves, sampled
+from twin.validation.paper_001.ranges.defocus import FieldPoint, PupilStudy, variant, with_return
 from twin.validation.paper_001.ranges.ranges_group import GROUP
 from twin.validation.paper_001.ranges.turns import BOX, CORNERS, EDGE_PX, WIDE_PX, joint_states, motion_of, single_range
 from twin.validation.registry import select
@@ -92,6 +94,44 @@ def test_the_figure_over_the_field_shows_readings_over_truth_less_one(monkeypatc
     for line, (form, k) in zip(lines, shown, strict=True):
         np.testing.assert_allclose(line.get_xdata(), [0.0, 0.6, 1.2], atol=1e-12)
         np.testing.assert_allclose(line.get_ydata(), [100 * (g[form][k] - 1) for g in gains], atol=1e-12)
+
+
+def test_the_figure_of_defocus_shows_false_readings_beside_the_theory(monkeypatch):
+    """A ray at a height h moves by z h / f over a defocus of z, which reads as an angle of z h / f^2."""
+    rng = np.random.default_rng(4)
+    offset = np.array([[-0.2, 0.0], [0.1, 0.0], [0.0, 0.1], [0.0, -0.3], [0.0, 0.0]])
+    slope, size = 1e6 * rng.normal(size=(5, 4)), np.array([1e-5, 1e-4, 1e-3])
+    curves = Curves(size, {f"{name} claimed": rng.uniform(0.1, 9.0, 3) for name in show.turns.NAMES})
+    monkeypatch.setattr(show, "to_svg", lambda figure: figure)
+    study = PupilStudy(offset, slope, np.zeros((4, 2)), np.zeros(4))
+    left, right = show.defocus_svg(study, curves, (5.0, 6.0)).axes
+    for axis, (f, sign) in enumerate(((5.0, -1.0), (6.0, 1.0))):
+        theory, marks = left.get_lines()[2 * axis : 2 * axis + 2]
+        # mm, and seconds of arc per um
+        np.testing.assert_allclose(theory.get_ydata(), sign * 1e-9 * theory.get_xdata() / f**2 * 206264.806, rtol=1e-8)
+        here = offset[:, 1 - axis] == 0.0
+        np.testing.assert_allclose(marks.get_xdata(), 1e3 * offset[here, axis], atol=1e-12)
+        np.testing.assert_allclose(marks.get_ydata(), 1e-6 * slope[here, axis], rtol=1e-12)
+    for line, name in zip(right.get_lines()[1:], ("d_beta", "d_alpha", "d_gamma", "d_f"), strict=True):
+        np.testing.assert_allclose(line.get_xdata(), [10.0, 100.0, 1000.0], rtol=1e-12)
+        np.testing.assert_array_equal(line.get_ydata(), curves.value[f"{name} claimed"])
+
+
+def test_the_figure_of_single_changes_shows_errors_and_limits_in_its_units(monkeypatch):
+    """Arcsec, and mm of the principal distance; one per cent is one per cent of what is drawn below it."""
+    rng, size = np.random.default_rng(5), np.geomspace(1.0, 1000.0, 6)
+    parts = [{form: np.stack([size * up, rng.normal(size=6)], axis=-1) for form in FORMS} for up in (1.0, 2000.0)]
+    one = SimpleNamespace(raw=parts[0], raw_traced=parts[1], lost=3e6, window=500.0)
+    monkeypatch.setattr(show, "to_svg", lambda figure: figure)
+    panels = show.singles_svg(dict.fromkeys(show.turns.NAMES, (one,))).axes
+    for axes, per, fine in zip(panels, (1.0, 1.0, 1.0, 1e-3), (0.1, 0.1, 0.1, 0.04), strict=True):
+        percent, limit, *rest = axes.get_lines()
+        np.testing.assert_allclose(percent.get_xdata(), [per, 3e6 * per])
+        np.testing.assert_allclose(percent.get_ydata(), 0.01 * percent.get_xdata())
+        assert limit.get_ydata()[0] == pytest.approx(fine)
+        drawn = next(line for line in rest if len(line.get_xdata()) == 12)
+        found = per * np.concatenate([part[show.PRINTED] for part in parts])
+        np.testing.assert_allclose(drawn.get_xydata(), np.abs(found), rtol=1e-12)
 
 
 def test_an_unknown_kind_of_return_is_refused(bench):
