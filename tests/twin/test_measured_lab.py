@@ -27,6 +27,7 @@ from twin.laboratory.distortion_run import DistortionRun, measure_files
 from twin.laboratory.export import export_turntable
 from twin.laboratory.focus_run import FocusRun, align_files
 from twin.laboratory.measured_readings import read_turntable
+from twin.laboratory.turntable_report import turntable_report
 from twin.laboratory.turntable_run import TurntableRun, run_turntable
 from twin.orbit.flight.line_camera import line_cameras
 
@@ -122,6 +123,23 @@ def test_focus_exported_and_read_back(tmp_path: Path) -> None:
     # after the round the assembly stands where the shims were to bring it
     after = numbers("focus", files / "focus_round_1_mtf.yaml", tmp_path / "after")
     assert after["confocal_um_max"] == pytest.approx(done["confocal_um_max"], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("noise", "subdivision", "said"),
+    [(100.0, 1.0, "the noise of the calibration"), (1.0, 10.0, "an offset common to all readings")],
+)
+def test_the_largest_error_of_a_table_is_what_limits_its_angles(noise: float, subdivision: float, said: str) -> None:
+    """Noise of the reference, and the error of the subdivision, which calibrated angles have in common."""
+    spec = load_named(TurntableTestSpec, LAB, JOBS / "turntable.yaml")
+    fine = spec.dividing_error.subdivision
+    fine = fine.model_copy(update={"rms": subdivision * fine.rms})
+    changed = {
+        "reference": spec.reference.model_copy(update={"noise": noise * spec.reference.noise}),
+        "dividing_error": spec.dividing_error.model_copy(update={"subdivision": fine}),
+    }
+    run = run_turntable(spec.model_copy(update=changed), 7, names=("cubic_spline",))
+    assert turntable_report(run).verdict.endswith(f"limited by {said}.")
 
 
 def test_exported_comparisons_are_those_of_the_bench(tmp_path: Path) -> None:
