@@ -12,6 +12,7 @@ from optics.numerics.invariants import UnphysicalError
 from optics.raytrace.aim import AimError
 from scenes.models.camera_axis import AfocalError
 from scenes.models.camera_model import CameraModel, derive_camera
+from scenes.models.stated_focal_length import check_entrance_pupil
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
@@ -154,6 +155,13 @@ def test_a_state_without_focus_is_said(backend, capsys) -> None:
         with pytest.raises(Exit if code else UnphysicalError) as left, cli.explained(Console(stderr=True)):
             raise kind
         assert code is None or left.value.exit_code == code
+
+
+def test_a_stop_whose_rim_other_rays_meet_is_refused() -> None:
+    spec = validate(CameraSpec, parse_yaml(text_of(CASSEGRAIN, "M1", 4.0, "300 mm", 0.5)))
+    check_entrance_pupil(spec, 0.2975)
+    with pytest.raises(InputError, match="stop: rays of other heights than the stated beam's meet the rim of the stop"):
+        check_entrance_pupil(spec, 0.2965)
 
 
 def test_a_telecentric_image_has_no_place_of_its_pupil(backend) -> None:

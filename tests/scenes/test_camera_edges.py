@@ -73,7 +73,9 @@ def test_edges_take_the_share_of_their_area(backend, cut, bare) -> None:
         # 10 000 rays spread evenly tell an area to its outline over their distance: 1e-3
         assert optics.wavefront().vignetted == pytest.approx(share, abs=2e-3), text
     with pytest.raises(InputError, match="edges leave no light to speak of"):
-        CameraOptics.alone(with_edges("{clear: circle, radius: 5 mm}"), backend).wavefront()
+        FieldBeams.field_errors(
+            derive_camera(with_edges("{clear: circle, radius: 5 mm}"), backend), backend, [(0.0, 0.0)], 6
+        )
 
 
 @pytest.mark.second

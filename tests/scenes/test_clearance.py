@@ -1,6 +1,7 @@
 """Bodies that stand in each other, prisms in the way of light, and beams that miss a prism: found, and told."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,15 @@ from scipy.spatial import ConvexHull, Delaunay
 
 from optics.geometry.pose import rotation_matrix
 from scenes.models import instrument_builder, obstruction
-from scenes.models.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, remedy, separation
+from scenes.models.clearance import (
+    LEAST_GAP,
+    check_clearance,
+    check_solids,
+    convex_bodies,
+    find_overlaps,
+    remedy,
+    separation,
+)
 from scenes.models.instrument_model import MisplacedError
 from scenes.models.obstruction import RAYS, find_obstructions
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
@@ -85,6 +94,15 @@ def test_beams_wider_than_the_optics_can_lead_are_refused(instrument, backend, m
     with pytest.raises(MisplacedError, match="light of the monitor does not get to its return faces") as caught:
         obstruction.check_beams(pair, backend)
     assert caught.value.key == ("monitor",)
+
+
+def test_a_body_that_is_open_is_refused(instrument) -> None:
+    pair = instrument("gf7_pair")
+    check_solids(pair.assembly, pair.solids)
+    prism = next(solid for solid in pair.solids if solid.path == "base/forward/monitor/left/prism_180")
+    with pytest.raises(MisplacedError, match="do not enclose a body; it is open") as caught:
+        check_solids(pair.assembly, [replace(prism, faces=prism.faces[:3])])
+    assert (caught.value.key, caught.value.channel) == (("monitor", "prism_180"), ("forward", "left"))
 
 
 @pytest.fixture

@@ -171,17 +171,14 @@ CURVE = XYPolynomial(x2=1e-3)
 @pytest.mark.parametrize(
     ("shape", "zemax", "batoid", "camera_file"),
     [
-        (
-            Surface(-0.1, figure=GRID),
-            "a figure on a grid",
-            "cannot carry this: a figure on a grid",
-            "which a camera's file",
-        ),
-        (
-            Surface(-0.1, figure=SummedFigure(ERROR, GRID)),
-            "a figure on a grid",
-            "cannot carry this: a figure on a grid",
-            "which a camera's file",
+        *(
+            (
+                Surface(-0.1, figure=figure),
+                "a figure on a grid",
+                "cannot carry this: a figure on a grid",
+                "which a camera's",
+            )
+            for figure in (GRID, SummedFigure(ERROR, GRID))
         ),
         (Surface(-0.1, terms=(CURVE,), figure=ERROR), "with other terms of its sag", "", ""),
         (Surface(-0.1, even=(0.0,) * 7 + (1e-9,)), "even powers beyond r^16", "", ""),
