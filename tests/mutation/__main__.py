@@ -142,6 +142,11 @@ def summary(verdicts: Iterable[Verdict], known: dict[str, str]) -> dict[str, Any
 @app.command("measure")
 def measured(folder: Map, workers: Annotated[int, typer.Option(min=1)] = 2) -> None:
     """Run all tests once and note which lines each of them runs."""
+    if any(folder.glob("*.coverage")):
+        typer.echo(
+            f"error: {folder} holds a map, of another tree perhaps; choose another folder or remove it", err=True
+        )
+        raise typer.Exit(2)
     raise typer.Exit(measure(Path.cwd(), folder, workers))
 
 
@@ -204,7 +209,7 @@ def utterances(
     for one in utterances_below(Path.cwd(), tuple(only.split(",")) if only else PACKAGES):
         every += 1
         seen, absent = one.tests(known)
-        if not seen or not absent:
+        if not seen or not (absent or one.always):
             bare += 1
             typer.echo(f"{one.path}:{one.line}\t{one.scope}\tseen by {len(seen)}, absent in {len(absent)}\t{one.text}")
     typer.echo(f"{every} utterances, {bare} without a test that sees them and one that sees them absent")

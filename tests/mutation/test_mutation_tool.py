@@ -119,6 +119,9 @@ def test_utterances_are_found_and_those_without_a_test_told() -> None:
     lines = {6: ["a", "b"], 7: ["a"], 8: ["b"]}
     assert one.tests(CoverageMap({"toy.py": lines}, {})) == ({"a"}, {"b"})
     assert one.tests(CoverageMap({"toy.py": {6: ["b"], 8: ["b"]}}, {})) == (set(), {"b"})
+    assert not one.always
+    (refusing,) = _of(ast.parse("def refuse(x):\n    x = str(x)\n    raise ValueError(x)"), "toy.py", "", (0, 0))
+    assert refusing.always
 
 
 def test_what_runs_at_import_is_met_by_all_tests_of_the_file() -> None:
@@ -161,6 +164,7 @@ def test_a_campaign_finds_what_tests_find(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(command, "planted", lambda root: [])
     run = CliRunner().invoke
     assert run(command.app, ["measure", "--map", "map"]).exit_code == 0
+    assert "holds a map" in run(command.app, ["measure", "--map", "map"]).output
     told = run(command.app, ["run", "--map", "map", "--out", "out", "--count", "24", "--workers", "1"])
     survivors = [line for line in told.stdout.splitlines() if "->" in line]
     assert any("unused" in line and "(uncovered)" in line for line in survivors), told.stdout

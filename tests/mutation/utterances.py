@@ -32,6 +32,7 @@ class Utterance:
         scope: function.
         body: first and last line of the function's body.
         text: beginning of what is said.
+        always: the function does nothing else, so that who calls it decides.
     """
 
     path: str
@@ -39,6 +40,7 @@ class Utterance:
     scope: str
     body: tuple[int, int]
     text: str
+    always: bool
 
     def tests(self, known: CoverageMap) -> tuple[set[str], set[str]]:
         """The tests that run its line, and those that run its function without it."""
@@ -56,16 +58,17 @@ def utterances_below(root: Path, places: tuple[str, ...]) -> Iterator[Utterance]
             yield from _of(ast.parse(file.read_bytes()), file.relative_to(root).as_posix(), "", (0, 0))
 
 
-def _of(node: ast.AST, path: str, scope: str, body: tuple[int, int]) -> Iterator[Utterance]:
+def _of(node: ast.AST, path: str, scope: str, body: tuple[int, int], always: bool = False) -> Iterator[Utterance]:
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         scope = f"{scope}.{node.name}".lstrip(".")
         if not isinstance(node, ast.ClassDef):
             body = (node.body[0].lineno, node.end_lineno or node.lineno)
     said = _said(node, scope.split(".")[-1])
     if said is not None and isinstance(node, ast.stmt):
-        yield Utterance(path, node.lineno, scope, body, said)
+        yield Utterance(path, node.lineno, scope, body, said, always)
+    leaves = isinstance(node, ast.FunctionDef) and not any(isinstance(one, ast.Return) for one in ast.walk(node))
     for child in ast.iter_child_nodes(node):
-        yield from _of(child, path, scope, body)
+        yield from _of(child, path, scope, body, leaves and isinstance(child, ast.Raise))
 
 
 def _said(node: ast.AST, function: str) -> str | None:
