@@ -76,9 +76,12 @@ def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera, monkeyp
     beams = VariedBeams(optics, [(0.0, 0.0)], None, None)
     with pytest.raises(BeamMissedError, match="a surface's edge stops light of a field"):
         beams.light([{"camera/M2": Motion(shift=(0.05, 0.0, 0.0))}])
-    # more terms than places at which the light is known
-    with pytest.raises(UnphysicalError, match="800 Zernike terms are not independent"):
-        beams.zernike_rows(800)
+    # more terms than places at which light comes through
+    assert np.isfinite(beams.zernike_rows(11)).all()
+    few = [one[:9] for one in beams.lit()[0]]
+    monkeypatch.setattr(beams, "lit", lambda: [few])
+    with pytest.raises(UnphysicalError, match="11 Zernike terms are not independent"):
+        beams.zernike_rows(11)
     monkeypatch.setattr(varied_beams, "RESIDUAL", 0.0)
     with pytest.raises(varied_beams.RoughError, match=r"polynomials do not follow: they leave \S+ waves"):
         VariedBeams(optics, [(0.0, 0.0)], None, None)

@@ -18,6 +18,7 @@ from scenes.specs.resolved import resolve_job
 from tests.tiers import quick
 from tests.twin import dirty_frames
 from tests.twin.dirty_frames import KINDS, Drawn, clean_scene, draw, measurement, record, replace
+from twin.recover import channel_measurement
 
 SETS = 30
 FALSE_ALARM = 1e-3
@@ -126,16 +127,18 @@ def test_the_noise_of_a_subtracted_level_is_that_of_the_light(bench, monkeypatch
     assert told == ["subtracted level"] * 6
 
 
-def test_too_little_of_a_spot_is_refused(bench):
-    """Saturated to where its flanks are faint, it would have a sigma many times as large."""
+def test_too_little_of_a_spot_is_refused(bench, monkeypatch):
+    """All but its faint flanks is saturated, which makes sigma 2.6 times as large: by a smaller limit too much."""
     template, detector, noise = bench
     drawn = draw(template, detector, (), 5)
-    lost = np.unravel_index(np.argsort(drawn.after.mean(axis=0), axis=None)[-150:], template.shape)
-    drawn.after[:, *lost] = 0
+    drawn.after[drawn.after > 0.03 * detector.max_dn] = detector.max_dn
+    monkeypatch.setattr(channel_measurement, "_DEAREST", 1.0)
     with one_blas_thread():
         work = measurement(drawn, template, noise)
-        (issue,) = work.search() or work.measure()
-    assert "too much of the spot is missing" in issue.problem, issue
+        assert work.search() == []
+        (issue,) = work.measure()
+    assert issue.key[-1] == "after"
+    assert re.search(r"too much of the spot is missing \(.*saturation.*\): sigma would grow 2\.6-fold", issue.problem)
 
 
 def test_dark_frames_with_a_level_do_not_go_with_frames_without(bench):
