@@ -143,9 +143,7 @@ def summary(verdicts: Iterable[Verdict], known: dict[str, str]) -> dict[str, Any
 def measured(folder: Map, workers: Annotated[int, typer.Option(min=1)] = 2) -> None:
     """Run all tests once and note which lines each of them runs."""
     if any(folder.glob("*.coverage")):
-        typer.echo(
-            f"error: {folder} holds a map, of another tree perhaps; choose another folder or remove it", err=True
-        )
+        typer.echo(f"error: {folder} holds a map already; choose another folder or remove it", err=True)
         raise typer.Exit(2)
     raise typer.Exit(measure(Path.cwd(), folder, workers))
 
