@@ -185,6 +185,7 @@ def test_progress_is_told_where_there_is_no_terminal(run: Callable, tmp_path: Pa
 
 @pytest.mark.parametrize("silent", [False, True])
 def test_work_that_takes_long_says_so_once_by_its_first_pieces(silent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part that begins again, of a second course for instance, has its own time."""
     now = [100.0]
     monkeypatch.setattr(cli, "time", SimpleNamespace(monotonic=lambda: now[0]))
     said = io.StringIO()
@@ -193,6 +194,9 @@ def test_work_that_takes_long_says_so_once_by_its_first_pieces(silent: bool, mon
             for done in range(first, first + 5):
                 advance(part, done, total)
                 now[0] += 4.0
+        for done in (1, 2, 25, 1, 2):
+            advance("ground", done, 25)
+            now[0] += 6.0 if done < 25 else 600.0
     assert said.getvalue() == ("" if silent else "note: passes: about 7 min left\n")
 
 

@@ -181,7 +181,7 @@ class Standing:
 
     def advance(self, part: str, done: int, total: int) -> None:
         """So many of so many parts of this are done."""
-        if part != self.part:
+        if part != self.part or done < self.done:
             self.begun, self.before = time.monotonic(), done
         self.part, self.done, self.total = part, done, total
 

@@ -279,6 +279,7 @@ def _passed(
     flight = PairFlight(pair, course.times, lines, calibrated, views)
     changes = {name: np.array([model.on_ground(name, row) for row in course.positions]) for name in model.cameras}
     truth = experiment.sight.truth(list(course.states))
+    advance("image quality", 0, 1)
     quality = image_quality(
         experiment.instrument, experiment.backend, list(course.states), FOCUS_FIELDS, obstruction=False
     )
@@ -298,7 +299,9 @@ def _passed(
         for name, one in quality.cameras.items()
     }
     images = []
-    for time in test.loop.images.times if test.loop.images is not None else ():
+    times = test.loop.images.times if test.loop.images is not None else ()
+    for done, time in enumerate(times):
+        advance("line images", done, len(times))
         k = number_of(time, test.times)
         assert k is not None  # the file was checked
         now = {name: values[k] for name, values in changes.items()}
