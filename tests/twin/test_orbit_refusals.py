@@ -113,6 +113,8 @@ def map_files(folder: Path) -> None:
         more = {"dtype": dtype, "crs": crs, "transform": place, "nodata": None if corner else -99.0}
         with rasterio.open(folder / name, "w", **how, **more) as file:
             file.write(np.full((120, 150), value, dtype), 1)
+    fine = {"dtype": "uint8", "crs": "EPSG:32650", "transform": from_origin(498_000.0, 4_430_000.0, 0.05, 0.05)}
+    rasterio.open(folder / "large.tif", "w", **how | fine | {"width": 60_000, "height": 60_000}, SPARSE_OK=True).close()
     with rasterio.open(folder / "image.png", "w", driver="PNG", width=4, height=4, count=1, dtype="uint8") as file:
         file.write(np.zeros((4, 4), "u1"), 1)
     (folder / "text.tif").write_text("no TIFF")
