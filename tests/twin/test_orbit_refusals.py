@@ -19,6 +19,7 @@ import twin.orbit.__main__ as command
 from analysis.orbit.forward_intersection import CalibratedLine
 from optics.numerics.invariants import UnphysicalError
 from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.measured.adjust_setup import resolve_measured_adjust
 from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resolve_measured_angle
 from scenes.specs.measured.pass_files import GroundFileSpec, PlatformFilesSpec, RasterFileSpec, with_absolute_files
@@ -35,6 +36,7 @@ from twin.laboratory.distortion_run import _check_angles
 from twin.orbit.angle.angle_flight import angle_camera
 from twin.orbit.angle.angle_run import SimulatedAngleRun
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
+from twin.orbit.block.block_run import run_adjustment
 from twin.orbit.block.point_workers import PointWorkers
 from twin.orbit.conventions.check_run import run_check
 from twin.orbit.export.estimated_change import ground_rows
@@ -163,9 +165,14 @@ def used(kind: type, setup: type, run: Callable[..., object], folder: Path, spec
     run(setup.model_construct(test=test, camera=load_three_line_camera("th1")), None, 0)
 
 
+def block_files(folder: Path) -> None:
+    shutil.copytree(SCENES / ORBIT / "measured", folder, dirs_exist_ok=True)
+
+
 READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, dict[str, Any]], object]]] = {
     "campaign": (campaign_files, lambda folder, _: orbit_files.read_back(folder / "calibrate.yaml")),
     "angle": (campaign_files, angle_used),
+    "block": (block_files, lambda folder, _: run_adjustment(resolve_measured_adjust(folder / "adjust.yaml"), None, 0)),
     "platform": (
         platform_files,
         lambda folder, spec: platform_table(
