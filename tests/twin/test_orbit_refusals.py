@@ -16,14 +16,17 @@ import tifffile
 from rasterio.transform import from_origin
 
 import twin.orbit.__main__ as command
-from analysis.orbit.forward_intersection import CalibratedLine
+from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
+from analysis.orbit.three_line_model import LineModel
+from analysis.spots.spot_positions import SpotError
 from optics.numerics.invariants import UnphysicalError
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.adjust_setup import resolve_measured_adjust
 from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resolve_measured_angle
 from scenes.specs.measured.pass_files import GroundFileSpec, PlatformFilesSpec, RasterFileSpec, with_absolute_files
-from scenes.specs.orbit.setup import load_three_line_camera, resolve_angle, resolve_simulate
+from scenes.specs.orbit.angle import EffectsSpec
+from scenes.specs.orbit.setup import JitterSetup, load_three_line_camera, resolve_angle, resolve_simulate
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.tiers import quick
@@ -38,23 +41,29 @@ from twin.orbit.angle.angle_run import SimulatedAngleRun
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
 from twin.orbit.block.block_run import run_adjustment
 from twin.orbit.block.point_workers import PointWorkers
+from twin.orbit.calibration.observations import light_shift
 from twin.orbit.conventions.check_run import run_check
 from twin.orbit.export.estimated_change import ground_rows
 from twin.orbit.export.export_run import read_exportable, run_export
+from twin.orbit.export.polynomial_control import controlled
 from twin.orbit.export.polynomial_export import read_polynomial_source
 from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
+from twin.orbit.images.patch import Patch, PatchError
 from twin.orbit.images.point_report import true_ground
 from twin.orbit.images.simulate_run import run_simulation
+from twin.orbit.jitter import jitter_run, sights
 from twin.orbit.jitter.sights import SightsError, sights_of
 from twin.orbit.matching.match_run import run_match
 from twin.orbit.measured.dimap_sensor import read_scene
 from twin.orbit.measured.earth_orientation import read_earth_orientation
 from twin.orbit.measured.ground_files import read_ground_points
 from twin.orbit.measured.map_part import UserMap
+from twin.orbit.measured.pass_measurements import GroundPoints
 from twin.orbit.measured.platform_files import platform_table, read_platform
+from twin.orbit.monitoring import closed_loop, monitoring_run
 from twin.orbit.monitoring.monitor_series import MonitorSeries
 from twin.run.cli import InputErrorText
 from twin.run.cluster import ClusterError
@@ -296,6 +305,16 @@ MEASURED: Any = Ns(setup=resolve_measured_angle(SCENES / ORBIT / "measured/angle
 PLACES = np.column_stack([np.zeros((2, 3)), [-179.9, 179.9], np.zeros(2)])
 SPOT = Ns(reading=np.ones((1, 1)), lines=np.full((1, 1), 3), file=Ns(file="spots.csv"), head="reading [deg]")
 UNMADE: Any = Ns(setup=None, test=None, camera=None, instrument=None, images={"nadir": 1}, kind="other", name="th1")
+MODEL = LineModel(np.eye(3), np.ones(3), np.zeros(3))
+NOWHERE: Any = Ns(offset=np.zeros(5), scale=np.ones(5), ground=lambda line, *_: np.full((2, len(line)), np.nan))
+TIES = GroundPoints.of(["a"], np.full((1, 3), np.nan), np.zeros((3, 3)), "tie")
+OFF = Ns(sensor=lost(), place=np.ones((1, 2)), point=np.zeros(1, int))
+STEEP: Any = Ns(
+    images={"nadir": Ns(image_point=lambda *at: at, sensor=Ns(ground=lambda line, pixel, height: height))},
+    terrain=Ns(limits=(0.0, 2.0), height=lambda east, north: 1.5 * east),
+    frame=Ns(local=lambda height: (height, height, height)),
+)
+"""Ground that rises by 1.5 m where the look, followed up by 1 m, leads."""
 CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: measure_points(UNMADE, Ns(tie=1)), PointsError, "tie points need two lines"),
     (lambda: true_ground(UNMADE, UNMADE), ValueError, "points are of kind map or tie, not 'other'"),
@@ -312,6 +331,22 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: run_export(UNMADE, UNMADE, None, changes={}), ValueError, "only the cameras of an instrument"),
     (lambda: PointWorkers(GONE, 1).results(abs, [(1,)]), ClusterError, "a worker was lost"),
     (lambda: ground_rows(lost(), calibrated(), np.zeros(4), 0.0), ValueError, "a look misses the Earth"),
+    (
+        lambda: light_shift(lost(), LineModel(np.eye(3), np.ones(3), np.zeros(3)), *np.ones((3, 1))),
+        UnphysicalError,
+        "a look misses",
+    ),
+    (
+        lambda: controlled(NOWHERE, Ns(at=lambda line, sample: np.zeros((len(line), 2)))),
+        ValueError,
+        "do not lead back to the",
+    ),
+    (lambda: Patch.true_point(STEEP, "nadir", np.ones(1), np.ones(1)), PatchError, "as steep as the look"),
+    (
+        lambda: sights._start(Ns(ground=TIES), {"blue": OFF}, np.arange(1), Ns(height=0.0)),
+        SightsError,
+        "lines look past",
+    ),
     (lambda: angle_camera(UNMADE, None), ValueError, "an instrument's lines need a backend"),
     (lambda: RationalPolynomial.through(PLACES, PLACES), ValueError, "the 180th meridian or a pole"),
     (lambda: sights_of(UNMADE, {}, ("blue",), None, None), SightsError, "no image points of blue"),
@@ -339,3 +374,75 @@ def test_what_is_refused(case: tuple[Any, ...], tmp_path: Path, monkeypatch: pyt
     call, error, words = case
     with pytest.raises(error, match=words):
         call()
+
+
+# --- errors of a part ---------------------------------------------------------------------------------------
+
+
+def fails(error: Exception) -> Callable[..., Any]:
+    def part(*_: object, **__: object) -> None:
+        raise error
+
+    return part
+
+
+MONITOR: Any = Ns(analysis=Ns(centroid=None), errors=Ns(switched_on=False), frames=1, mechanisms=None, times=[60.0])
+MONITOR.times_key = ("mechanisms", "readings")
+EXPERIMENT: Any = Ns(expected_frames=abs, nominal_photons=1, calibration=Ns(spots=2), instrument=None)
+SERIES: Any = Ns(experiment=EXPERIMENT, spec=MONITOR)
+EXPERIMENT.path = Ns(channels=[Ns(key="left"), Ns(key="right")])
+STRIP: Any = JitterSetup.__new__(JitterSetup)
+object.__setattr__(STRIP, "test", Ns(effects=EffectsSpec(), lines=("blue", "red"), search=None))
+object.__setattr__(STRIP, "camera", load_three_line_camera("ms4"))
+
+
+def spots_lost() -> None:
+    with MonitorSeries._told(SERIES, [0]):
+        raise SpotError({1: "too faint"})
+
+
+PARTS: dict[str, tuple[Any, dict[str, Any], Callable[[], object], tuple[str, ...], str, str]] = {
+    "monitor": (
+        monitoring_run,
+        {"fly_monitored": fails(IntersectionError("looks are parallel"))},
+        lambda: monitoring_run.run_monitor(Ns(test=MONITOR), UNMADE, 1),
+        ("cameras",),
+        "looks are parallel",
+        "cameras that look different ways",
+    ),
+    "spots of a loop": (
+        closed_loop,
+        {"observe": fails(SpotError({0: "too faint"})), "judged_spots": lambda *_: None},
+        lambda: closed_loop.reader(Ns(experiment=EXPERIMENT), MONITOR, 1)({}, 0),
+        MONITOR.times_key,
+        "the spots cannot be read at 1 min: spot 0: too faint",
+        "a smaller range of the mechanisms",
+    ),
+    "spots of a course": (
+        closed_loop,
+        {},
+        spots_lost,
+        ("course",),
+        "the spot right cannot be measured at 1 min (too faint)",
+        "the spots on their CCDs",
+    ),
+    "jitter": (
+        jitter_run,
+        {"fly_strip": lambda *_: (Ns(name="strip", line_times={}), None), "sights_of": fails(SightsError("blind"))},
+        lambda: jitter_run.run_jitter(STRIP, None, 1),
+        ("points",),
+        "strip: blind",
+        jitter_run._REMEDY,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_an_error_of_a_part_is_told_with_its_key_and_remedy(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module, parts, call, key, words, remedy = PARTS[name]
+    for part, made in parts.items():
+        monkeypatch.setattr(module, part, made)
+    with pytest.raises(BenchError) as caught:
+        call()
+    assert (str(caught.value), caught.value.key) == (words, key)
+    assert remedy in caught.value.remedy
