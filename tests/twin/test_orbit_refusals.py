@@ -4,6 +4,7 @@ file leads to."""
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace as Ns
@@ -34,11 +35,12 @@ from tests.twin import dimap_bench, orbit_files
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import edited_copy, invoke, refused
 from tests.twin.orbit_files import REFUSALS
-from tests.twin.pushbroom_bench import lost
+from tests.twin.pushbroom_bench import lines, lost
 from twin.laboratory.distortion_run import _check_angles
 from twin.orbit.angle.angle_flight import angle_camera
 from twin.orbit.angle.angle_run import SimulatedAngleRun
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
+from twin.orbit.block import point_workers
 from twin.orbit.block.block_run import run_adjustment
 from twin.orbit.block.point_workers import PointWorkers
 from twin.orbit.calibration.observations import light_shift
@@ -48,6 +50,7 @@ from twin.orbit.export.export_run import read_exportable, run_export
 from twin.orbit.export.polynomial_control import controlled
 from twin.orbit.export.polynomial_export import read_polynomial_source
 from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
+from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
@@ -56,6 +59,7 @@ from twin.orbit.images.point_report import true_ground
 from twin.orbit.images.simulate_run import run_simulation
 from twin.orbit.jitter import jitter_run, sights
 from twin.orbit.jitter.sights import SightsError, sights_of
+from twin.orbit.matching import match_run
 from twin.orbit.matching.match_run import run_match
 from twin.orbit.measured.dimap_sensor import read_scene
 from twin.orbit.measured.earth_orientation import read_earth_orientation
@@ -63,7 +67,7 @@ from twin.orbit.measured.ground_files import read_ground_points
 from twin.orbit.measured.map_part import UserMap
 from twin.orbit.measured.pass_measurements import GroundPoints
 from twin.orbit.measured.platform_files import platform_table, read_platform
-from twin.orbit.monitoring import closed_loop, monitoring_run
+from twin.orbit.monitoring import closed_loop, line_images, monitoring_run
 from twin.orbit.monitoring.monitor_series import MonitorSeries
 from twin.run.cli import InputErrorText
 from twin.run.cluster import ClusterError
@@ -376,6 +380,17 @@ def test_what_is_refused(case: tuple[Any, ...], tmp_path: Path, monkeypatch: pyt
         call()
 
 
+# --- workers ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("warnings", [[], ["another version of NumPy"]])
+def test_what_is_to_be_known_of_a_cluster_is_told(warnings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(point_workers, "remote_workers", lambda *_: nullcontext(Ns(warnings=warnings, count=1)))
+    told: list[str] = []
+    with point_workers.point_workers(None, "tcp://localhost:1", told.append):
+        assert told == warnings
+
+
 # --- errors of a part ---------------------------------------------------------------------------------------
 
 
@@ -446,3 +461,38 @@ def test_an_error_of_a_part_is_told_with_its_key_and_remedy(name: str, monkeypat
         call()
     assert (str(caught.value), caught.value.key) == (words, key)
     assert remedy in caught.value.remedy
+
+
+@pytest.mark.second
+def test_images_that_matching_cannot_use_are_told(good, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, spec = good("match")
+    monkeypatch.setattr(match_run, "measure_points", fails(ValueError("no spline")))
+    with pytest.raises(BenchError, match="^the images cannot be matched: no spline$") as caught:
+        READERS["match"][1](folder, spec)
+    assert (caught.value.key, caught.value.remedy) == (("images",), "images of the map's ground")
+
+
+LINE_IMAGES: Any = Ns(images=Ns(ground=Ns(terrain=Ns(height=0.0)), side=9, points=None))
+PAIR: Any = Ns(
+    pair=("forward", "backward"),
+    test=Ns(loop=LINE_IMAGES, times=[0.0], line_time=1e-3, ground=Ns(first=5999.0, last=6001.0)),
+)
+FEW: dict[str, Any] = {
+    "corrected_line": lambda line, *_: line,
+    "_optics": lambda *_: None,
+    "second_view": lambda *_: 0.0,
+    "Sensor": lambda *_: lines()["nadir"].sensor,
+    "imaged_lines": lambda *_: None,
+    "fly_patch": lambda *_: None,
+    "tie_points": lambda *_, **__: Ns(in_all=np.arange(20) < 7),
+}
+
+
+def test_line_images_with_too_few_points_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    for part, made in FEW.items():
+        monkeypatch.setattr(line_images, part, made)
+    known = dict.fromkeys(PAIR.pair)
+    flight, flown = Ns(lines=[known], calibrated=known), Ns(true=None, measured=None, earth=Earth())
+    with pytest.raises(BenchError, match="^line images: only 7 of 20 points were matched$") as caught:
+        line_images.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
+    assert caught.value.key == ("mechanisms", "images")
