@@ -467,7 +467,7 @@ def test_an_error_of_a_part_is_told_with_its_key_and_remedy(name: str, monkeypat
 def test_images_that_matching_cannot_use_are_told(good, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, spec = good("match")
     monkeypatch.setattr(match_run, "measure_points", fails(ValueError("no spline")))
-    with pytest.raises(BenchError, match="^the images cannot be matched: no spline$") as caught:
+    with pytest.raises(BenchError, match=r"^the images cannot be matched: no spline$") as caught:
         READERS["match"][1](folder, spec)
     assert (caught.value.key, caught.value.remedy) == (("images",), "images of the map's ground")
 
@@ -493,6 +493,6 @@ def test_line_images_with_too_few_points_are_told(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(line_images, part, made)
     known = dict.fromkeys(PAIR.pair)
     flight, flown = Ns(lines=[known], calibrated=known), Ns(true=None, measured=None, earth=Earth())
-    with pytest.raises(BenchError, match="^line images: only 7 of 20 points were matched$") as caught:
+    with pytest.raises(BenchError, match=r"^line images: only 7 of 20 points were matched$") as caught:
         line_images.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
     assert caught.value.key == ("mechanisms", "images")
