@@ -172,6 +172,8 @@ class Reduction:
             places.append(np.arange(len(columns)))
             tables += list(columns[where])
             first += len(where)
+        if not points:
+            return ()
         order = np.lexsort((np.concatenate(codes), np.concatenate(points)))
         every: list[Indices] = [np.concatenate(v).astype(np.intp)[order] for v in (points, codes, owners, places)]
         point, code, owner, place = every

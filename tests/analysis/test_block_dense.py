@@ -26,6 +26,7 @@ def compared(block):
     """Largest differences in sigmas, and relative ones of covariances."""
     found, dense = adjust_block(block), DenseBlock(block)
     spread = found.point_covariance(dense.points)
+    assert found.point_covariance(dense.points[:0]).shape == (0, 3, 3)
     sigma = np.sqrt(np.diagonal(dense.ground_covariance, axis1=1, axis2=2))
     apart = np.abs(found.ground[dense.points] - dense.ground) / sigma
     wrong = np.abs(spread - dense.ground_covariance) / (sigma[:, :, None] * sigma[:, None, :])

@@ -15,6 +15,7 @@ from scenes.specs.orbit.setup import resolve_simulate
 from tests.twin.commands import invoke
 from tests.twin.line_scanner_model import LineScannerModel
 from tests.twin.test_simulate import write
+from twin.orbit.export import line_scanner as line_scanning
 from twin.orbit.export.line_scanner import line_scanner
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
@@ -50,6 +51,16 @@ def _places(sensor: Sensor, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.second
+def test_a_trajectory_that_no_number_of_nodes_follows_is_refused(flight, monkeypatch) -> None:
+    """Followed to no error at all."""
+    sensor = _sensor(flight, "nadir", NO_EFFECTS)
+    _isd(sensor)
+    monkeypatch.setattr(line_scanning, "_FOLLOWED", 0.0)
+    monkeypatch.setattr(line_scanning, "_MOST", 128)
+    with pytest.raises(ValueError, match="128 nodes of the orbit and the attitude do not follow the trajectory"):
+        _isd(sensor)
+
+
 @pytest.mark.parametrize("name", ["gf7_forward_fx", "th1_nadir_nofx"])
 def test_the_reader_agrees_with_the_communitys_model(name: str) -> None:
     table = np.loadtxt(CSM / f"{name}.csv", delimiter=",", skiprows=1)

@@ -1,6 +1,7 @@
 """Points measured in rendered images, against the exact sensor; the commands that use them."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -118,6 +119,20 @@ def test_ground_without_points_is_refused(flown: Simulation) -> None:
     ):
         with pytest.raises(image_points.PointsError, match=words):
             points(wrong, asked())
+
+
+@pytest.mark.second
+def test_matches_that_agree_on_nothing_are_refused(flown: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Places all over the windows that are searched."""
+    right, random = image_points.match, np.random.default_rng(1)
+
+    def wrong(*what: Any, **how: Any) -> Any:
+        found = right(*what, **how)
+        return replace(found, place=found.place + random.uniform(-20.0, 20.0, found.place.shape))
+
+    monkeypatch.setattr(image_points, "match", wrong)
+    with pytest.raises(image_points.PointsError, match=r"forward: .*no consensus.*; .* accepted"):
+        map_points(flown.patch, asked().model_copy(update={"control": 60, "check": 20}))
 
 
 def two_patches() -> OrbitCalibrationSpec:

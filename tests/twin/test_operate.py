@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from sqlalchemy import create_engine, inspect
+from sqlalchemy.exc import IntegrityError
 
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
@@ -24,10 +25,11 @@ from twin.operate.__main__ import _record_warnings, app
 from twin.operate.record import schema
 from twin.operate.record.entries import Alarm, Entry, Given, digest_of_job, instrument_digest, micros, now, utc_text
 from twin.operate.record.history import History, content_of, initialised
-from twin.operate.record.place import FILE, NotARecord
+from twin.operate.record.place import FILE, NotARecord, RecordFailed
 from twin.operate.record.record_tables import tables
 from twin.operate.record.schema import url_of
 from twin.operate.record.sources import time_of_name
+from twin.operate.record.taking import Taking
 
 
 def run(*words: object):
@@ -424,6 +426,25 @@ def test_a_guard_that_is_not_there_is_told_by_kind_of_database() -> None:
     said = [_record_warnings({"altered": [], "guarded": guarded, "record": url}) for guarded, url in guards]
     assert [len(one) for one in said] == [0, 1, 1]
     assert ("status --check-all" in said[1][0], "does not itself refuse" in said[2][0]) == (True, True)
+
+
+@pytest.mark.parametrize("beaten", [1, 2])
+def test_a_writer_that_another_beats_twice_is_told(beaten: int, record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a database without a lock; once is tried again."""
+    taken, errors = Taking.take, [IntegrityError("", None, Exception("UNIQUE constraint\nfailed"))] * beaten
+
+    def take(self: Taking, file: Given) -> object:
+        if errors:
+            raise errors.pop()
+        return taken(self, file)
+
+    monkeypatch.setattr(Taking, "take", take)
+    with History(str(record)) as history:
+        file = given("t", temperatures(0, 3))
+        if beaten == 2:
+            with pytest.raises(RecordFailed, match=r"^UNIQUE constraint failed$"):
+                history.take(file)
+        assert history.take(file).new == 3
 
 
 def test_a_clock_that_runs_backwards(record: Path) -> None:

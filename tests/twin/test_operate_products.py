@@ -21,7 +21,7 @@ from scenes.specs.disturbances import MOST_JOINT
 from scenes.specs.load import ORBIT, SCENES, load_disturbances
 from scenes.specs.operation import OperationSetup
 from scenes.specs.resolved import resolve, resolve_with
-from scenes.yaml.errors import Problem
+from scenes.yaml.errors import InputError, Problem
 from tests.twin import operation_records as records
 from tests.twin.commands import files, invoke
 from tests.twin.line_scanner_model import LineScannerModel
@@ -225,6 +225,13 @@ def test_times_of_which_nothing_is_known_are_refused(history: History, tmp_path:
     assert "a longer horizon in the plan" in (late.allowed or "")
     assert "no reading of the monitor" in none.problem
     assert "twin.operate ingest" in (none.allowed or "")
+
+
+def test_a_scene_that_its_orbit_does_not_cover_is_refused(history: History, tmp_path: Path) -> None:
+    (tmp_path / "angle.yaml").write_text(SCENE.read_text("utf-8").replace("time: 0 s", "time: 59.9999 s"), "utf-8")
+    source = read_source(tmp_path / "angle.yaml")
+    with pytest.raises(InputError, match=": time: the orbit ends at the moment of the test; allowed: a longer orbit"):
+        products_of(stand_in(drawn(3)), history, START, source, load_backend())
 
 
 @pytest.mark.parametrize(

@@ -111,23 +111,30 @@ def test_the_page_needs_nothing_else_and_runs_nothing_that_a_text_brings(page):
     assert not re.search(r'(src|href)="(?!#|data:)', page)
 
 
-def test_what_a_reader_has_to_know_is_told_and_nothing_else() -> None:
+@pytest.mark.parametrize(
+    ("age", "alarms", "states", "told"),
+    [
+        (DAY, 0, "ok", []),
+        (
+            2 * DAY,
+            1,
+            "ok stuck dead",
+            [
+                "the newest reading is 2 d older than the end of the day",
+                "one alarm waits for an acknowledgement; the newest: alarm 0",
+                "sensors that are not in order: body1 (stuck), body2 (dead)",
+            ],
+        ),
+        (0, 3, "", ["3 alarms wait for an acknowledgement; the newest: alarm 0"]),
+    ],
+)
+def test_what_a_reader_has_to_know_is_told_and_nothing_else(age: int, alarms: int, states: str, told: list) -> None:
     """A reading more than a day old, alarms that wait, sensors that fail; beside what the estimate warns of."""
-
-    def said(age: int, alarms: int, states: str) -> tuple[str, ...]:
-        sensors = [SimpleNamespace(body=f"body{k}", state=state) for k, state in enumerate(states.split())]
-        following = SimpleNamespace(warnings=["doubt"], sensors=sensors)
-        waiting = [{"text": f"alarm {k}"} for k in range(alarms)]
-        return _warnings(SimpleNamespace(following=following, time=0, open_alarms=lambda: waiting), age)
-
-    assert said(DAY, 0, "ok") == ("doubt",)
-    assert said(2 * DAY, 1, "ok stuck dead") == (
-        "doubt",
-        "the newest reading is 2 d older than the end of the day",
-        "one alarm waits for an acknowledgement; the newest: alarm 0",
-        "sensors that are not in order: body1 (stuck), body2 (dead)",
-    )
-    assert said(0, 3, "")[1] == "3 alarms wait for an acknowledgement; the newest: alarm 0"
+    sensors = [SimpleNamespace(body=f"body{k}", state=state) for k, state in enumerate(states.split())]
+    following = SimpleNamespace(warnings=["doubt"], sensors=sensors)
+    waiting = [{"text": f"alarm {k}"} for k in range(alarms)]
+    overview = SimpleNamespace(following=following, time=0, open_alarms=lambda: waiting)
+    assert _warnings(overview, age) == ("doubt", *told)
 
 
 def test_of_many_rows_the_newest_are_shown_and_all_can_be_taken_away() -> None:

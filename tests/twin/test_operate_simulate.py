@@ -338,6 +338,12 @@ def test_readings_that_could_not_be_are_told(tmp_path: Path, monkeypatch: pytest
     assert json.loads((tmp_path / "files/manifest.json").read_text("utf-8"))["warnings"] == [lost]
     done = run("simulate", PLAN, *words, "--out", tmp_path / "more", "--truth", tmp_path / "no/truth.json")
     assert (done.exit_code, "--truth: " in done.stderr, "cannot be written" in done.stderr) == (2, True, True)
+    assert run("init", tmp_path / "record", "gf7_pair", "--simulated").exit_code == 0
+    taken = [SimpleNamespace(refused=((3, "no such body"),)), SimpleNamespace(refused=())]
+    monkeypatch.setattr(simulation_run, "take_files", lambda *_: taken)
+    done = run("simulate", PLAN, tmp_path / "record", *words, "--out", tmp_path / "refused")
+    told = "1 of what was simulated was refused, the first: no such body"
+    assert (done.exit_code, told in " ".join(done.stderr.split())) == (2, True), done.stderr
     monkeypatch.setattr(
         simulation_run, "recorded", lambda *a: SimpleNamespace(readings=(), lost=((when, "it misses"),))
     )

@@ -68,6 +68,8 @@ def operated(tmp_path_factory, backend):
     with record_of(folder / "record", plan) as history:
         history.take(given("all", entries))
     (folder / "own_lines.yaml").write_text(PAYLOAD)
+    (folder / "turned.yaml").write_text(PAYLOAD.replace("26 deg", "20 deg"))
+    (folder / "renamed.yaml").write_text(PAYLOAD.replace("backward", "rear"))
     text = FILE.replace("EPOCH_ONE", utc(PASSES[0])).replace("EPOCH_TWO", utc(PASSES[1]))
     (folder / "block.yaml").write_text(text)
     shifts = [[one["after"][k] - 30.0 for one in places(entry) for k in ("row", "column")] for entry in entries]
@@ -144,7 +146,9 @@ TWO = "\nmonitor: {angles: [0.2 arcsec, 0.2 arcsec, 2 arcsec], principal_distanc
     ("old", "new", "told"),
     [
         ("own_lines.yaml", "gf7_lines", "has another principal distance.*5512 mm|7680 mm, not 5512 mm"),
-        ("record: record,", "record: nowhere,", "monitor_record.record"),
+        ("own_lines.yaml", "turned.yaml", "camera looks elsewhere than this block's; found 26 deg, not 20 deg"),
+        ("backward", "rear", ": monitor_record.record: .* no camera of this name; found 'rear', allowed: forward, b"),
+        ("record: record,", "record: nowhere,", ": monitor_record.record: "),
         ("record: record, plan: plan.yaml", "record: record", "the record keeps no plan of operation"),
         (utc(PASSES[0]), "2025-01-01T03:05:00Z", "monitor_record"),
         ("plan.yaml", "other/plan.yaml", "a plan of another instrument than the record's"),
@@ -157,6 +161,7 @@ def test_a_record_that_does_not_fit_is_refused(operated, old, new, told):
     plan_of(folder / "other", "gf7_pair")
     text = (folder / "block.yaml").read_text()
     assert old in text
+    text = text.replace("own_lines.yaml", "renamed.yaml") if new == "rear" else text
     (folder / "wrong.yaml").write_text(text.replace(old, new))
     with pytest.raises(InputError, match=told):
         run_operated_block(resolve_adjust(folder / "wrong.yaml"), None, 5)

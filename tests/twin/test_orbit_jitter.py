@@ -172,6 +172,17 @@ def test_lines_without_points_cannot_be_searched() -> None:
         sights_of(measured, {"blue": line_cameras(one.camera)["blue"]}, None, one.test.search, LightEffects())
 
 
+def test_lines_of_which_one_looks_elsewhere_cannot_be_searched() -> None:
+    """A thousand pixels across, which no height explains: half of them in each line, where 200 may be."""
+    one = setup()
+    measured, _ = fly_strip(one, 1)
+    (name, moved), *others = measured.images.items()
+    away = replace(measured, images=dict(others) | {name: replace(moved, pixel=(moved.pixel + 1000.0) % 8799.0)})
+    cameras, more = line_cameras(one.camera), (one.test.lines, one.test.search, LightEffects.of(one.test.effects))
+    with pytest.raises(SightsError, match="no point is seen by two lines where camera and platform expect it"):
+        sights_of(away, cameras, *more)
+
+
 @pytest.mark.second
 def test_lines_at_large_angles_tell_of_roll_whatever_the_heights() -> None:
     """The three lines of th1 see a place 33 s after one another and at 25 degrees: along the track they tell heights,

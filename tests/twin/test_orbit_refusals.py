@@ -4,6 +4,7 @@ file leads to."""
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace as Ns
@@ -16,13 +17,17 @@ import tifffile
 from rasterio.transform import from_origin
 
 import twin.orbit.__main__ as command
-from analysis.orbit.forward_intersection import CalibratedLine
+from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
+from analysis.orbit.three_line_model import LineModel
+from analysis.spots.spot_positions import SpotError
 from optics.numerics.invariants import UnphysicalError
 from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.measured.adjust_setup import resolve_measured_adjust
 from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec
 from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resolve_measured_angle
 from scenes.specs.measured.pass_files import GroundFileSpec, PlatformFilesSpec, RasterFileSpec, with_absolute_files
-from scenes.specs.orbit.setup import load_three_line_camera, resolve_angle, resolve_simulate
+from scenes.specs.orbit.angle import EffectsSpec
+from scenes.specs.orbit.setup import JitterSetup, load_three_line_camera, resolve_angle, resolve_simulate
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.tiers import quick
@@ -30,29 +35,40 @@ from tests.twin import dimap_bench, orbit_files
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import edited_copy, invoke, refused
 from tests.twin.orbit_files import REFUSALS
-from tests.twin.pushbroom_bench import lost
+from tests.twin.pushbroom_bench import lines, lost
 from twin.laboratory.distortion_run import _check_angles
 from twin.orbit.angle.angle_flight import angle_camera
 from twin.orbit.angle.angle_run import SimulatedAngleRun
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
+from twin.orbit.block import point_workers
+from twin.orbit.block.block_run import run_adjustment
 from twin.orbit.block.point_workers import PointWorkers
+from twin.orbit.calibration.observations import light_shift
 from twin.orbit.conventions.check_run import run_check
 from twin.orbit.export.estimated_change import ground_rows
 from twin.orbit.export.export_run import read_exportable, run_export
+from twin.orbit.export.polynomial_control import controlled
 from twin.orbit.export.polynomial_export import read_polynomial_source
 from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
+from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
+from twin.orbit.images.patch import Patch, PatchError
 from twin.orbit.images.point_judgement import true_ground
+from twin.orbit.images.point_report import true_ground
 from twin.orbit.images.simulate_run import run_simulation
+from twin.orbit.jitter import jitter_run, sights
 from twin.orbit.jitter.sights import SightsError, sights_of
+from twin.orbit.matching import match_run
 from twin.orbit.matching.match_run import run_match
 from twin.orbit.measured.dimap_sensor import read_scene
 from twin.orbit.measured.earth_orientation import read_earth_orientation
 from twin.orbit.measured.ground_files import read_ground_points
 from twin.orbit.measured.map_part import UserMap
+from twin.orbit.measured.pass_measurements import GroundPoints
 from twin.orbit.measured.platform_files import platform_table, read_platform
+from twin.orbit.monitoring import closed_loop, line_images, monitoring_run
 from twin.orbit.monitoring.monitor_series import MonitorSeries
 from twin.run.cli import InputErrorText
 from twin.run.cluster import ClusterError
@@ -113,6 +129,8 @@ def map_files(folder: Path) -> None:
         more = {"dtype": dtype, "crs": crs, "transform": place, "nodata": None if corner else -99.0}
         with rasterio.open(folder / name, "w", **how, **more) as file:
             file.write(np.full((120, 150), value, dtype), 1)
+    fine = {"dtype": "uint8", "crs": "EPSG:32650", "transform": from_origin(498_000.0, 4_430_000.0, 0.05, 0.05)}
+    rasterio.open(folder / "large.tif", "w", **how | fine | {"width": 60_000, "height": 60_000}, SPARSE_OK=True).close()
     with rasterio.open(folder / "image.png", "w", driver="PNG", width=4, height=4, count=1, dtype="uint8") as file:
         file.write(np.zeros((4, 4), "u1"), 1)
     (folder / "text.tif").write_text("no TIFF")
@@ -161,9 +179,14 @@ def used(kind: type, setup: type, run: Callable[..., object], folder: Path, spec
     run(setup.model_construct(test=test, camera=load_three_line_camera("th1")), None, 0)
 
 
+def block_files(folder: Path) -> None:
+    shutil.copytree(SCENES / ORBIT / "measured", folder, dirs_exist_ok=True)
+
+
 READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, dict[str, Any]], object]]] = {
     "campaign": (campaign_files, lambda folder, _: orbit_files.read_back(folder / "calibrate.yaml")),
     "angle": (campaign_files, angle_used),
+    "block": (block_files, lambda folder, _: run_adjustment(resolve_measured_adjust(folder / "adjust.yaml"), None, 0)),
     "platform": (
         platform_files,
         lambda folder, spec: platform_table(
@@ -287,6 +310,16 @@ MEASURED: Any = Ns(setup=resolve_measured_angle(SCENES / ORBIT / "measured/angle
 PLACES = np.column_stack([np.zeros((2, 3)), [-179.9, 179.9], np.zeros(2)])
 SPOT = Ns(reading=np.ones((1, 1)), lines=np.full((1, 1), 3), file=Ns(file="spots.csv"), head="reading [deg]")
 UNMADE: Any = Ns(setup=None, test=None, camera=None, instrument=None, images={"nadir": 1}, kind="other", name="th1")
+MODEL = LineModel(np.eye(3), np.ones(3), np.zeros(3))
+NOWHERE: Any = Ns(offset=np.zeros(5), scale=np.ones(5), ground=lambda line, *_: np.full((2, len(line)), np.nan))
+TIES = GroundPoints.of(["a"], np.full((1, 3), np.nan), np.zeros((3, 3)), "tie")
+OFF = Ns(sensor=lost(), place=np.ones((1, 2)), point=np.zeros(1, int))
+STEEP: Any = Ns(
+    images={"nadir": Ns(image_point=lambda *at: at, sensor=Ns(ground=lambda line, pixel, height: height))},
+    terrain=Ns(limits=(0.0, 2.0), height=lambda east, north: 1.5 * east),
+    frame=Ns(local=lambda height: (height, height, height)),
+)
+"""Ground that rises by 1.5 m where the look, followed up by 1 m, leads."""
 CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: measure_points(UNMADE, Ns(tie=1)), PointsError, "tie points need two lines"),
     (lambda: true_ground(UNMADE, UNMADE), ValueError, "points are of kind map or tie, not 'other'"),
@@ -303,6 +336,22 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: run_export(UNMADE, UNMADE, None, changes={}), ValueError, "only the cameras of an instrument"),
     (lambda: PointWorkers(GONE, 1).results(abs, [(1,)]), ClusterError, "a worker was lost"),
     (lambda: ground_rows(lost(), calibrated(), np.zeros(4), 0.0), ValueError, "a look misses the Earth"),
+    (
+        lambda: light_shift(lost(), LineModel(np.eye(3), np.ones(3), np.zeros(3)), *np.ones((3, 1))),
+        UnphysicalError,
+        "a look misses",
+    ),
+    (
+        lambda: controlled(NOWHERE, Ns(at=lambda line, sample: np.zeros((len(line), 2)))),
+        ValueError,
+        "do not lead back to the",
+    ),
+    (lambda: Patch.true_point(STEEP, "nadir", np.ones(1), np.ones(1)), PatchError, "as steep as the look"),
+    (
+        lambda: sights._start(Ns(ground=TIES), {"blue": OFF}, np.arange(1), Ns(height=0.0)),
+        SightsError,
+        "lines look past",
+    ),
     (lambda: angle_camera(UNMADE, None), ValueError, "an instrument's lines need a backend"),
     (lambda: RationalPolynomial.through(PLACES, PLACES), ValueError, "the 180th meridian or a pole"),
     (lambda: sights_of(UNMADE, {}, ("blue",), None, None), SightsError, "no image points of blue"),
@@ -330,3 +379,121 @@ def test_what_is_refused(case: tuple[Any, ...], tmp_path: Path, monkeypatch: pyt
     call, error, words = case
     with pytest.raises(error, match=words):
         call()
+
+
+# --- workers ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("warnings", [[], ["another version of NumPy"]])
+def test_what_is_to_be_known_of_a_cluster_is_told(warnings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(point_workers, "remote_workers", lambda *_: nullcontext(Ns(warnings=warnings, count=1)))
+    told: list[str] = []
+    with point_workers.point_workers(None, "tcp://localhost:1", told.append):
+        assert told == warnings
+
+
+# --- errors of a part ---------------------------------------------------------------------------------------
+
+
+def fails(error: Exception) -> Callable[..., Any]:
+    def part(*_: object, **__: object) -> None:
+        raise error
+
+    return part
+
+
+MONITOR: Any = Ns(analysis=Ns(centroid=None), errors=Ns(switched_on=False), frames=1, mechanisms=None, times=[60.0])
+MONITOR.times_key = ("mechanisms", "readings")
+EXPERIMENT: Any = Ns(expected_frames=abs, nominal_photons=1, calibration=Ns(spots=2), instrument=None)
+SERIES: Any = Ns(experiment=EXPERIMENT, spec=MONITOR)
+EXPERIMENT.path = Ns(channels=[Ns(key="left"), Ns(key="right")])
+STRIP: Any = JitterSetup.__new__(JitterSetup)
+object.__setattr__(STRIP, "test", Ns(effects=EffectsSpec(), lines=("blue", "red"), search=None))
+object.__setattr__(STRIP, "camera", load_three_line_camera("ms4"))
+
+
+def spots_lost() -> None:
+    with MonitorSeries._told(SERIES, [0]):
+        raise SpotError({1: "too faint"})
+
+
+PARTS: dict[str, tuple[Any, dict[str, Any], Callable[[], object], tuple[str, ...], str, str]] = {
+    "monitor": (
+        monitoring_run,
+        {"fly_monitored": fails(IntersectionError("looks are parallel"))},
+        lambda: monitoring_run.run_monitor(Ns(test=MONITOR), UNMADE, 1),
+        ("cameras",),
+        "looks are parallel",
+        "cameras that look different ways",
+    ),
+    "spots of a loop": (
+        closed_loop,
+        {"observe": fails(SpotError({0: "too faint"})), "judged_spots": lambda *_: None},
+        lambda: closed_loop.reader(Ns(experiment=EXPERIMENT), MONITOR, 1)({}, 0),
+        MONITOR.times_key,
+        "the spots cannot be read at 1 min: spot 0: too faint",
+        "a smaller range of the mechanisms",
+    ),
+    "spots of a course": (
+        closed_loop,
+        {},
+        spots_lost,
+        ("course",),
+        "the spot right cannot be measured at 1 min (too faint)",
+        "the spots on their CCDs",
+    ),
+    "jitter": (
+        jitter_run,
+        {"fly_strip": lambda *_: (Ns(name="strip", line_times={}), None), "sights_of": fails(SightsError("blind"))},
+        lambda: jitter_run.run_jitter(STRIP, None, 1),
+        ("points",),
+        "strip: blind",
+        jitter_run._REMEDY,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_an_error_of_a_part_is_told_with_its_key_and_remedy(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module, parts, call, key, words, remedy = PARTS[name]
+    for part, made in parts.items():
+        monkeypatch.setattr(module, part, made)
+    with pytest.raises(BenchError) as caught:
+        call()
+    assert (str(caught.value), caught.value.key) == (words, key)
+    assert remedy in caught.value.remedy
+
+
+@pytest.mark.second
+def test_images_that_matching_cannot_use_are_told(good, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, spec = good("match")
+    monkeypatch.setattr(match_run, "measure_points", fails(ValueError("no spline")))
+    with pytest.raises(BenchError, match=r"^the images cannot be matched: no spline$") as caught:
+        READERS["match"][1](folder, spec)
+    assert (caught.value.key, caught.value.remedy) == (("images",), "images of the map's ground")
+
+
+LINE_IMAGES: Any = Ns(images=Ns(ground=Ns(terrain=Ns(height=0.0)), side=9, points=None))
+PAIR: Any = Ns(
+    pair=("forward", "backward"),
+    test=Ns(loop=LINE_IMAGES, times=[0.0], line_time=1e-3, ground=Ns(first=5999.0, last=6001.0)),
+)
+FEW: dict[str, Any] = {
+    "corrected_line": lambda line, *_: line,
+    "_optics": lambda *_: None,
+    "second_view": lambda *_: 0.0,
+    "Sensor": lambda *_: lines()["nadir"].sensor,
+    "imaged_lines": lambda *_: None,
+    "fly_patch": lambda *_: None,
+    "tie_points": lambda *_, **__: Ns(in_all=np.arange(20) < 7),
+}
+
+
+def test_line_images_with_too_few_points_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    for part, made in FEW.items():
+        monkeypatch.setattr(line_images, part, made)
+    known = dict.fromkeys(PAIR.pair)
+    flight, flown = Ns(lines=[known], calibrated=known), Ns(true=None, measured=None, earth=Earth())
+    with pytest.raises(BenchError, match=r"^line images: only 7 of 20 points were matched$") as caught:
+        line_images.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
+    assert caught.value.key == ("mechanisms", "images")

@@ -8,12 +8,14 @@ from scipy import constants
 from scipy.special import erf
 
 from analysis.mtf.slanted_edge import measure_edge
+from optics.numerics.invariants import UnphysicalError
 from scenes.specs.load import load_detector
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, TerrainSpec
 from scenes.specs.orbit.setup import load_three_line_camera
 from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, lost, optics, shaken
 from twin.orbit.flight.line_camera import LineCamera
 from twin.orbit.ground.grid import GroundFrame, Terrain
+from twin.orbit.images import pushbroom
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
 from twin.orbit.images.patch import PatchError, fly_patch, window_of
 from twin.orbit.images.pushbroom import (
@@ -217,6 +219,23 @@ def test_looks_that_cannot_be_followed_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match=words):
             look_map(sensor, FRAME, flat, window)
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "words"),
+    [
+        ("_MOST_STEPS", 1, "looks and terrain do not meet within"),
+        ("LARGEST_ERROR", 0.0, "terrain so rough that places"),
+    ],
+)
+def test_places_that_are_not_found_well_are_no_image(limit: str, value: float, words: str, monkeypatch) -> None:
+    """A limit is set that no slope can hold; what would be returned is where the search stands."""
+    heights = 600.0 + 20.0 * np.sin(np.arange(201) / 9.0)[:, None] * np.ones(201)
+    terrain, ground = Terrain.through(heights, (10.0, 10.0), (-1000.0, -1000.0)), Ground(lambda e, n: 0.3 + 0.0 * e)
+    assert np.all(photograph("forward", terrain, ground, 40).photons > 0.0)
+    monkeypatch.setattr(pushbroom, limit, value)
+    with pytest.raises(UnphysicalError if limit == "LARGEST_ERROR" else SteepTerrainError, match=words):
+        photograph("forward", terrain, ground, 40)
 
 
 HILLS = TerrainSpec.model_validate({"kind": "fractal", "relief": "60 m", "height": "600 m", "exponent": 2.3})

@@ -138,7 +138,7 @@ def run_operated_block(
         try:
             return _recorded(setup, named, epochs, lines, advance)
         except Problem as problem:
-            raise setup.test.error(problem, ("monitor_record", *problem.within)) from None
+            raise setup.test.error(problem, ("monitor_record",)) from None
         except (RecordFailed, NotARecord) as error:
             wrong = Problem(str(error), named.record, "a record that python -m twin.operate init made")
             raise setup.test.error(wrong, ("monitor_record", "record")) from None

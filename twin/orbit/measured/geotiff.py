@@ -51,7 +51,8 @@ class GeoRaster:
         """The inverse."""
         a, b, c, d, e, f = self.transform
         u, v, area = np.asarray(x) - c, np.asarray(y) - f, a * e - b * d
-        return (a * v - d * u) / area, (e * u - b * v) / area
+        with np.errstate(invalid="ignore"):  # of places beyond the system, which are infinite
+            return (a * v - d * u) / area, (e * u - b * v) / area
 
     def read(self, rows: slice | None = None, columns: slice | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Values (r, c) of a part, of the raster's own type, and which of them hold something (bool).

@@ -103,10 +103,7 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
             Issue("no place on the ground", file, rows.lines[row], (), found, "-1000 m to 10 000 m; units?")
         )
     covariance = _covariance(spec, file, rows, itrs, path.suffix.lower() == ".gcp" and spec.sigma_axes == "xyz")
-    try:
-        points = GroundPoints.of(np.array(rows.ids, object), itrs, covariance, np.array(rows.roles, object))
-    except ValueError as error:
-        raise InputError(Issue(str(error), file)) from None
+    points = GroundPoints.of(np.array(rows.ids, object), itrs, covariance, np.array(rows.roles, object))
     return GroundFile(points, datum.accuracy, images)
 
 
