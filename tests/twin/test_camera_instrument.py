@@ -25,6 +25,7 @@ from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
 from tests.scenes.lens.colour_cameras import colour_camera
 from tests.twin.commands import invoke
+from tests.twin.study_bench import refusals
 from twin.camera import camera_run
 from twin.camera.__main__ import app as camera_app
 from twin.camera.camera_optics import CameraOptics
@@ -65,20 +66,10 @@ def test_words_are_what_the_keys_are() -> None:
     assert job(perturb=words).perturb == job(perturb=keys).perturb
 
 
-def test_words_that_say_nothing() -> None:
-    for words, problem in (
-        ("M2", "not a motion of a node"),
-        ("M2 shft z 20 um", "no such kind of perturbation"),
-        ("M2 shift w 20 um", "not a motion of a node"),
-        ("M2 shift z 20", "no amount with a unit"),
-        ("M2 shift z", "no amount with a unit"),
-        ("M2 figure Q5 2 nm", "not a Zernike term"),
-        ("M2 temperature 2 K about centre", "has no pivot"),
-        ("M2 shift z 2 um, M2 shift z 3 um", "said twice"),
-        ("M2 rotate x 2 arcsec about centre, M2 rotate y 2 arcsec about origin", "one pivot"),
-    ):
-        with pytest.raises(Problem, match=problem):
-            perturbation_in_words(words.split(", "))
+@pytest.mark.parametrize(("words", "problem"), refusals("words"))
+def test_words_that_say_nothing(words: list[str], problem: str) -> None:
+    with pytest.raises(Problem, match=problem):
+        perturbation_in_words(words)
 
 
 def test_a_wrong_unit_is_told_once() -> None:
@@ -201,15 +192,7 @@ def test_a_camera_with_lenses_of_an_unknown_glass_is_moved_and_not_warmed(backen
 # --- what needs a monitor --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("says", "problem"),
-    [
-        ({"course": {"times": ["0 s", "1 s"], "motion": {"M2": {"shift": ["0 0 0 um", "0 0 1 um"]}}}},
-         "a course.*python -m twin.study"),
-        ({"render": {"stray": True}}, "stray light"),
-        ({"disturbances": {"file": "launch"}}, "sigmas on disturbances"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("says", "problem"), refusals("of_a_monitor"))
 def test_what_only_a_monitor_gives_is_refused(says: dict, problem: str, backend) -> None:
     with pytest.raises(InputError, match=problem) as error:
         render_job.render_job(resolve_job(job(**says)), backend)
