@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from analysis.wavefront_maps.orientation import Orientation
 from optics.geometry import zernike
 from optics.numerics.backend import Backend
 from optics.numerics.invariants import UnphysicalError
+from optics.raytrace.trace import BeamMissedError
 from scenes.specs.asbuilt import resolve_asbuilt
 from scenes.specs.load import EXAMPLES
 from scenes.specs.tolerance import MeritSpec
@@ -32,6 +34,7 @@ from twin.asbuilt.asbuilt_run import ASBUILT, _standing, _warnings, motions, req
 from twin.asbuilt.next_step import advice, expected, wanted_move
 from twin.asbuilt.orientation_check import run_check
 from twin.camera.camera_optics import CameraOptics
+from twin.camera.varied_beams import VariedBeams
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.motions import ElementaryMotion
@@ -434,6 +437,12 @@ def test_bad_input_has_one_message(backend, tmp_path, changes, words) -> None:
         AsBuiltBench(resolve_asbuilt(written(tmp_path, **{"measurements": ONE, **changes})), backend)
     assert words in str(caught.value)
     assert "asbuilt.yaml" in str(caught.value)
+
+
+def test_a_measurement_that_no_light_comes_to_is_told_at_its_key(backend, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(VariedBeams, "_rays", Mock(side_effect=BeamMissedError("light is lost")))
+    with pytest.raises(InputError, match=r"asbuilt\.yaml:\d+: measurements\.wavefronts\.one: light is lost"):
+        bench_of(backend, tmp_path, ONE)
 
 
 @pytest.mark.parametrize(("kind", "keys", "files", "text", "words"), refusals("unread"))

@@ -4,11 +4,15 @@ derivatives by motions of its parts, against formulas of the first order.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import twin
 from optics.geometry.tree import Motion
+from optics.numerics.invariants import UnphysicalError
+from optics.raytrace.trace import BeamMissedError
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, checked_nodes
@@ -21,18 +25,22 @@ from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
 from tests.scenes.lens.colour_cameras import colour_camera
 from tests.twin.commands import invoke
+from tests.twin.study_bench import refusals
 from twin.camera import camera_run
 from twin.camera.__main__ import app as camera_app
 from twin.camera.camera_optics import CameraOptics
-from twin.main_job.render_job import render_job
+from twin.main_job import render_job
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import image_quality
-from twin.monitor.truth import trace_truth
+from twin.monitor.truth import LineSight, trace_truth
+from twin.path_tracing.stray_light import NominalPathLost
+from twin.run.procedure import silent
 from twin.study.gradient.study_gradient import AD, TRACED, Gradient, study_gradient
 from twin.study.runs.setup import resolve_study
 
 RC = "ritchey_chretien"
 DESPACE = "M2 shift z 20 um"
+PATHLESS = SimpleNamespace(path=SimpleNamespace(channels=()))
 
 
 def job(**says) -> JobSpec:
@@ -41,7 +49,7 @@ def job(**says) -> JobSpec:
 
 @pytest.fixture(scope="module")
 def run(backend) -> JobRun:
-    return render_job(resolve_job(job(perturb=[DESPACE])), backend)
+    return render_job.render_job(resolve_job(job(perturb=[DESPACE])), backend)
 
 
 # --- the words -------------------------------------------------------------------------------------------
@@ -58,20 +66,10 @@ def test_words_are_what_the_keys_are() -> None:
     assert job(perturb=words).perturb == job(perturb=keys).perturb
 
 
-def test_words_that_say_nothing() -> None:
-    for words, problem in (
-        ("M2", "not a motion of a node"),
-        ("M2 shft z 20 um", "no such kind of perturbation"),
-        ("M2 shift w 20 um", "not a motion of a node"),
-        ("M2 shift z 20", "no amount with a unit"),
-        ("M2 shift z", "no amount with a unit"),
-        ("M2 figure Q5 2 nm", "not a Zernike term"),
-        ("M2 temperature 2 K about centre", "has no pivot"),
-        ("M2 shift z 2 um, M2 shift z 3 um", "said twice"),
-        ("M2 rotate x 2 arcsec about centre, M2 rotate y 2 arcsec about origin", "one pivot"),
-    ):
-        with pytest.raises(Problem, match=problem):
-            perturbation_in_words(words.split(", "))
+@pytest.mark.parametrize(("words", "problem"), refusals("words"))
+def test_words_that_say_nothing(words: list[str], problem: str) -> None:
+    with pytest.raises(Problem, match=problem):
+        perturbation_in_words(words)
 
 
 def test_a_wrong_unit_is_told_once() -> None:
@@ -194,18 +192,10 @@ def test_a_camera_with_lenses_of_an_unknown_glass_is_moved_and_not_warmed(backen
 # --- what needs a monitor --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("says", "problem"),
-    [
-        ({"course": {"times": ["0 s", "1 s"], "motion": {"M2": {"shift": ["0 0 0 um", "0 0 1 um"]}}}},
-         "a course.*python -m twin.study"),
-        ({"render": {"stray": True}}, "stray light"),
-        ({"disturbances": {"file": "launch"}}, "sigmas on disturbances"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("says", "problem"), refusals("of_a_monitor"))
 def test_what_only_a_monitor_gives_is_refused(says: dict, problem: str, backend) -> None:
     with pytest.raises(InputError, match=problem) as error:
-        render_job(resolve_job(job(**says)), backend)
+        render_job.render_job(resolve_job(job(**says)), backend)
     assert f"{RC} has none" in str(error.value)
 
 
@@ -217,7 +207,27 @@ def test_a_target_that_a_perturbation_loses_is_told(backend) -> None:
         "render": {"images": ["knife_edge"]},
     }
     with pytest.raises(InputError, match="the perturbed instrument cannot be rendered: the line CCD of camera gf7"):
-        render_job(resolve_job(validate(JobSpec, YamlFile("", says, {}))), backend)
+        render_job.render_job(resolve_job(validate(JobSpec, YamlFile("", says, {}))), backend)
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "error", "lose"),
+    [
+        (LineSight, "truth", BeamMissedError, render_job.render_job),
+        (render_job, "image_quality", UnphysicalError, render_job.render_job),
+        (render_job, "stray_light", NominalPathLost, lambda job, _: render_job._stray(PATHLESS, job, {}, 1, silent)),
+    ],
+)
+def test_light_that_motions_lose_is_told_at_their_key(place, name, error, lose, backend, monkeypatch) -> None:
+    resolved = resolve_job(job(perturb=[DESPACE], render={"stray": True} if name == "stray_light" else {}))
+
+    def lost(*_: object, **__: object) -> None:
+        raise error("none is left")
+
+    monkeypatch.setattr(place, name, lost)
+    words = r"perturb: the perturbed instrument cannot be rendered: none is left.*motions of .*M2.*make them smaller"
+    with pytest.raises(InputError, match=words):
+        lose(resolved, backend)
 
 
 # --- where users meet it ---------------------------------------------------------------------------------

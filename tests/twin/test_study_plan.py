@@ -13,7 +13,7 @@ from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.tiers import quick
-from tests.twin.study_bench import STUDY, TEXTS, refusals, write_study
+from tests.twin.study_bench import REFUSED, STUDY, TEXTS, refusals, write_study
 from twin.live.knobs import factor_knobs
 from twin.study.gradient.study_gradient import GradientFactor
 from twin.study.runs import setup
@@ -245,14 +245,8 @@ def test_places_of_results_that_are_no_numbers_are_refused() -> None:
     sample = {"a": {"list": [1, 2], "text": "x", "number": 1.0}}
     check_response(sample, ("a", "number"))
     check_response(sample, ("a", "list", 1))
-    for key, told in (
-        (("a",), "not a single number"),
-        (("a", "list"), "not a single number"),
-        (("a", "text"), "not a number"),
-        (("a", "number", "x"), "a single value has nothing below it"),
-        (("a", "list", 2), "no such place in a list"),
-    ):
+    for key, told in REFUSED["places"]:
         with pytest.raises(Problem, match=told):
-            check_response(sample, key)
+            check_response(sample, tuple(key))
     result = BlockResult.of([sample], {"r": ResponseSpec(key=("a", "text"))})
     assert result.messages[0].endswith("the response 'r' is not a number but str")

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from twin.tolerance.adjustments import Adjustments
 
 from scenes.specs.job import checked_nodes
 from scenes.specs.load import LIBRARY
@@ -27,10 +26,10 @@ from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import MeritModel, inverse_limits, sensitivities
 from twin.tolerance.monitor_merit import Merit
 from twin.tolerance.samples import Workforce, draw_samples, study_of
-from twin.tolerance.tolerance_bench import ToleranceBench
+from twin.tolerance.tolerance_bench import Adjustments, ToleranceBench
 from twin.tolerance.tolerance_report import tolerance_report
 from twin.tolerance.tolerance_run import Yield, run_tolerance, worst_jobs
-from twin.tolerance.variations import spectrum_shares, states_of
+from twin.tolerance.variations import spectrum_shares, states_of, tolerance_numbers
 
 
 @pytest.fixture(scope="module")
@@ -322,6 +321,15 @@ def test_bad_input_is_told_with_its_key(name: str, changes: dict, key: str, word
         ToleranceBench(budget(tmp_path, name, **changes), backend)
     for part in (words, key, "budget.yaml:"):
         assert part in str(caught.value)
+
+
+def test_a_body_warmed_within_what_is_known_grows_by_its_expansion(bench, tmp_path) -> None:
+    setup = budget(tmp_path, tolerances={"a": {"motion": "focal_plane temperature", "limit": "5 K"}})
+    thermal = bench.experiment.thermal
+    (number,) = tolerance_numbers(setup, bench.instrument, thermal)
+    grown = {body: move.shape["stretch"] for body, move in number.moves.items()}
+    assert grown.keys() == {"base/gf7/focal_plane", "base/gf7/focal_plane/line"}
+    assert grown == pytest.approx({body: thermal.materials[body].expansion for body in grown})
 
 
 def test_a_design_without_light_and_a_strange_journal_are_refused(tmp_path) -> None:

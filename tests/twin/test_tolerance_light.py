@@ -11,6 +11,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from optics.numerics.backend import Backend
+from optics.numerics.invariants import UnphysicalError
 from scenes.models.camera_model import CameraModel
 from scenes.specs.camera import CameraSpec
 from scenes.specs.tolerance import ToleranceSetup
@@ -20,12 +21,16 @@ from tests.own_trace import OwnCamera, Traced
 from tests.scenes.lens.colour_cameras import colour_camera
 from tests.twin import study_bench
 from tests.twin.study_bench import TEXTS
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.varied_beams import CutError, RoughError
+from twin.tolerance import tolerance_bench
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance
 from twin.tolerance.variations import states_of
 
 D_LINE = 587.5618e-9
 FIELDS = [[0.0, 0.0], [1.0, 0.0]]
+WAVEFRONT = {"wavefront": {"kind": "wavefront", "at_most": 0.2, "fields": [[0.0, 0.0]]}}
 
 
 def budget(folder: Path, camera: CameraSpec | None = None, **changes: Any) -> ToleranceSetup:
@@ -166,15 +171,14 @@ def test_mtfs_over_the_light_are_those_of_the_camera_program(bench: ToleranceBen
 
 def test_light_of_a_band_takes_as_many_wavelengths_as_it_needs(backend: Backend, tmp_path: Path) -> None:
     camera = colour_camera("achromat", "[500 nm, 640 nm]")
-    merits = {"wavefront": {"kind": "wavefront", "at_most": 0.2, "fields": [[0.0, 0.0]]}}
-    band = ToleranceBench(budget(tmp_path, camera, merits=merits), backend)
+    band = ToleranceBench(budget(tmp_path, camera, merits=WAVEFRONT), backend)
     values = band.values(band.try_out(np.zeros((1, 4))).parts)[0]
     assert len(band.colours) > 3
     assert camera.light is not None
     band._prepare_in(*camera.light.rule(2 * len(band.colours)))
     fine = band.values(band.try_out(np.zeros((1, 4))).parts)[0]
     np.testing.assert_allclose(values, fine, rtol=0, atol=5e-4)
-    design = ToleranceBench(budget(tmp_path, camera, merits=merits, light="design"), backend)
+    design = ToleranceBench(budget(tmp_path, camera, merits=WAVEFRONT, light="design"), backend)
     assert design.colours.tolist() == [D_LINE]
     alone = design.values(design.try_out(np.zeros((1, 4))).parts)[0]
     assert alone[0] < 0.8 * values[0]
@@ -186,6 +190,29 @@ def test_light_of_a_band_takes_as_many_wavelengths_as_it_needs(backend: Backend,
 def test_a_blurred_camera_has_no_mtf_for_tolerances(backend: Backend, tmp_path: Path, changes: dict, why: str) -> None:
     with pytest.raises(InputError, match=rf"merits\.mtf: the MTF of the designed camera is not settled{why}"):
         ToleranceBench(budget(tmp_path, colour_camera("achromat", **changes)), backend)
+
+
+def test_colours_too_far_apart_for_a_sum_are_told_at_the_light(backend: Backend, tmp_path: Path) -> None:
+    camera = colour_camera("achromat", "[350 nm, 2000 nm]")
+    with pytest.raises(InputError, match=r"light: merits over .* colours stand too far apart.*light: design"):
+        ToleranceBench(budget(tmp_path, camera, merits=WAVEFRONT), backend)
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "error", "words"),
+    [
+        (tolerance_bench, "VariedBeams", CutError("cut"), "merits: cut.*fields whose light comes through whole"),
+        (tolerance_bench, "VariedBeams", RoughError("rough"), "merits: rough.*a sharper camera"),
+        (CameraOptics, "colour_pupils", UnphysicalError("more light"), r"merits\.mtf: .* has no MTF: more light"),
+    ],
+)
+def test_light_that_no_merit_is_told_of_is_refused(place, name, error, words, backend, tmp_path, monkeypatch) -> None:
+    def refuse(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(place, name, refuse)
+    with pytest.raises(InputError, match=words):
+        ToleranceBench(budget(tmp_path), backend)
 
 
 @pytest.mark.second

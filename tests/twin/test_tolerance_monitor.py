@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,12 +14,14 @@ from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import Motion
 from scenes.models.disturbances import state_of
 from scenes.specs.tolerance import MeritSpec
+from scenes.yaml.errors import InputError
 from tests.twin.study_bench import TEXTS, budget
 from twin.monitor.image_quality import image_quality
 from twin.monitor.information import built_noise, quantity_rows
 from twin.monitor.monitor_derivative import SMALL, STEPS
 from twin.monitor.monitor_experiment import TEMPLATE_MARGIN
 from twin.monitor.observation import Observing, observe, one_detector
+from twin.tolerance import monitor_merit
 from twin.tolerance.monitor_merit import ROTATIONS, obstructed_shares, readings_of
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance
@@ -181,7 +184,12 @@ def test_a_run_tells_of_the_monitor(backend, tmp_path) -> None:
     assert all("disturbances: launch" in text for text in run.jobs.values())
 
 
-def test_which_readings_count() -> None:
+def test_which_readings_count(tmp_path) -> None:
     one = MeritSpec.model_validate({"kind": "monitor_angle", "at_most": "1 arcsec"})
     assert readings_of(one, ("a", "b")) == ("angle",)
     assert readings_of(one, ("a",)) == ROTATIONS
+    angle, setup = one.model_copy(update={"reading": "angle"}), budget(tmp_path, "pair")
+    two, three = (SimpleNamespace(instrument=SimpleNamespace(cameras=names)) for names in ("ab", "abc"))
+    assert monitor_merit._readings(setup, two, "angle", angle, "a") == ["angle"]
+    with pytest.raises(InputError, match=r"merits\.angle\.reading: .*of two cameras, and there are 3.*d_gamma"):
+        monitor_merit._readings(setup, three, "angle", angle, "a")

@@ -96,7 +96,7 @@ class MeasuredKind(ABC):
         try:
             self.prepare()
         except PhysicalError as error:
-            raise site.test.error(str(error) or "the light is lost", key) from error
+            raise site.test.error(str(error), key) from error
 
     @abstractmethod
     def prepare(self) -> None:

@@ -43,9 +43,13 @@ RESIDUAL = 1e-3
 class CutError(UnphysicalError):
     """Beams are cut by what is not the stop and has no edges of its own."""
 
+    allowed = "fields whose light comes through whole"
+
 
 class RoughError(UnphysicalError):
     """Polynomials do not follow the wavefronts."""
+
+    allowed = "a sharper camera, or fields where it is"
 
 
 class BeamLight(NamedTuple):

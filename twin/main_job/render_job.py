@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 
@@ -132,14 +132,12 @@ def render_job(
     except LOST as error:
         raise _no_spots(experiment, str(error)) from error
     which = np.array([shown])
-    try:
+    with _lost_by_motions(resolved, *LOST):
         stage.begin(3)
         experiment.calibration  # noqa: B018 - before the long parts
         stage.begin(4)
         nominal = experiment.nominal_photons
         light = light_of(experiment, [state], which, single=False) if course is None else None
-    except LOST as error:
-        raise _too_large(resolved, str(error)) from error
     series = None
     if light is None:
         series = run_series(experiment, resolved, states, lambda done: advance(COURSE, done, len(states)))
@@ -248,10 +246,8 @@ def _without_monitor(
     stage.begin(1)
     state = experiment.state(job)
     stage.begin(2)
-    try:
+    with _lost_by_motions(resolved, *LOST):
         truth = experiment.sight.truth([state])
-    except LOST as error:
-        raise _too_large(resolved, str(error)) from error
     stage.end()
     seed = job.render.seed
     targets, quality = _images(experiment, resolved, state, seed, advance)
@@ -286,10 +282,8 @@ def _images(
     if not resolved.quality:
         return targets, None
     advance(QUALITY, 0, 1)
-    try:
+    with _lost_by_motions(resolved, UnphysicalError):
         quality = image_quality(experiment.instrument, experiment.backend, [{}, state], obstruction=render.obstructed)
-    except UnphysicalError as error:
-        raise _too_large(resolved, str(error)) from error
     advance(QUALITY, 1, 1)
     return targets, quality
 
@@ -336,7 +330,7 @@ def _stray(
     assert resolved.job.render.stray is not None
     paths = resolved.job.render.stray.paths
     sources = len(experiment.path.channels) * paths
-    try:
+    with _lost_by_motions(resolved, NominalPathLost):
         measured = measured_finishes(resolved)
         finishes = None if measured is None else measured.finishes
 
@@ -349,8 +343,6 @@ def _stray(
             return StrayPair(before, before, taken, measured)
         say = partial(_second_half, advance, sources)
         return StrayPair(before, stray_light(experiment, state, paths, seed, say, finishes), taken, measured)
-    except NominalPathLost as error:
-        raise _too_large(resolved, str(error)) from error
 
 
 def _targets(
@@ -362,10 +354,8 @@ def _targets(
         InputError: their light is lost.
     """
     say = partial(advance, TARGETS)
-    try:
+    with _lost_by_motions(resolved, TargetLostError):
         return render_targets(resolved, experiment.instrument, experiment.backend, state, seed, say)
-    except TargetLostError as error:
-        raise _too_large(resolved, str(error)) from error
 
 
 def _in_the_way(stray: StrayPair) -> tuple[str, ...]:
@@ -378,6 +368,15 @@ def _in_the_way(stray: StrayPair) -> tuple[str, ...]:
 
 def _second_half(advance: Advance, first: int, done: int, _: int) -> None:
     advance(STRAY, first + done, 2 * first)
+
+
+@contextmanager
+def _lost_by_motions(resolved: ResolvedJob, *errors: type[Exception]) -> Iterator[None]:
+    """Tell errors that motions cause at the key of these. Raises InputError."""
+    try:
+        yield
+    except errors as error:
+        raise _too_large(resolved, str(error)) from error
 
 
 def _too_large(resolved: ResolvedJob, reason: str) -> InputError:

@@ -292,12 +292,8 @@ class ToleranceBench:
         self.traced_shares = shares if len(traced) == len(colours) else np.ones(1)
         try:
             self.beams = VariedBeams(self.optics, self.fields, traced, self.traced_shares, "mtf" in self._wanted)
-        except CutError as error:
-            allowed = "fields whose light comes through whole"
-            raise self.setup.test.error(str(error), ("merits",), allowed=allowed) from error
-        except RoughError as error:
-            allowed = "a sharper camera, or fields where it is"
-            raise self.setup.test.error(str(error), ("merits",), allowed=allowed) from error
+        except (CutError, RoughError) as error:
+            raise self.setup.test.error(str(error), ("merits",), allowed=error.allowed) from error
         self._roots = LitRoots.of(self.beams.lit(), self.beams.degree)
         self._transfers = fixed_transfers(
             self.optics,

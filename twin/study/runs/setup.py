@@ -269,7 +269,7 @@ def _with_tables(study: StudySpec) -> StudySpec:
         try:
             new.numbers()
         except Problem as problem:
-            raise StudySetup(study, {}, {}).error(problem, key) from None
+            raise StudySetup(study, {}, {}).error(problem, ("factors", name)) from None
         factors[name] = new
     out = study.model_copy(update={"factors": FrozenMap(factors)}).with_source(study.source)
     assert isinstance(out, StudySpec)
