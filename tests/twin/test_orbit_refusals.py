@@ -56,7 +56,6 @@ from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import Patch, PatchError
 from twin.orbit.images.point_judgement import true_ground
-from twin.orbit.images.point_report import true_ground
 from twin.orbit.images.simulate_run import run_simulation
 from twin.orbit.jitter import jitter_run, sights
 from twin.orbit.jitter.sights import SightsError, sights_of
