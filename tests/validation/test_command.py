@@ -11,6 +11,7 @@ import pytest
 
 import twin.validate as command
 from tests.twin.commands import invoke
+from tests.twin.study_bench import REFUSED
 from twin.run.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation import registry
 from twin.validation.checks.check import (
@@ -285,16 +286,7 @@ def test_nothing_is_confirmed_that_could_not_have_failed(sigma, verdict, correct
 
 @pytest.mark.parametrize(
     ("more", "words"),
-    [
-        ({"tells": None}, "what the row tells"),
-        ({"tells": 0.0}, "greater than 0"),
-        ({"against": ""}, "what the row tells"),
-        ({"tells": 0.09}, "can never tell"),
-        ({"basis": "theory"}, "not what the row rests on"),
-        ({"basis": "printed", "theory": "optics"}, "not what the row rests on"),
-        ({"theory": "optics"}, "not what the row rests on"),
-        ({"also": ("002.x",)}, "not an id of a check"),
-    ],
+    REFUSED["validation_rows"],
 )
 def test_a_row_says_beforehand_what_it_tells(more, words):
     with pytest.raises(ValueError, match=words):
