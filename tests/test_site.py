@@ -134,10 +134,7 @@ def write_site(folder: Path, **pages: str) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    ("page", "said"),
-    REFUSED["sites"],
-)
+@pytest.mark.parametrize(("page", "said"), REFUSED["sites"])
 def test_a_broken_site_is_found(page: str, said: str | None, tmp_path: Path) -> None:
     found = faults(write_site(tmp_path, index=page, other='<p id="here"></p>'))
     assert (said is None and found == []) or any(said in line for line in found if said)

@@ -216,10 +216,7 @@ def test_expected_dn_by_hand():
     assert value[0, 0] == pytest.approx(64 + 0.06 * (600 + 40), rel=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    REFUSED["data_sheets"],
-)
+@pytest.mark.parametrize(("field", "value"), REFUSED["data_sheets"])
 def test_impossible_data_sheets_name_the_field(field, value):
     with pytest.raises(ValueError, match=field):
         detector(**{field: value})
@@ -267,10 +264,7 @@ def test_impossible_exposures_are_explained() -> None:
             call()
 
 
-@pytest.mark.parametrize(
-    ("part", "key", "value", "message"),
-    REFUSED["detectors_in_files"],
-)
+@pytest.mark.parametrize(("part", "key", "value", "message"), REFUSED["detectors_in_files"])
 def test_detectors_that_cannot_work_are_told_by_file_and_line(tmp_path, part, key, value, message):
     """They were tracebacks, some of them after minutes."""
     files = {

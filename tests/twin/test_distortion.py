@@ -258,10 +258,7 @@ def test_held_out_residuals_and_sigmas() -> None:
     assert np.mean(ratio) == pytest.approx(1.0, abs=4.0 * np.std(ratio) / math.sqrt(40.0))
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "text"),
-    REFUSED["turntable_file"],
-)
+@pytest.mark.parametrize(("old", "new", "text"), REFUSED["turntable_file"])
 def test_bad_files(old: str, new: str, text: str, tmp_path: Path) -> None:
     source = FILE.read_text("utf-8")
     assert source.count(old) == 1

@@ -186,10 +186,7 @@ def test_command(tmp_path: Path) -> None:
     assert (tmp_path / "truth" / "models" / "nadir.json").read_text() != (models / "nadir.json").read_text()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    REFUSED["scene_exports"],
-)
+@pytest.mark.parametrize(("arguments", "words"), REFUSED["scene_exports"])
 def test_bad_input(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
     known = {
         "payload": SCENES / "library" / "payloads" / "th1.yaml",

@@ -335,10 +335,7 @@ DATA = {
 }
 
 
-@pytest.mark.parametrize(
-    ("program", "test", "words"),
-    REFUSED["shown_runs"],
-)
+@pytest.mark.parametrize(("program", "test", "words"), REFUSED["shown_runs"])
 def test_run_folders_without_a_monitors_state(tmp_path, program, test, words):
     folder = run_folder(tmp_path / "run", program, DATA[program]() if program in DATA else None, test)
     for place in (folder, folder / "config.yaml") if program in DATA else (folder,):

@@ -362,16 +362,7 @@ def test_a_refused_row_of_a_growing_table_counts_once(record: Path, tmp_path: Pa
     assert (held["open"], held["entries"], sorted(one["line"] for one in held["refused"])) == (2, 6, [3, 4])
 
 
-ATTACKS = {
-    "replace by id": "INSERT OR REPLACE INTO {to}entry SELECT id, 'x', kind, subject, time_us, time_utc, '{{}}', "
-    "source_id, line, origin FROM {to}entry WHERE id = 1",
-    "replace by digest": "REPLACE INTO {to}entry SELECT 99, sha256, kind, subject, time_us, time_utc, '{{}}', "
-    "source_id, line, origin FROM {to}entry WHERE id = 1",
-    "replace": "REPLACE INTO {to}instrument SELECT id, 'x', sha256, temperature_k, simulated, bodies, plain "
-    "FROM {to}instrument",
-    "update": "UPDATE {to}entry SET content = '{{}}'",
-    "upsert": "INSERT INTO {to}source SELECT * FROM {to}source WHERE true ON CONFLICT (id) DO UPDATE SET file = 'x'",
-}
+ATTACKS = INPUTS["attacks"]
 
 
 @pytest.mark.parametrize("attached", [False, True])

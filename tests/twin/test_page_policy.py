@@ -74,10 +74,7 @@ def test_a_text_of_a_users_file_brings_no_markup(evil):
     assert evil.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&#34;") in page
 
 
-@pytest.mark.parametrize(
-    "broken",
-    REFUSED["breaches"],
-)
+@pytest.mark.parametrize("broken", REFUSED["breaches"])
 def test_a_breach_would_be_found(broken):
     assert breaches(page_of("plain").replace("<body>", f"<body>{broken}"))
 

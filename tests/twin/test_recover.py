@@ -355,10 +355,7 @@ call = partial(invoke, app, terminal_width=200)
 PLAIN = "forward/left: {before: a.tif, after: b.tif}"
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    REFUSED["measurement_files"],
-)
+@pytest.mark.parametrize(("text", "told"), REFUSED["measurement_files"])
 def test_bad_measurement_files(images, tmp_path, text, told):
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.csv").write_text("channel,when,file\nforward/lft,before,x.tif\n")

@@ -105,10 +105,7 @@ def test_what_cannot_be_measured_is_said(folder, tmp_path):
     assert "not measurable" in (tmp_path / "run" / "report.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    REFUSED["target_jobs"],
-)
+@pytest.mark.parametrize(("text", "says"), REFUSED["target_jobs"])
 def test_bad_input(tmp_path, text, says):
     short = re.sub(r"pixels: \d+", "pixels: 200", (LIBRARY / "cameras" / "gf7.yaml").read_text())
     (tmp_path / "short.yaml").write_text(short)

@@ -121,16 +121,7 @@ def test_ids_that_are_there_are_known_before_any_group_is_imported(only, monkeyp
     assert "GROUPS" not in vars(registry)
 
 
-@pytest.mark.parametrize(
-    ("only", "words"),
-    [
-        ("001.tabel3", ("no check '001.tabel3'", "did you mean '001.table3'?")),
-        ("001.table3,004.eq3.g", ("'004.eq3.g'", "did you mean '004.eq3.")),
-        ("001.table3,", ("empty id",)),
-        ("", ("empty id",)),
-        ("zzzzzz", ("no check 'zzzzzz'; --list shows all",)),
-    ],
-)
+@pytest.mark.parametrize(("only", "words"), REFUSED["unknown_checks"])
 def test_unknown_ids(only, words, fake, tmp_path):
     fake(GOOD, NEAR, LEAF, OTHER)
     with pytest.raises(UnknownCheck):
@@ -284,10 +275,7 @@ def test_nothing_is_confirmed_that_could_not_have_failed(sigma, verdict, correct
     assert check().evaluate(3.0, sigma, "", explained=[None, 3.0]).verdict == REFUTED
 
 
-@pytest.mark.parametrize(
-    ("more", "words"),
-    REFUSED["validation_rows"],
-)
+@pytest.mark.parametrize(("more", "words"), REFUSED["validation_rows"])
 def test_a_row_says_beforehand_what_it_tells(more, words):
     with pytest.raises(ValueError, match=words):
         check(**more)
