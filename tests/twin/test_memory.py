@@ -159,7 +159,7 @@ def test_runs_of_a_study_are_counted(tmp_path, monkeypatch) -> None:
         require_study_memory(setup)
 
 
-BEYOND: dict[str, tuple[str, str, str, str]] = REFUSED["beyond_memory"]
+BEYOND = REFUSED["beyond_memory"]
 """Command -> a file of ``scenes``, what stands there for what, the key that is named then, and the number's unit."""
 
 
