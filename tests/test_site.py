@@ -19,6 +19,7 @@ from docs.site.spec_examples import accepted, examples, kinds_of, shipped
 from docs.site.spec_keys import flow
 from scenes.schema import MODELS, json_schema
 from scenes.yaml.yaml_file import parse_yaml
+from tests.twin.study_bench import REFUSED
 from twin.run.page import checksum
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -133,19 +134,7 @@ def write_site(folder: Path, **pages: str) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    ("page", "said"),
-    [
-        ('<a href="other.html#here">x</a>', None),
-        ('<a href="#top">x</a><p id="top"></p><a href="other.html">o</a>', None),
-        ('<a href="gone.html">x</a><a href="other.html">o</a>', "gone.html leads nowhere"),
-        ('<a href="other.html#there">x</a>', "names no place in other.html"),
-        ('<a href="other.html">x</a><img src="https://example.org/a.png">', "from the network"),
-        ('<a href="other.html">x</a><script src="//cdn.example.org/a.js"></script>', "from the network"),
-        ('<a href="other.html">x</a><link rel="stylesheet" href="a.css">', "a.css, which is not there"),
-        ("nothing", "other.html cannot be reached"),
-    ],
-)
+@pytest.mark.parametrize(("page", "said"), REFUSED["sites"])
 def test_a_broken_site_is_found(page: str, said: str | None, tmp_path: Path) -> None:
     found = faults(write_site(tmp_path, index=page, other='<p id="here"></p>'))
     assert (said is None and found == []) or any(said in line for line in found if said)

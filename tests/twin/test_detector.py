@@ -27,6 +27,7 @@ from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.commands import invoke
+from tests.twin.study_bench import REFUSED
 from twin.main_job.render_job import render_job
 from twin.render import app
 from twin.run import frame_store
@@ -215,24 +216,7 @@ def test_expected_dn_by_hand():
     assert value[0, 0] == pytest.approx(64 + 0.06 * (600 + 40), rel=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("quantum_efficiency", 0.0),
-        ("quantum_efficiency", 1.2),
-        ("system_gain_dn_per_e", -1.0),
-        ("dark_noise_e", float("nan")),
-        ("dark_current_e_per_s", float("inf")),
-        ("full_well_e", 0.0),
-        ("prnu", 0.5),
-        ("dsnu_e", -1.0),
-        ("bit_depth", 17),
-        ("bit_depth", 11.5),
-        ("offset_dn", 5000.0),
-        ("system_gain_dn_per_e", 1e-30),
-        ("prnu", "1%"),
-    ],
-)
+@pytest.mark.parametrize(("field", "value"), REFUSED["data_sheets"])
 def test_impossible_data_sheets_name_the_field(field, value):
     with pytest.raises(ValueError, match=field):
         detector(**{field: value})
@@ -280,18 +264,7 @@ def test_impossible_exposures_are_explained() -> None:
             call()
 
 
-@pytest.mark.parametrize(
-    ("part", "key", "value", "message"),
-    [
-        ("area_ccd", "rows", 8, "rows: outside the limits; found 8, allowed: at least 24"),
-        ("area_ccd", "columns", 23, "columns: outside the limits; found 23, allowed: at least 24"),
-        ("area_ccd", "pitch", "1 nm", "pitch: outside the limits; found '1 nm', allowed: at least 0.5 um"),
-        ("sheet", "system_gain_dn_per_e", 1e-30, "system_gain_dn_per_e: a full well is not even one grey value"),
-        ("sheet", "noise", {"ofset": 2.0}, "noise.ofset: no such noise; did you mean 'offset'?"),
-        ("sheet", "dark_current_e_per_s", 1e8, "less than 1e+07 electrons per second with the exposure of 10 ms"),
-        ("band", "pitch", "1 nm", "bands.P.pitch: outside the limits"),
-    ],
-)
+@pytest.mark.parametrize(("part", "key", "value", "message"), REFUSED["detectors_in_files"])
 def test_detectors_that_cannot_work_are_told_by_file_and_line(tmp_path, part, key, value, message):
     """They were tracebacks, some of them after minutes."""
     files = {

@@ -26,6 +26,7 @@ from scenes.specs.resolved import resolve_distortion
 from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
+from tests.twin.study_bench import REFUSED
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import CLOSED_FORMS, SimulatedDistortion, measure, reduce
 from twin.laboratory.turntable_bench import TurntableModel
@@ -257,19 +258,7 @@ def test_held_out_residuals_and_sigmas() -> None:
     assert np.mean(ratio) == pytest.approx(1.0, abs=4.0 * np.std(ratio) / math.sqrt(40.0))
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "text"),
-    [
-        ("step: 0.5 deg", "step: 0.3 deg", "the region is no whole number of steps"),
-        ("last: 112 deg", "last: 92 deg", "all angles would be the same"),
-        ("last: 112 deg", "last: 90 deg", "before the first"),
-        ("  repeats: 10                   # paper", "  repeats: 1", "one repeat only"),
-        ("spread: 18 arcsec", "spread: 0.25 deg", "would reach the calibrated ones"),
-        ("camera_angle: 102 deg", "camera_angle: 113 deg", "outside of the calibrated region"),
-        ("last: 150", "last: 2", "last harmonic is below the first"),
-        ("rms: 0.025 arcsec", "rms: 0.025", "without a unit"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "text"), REFUSED["turntable_file"])
 def test_bad_files(old: str, new: str, text: str, tmp_path: Path) -> None:
     source = FILE.read_text("utf-8")
     assert source.count(old) == 1

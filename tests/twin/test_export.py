@@ -14,6 +14,7 @@ from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.setup import resolve_simulate
 from tests.twin.commands import invoke
 from tests.twin.line_scanner_model import LineScannerModel
+from tests.twin.study_bench import REFUSED
 from tests.twin.test_simulate import write
 from twin.orbit.export import line_scanner as line_scanning
 from twin.orbit.export.line_scanner import line_scanner
@@ -196,19 +197,7 @@ def test_command(tmp_path: Path) -> None:
     assert (tmp_path / "truth" / "models" / "nadir.json").read_text() != (models / "nadir.json").read_text()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["nothing.yaml"], ["no such file"]),
-        (["payload"], ["a three-line payload", "has no orbit"]),
-        (["calibrate"], ["an in-orbit calibration", "does not read this"]),
-        (["folder"], ["not the run folder of twin.orbit simulate"]),
-        (["simulate", "--lowest", "0 m"], ["both --lowest and --highest"]),
-        (["simulate", "--lowest", "0", "--highest", "1 km"], ["without a unit"]),
-        (["simulate", "--lowest", "2 km", "--highest", "1 km"], ["below --highest"]),
-        (["simulate", "--lowest", "0 m", "--highest", "90 km"], ["9000"]),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words"), REFUSED["scene_exports"])
 def test_bad_input(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
     known = {
         "payload": SCENES / "library" / "payloads" / "th1.yaml",

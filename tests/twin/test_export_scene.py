@@ -14,6 +14,7 @@ import pytest
 import twin.orbit.__main__ as command
 from tests.twin.commands import files, invoke
 from tests.twin.dimap_bench import Scene, rpc, write
+from tests.twin.study_bench import REFUSED
 from twin.orbit.export import ground_accuracy, line_scanner
 from twin.orbit.export.export_report import _warnings as export_warnings
 from twin.orbit.export.quality_sections import quality_warnings
@@ -114,17 +115,6 @@ def test_a_map_of_the_accuracy(folder: Path, tmp_path: Path) -> None:
     assert (found.bias_m, found.random_m) == pytest.approx((numbers["common_m"], numbers["random_m"]))
 
 
-REFUSED = {
-    "no control": (("--control", "none.gcp"), "no such file"),
-    "another ending": (("--control", "RPC_SCENE.XML"), "not a .gcp file"),
-    "no unit": (("--attitude-sigma", "2"), "--attitude-sigma"),
-    "a length": (("--attitude-sigma", "2 m"), "--attitude-sigma"),
-    "too large": (("--position-sigma", "1e9 m"), "--position-sigma must lie between"),
-    "a band": (("--band", "B7"), "no such band"),
-    "the truth": (("--truth",), "nobody knows the truth of a scene"),
-}
-
-
 def refused(scene: Path, out: Path, arguments, message: str) -> None:
     result = run("export", scene, *arguments, "--out", out)
     assert result.exit_code == 2, message
@@ -134,7 +124,7 @@ def refused(scene: Path, out: Path, arguments, message: str) -> None:
 
 def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
     known = {one: folder / one for one in ("none.gcp", "RPC_SCENE.XML")}
-    for arguments, message in REFUSED.values():
+    for arguments, message in REFUSED["scene_arguments"].values():
         refused(folder / "DIM_SCENE.XML", tmp_path / "out", [known.get(a, a) for a in arguments], message)
     points = (folder / "points.gcp").read_text()
     rows = points.splitlines()

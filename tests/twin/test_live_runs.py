@@ -18,6 +18,7 @@ from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.orbit.setup import resolve_angle, resolve_monitor
 from scenes.specs.resolved import resolve, resolve_camera, resolve_turntable
 from scenes.yaml.errors import InputError
+from tests.twin.study_bench import REFUSED
 from twin.live.camera_pictures import _with_targets
 from twin.live.live_bench import LiveBench
 from twin.live.messages import MOST_FRAMES, AskedState
@@ -334,18 +335,7 @@ DATA = {
 }
 
 
-@pytest.mark.parametrize(
-    ("program", "test", "words"),
-    [
-        ("twin.lab", "turntable", "a turntable test (twin.lab turntable)|report.html"),
-        ("twin.orbit", "angle", "intersection angles|twin.live gf7_pair opens its instrument"),
-        ("twin.camera", "optics", "twin.camera|twin.live gf7_pair opens its instrument"),
-        ("twin.compare", "compare", "twin.compare|report.html"),
-        ("twin.export", "files", "twin.export|report.html"),
-        ("twin.validate", "", "twin.validate|report.html"),
-        ("twin.study", "", "orbit monitor|a study of base: {command: render}"),
-    ],
-)
+@pytest.mark.parametrize(("program", "test", "words"), REFUSED["shown_runs"])
 def test_run_folders_without_a_monitors_state(tmp_path, program, test, words):
     folder = run_folder(tmp_path / "run", program, DATA[program]() if program in DATA else None, test)
     for place in (folder, folder / "config.yaml") if program in DATA else (folder,):

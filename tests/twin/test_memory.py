@@ -15,11 +15,12 @@ import pytest
 import tifffile
 
 from optics.numerics.backend import Backend
-from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
+from scenes.specs.load import EXAMPLES, SCENES
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.limits.extremes import STUDIES_BEYOND, Extreme
 from tests.twin.commands import files, invoke
+from tests.twin.study_bench import REFUSED
 from twin.main_job.render_job import render_job
 from twin.monitor import monitor_memory
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -158,23 +159,7 @@ def test_runs_of_a_study_are_counted(tmp_path, monkeypatch) -> None:
         require_study_memory(setup)
 
 
-BEYOND: dict[str, tuple[str, str, str, str]] = {
-    "lab focus": (f"{LAB}/focus.yaml", "frames: 4\n>frames: 9000\n|region: 64>region: 256", "frames", "frames"),
-    "lab distortion": (f"{LAB}/distortion.yaml", "points: 55 >points: 900 |sets: 10 >sets: 900 ", "sets", "sets"),
-    "orbit adjust": (f"{ORBIT}/adjust.yaml", "tie: 120>tie: 900000", "points.tie", "tie points"),
-    "orbit calibrate": (f"{ORBIT}/calibrate_strip.yaml", "ties: 300>ties: 5000", "strip.ties", "tie points"),
-    "orbit simulate": (
-        f"{ORBIT}/simulate.yaml",
-        "lines: 1000, pixels: 1000>lines: 5000, pixels: 5000",
-        *("patch", "lines and pixels"),
-    ),
-    "tolerance": (f"{EXAMPLES.name}/tolerance_gf7.yaml", "samples: 1000>samples: 9000000", "samples", "samples"),
-    "asbuilt estimate": (
-        f"{EXAMPLES.name}/asbuilt_gf7.yaml",
-        "prior: assembled>draws: 99000\nprior: assembled",
-        *("draws", "draws"),
-    ),
-}
+BEYOND = REFUSED["beyond_memory"]
 """Command -> a file of ``scenes``, what stands there for what, the key that is named then, and the number's unit."""
 
 

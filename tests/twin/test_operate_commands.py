@@ -14,6 +14,7 @@ from optics.numerics.backend import load_backend
 from scenes.specs.operation import OperationSpec, RequirementSpec
 from tests.twin.commands import invoke
 from tests.twin.operation_records import START, entries_of, given, life_of, plan_of, record_of
+from tests.twin.study_bench import REFUSED
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.alarms import AGAIN, alarms_of, raise_alarms
@@ -150,13 +151,7 @@ def test_a_forecast_begins_now_and_its_sigma_grows(record: Path, life: Path) -> 
     assert "forecast from 2026-06-25T00:00:00Z to 2026-07-25T00:00:00Z" in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("until", "text"),
-    [
-        ("2026-04-01T00:00:00Z", "is not after the newest reading, 2026-06-25T00:00:00Z"),
-        ("April", "--until: not a date and time"),
-    ],
-)
+@pytest.mark.parametrize(("until", "text"), REFUSED["past_forecasts"])
 def test_a_forecast_of_what_is_past(until: str, text: str, record: Path, life: Path) -> None:
     done = run("forecast", record, life / "plan.yaml", "--until", until)
     assert (done.exit_code, text in done.stderr) == (2, True), done.stderr
@@ -223,15 +218,7 @@ def test_alarms_are_listed_and_acknowledged(record: Path, life: Path) -> None:
     assert "1 alarm is open" in run("status", record, life / "plan.yaml").stdout
 
 
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (("--acknowledge", 1), "who has seen the alarm? --by NAME"),
-        (("--acknowledge", 1, "--by", " "), "who has seen the alarm? --by NAME"),
-        (("--acknowledge", 9, "--by", "Ann"), "no such alarm; found 9, allowed: none: no alarm was raised"),
-        (("--by", "Ann"), "which alarm? --acknowledge ID"),
-    ],
-)
+@pytest.mark.parametrize(("words", "text"), REFUSED["unseen_alarms"])
 def test_who_has_seen_which_alarm(words: tuple[object, ...], text: str, record: Path) -> None:
     done = run("alarms", record, *words)
     assert (done.exit_code, text in done.stderr) == (2, True), done.stderr

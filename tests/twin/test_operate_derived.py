@@ -11,6 +11,7 @@ from scenes.specs.operation import read_operation
 from scenes.yaml.errors import Problem
 from tests.twin.commands import invoke
 from tests.twin.record_bench import MINUTE, START, given, made, temperatures
+from tests.twin.study_bench import REFUSED
 from twin.operate.__main__ import app
 from twin.operate.estimate.operation_model import kept_plan, plan_digest, quantity_names, read_plan
 from twin.operate.record.entries import Alarm
@@ -164,17 +165,7 @@ def test_an_estimate_rests_on_a_part_of_the_plan(tmp_path: Path) -> None:
     assert digest("") != own
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("instrument: gf7_pair_two\ndisturbances: in_service\n", "a plan of another instrument than the record's"),
-        (
-            "instrument: gf7_pair\ndisturbances: in_service\nrequirements: [{quantity: foward d_f_um, limit: 1 um}]\n",
-            "gf7_pair has no such quantity",
-        ),
-        ("instrument: gf7_pair\n", "'disturbances' is missing"),
-    ],
-)
+@pytest.mark.parametrize(("text", "said"), REFUSED["plans"])
 def test_a_plan_that_is_not_of_the_record(text: str, said: str, record: Path, tmp_path: Path) -> None:
     (tmp_path / "plan.yaml").write_text(text)
     result = invoke(app, "init", record, "gf7_pair", "--plan", tmp_path / "plan.yaml")

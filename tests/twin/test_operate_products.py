@@ -234,21 +234,14 @@ def test_a_scene_that_its_orbit_does_not_cover_is_refused(history: History, tmp_
         products_of(stand_in(drawn(3)), history, START, source, load_backend())
 
 
-@pytest.mark.parametrize(
-    ("change", "said"), [(("camera: gf7_pair", "camera: zy3_pair"), "another instrument"), (None, "of a payload")]
-)
-def test_a_scene_of_another_instrument_is_refused(history: History, tmp_path: Path, change, said: str) -> None:
-    text = SCENE.read_text("utf-8")
-    if change is None:
-        source = read_source(SCENES / ORBIT / "angle.yaml")
-    else:
-        other = (SCENES / "library" / "instruments" / "gf7_pair.yaml").read_text("utf-8")
-        other = other.replace("name: gf7_pair", "name: zy3_pair").replace("look: 26 deg", "look: 25 deg")
-        (tmp_path / "zy3_pair.yaml").write_text(other, "utf-8")
-        (tmp_path / "angle.yaml").write_text(text.replace("camera: gf7_pair ", "camera: ./zy3_pair.yaml "), "utf-8")
-        source = read_source(tmp_path / "angle.yaml")
-    told = problem(history, START, source)
-    assert said in told.problem
+def test_a_scene_of_another_instrument_is_refused(history: History, tmp_path: Path) -> None:
+    other = (SCENES / "library" / "instruments" / "gf7_pair.yaml").read_text("utf-8")
+    other = other.replace("name: gf7_pair", "name: zy3_pair").replace("look: 26 deg", "look: 25 deg")
+    (tmp_path / "zy3_pair.yaml").write_text(other, "utf-8")
+    text = SCENE.read_text("utf-8").replace("camera: gf7_pair ", "camera: ./zy3_pair.yaml ")
+    (tmp_path / "angle.yaml").write_text(text, "utf-8")
+    told = problem(history, START, read_source(tmp_path / "angle.yaml"))
+    assert "another instrument" in told.problem
     assert "camera: gf7_pair" in (told.allowed or "")
 
 
@@ -570,12 +563,10 @@ def test_a_state_has_the_temperatures_that_do_what_was_found(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--time", "2026-02-01T00:00:00Z"), "before the first reading"),
-        (("--time", "2027-02-01T00:00:00Z"), "a longer horizon in the plan"),
         (("--time", "yesterday"), "--time"),
         ((), "of which time? --time UTC, or --scene FILE"),
         (("--scene", SCENE), "before the first reading"),
-        (("--time", "2026-03-03T00:00:00Z", "--scene", SCENES / ORBIT / "angle.yaml"), "the record's instrument"),
+        (("--time", "2026-03-03T00:00:00Z", "--scene", SCENES / ORBIT / "angle.yaml"), "of a payload"),
         (("--time", "2026-03-03T00:00:00Z", "--scene", SCENES / ORBIT / "monitor.yaml"), "does not read this"),
         (("--time", "2026-03-03T00:00:00Z", "--scene", "no.yaml"), "no.yaml"),
         (("--scene", SCENES / ORBIT / "simulate.yaml"), "--scene: not a scene of an instrument"),

@@ -30,7 +30,7 @@ from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue
 from tests.tiers import quick
 from tests.twin.commands import invoke
-from tests.twin.study_bench import ROOT
+from tests.twin.study_bench import REFUSED, ROOT
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -355,40 +355,13 @@ call = partial(invoke, app, terminal_width=200)
 PLAIN = "forward/left: {before: a.tif, after: b.tif}"
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("frames: images\n", ["an instrument or its geometry is needed"]),
-        (HEAD + "perturb: {base: {shift: [1 um, 0 um, 0 um]}}\n", ["this is a job of the monitor"]),
-        (HEAD + "template: twin\ncorrections: none\n", ["'frames' is missing"]),
-        (HEAD + "frames: imges\n", ["no such folder", "measurement.yaml:3: frames"]),
-        (HEAD + "frames: measurement.yaml\n", ["neither a folder nor a table"]),
-        (HEAD + "frames: empty\n", ["no frames of forward/left before", "forward_left_before.tiff"]),
-        (HEAD + "frames: images\nsmear: 1\n", ["unknown key", "'smear'"]),
-        (HEAD + "frames: images\ncorrections: auto\n", ["not one of the choices", "automatic"]),
-        (HEAD + "frames: images\ndark: nodark.fits\n", ["no such file", "measurement.yaml:4: dark.all"]),
-        (HEAD + "frames: images\nflat: a.tif\n", ["flat frames are of no use without dark frames"]),
-        (HEAD + "frames: images\nphoton_transfer: measured\n", ["dark: FILES and flat: FILES"]),
-        (HEAD + "frames: images\nexposure: 10 m\n", ["measurement.yaml:4: exposure"]),
-        (HEAD + "frames: images\ndetector: monitor_cd\n", ["did you mean 'monitor_ccd'"]),
-        (HEAD + f"frames:\n  {PLAIN}\n", ["no such file", "a.tif"]),
-        (HEAD + "frames:\n  forwad/left: {before: a.tif, after: b.tif}\n", ["no such channel", "did you mean"]),
-        (HEAD + f"times: [0 s, 1 s]\nframes:\n  {PLAIN}\n", ["not as many entries as times"]),
-        (
-            "geometry: {f: {principal_distance: 1 m, separation: 1 m, pitch: 9 um}}\nframes: images\n",
-            ["template: measured"],
-        ),
-        (HEAD + "geometry: {f: {principal_distance: 1 m, separation: 1 m, pitch: 9 um}}\nframes: images\n", ["both"]),
-        (HEAD + "frames: bad.csv\n", ["bad.csv:2", "no such channel"]),
-        (HEAD + "frames: heads.csv\n", ["heads.csv:1", "not the head of a column"]),
-    ],
-)
+@pytest.mark.parametrize(("text", "told"), REFUSED["measurement_files"])
 def test_bad_measurement_files(images, tmp_path, text, told):
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.csv").write_text("channel,when,file\nforward/lft,before,x.tif\n")
     (tmp_path / "heads.csv").write_text("channel,wen,file\n")
     (tmp_path / "images").symlink_to(images)
-    (tmp_path / "measurement.yaml").write_text(text)
+    (tmp_path / "measurement.yaml").write_text(text.replace("HEAD\n", HEAD))
     result = call(tmp_path / "measurement.yaml", "--out", tmp_path / "out")
     assert result.exit_code == 2, result.output
     assert result.stdout == ""

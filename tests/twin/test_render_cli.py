@@ -28,6 +28,7 @@ from optics.numerics.threads import LIMIT
 from scenes.specs.load import EXAMPLES
 from tests.tiers import quick
 from tests.twin.commands import files, invoke
+from tests.twin.study_bench import REFUSED
 from twin.main_job.render_drawings import (
     IRRADIANCE,
     SCENE,
@@ -175,18 +176,7 @@ def test_config_repeats_the_run_bit_for_bit(computed, tmp_path, monkeypatch):
 # --- bad input --------------------------------------------------------------------------------------------------------
 
 HEAD = "instrument: gf7_pair\nperturb:\n"
-BAD_FILES = {
-    "unknown node": (
-        HEAD + "  base/forwards/M2: {shift: [0 um, 0 um, 3 um]}",
-        ("no such node", "base/forward/M2", ":3"),
-    ),
-    "unknown pivot": (HEAD + "  base/forward/focal_plane: {pivot: rear_nod}", ("pivot", "rear_node", ":3")),
-    "unknown key": (HEAD + "  base/forward/M2: {shfit: [0 um, 0 um, 3 um]}", ("unknown key", "shift", ":3")),
-    "unknown instrument": ("instrument: gf7_par", ("no such name in instruments", "gf7_pair")),
-    "unknown unit": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 3 umm]}", ("unknown unit", "umm", ":3")),
-    "NaN": (HEAD + "  base/forward/M2: {shift: [0 um, .nan, 3 um]}", ("not a finite number", "shift[1]")),
-    "absurd": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 10 m]}", ("outside the limits", "10 m", "100 mm")),
-    "duplicate keys": (HEAD + "  base/forward/M2: {}\n  base/forward/M2: {}", ("duplicate key", "line 3", ":4")),
+BAD_FILES = REFUSED["job_files"] | {
     "binary": (b"\xff\xfe\x00", ("not UTF-8",)),
     "too large": ("#" * 1_000_001, ("too large", "1 MB")),
 }
@@ -212,17 +202,6 @@ def test_bad_files(case, tmp_path):
     message = complains(run(job, "--out", tmp_path / "new/run"), job, *words)
     assert len(message.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]
-
-
-def test_files_that_cannot_be_read(tmp_path):
-    complains(run(tmp_path / "none.yaml", "--out", tmp_path / "run"), "none.yaml: no such file")
-    complains(run(tmp_path, "--out", tmp_path / "run"), "is a directory")
-    complains(run("/dev/zero", "--out", tmp_path / "run"), "not a regular file")
-    locked = tmp_path / "locked.yaml"
-    locked.touch(mode=0)
-    if not os.access(locked, os.R_OK):  # root reads everything
-        complains(run(locked, "--out", tmp_path / "run"), "Permission denied")
-    assert not (tmp_path / "run").exists()
 
 
 def test_bad_options(tmp_path):

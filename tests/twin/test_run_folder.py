@@ -155,13 +155,6 @@ def test_nan_is_no_json(tmp_path):
     assert everything(tmp_path) == set()
 
 
-def test_an_existing_folder_is_kept(tmp_path):
-    target = a_run(tmp_path / "run")
-    with pytest.raises(RunFolderError, match=r"exists; choose another with --out, or replace it with --force"):
-        RunFolder(target)
-    assert (target / "a/b.txt").read_text() == "first"
-
-
 def test_force_replaces_a_run(tmp_path):
     target = a_run(tmp_path / "run")
     (target / "empty").mkdir()
@@ -355,7 +348,6 @@ def kill_a_run(target: Path, act: str = "") -> None:
 def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
     kill_a_run(tmp_path / "other")
     assert {path.suffix for path in tmp_path.iterdir()} == {f".{PARTIAL}", f".{LOCK}"}
-    (tmp_path / ".other.0123abcd.partial").mkdir()  # of a version that had no locks
     (tmp_path / ".mine.partial").mkdir()
     (tmp_path / ".mine.01234567.partial").touch()
     a_run(tmp_path / "run")

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import twin.orbit.__main__ as command
 from scenes.specs.load import ORBIT, SCENES
 from tests.twin.commands import edited_copy, invoke, refused
+from tests.twin.study_bench import REFUSED
 
 run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "simulate.yaml"
@@ -91,14 +92,7 @@ def test_other_software_finds_the_ground(folder: Path) -> None:
 
 
 # what is wrong, key, what to do about it
-BAD = {
-    "no size": (SMALL, "lines: 0, pixels: 80}", "patch.lines", ["16"]),
-    "line": ("lines: [forward, nadir, backward]", "lines: [forward, nadr]", "lines", ["did you mean 'nadir'"]),
-    "edge": ("pixel: 6000", "pixel: 40", "patch", ["reaches into", "nadir"]),
-    "short before": ("before: 60 s ", "before: 20 s ", "orbit", ["before the orbit data begin", "longer"]),
-    "short after": ("after: 60 s", "after: 20 s", "orbit", ["after the orbit data end", "longer"]),
-    "steep": ("kind: real, height: 500 m", "kind: real, height: 4000 m, relief: 1500 m", "ground.terrain", ["hides"]),
-}
+BAD = REFUSED["simulated_files"]
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -12,6 +12,7 @@ import yaml
 import twin.render as command
 from scenes.specs.load import LIBRARY
 from tests.twin.commands import invoke
+from tests.twin.study_bench import REFUSED
 from twin.targets.target_images import DIRECTIONS, PLACES
 
 run = partial(invoke, command.app)
@@ -104,18 +105,7 @@ def test_what_cannot_be_measured_is_said(folder, tmp_path):
     assert "not measurable" in (tmp_path / "run" / "report.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("render: {images: [spots, knife_edges]}", "render.images"),
-        ("render: {images: [spots], targets: {white: 10 percent}}", "none is rendered"),
-        ("render: {images: [knife_edge], targets: {angle: 45 deg}}", "render.targets.angle"),
-        ("render: {images: [knife_edge], targets: {region: 8}}", "render.targets.region"),
-        ("render: {images: [bars], targets: {frames: 10000, region: 512}}", "do not fit into memory"),
-        ("render: {images: [bars], frames: 9000}", "render.targets.frames"),
-        ("render: {images: [bars], targets: {region: 200}}", "region: the images of targets do not fit the line CCD"),
-    ],
-)
+@pytest.mark.parametrize(("text", "says"), REFUSED["target_jobs"])
 def test_bad_input(tmp_path, text, says):
     short = re.sub(r"pixels: \d+", "pixels: 200", (LIBRARY / "cameras" / "gf7.yaml").read_text())
     (tmp_path / "short.yaml").write_text(short)

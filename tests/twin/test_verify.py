@@ -358,19 +358,6 @@ def test_the_files_alone_take_no_computing(folder) -> None:
     assert told["verdict"].startswith("numbers.json is not as the run wrote it")
 
 
-def test_a_folder_of_an_older_program_is_told(folder) -> None:
-    """Nor is it touched: without its command it cannot be made again."""
-    told = json.loads((folder / MANIFEST).read_text())
-    old = {key: value for key, value in told.items() if key not in ("digest", "provenance", "again")}
-    (folder / MANIFEST).write_text(json.dumps(old, indent=2) + "\n")
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    result = invoke(app, folder)
-    assert result.exit_code == 2
-    assert "older version, whose manifest does not say by which command" in result.stdout
-    assert "no checksum of itself" in result.stdout
-    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-
-
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory) -> Path:
     """The folder of a real run that takes no second: two hand-made runs compared."""

@@ -11,6 +11,7 @@ import pytest
 
 import twin.validate as command
 from tests.twin.commands import invoke
+from tests.twin.study_bench import REFUSED
 from twin.run.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation import registry
 from twin.validation.checks.check import (
@@ -120,16 +121,7 @@ def test_ids_that_are_there_are_known_before_any_group_is_imported(only, monkeyp
     assert "GROUPS" not in vars(registry)
 
 
-@pytest.mark.parametrize(
-    ("only", "words"),
-    [
-        ("001.tabel3", ("no check '001.tabel3'", "did you mean '001.table3'?")),
-        ("001.table3,004.eq3.g", ("'004.eq3.g'", "did you mean '004.eq3.")),
-        ("001.table3,", ("empty id",)),
-        ("", ("empty id",)),
-        ("zzzzzz", ("no check 'zzzzzz'; --list shows all",)),
-    ],
-)
+@pytest.mark.parametrize(("only", "words"), REFUSED["unknown_checks"])
 def test_unknown_ids(only, words, fake, tmp_path):
     fake(GOOD, NEAR, LEAF, OTHER)
     with pytest.raises(UnknownCheck):
@@ -283,19 +275,7 @@ def test_nothing_is_confirmed_that_could_not_have_failed(sigma, verdict, correct
     assert check().evaluate(3.0, sigma, "", explained=[None, 3.0]).verdict == REFUTED
 
 
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        ({"tells": None}, "what the row tells"),
-        ({"tells": 0.0}, "greater than 0"),
-        ({"against": ""}, "what the row tells"),
-        ({"tells": 0.09}, "can never tell"),
-        ({"basis": "theory"}, "not what the row rests on"),
-        ({"basis": "printed", "theory": "optics"}, "not what the row rests on"),
-        ({"theory": "optics"}, "not what the row rests on"),
-        ({"also": ("002.x",)}, "not an id of a check"),
-    ],
-)
+@pytest.mark.parametrize(("more", "words"), REFUSED["validation_rows"])
 def test_a_row_says_beforehand_what_it_tells(more, words):
     with pytest.raises(ValueError, match=words):
         check(**more)

@@ -8,6 +8,7 @@ import yaml
 
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import parse_yaml
+from tests.twin.study_bench import REFUSED
 from twin.validation.checks.check import Supposed
 from twin.validation.checks.group import Printed, load_printed
 from twin.validation.checks.row_names import FILE
@@ -34,19 +35,7 @@ def test_readers() -> None:
     assert dict(SMALL.columns("table1.columns")) == {"X": (0.04,), "Y": ()}
 
 
-@pytest.mark.parametrize(
-    ("reader", "key", "words"),
-    [
-        ("number", "table1.size_mm", r"paper\.yaml:1: table1: nothing is printed as 'size_mm'.*'size_um'"),
-        ("number", "table1.size_um.more", r"paper\.yaml:2: table1\.size_um: nothing is printed as 'more'"),
-        ("number", "table1.rows", r"paper\.yaml:4: table1\.rows: no number"),
-        ("whole", "table1.size_um", r"paper\.yaml:2: table1\.size_um: no whole number; found 2\.3"),
-        ("column", "table1.bands", r"paper\.yaml:5: table1\.bands: no list"),
-        ("numbers", "table1.rows", r"paper\.yaml:4: table1\.rows: no mapping"),
-        ("numbers", "table1.columns", r"paper\.yaml:6: table1\.columns\.X: no number"),
-        ("columns", "table1.bands", r"paper\.yaml:5: table1\.bands\.P: no list"),
-    ],
-)
+@pytest.mark.parametrize(("reader", "key", "words"), REFUSED["printed_values"])
 def test_errors_say_where(reader: str, key: str, words: str) -> None:
     with pytest.raises(InputError) as error:
         getattr(SMALL, reader)(key)

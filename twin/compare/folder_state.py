@@ -46,8 +46,8 @@ class FolderState:
 
     @property
     def sealed(self) -> bool:
-        """Whether the manifest has a checksum of itself; one that says where it was made has."""
-        return self.manifest.digest is not None or self.manifest.provenance is not None
+        """Whether the manifest has a checksum of itself."""
+        return self.manifest.digest is not None
 
     @property
     def is_study(self) -> bool:
@@ -72,7 +72,7 @@ def folder_state(folder: Path) -> FolderState:
     changed, gone = (tuple(name for name, now in inputs.items() if now == what) for what in ("changed", "gone"))
     state = FolderState(folder, manifest, (), (), (), changed, gone)
     whole = manifest.digest == run_folder.seal(written) and content == run_folder.json_text(written).encode()
-    if state.sealed and not whole:
+    if not whole:
         wrong.append(MANIFEST)
     known = {MANIFEST, *manifest.sha256}
     if state.is_study:

@@ -221,8 +221,6 @@ class Repetition:
 def obstacle(state: FolderState) -> str:
     """Return why a run cannot be repeated from its folder; empty where it can."""
     manifest = state.manifest
-    if not manifest.again and manifest.provenance is None:
-        return "it was made by an older version, whose manifest does not say by which command"
     if not manifest.again:
         return (
             "it holds measurements that a test wrote beside its run (--export); the run folder of the test can be "
@@ -467,8 +465,6 @@ class Verification:
     def lines(self) -> list[str]:
         """Return what a reader should know beside the verdict, line by line."""
         state, out = self.state, []
-        if not state.sealed:
-            out.append("the manifest has no checksum of itself: it is of an older version")
         out += [f"read by the run and changed since: {name}" for name in state.inputs_changed]
         out += [f"read by the run and gone: {name}" for name in state.inputs_gone]
         for one in () if self.repetition is None else self.repetition.files:

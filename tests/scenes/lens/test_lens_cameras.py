@@ -36,6 +36,7 @@ from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.lens.files import BATOID, SINGLET, TMA
 from tests.scenes.refusals.tables import changed
 from tests.tiers import quick
+from tests.twin.study_bench import REFUSED
 
 ROUNDING = 1e-12
 """Metres: some ten metres of path in float64, with a lever arm of mirrors."""
@@ -318,21 +319,7 @@ def test_the_command(tmp_path: Path, backend) -> None:
     assert load_camera(camera).line.pitch == pytest.approx(15e-6)
     (tmp_path / "job.yaml").write_text(JOB, "utf-8")
     (tmp_path / "what.doc").touch()
-    for words, problem in (
-        ("read two.yaml --out a.yaml", "names no wavelength"),
-        ("read none.zmx --out a.yaml", "no such file"),
-        ("read what.doc --out a.yaml", "what kind of file is this?"),
-        ("read tma.zmx --out a.txt", "what kind of file is this to be?"),
-        ("read tma.zmx --out a.yaml --pupil 3_kg", "--pupil"),
-        ("read tma.zmx --out a.yaml --pupil 0_mm", "--pupil is not greater than zero"),
-        ("read tma.zmx --out a.yaml --wavelength 650_nm", "--wavelength is for files of batoid"),
-        ("read tma.zmx --out nowhere/a.yaml", "cannot be written"),
-        ("write gf8 --out a.zmx", "did you mean 'gf7'"),
-        ("write gf7 --out a.zmx --camera forward", "--camera is for --perturbed"),
-        ("write gf7 --perturbed job.yaml --out a.zmx", "which of them?"),
-        ("write gf7 --perturbed job.yaml --camera upward --out a.zmx", "no such camera"),
-        ("write korsch --perturbed job.yaml --out a.zmx", "the job's instrument has no such camera"),
-    ):
+    for words, problem in REFUSED["lens_commands"]:
         code, said = run(
             *(tmp_path / one if "." in one or "/" in one else one.replace("_", " ") for one in words.split())
         )

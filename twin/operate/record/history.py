@@ -75,12 +75,7 @@ class History:
             found = schema.version(connection)
             if found == 0:
                 raise NotARecord(f"no record in {self.url}; python -m twin.operate init makes one")
-            if found != schema.VERSION:
-                schema.migrate(connection, found) if found > schema.VERSION else None
-                raise NotARecord(
-                    f"the record in {self.url} is of version {found}, this program writes {schema.VERSION}; "
-                    "python -m twin.operate init with the same instrument brings it up"
-                )
+            schema.require_version(found)
             row = connection.execute(select(INSTRUMENT)).mappings().one()
         self.name, self.sha256 = str(row["name"]), str(row["sha256"])
         self.temperature, self.simulated = float(row["temperature_k"]), bool(row["simulated"])
@@ -542,7 +537,7 @@ def bodies_of(job: ResolvedJob) -> dict[str, list[str]]:
 
 
 def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
-    """Make a record, or bring one of an earlier version up to this one.
+    """Make a record where there is none.
 
     Args:
         place: folder, or address of a database.
@@ -550,10 +545,10 @@ def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[
         simulated: whether times are not compared with the computer's clock.
 
     Returns:
-        Versions that the record has passed: this one of a new record, none where nothing was to be done.
+        The version of a new record; nothing where there was one.
 
     Raises:
-        NotARecord: there is one of another instrument, or of a later version.
+        NotARecord: there is one of another instrument, or of another version.
         RecordFailed: it cannot be made.
     """
     url = url_of(place)
@@ -567,9 +562,13 @@ def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[
     try:
         with writing(engine) as connection:
             found = schema.version(connection)
-            passed = schema.migrate(connection, found) if found else (schema.VERSION,)
-            if not found:
+            if found:
+                schema.require_version(found)
+            else:
                 schema.create(connection)
+                program = f"{WRITER} {importlib.metadata.version(WRITER)}"
+                made = {"version": schema.VERSION, "made_utc": utc_text(now()), "program": program}
+                connection.execute(insert(schema.SCHEMA).values(**made))
                 row = {"name": job.instrument.name, "sha256": digest, "simulated": simulated}
                 row |= {"temperature_k": repr(job.instrument.temperature), "bodies": canonical(bodies_of(job))}
                 row |= {"plain": canonical(job.plain()["instrument"])}
@@ -580,12 +579,8 @@ def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[
                     f"the record is of {own['name']} ({own['sha256'][:12]}), not of {job.instrument.name} "
                     f"({digest[:12]}): what an instrument is does not change in its record; make another record"
                 )
-            program = f"{WRITER} {importlib.metadata.version(WRITER)}"
-            rows = [{"version": one, "made_utc": utc_text(now()), "program": program} for one in passed]
-            if rows:
-                connection.execute(insert(schema.SCHEMA), rows)
     finally:
         engine.dispose()
     if folder is not None:
         sync_folder(folder)
-    return passed
+    return () if found else (schema.VERSION,)

@@ -6,7 +6,7 @@ The database of a record: found by its address, opened, written by one writer at
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -36,9 +36,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, IntegrityError, NoSuchModuleError
-from sqlalchemy.schema import CreateIndex, CreateTable
 
-from optics.numerics.frozen_map import FrozenMap
 from twin.operate.record.entries import digest_of_data, utc_text
 from twin.operate.record.place import NotARecord, RecordFailed, file_of, require_file
 
@@ -180,10 +178,8 @@ def _triggers(table: Table) -> dict[str, str]:
 def _guard(connection: Connection, table: Table) -> None:
     """Let the database refuse to alter or remove rows of a table; on others than these two only the program does."""
     if connection.dialect.name == "sqlite":
-        there = set(connection.execute(text("SELECT name FROM sqlite_master WHERE type = 'trigger'")).scalars())
-        for name, sql in _triggers(table).items():
-            if name not in there:
-                connection.execute(text(sql))
+        for sql in _triggers(table).values():
+            connection.execute(text(sql))
     elif connection.dialect.name == "postgresql":
         for what in ("UPDATE", "DELETE"):
             connection.execute(
@@ -267,63 +263,12 @@ def version(connection: Connection) -> int:
     return int(connection.execute(select(func.max(SCHEMA.c.version))).scalar_one() or 0)
 
 
-def _to_two(connection: Connection) -> None:
-    """Add where a reading was found from, and what was refused; old rows get no origin, since none is altered."""
-    connection.execute(text("ALTER TABLE entry ADD COLUMN origin VARCHAR(64)"))
-    _make_index(connection, ENTRY, "entry_origin")
-    _make_table(connection, REFUSED)
-
-
-def _to_three(connection: Connection) -> None:
-    """Add plans of operation, what is derived under them, alarms, and who has seen them."""
-    _make_index(connection, ENTRY, "entry_time")
-    for table in (PLAN, ALARM, ACKNOWLEDGEMENT, CHECKPOINT):
-        _make_table(connection, table)
-
-
-def _make_table(connection: Connection, table: Table) -> None:
-    connection.execute(CreateTable(table))
-    for index in table.indexes:
-        connection.execute(CreateIndex(index))
-    if table.name not in _DERIVED:
-        _guard(connection, table)
-
-
-def _to_four(connection: Connection) -> None:
-    """Let the database refuse to replace rows, too."""
-    if connection.dialect.name == "sqlite":
-        for table in _METADATA.sorted_tables:
-            if table.name not in _DERIVED:
-                _guard(connection, table)
-
-
-def _make_index(connection: Connection, table: Table, name: str) -> None:
-    (index,) = (one for one in table.indexes if one.name == name)
-    connection.execute(CreateIndex(index))
-
-
-MIGRATIONS: Mapping[int, Callable[[Connection], None]] = FrozenMap({1: _to_two, 2: _to_three, 3: _to_four})
-"""Version -> what makes the next one of it. Rows are added, none is altered."""
-
-
-def migrate(connection: Connection, found: int) -> tuple[int, ...]:
-    """Bring a record to this version.
-
-    Args:
-        connection: in a transaction.
-        found: its version.
-
-    Returns:
-        The versions that it passed, this one last.
-
-    Raises:
-        NotARecord: it is of a later version.
-    """
-    if found > VERSION:
-        raise NotARecord(f"the record is of version {found}, this program knows {VERSION}; use a later program")
-    for step in range(found, VERSION):
-        MIGRATIONS[step](connection)
-    return tuple(range(found + 1, VERSION + 1))
+def require_version(found: int) -> None:
+    """Raise NotARecord of a record that a program of another version made."""
+    if found != VERSION:
+        raise NotARecord(
+            f"the record is of version {found}, this program knows {VERSION}; use the program that made it"
+        )
 
 
 WAIT = 60.0
