@@ -1,9 +1,8 @@
 """Glasses and materials against data sheets and handbooks."""
 
 import pytest
-from optics.materials.dispersion import FORMULAS, CatalogueGlass
 
-from optics.materials.glass import FUSED_SILICA, GLASSES, N_BK7, ZERODUR, air_index, glass
+from optics.materials.glass import FORMULAS, FUSED_SILICA, GLASSES, N_BK7, ZERODUR, CatalogueGlass, air_index, glass
 from optics.materials.material import MATERIALS, material
 
 D_LINE, E_LINE, F_LINE, C_LINE = 587.5618e-9, 546.074e-9, 486.1327e-9, 656.2725e-9

@@ -7,7 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from analysis.turntable.angle_fits import FITS, NotConvergedError, fit
+from analysis.turntable.angle_fits import FITS, fit
+from analysis.turntable.angle_network import NotConvergedError
 from optics.numerics.backend import load_backend
 from tests.tiers import quick
 from twin.validation import registry
