@@ -99,11 +99,7 @@ class StripAdjustment:
 
 
 def adjust_strip(
-    rays: Mapping[str, Rays],
-    cameras: Mapping[str, LineModel],
-    noise: Noise,
-    *,
-    bias: ArrayLike = (0.0, 0.0, 0.0),
+    rays: Mapping[str, Rays], cameras: Mapping[str, LineModel], noise: Noise, *, bias: ArrayLike = (0.0, 0.0, 0.0)
 ) -> StripAdjustment:
     """Adjust one pass on its tie points.
 

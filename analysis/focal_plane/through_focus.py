@@ -423,13 +423,7 @@ def _deviations(z: Array, v: Array, s: Array, groups: NDArray[np.intp]) -> tuple
     return rest, np.nan_to_num(np.abs(rest) / np.sqrt(variance * scale))
 
 
-def _faults(
-    model: _Lobe,
-    mask: NDArray[np.bool_],
-    place: Array,
-    bend: Array,
-    covariance: Array,
-) -> NDArray[np.str_]:
+def _faults(model: _Lobe, mask: NDArray[np.bool_], place: Array, bend: Array, covariance: Array) -> NDArray[np.str_]:
     """(B,) empty, or why a curve has no vertex."""
     fault = np.full(len(place), "", dtype="<U12")
     scarce = model.positions(model.window(WIDEST_FRACTION)) < LEAST_POINTS
@@ -444,10 +438,7 @@ def _faults(
     misfit = model.chi_square(mask) > _MISFIT * np.maximum(mask.sum(axis=1) - 3, 1)
     place_sigma = np.sqrt(covariance[:, 1, 1]) / model.scale
     trend, half = _trend(model, mask), model.reach(WIDEST_FRACTION) / model.scale
-    for sign, name, room in (
-        (-1, "peak below", model.x0 - model.ends[0]),
-        (1, "peak above", model.ends[1] - model.x0),
-    ):
+    for sign, name, room in ((-1, "peak below", model.x0 - model.ends[0]), (1, "peak above", model.ends[1] - model.x0)):
         rising = sign * trend > _SIGNIFICANT
         # Within two sigma of the end it is not seen to be inside.
         fault[(room < 2 * place_sigma) & (curved | rising)] = name
@@ -474,12 +465,7 @@ def _trend(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
 
 
 def _raise(
-    fault: NDArray[np.str_],
-    shape: tuple[int, ...],
-    z: Array,
-    weight: Array,
-    place: Array,
-    reach: Array,
+    fault: NDArray[np.str_], shape: tuple[int, ...], z: Array, weight: Array, place: Array, reach: Array
 ) -> None:
     """FocusError when a curve has a fault; the message names the first few."""
     bad = np.flatnonzero(fault != "")

@@ -226,8 +226,7 @@ ESTIMATORS: dict[str, Estimator] = {
     ),
     "paper_joint": Formula("paper_joint", "joint changes as Wang et al. (2018) print them"),
     "derived": Formula(
-        "derived",
-        "the same spot coordinates with the factors of a plane return, plate scale and distortion calibrated",
+        "derived", "the same spot coordinates with the factors of a plane return, plate scale and distortion calibrated"
     ),
     "model": LeastSquares(),
     "posterior": Posterior(),

@@ -163,12 +163,7 @@ def coefficients(name: str, geometry: MonitorGeometry) -> Array:
     gamma = delta / length if paper else delta / (2 * length) * f / f_x
     scale = delta * f / (length * {"paper_single": 2, "paper_joint": 4, "derived": 2}[name])
     matrix = np.array(
-        [
-            [0.0, -alpha, 0.0, -alpha],
-            [-beta, 0.0, -beta, 0.0],
-            [0.0, -gamma, 0.0, gamma],
-            [scale, 0.0, -scale, 0.0],
-        ]
+        [[0.0, -alpha, 0.0, -alpha], [-beta, 0.0, -beta, 0.0], [0.0, -gamma, 0.0, gamma], [scale, 0.0, -scale, 0.0]]
     )
     if not paper:
         matrix[2] += geometry.d_gamma_per_beta * matrix[1]

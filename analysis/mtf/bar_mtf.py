@@ -439,13 +439,7 @@ def measure_bar_pages(
 
     def measured(left: float) -> BarMtf:
         return measure_bars(
-            mean,
-            low,
-            high,
-            frequency,
-            saturation=saturation,
-            offset=offset,
-            rounding=(left, rounding[1], rounding[2]),
+            mean, low, high, frequency, saturation=saturation, offset=offset, rounding=(left, rounding[1], rounding[2])
         )
 
     found = measured(rounding[0])

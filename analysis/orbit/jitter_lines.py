@@ -393,11 +393,7 @@ def _fitted(given: Observations, frequency: Array, chance: Array) -> Lines:
         raise JitterError("an oscillation that was found is none of one frequency")
     factor = float(left @ left) / max(given.freedom - count * width, 1)
     spread = (vt.T / s**2) @ vt / size[:, None] / size
-    return replace(
-        lines,
-        frequency=f,
-        covariance=np.asarray(factor * spread),
-    )
+    return replace(lines, frequency=f, covariance=np.asarray(factor * spread))
 
 
 @dataclass(frozen=True, eq=False)

@@ -210,12 +210,7 @@ class Rays:
 
     @classmethod
     def of(
-        cls,
-        point: ArrayLike,
-        image: ArrayLike,
-        station: ArrayLike,
-        attitude: ArrayLike,
-        time: ArrayLike | None = None,
+        cls, point: ArrayLike, image: ArrayLike, station: ArrayLike, attitude: ArrayLike, time: ArrayLike | None = None
     ) -> Rays:
         """The rays, checked.
 

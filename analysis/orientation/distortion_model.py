@@ -38,12 +38,7 @@ from analysis.arrays import Array
 from analysis.measurement_error import MeasurementError
 
 # power of tan W and sign of each term
-_POWER = {
-    "constant": (0, 1.0),
-    "principal_distance": (1, 1.0),
-    "principal_point": (2, -1.0),
-    "radial3": (3, 1.0),
-}
+_POWER = {"constant": (0, 1.0), "principal_distance": (1, 1.0), "principal_point": (2, -1.0), "radial3": (3, 1.0)}
 TERMS = tuple(_POWER)
 # Line cameras see a few degrees; beyond this an angle is rather in degrees than in radians.
 _WIDEST = np.pi / 4

@@ -119,11 +119,7 @@ def _energy(
 
 
 def gaussian_fit(
-    mean: ArrayLike,
-    frames: int,
-    noise: NoiseModel,
-    radius_px: float | None = None,
-    elliptical: bool = False,
+    mean: ArrayLike, frames: int, noise: NoiseModel, radius_px: float | None = None, elliptical: bool = False
 ) -> SpotPositions:
     """Weighted least squares of background + amplitude exp(-q/2) in a soft circular window that follows the centre.
 

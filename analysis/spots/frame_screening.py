@@ -467,11 +467,7 @@ def noise_ratio(
 
 
 def shown_noise(
-    frames: NDArray[Any],
-    noise: NoiseModel,
-    ratio: float | None,
-    bad: Mask | None = None,
-    released: Released = _kept,
+    frames: NDArray[Any], noise: NoiseModel, ratio: float | None, bad: Mask | None = None, released: Released = _kept
 ) -> NoiseModel:
     """The detector with the noise that its frames show, where that is more than stated: what is more is taken for read
     noise.

@@ -261,13 +261,7 @@ class SpotTemplate:
         return out[0], out[1]
 
     def _shift(
-        self,
-        polynomials: Array,
-        centre: Array,
-        position: Array,
-        which: NDArray[np.intp],
-        pixels: int,
-        flux: Array,
+        self, polynomials: Array, centre: Array, position: Array, which: NDArray[np.intp], pixels: int, flux: Array
     ) -> Array:
         """Spline along one axis: (B, 2, pixels, R), values at the detector's pixels and derivatives for the position
         times flux (B,).

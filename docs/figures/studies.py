@@ -194,7 +194,7 @@ STUDIES: Mapping[tuple[str, ...], Mapping[str, tuple[int, str, Read]]] = {
             0,
             "1e-7",
             lambda folder: 1e7 * float(json.loads((folder / "gradient.json").read_text("utf-8"))["worst_relative"]),
-        ),
+        )
     },
     ("twin.design", "scenes/examples/design_gf7_short.yaml"): {
         **_of_design("after", "short"),

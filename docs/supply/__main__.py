@@ -109,8 +109,7 @@ def licences() -> None:
 
 @app.command()
 def audit(
-    layers: Layer = ALL,
-    service: Annotated[str, typer.Option(help="Who is asked: pypi or osv.")] = "pypi",
+    layers: Layer = ALL, service: Annotated[str, typer.Option(help="Who is asked: pypi or osv.")] = "pypi"
 ) -> None:
     """Ask for known vulnerabilities of the locked packages, those of this Python and platform. Needs the network. Exit
     code 0: none is known; 1: some are, and listed; 2: not all packages could be checked.

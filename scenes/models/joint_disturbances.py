@@ -99,10 +99,7 @@ def joint_files(spec: DisturbancesSpec, stem: str, remark: str = "") -> dict[str
     rows.writerow(joint.components)
     rows.writerows([[repr(value) for value in row] for row in joint.correlation])
     short = joint.model_copy(update={"correlation": None, "correlation_file": f"{stem}.csv"})
-    return {
-        f"{stem}.yaml": spec.model_copy(update={"joint": short}).file_text(remark),
-        f"{stem}.csv": table.getvalue(),
-    }
+    return {f"{stem}.yaml": spec.model_copy(update={"joint": short}).file_text(remark), f"{stem}.csv": table.getvalue()}
 
 
 def _name(component: Component, nodes: Mapping[str, NodeInfo]) -> str:

@@ -44,9 +44,7 @@ ENDINGS: Mapping[str, tuple[Kind, str]] = FrozenMap(
 MOST_REQUIREMENTS, MOST_CAUSES = 100, 100
 Span = Annotated[float, Quantity(MOMENT, above_zero=True, largest="1000000 h")]
 Causes = Annotated[
-    tuple[Name, ...],
-    short_for(None, str, schema=Name | tuple[Name, ...]),
-    Field(min_length=1, max_length=MOST_CAUSES),
+    tuple[Name, ...], short_for(None, str, schema=Name | tuple[Name, ...]), Field(min_length=1, max_length=MOST_CAUSES)
 ]
 
 

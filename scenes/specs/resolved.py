@@ -514,11 +514,7 @@ def _of_job(resolved: ResolvedJob, file: str, name: str | None) -> CameraSetup:
     chosen = _chosen(tuple(resolved.instrument.cameras), file, name)
     camera = resolved.cameras[resolved.instrument.cameras[chosen].camera]
     return CameraSetup.model_construct(
-        camera=camera,
-        mounted=chosen,
-        instrument=resolved.instrument,
-        cameras=resolved.cameras,
-        perturb=job.perturb,
+        camera=camera, mounted=chosen, instrument=resolved.instrument, cameras=resolved.cameras, perturb=job.perturb
     ).with_source(job.source)
 
 

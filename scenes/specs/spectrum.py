@@ -180,10 +180,7 @@ class SpectrumSpec(Spec):
             return self
         folder = Path(owner.source.file).parent
         path = owner.file_at((*key, "table"), self.table, folder, "a CSV file")
-        columns = (
-            Column("wavelength", LENGTH, least=100e-9, most=100e-6),
-            Column("response", least=0.0),
-        )
+        columns = (Column("wavelength", LENGTH, least=100e-9, most=100e-6), Column("response", least=0.0))
         read = read_table(path, columns, least_rows=2)
         if len(read) > MOST_SAMPLES:
             raise owner.error(

@@ -79,15 +79,7 @@ INDICES = {
     "ansi": {4: 4, 5: 3, 6: 5, 7: 7, 8: 8, 11: 12},
 }
 """Noll's index -> that of the order, by the definitions."""
-UNITS = {
-    "m": 1.0,
-    "mm": 1e-3,
-    "um": 1e-6,
-    "µm": 1e-6,
-    "\u03bcm": 1e-6,
-    "nm": 1e-9,
-    "waves": 632.8e-9,
-}
+UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "\u03bcm": 1e-6, "nm": 1e-9, "waves": 632.8e-9}
 
 
 def text_of(order: str, size: str, unit: str, form: str, statements: bool = True) -> str:

@@ -30,9 +30,7 @@ if os.environ.get("TWIN_TEST"):
     atexit.register(lambda: (measured.stop(), measured.save()))
 """
 _measured = coverage.Coverage(
-    data_file=str(_OUT / f"{_WORKER}.coverage"),
-    include=[f"{_ROOT / place}/*" for place in PLACES],
-    config_file=False,
+    data_file=str(_OUT / f"{_WORKER}.coverage"), include=[f"{_ROOT / place}/*" for place in PLACES], config_file=False
 )
 # Before the first import of what is measured: constants of modules count, too.
 _measured.start()

@@ -168,10 +168,7 @@ def test_what_a_table_of_temperatures_does_not_tell_is_said() -> None:
         ({"between": 4e-3}, "b: the table is coarser than its field: nodes left out are foretold to 0.004 K rms only"),
         ({"faces": {"f": replace(face, unmeshed=2e-9)}}, "f: finite elements here follow the table to 2 nm rms only"),
         ({"faces": {"f": replace(face, lost=4e-9)}}, "f: 4 nm rms of its change by the table are finer than Z"),
-        (
-            {"index_path": 3e-9},
-            "b: the index of glass follows the linear part of the table; the rest is worth",
-        ),
+        ({"index_path": 3e-9}, "b: the index of glass follows the linear part of the table; the rest is worth"),
     ):
         (text,) = replace(good, **changed).warnings("b")
         assert text.startswith(words)

@@ -575,11 +575,7 @@ def test_a_wrong_description_names_its_line(case: str, record: Path, tmp_path: P
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [
-        (b"", "an empty table"),
-        (b"UTC,T,T\n", "more than one column 'T'"),
-        (b"UTC,\xff\n", "allowed: a row of heads"),
-    ],
+    [(b"", "an empty table"), (b"UTC,T,T\n", "more than one column 'T'"), (b"UTC,\xff\n", "allowed: a row of heads")],
 )
 def test_a_table_that_is_none_is_refused_as_a_whole(content: bytes, words: str, record: Path, tmp_path: Path) -> None:
     file = written(tmp_path, TELEMETRY, {})

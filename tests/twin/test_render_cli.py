@@ -284,10 +284,7 @@ def test_a_missing_library_is_explained(tmp_path, monkeypatch):
 
 
 @pytest.mark.second
-@pytest.mark.parametrize(
-    ("number", "code"),
-    [(signal.SIGINT, 130), (signal.SIGTERM, 143)],
-)
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupt_leaves_nothing(number, code, tmp_path):
     # on a busy machine the run may be over before this process sends the signal: once more, sooner
     for number_of_try, wait in enumerate((0.3, 0.1, 0.0)):

@@ -196,11 +196,7 @@ STEP = 0.01
 """Step of a number, relative to the range in which it may vary: A is smooth over all of it, and aimed to 1e-9 of it."""
 ORDER = 6
 """Order of the central differences, where nothing else is asked for."""
-_WEIGHTS = {
-    2: {1: 1.0 / 2.0},
-    4: {1: 8.0 / 12.0, 2: -1.0 / 12.0},
-    6: {1: 45.0 / 60.0, 2: -9.0 / 60.0, 3: 1.0 / 60.0},
-}
+_WEIGHTS = {2: {1: 1.0 / 2.0}, 4: {1: 8.0 / 12.0, 2: -1.0 / 12.0}, 6: {1: 45.0 / 60.0, 2: -9.0 / 60.0, 3: 1.0 / 60.0}}
 """Order -> weights of central differences by the number of steps (Fornberg, Math. Comp. 51, 699, 1988)."""
 _JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
 """Order -> weights of f(k h) + f(-k h) - 2 f(0). Their sum is what that tends to with k, extrapolated by even powers:

@@ -254,7 +254,7 @@ def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     text = [
         "D is what is left of the spots' places after a constant, f tan W and p tan² W. Its sigma holds the scatter of "
         "the sets, the stated errors of the angles with their covariance, and what the points scatter about a smooth "
-        "curve beyond that. It does not hold what moves every centroid alike at one place of the field, as coma does.",
+        "curve beyond that. It does not hold what moves every centroid alike at one place of the field, as coma does."
     ]
     if run.compensation is not None:
         text.append(
@@ -416,7 +416,7 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
         + ("between the sets" if run.reading.shape[1] > 1 else "by its stated sigmas")
         + (f"; noise of its place makes {stated:.3f} µm of it" if stated > 0.0 else "")
         + f". Beyond what is stated, points scatter by {noise['white_compensated_um']:.3f} µm about a smooth curve"
-        + ("." if run.compensation is None else f", {noise['white_raw_um']:.3f} µm with angles as read."),
+        + ("." if run.compensation is None else f", {noise['white_raw_um']:.3f} µm with angles as read.")
     ]
     if data["across_range_um"] is not None:
         text.append(f"Across the line the spots range over {data['across_range_um']:.0f} µm.")

@@ -320,13 +320,7 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
         allowed = "reversed: true, where readings rise as places fall" if "opposite senses" in text else None
         raise files.error(text, ("spots",), allowed=allowed) from error
     return DistortionRun(
-        test=spec,
-        seed=seed,
-        calibration=series,
-        compensation=compensation,
-        readings=found,
-        tables=tables,
-        **reduced,
+        test=spec, seed=seed, calibration=series, compensation=compensation, readings=found, tables=tables, **reduced
     )
 
 

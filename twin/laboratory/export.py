@@ -156,10 +156,7 @@ def _turntable_files(
     for name, one in ((COMPARISONS, series), (HELD_OUT, held_out)):
         out[name] = csv_table(_comparisons(one))
     return TurntableFiles.model_construct(
-        comparisons=COMPARISONS,
-        held_out=HELD_OUT,
-        reference=spec.reference.calibration,
-        folds=spec.calibration.folds,
+        comparisons=COMPARISONS, held_out=HELD_OUT, reference=spec.reference.calibration, folds=spec.calibration.folds
     )
 
 

@@ -22,11 +22,7 @@ from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed
 from twin.run.report import Report, Section, answer
 from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
-MOVED = {
-    "image": "image, along the light",
-    "target": "target, along the light",
-    "focal_plane": "CCD, along the light",
-}
+MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}
 
 
 def focus_report(run: FocusRun) -> Report:
@@ -313,7 +309,7 @@ def _curves(run: FocusRun) -> Section:
     text = [
         "The main peak of every curve is fitted by v = p (1 − u + 0.3 u²), u = a (z − z₀)², over the positions where "
         "it is above half of its peak; best focus of a place is midway between its directions, which astigmatism moves "
-        "apart.",
+        "apart."
     ]
     if isinstance(run, SimulatedFocus):
         ratio = run.bench.sites[0].nominal_per_shift

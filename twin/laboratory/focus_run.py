@@ -432,11 +432,7 @@ def line_turn(pose: Pose) -> float:
 
 
 def recorder_of(
-    bench: FocusBench,
-    standing: Standing,
-    seed: int,
-    number: int,
-    patterns: Mapping[str, FixedPattern] | None = None,
+    bench: FocusBench, standing: Standing, seed: int, number: int, patterns: Mapping[str, FixedPattern] | None = None
 ) -> Recorder:
     """What records the edges of a standing: the same frames whenever it is asked for the same ones.
 

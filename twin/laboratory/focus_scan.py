@@ -105,11 +105,7 @@ class Recorder:
     """
 
     def __init__(
-        self,
-        bench: FocusBench,
-        standing: Standing,
-        seed: np.random.SeedSequence,
-        patterns: Mapping[str, FixedPattern],
+        self, bench: FocusBench, standing: Standing, seed: np.random.SeedSequence, patterns: Mapping[str, FixedPattern]
     ) -> None:
         self.bench = bench
         self.standing = standing

@@ -248,7 +248,7 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
             "Dividing error",
             f"Means with their sigmas (the scatter of the repeats and the reference), {drawn}.",
             figure_svg("curve", run),
-        ),
+        )
     ]
     if held is not None:
         note = "Squares: held-out readings minus the fit, with the sigma of the measurement."

@@ -211,12 +211,7 @@ def _fan(axes: Axes, beam: Beam, colour: str, alpha: float) -> None:
 
 
 def _label(
-    axes: Axes,
-    text: str,
-    at: np.ndarray,
-    offset: tuple[float, float],
-    vertical: str,
-    bold: bool = False,
+    axes: Axes, text: str, at: np.ndarray, offset: tuple[float, float], vertical: str, bold: bool = False
 ) -> None:
     axes.annotate(
         text,

@@ -274,11 +274,7 @@ class MonitorReading:
             "chance_sigma_noise": found.chance_sigma_noise,
             "agrees": found.agrees,
             "suspects": [
-                {
-                    "body": one.body,
-                    "times_stated": _to_digits(one.times),
-                    "log_likelihood_gain": _to_digits(one.gain),
-                }
+                {"body": one.body, "times_stated": _to_digits(one.times), "log_likelihood_gain": _to_digits(one.gain)}
                 for one in found.suspects
             ],
         }

@@ -183,10 +183,7 @@ def render_report(
             warnings=told.warnings,
         ),
         _again_words(run, backend, bool(pictures)),
-        [
-            ("Again", AGAIN),
-            ("Backend", f"{backend}, float64"),
-        ],
+        [("Again", AGAIN), ("Backend", f"{backend}, float64")],
         config_text(run.resolved),
         viewer_programs() if scene else (),
         viewer_scripts(scene) if scene else "",

@@ -455,11 +455,7 @@ def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]
 
 
 def _warnings(
-    experiment: MonitorExperiment,
-    nominal: np.ndarray,
-    photons: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
+    experiment: MonitorExperiment, nominal: np.ndarray, photons: np.ndarray, before: np.ndarray, after: np.ndarray
 ) -> tuple[str, ...]:
     """What the user should know before using the numbers."""
     out = []

@@ -566,13 +566,7 @@ class _CameraBench:
         points = np.stack([_FEW.x, _FEW.y], axis=-1)
         counted = np.mean(covered(shadows.pieces, points, SMALLEST), axis=-1)
         hold_equal(f"the share of the stop {of} that bodies take", together, counted, "that of points in it", _APART)
-        hold_equal(
-            f"the share of the stop {of} that bodies take",
-            together[told],
-            lost,
-            "that of the light",
-            _APART,
-        )
+        hold_equal(f"the share of the stop {of} that bodies take", together[told], lost, "that of the light", _APART)
 
     def _note(self, pupils: PupilStack, lit: np.ndarray, which: np.ndarray) -> None:
         """Keep how the pupils of states look of which all fields are lit."""

@@ -359,11 +359,7 @@ def single_states(components: Sequence[Component], amounts: np.ndarray, thermal:
 
 
 def _by_differences(
-    components: Sequence[Component],
-    path: MonitorPath,
-    thermal: ThermalModel,
-    instrument: Instrument,
-    backend: Backend,
+    components: Sequence[Component], path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
 ) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of spots (2 C, M), px, and parameters (4 K, M) per SI unit."""
     steps = np.array([STEPS[c.kind] for c in components])

@@ -116,8 +116,7 @@ def ingest(
     files: Annotated[
         list[Path],
         typer.Argument(
-            readable=False,
-            help="YAML files that say what tables hold, run folders, or folders with some of these.",
+            readable=False, help="YAML files that say what tables hold, run folders, or folders with some of these."
         ),
     ],
     moment: Annotated[

@@ -21,8 +21,7 @@ def simulate(
     days: Annotated[float, typer.Option(help="How long the life takes, in days.")],
     every: Annotated[str, typer.Option(help="Time from one reading to the next, with its unit: 6d, 12h.")],
     record: Annotated[
-        str | None,
-        typer.Argument(metavar="[DIR_OR_URL]", help="Record to make. Without it there are the files alone."),
+        str | None, typer.Argument(metavar="[DIR_OR_URL]", help="Record to make. Without it there are the files alone.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of everything that is drawn.")] = 1,
     frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames of every exposure.")] = 10,

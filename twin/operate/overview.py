@@ -263,10 +263,7 @@ class Overview:
     def coverages(self) -> tuple[Coverage, ...]:
         """Whether predictions came true, within 1 and 2 sigma."""
         scores = self.following.scores
-        return (
-            coverage(1, scores.within_one, scores.components),
-            coverage(2, scores.within_two, scores.components),
-        )
+        return (coverage(1, scores.within_one, scores.components), coverage(2, scores.within_two, scores.components))
 
     def happened(self) -> Iterator[Happening]:
         """All that happened, in no order: jumps at the end of the interval in which they came."""

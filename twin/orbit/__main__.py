@@ -273,11 +273,7 @@ def _sigma(name: str, given: str | float | None, option: str) -> float:
     return value
 
 
-_SIGMAS = {
-    "position": (DISTANCE, 1e5, "1 m"),
-    "attitude": (ANGLE, 0.1, "2 arcsec"),
-    "height": (DISTANCE, 1e4, "3 m"),
-}
+_SIGMAS = {"position": (DISTANCE, 1e5, "1 m"), "attitude": (ANGLE, 0.1, "2 arcsec"), "height": (DISTANCE, 1e4, "3 m")}
 """Kind of quantity, largest value, example."""
 
 

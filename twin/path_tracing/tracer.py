@@ -391,13 +391,7 @@ class PathTracer:
         )
 
     def _ways(
-        self,
-        source: Source,
-        collector: Collector,
-        total: int,
-        seed: int,
-        toward: str | None,
-        thinning: Thinning | None,
+        self, source: Source, collector: Collector, total: int, seed: int, toward: str | None, thinning: Thinning | None
     ) -> dict[Key, tuple[Touch, ...]]:
         """Events of the families: of the nominal ones as given, of the others by tracing one path of each again."""
         names = [d.name for d in self.scenery.detectors]

@@ -69,10 +69,7 @@ Given = TypeVar("Given")
 
 
 def run_command(
-    stem: str,
-    options: cli.Options,
-    resolve: Callable[[], Given],
-    work: Callable[[Given, Session], Result],
+    stem: str, options: cli.Options, resolve: Callable[[], Given], work: Callable[[Given, Session], Result]
 ) -> None:
     """Read what is asked for, do it in a run folder and print what it gave.
 

@@ -113,7 +113,7 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "merits": "of the line of sight, against the designed camera's",
         },
         "orientation": {
-            "readings": "what has to be done to a map for the stop's axes: x along the line, y along the track",
+            "readings": "what has to be done to a map for the stop's axes: x along the line, y along the track"
         },
         "optics": {
             "fields": "shares of the half field: along the line, positive at the end at +Y of the focal plane (left), "

@@ -253,13 +253,7 @@ def draw_samples(
     merits, moves = len(bench.merits), len(bench.compensators)
     values = result.values
     return Samples(
-        x,
-        values[:, :merits],
-        values[:, merits : merits + moves],
-        values[:, -1],
-        seeds,
-        result.messages,
-        result.seconds,
+        x, values[:, :merits], values[:, merits : merits + moves], values[:, -1], seeds, result.messages, result.seconds
     )
 
 

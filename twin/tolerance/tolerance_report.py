@@ -221,11 +221,7 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
     for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
-        cells: list[Cell] = [
-            name,
-            one.words,
-            str(one.limit),
-        ]
+        cells: list[Cell] = [name, one.words, str(one.limit)]
         for m, result in enumerate(run.merits):
             cells += [_scaled(float(run.found.values[e, end, m]), result) for end in (0, 1)]
         shares = [

@@ -254,12 +254,7 @@ def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> Tol
 
 
 def _judged(
-    setup: ToleranceSetup,
-    backend: Backend,
-    allocation: Allocation,
-    seed: int,
-    force: Workforce,
-    advance: Advance,
+    setup: ToleranceSetup, backend: Backend, allocation: Allocation, seed: int, force: Workforce, advance: Advance
 ) -> Yield:
     """Yield of the allocated limits by cameras of their own."""
     other = with_limits(setup, allocation.limits)

@@ -322,11 +322,7 @@ def states_of(numbers: Sequence[VariedNumber], amounts: np.ndarray) -> list[Stat
 
 
 def _motions(
-    count: int,
-    rotate: np.ndarray,
-    shift: np.ndarray,
-    figure: dict[int, np.ndarray],
-    shape: dict[str, np.ndarray],
+    count: int, rotate: np.ndarray, shift: np.ndarray, figure: dict[int, np.ndarray], shape: dict[str, np.ndarray]
 ) -> list[Motion]:
     """Motions of one body in S states."""
     turns, shifts = rotate.tolist(), shift.tolist()

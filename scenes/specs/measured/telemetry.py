@@ -15,11 +15,7 @@ from scenes.yaml.spec import Paths, Reference, Spec, Text, not_empty, short_for
 from scenes.yaml.units import ANGLE, LENGTH, MOMENT, TEMPERATURE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 
 VALUES: Mapping[str, tuple[Kind, Kind]] = FrozenMap(
-    {
-        "temperature": (TEMPERATURE, TEMPERATURE_DIFFERENCE),
-        "attitude": (ANGLE, ANGLE),
-        "focus": (LENGTH, LENGTH),
-    }
+    {"temperature": (TEMPERATURE, TEMPERATURE_DIFFERENCE), "attitude": (ANGLE, ANGLE), "focus": (LENGTH, LENGTH)}
 )
 """Sort of reading that is numbers in a table -> what they measure, and what their sigmas do."""
 RUNS = ("monitor", "calibration", "angle")
@@ -128,8 +124,4 @@ class TelemetrySpec(Spec):
     """
 
     instrument: Reference
-    readings: Annotated[
-        tuple[ReadingTableSpec, ...],
-        Field(max_length=100),
-        not_empty("no tables", "a list of tables"),
-    ]
+    readings: Annotated[tuple[ReadingTableSpec, ...], Field(max_length=100), not_empty("no tables", "a list of tables")]

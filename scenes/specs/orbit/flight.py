@@ -21,8 +21,7 @@ Frequency = Annotated[float, Quantity(FREQUENCY, above_zero=True, largest="10 kH
 Amplitudes = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, smallest="0 arcsec", largest="0.1 deg"))]
 Phases = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="360 deg"), alike=True)]
 Levels = Annotated[
-    tuple[float, float, float],
-    Vector(Quantity(ANGLE_SPECTRUM, smallest="0 arcsec^2/Hz", largest="1e6 arcsec^2/Hz")),
+    tuple[float, float, float], Vector(Quantity(ANGLE_SPECTRUM, smallest="0 arcsec^2/Hz", largest="1e6 arcsec^2/Hz"))
 ]
 
 

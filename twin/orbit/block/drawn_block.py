@@ -180,10 +180,7 @@ def _summed(parts: list[Course]) -> Course:
 
 
 def _cameras(
-    spec: OrbitAdjustSpec,
-    days: np.ndarray,
-    random: np.random.Generator,
-    recorded: known.CamerasKnowledge | None,
+    spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator, recorded: known.CamerasKnowledge | None
 ) -> tuple[dict[str, np.ndarray], dict[str, known.CameraKnowledge], Monitored | None]:
     """Line -> true changes (T, 4), what is expected of them, and what is known after the monitor's readings."""
     if recorded is not None:

@@ -333,7 +333,7 @@ def _parameters(run: CalibrationRun) -> Section:
         others.append((name, shown, float(value), float(s), *cells))
     text = [
         "All fields at once, one interior orientation for all: changes from the laboratory's values."
-        + " z is the error in sigmas of this adjustment." * (truth is not None),
+        + " z is the error in sigmas of this adjustment." * (truth is not None)
     ]
     known = 0 if truth is None else 2
     apart = f"up to {run.campaign.passes[0].seconds_apart:.0f} s apart"

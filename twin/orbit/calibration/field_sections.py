@@ -56,13 +56,7 @@ def fields_section(run: CalibrationRun) -> Section:
         scale, shown = (ARCSEC, "arcsec") if angle else (1e-3, "mm")
         held = r.sigma == 0.0
         scatter.append(
-            (
-                r.name,
-                shown,
-                None if held else r.scatter / scale,
-                None if held else r.sigma / scale,
-                r.p_value,
-            )
+            (r.name, shown, None if held else r.scatter / scale, None if held else r.sigma / scale, r.p_value)
         )
     inner = [r for r in found if r.name not in BIAS and r.sigma > 0.0]
     worst = max(inner, key=lambda r: r.scatter)
@@ -412,16 +406,7 @@ def light_section(run: CalibrationRun) -> Section:
         "RMS at check points, mean of the fields, metres: by the laboratory's camera, and by each field's own "
         "parameters; the unknowns of the simultaneous adjustment that move by the most of their sigmas; chance of the "
         "fit, with the noise of the readings counted as independent.",
-        (
-            "case",
-            "plan before",
-            "height before",
-            "plan after",
-            "height after",
-            "interior",
-            "bias",
-            "chance of the fit",
-        ),
+        ("case", "plan before", "height before", "plan after", "height after", "interior", "bias", "chance of the fit"),
         rows,
         (None, 2, 2, 2, 2, None, None, 3),
     )

@@ -270,14 +270,7 @@ def _counted(one: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], ch
         right_lost += int((~wrong & ~stays).sum())
     bad = np.any(list(shown.wrong_check.values()), axis=0)
     return Screening(
-        entered,
-        left,
-        wrong_entered,
-        wrong_left,
-        right_lost,
-        len(check),
-        int(check.sum()),
-        int((bad & check).sum()),
+        entered, left, wrong_entered, wrong_left, right_lost, len(check), int(check.sum()), int((bad & check).sum())
     )
 
 

@@ -487,11 +487,7 @@ def _line_time(line: LineCamera, trajectory: Trajectory, earth: Any, time: float
 
 
 def _exported(
-    window: ImagedWindow,
-    epoch: str,
-    heights: tuple[float, float, float],
-    change: EstimatedChange | None,
-    level: float,
+    window: ImagedWindow, epoch: str, heights: tuple[float, float, float], change: EstimatedChange | None, level: float
 ) -> ExportedLine:
     ground = None
     try:

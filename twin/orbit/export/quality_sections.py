@@ -38,11 +38,7 @@ ACCURACY: Record[AccuracyMap] = Record(
     Quantity("ce90_largest_m", _over(lambda f: f.ce90, np.max), "the largest"),
     Quantity("le90_median_m", _over(lambda f: f.le90, np.median), "interval of 90 % of the vertical errors, median"),
     Quantity("le90_largest_m", _over(lambda f: f.le90, np.max), "the largest"),
-    Quantity(
-        "common_m",
-        lambda f: f.horizontal()[0],
-        "error that points have in common, of each horizontal axis",
-    ),
+    Quantity("common_m", lambda f: f.horizontal()[0], "error that points have in common, of each horizontal axis"),
     Quantity(
         "random_m",
         lambda f: f.horizontal()[1],

@@ -30,12 +30,7 @@ def jitter_report(run: JitterRun) -> Report:
         head = "" if len(run.passes) == 1 else f" of {name}"
         sections += [_spectrum(run, one, suffix, head), _blind(one, suffix, head), _course(run, one, suffix, head)]
     return Report(
-        "Jitter of the attitude",
-        *_verdict(run),
-        _facts(run),
-        _summary(run),
-        tuple(sections),
-        warnings=_warnings(run),
+        "Jitter of the attitude", *_verdict(run), _facts(run), _summary(run), tuple(sections), warnings=_warnings(run)
     )
 
 

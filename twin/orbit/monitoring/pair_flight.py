@@ -291,11 +291,7 @@ def fly(spec: OrbitMonitorSpec, seed: np.random.SeedSequence) -> Flown:
 
 
 def _view(
-    spec: OrbitMonitorSpec,
-    time: float,
-    cameras: Sequence[LineCamera],
-    flown: Flown,
-    seed: np.random.SeedSequence,
+    spec: OrbitMonitorSpec, time: float, cameras: Sequence[LineCamera], flown: Flown, seed: np.random.SeedSequence
 ) -> View:
     """Points at a time."""
     place, image = (np.random.default_rng(stream(seed, k)) for k in range(2))

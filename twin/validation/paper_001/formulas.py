@@ -179,11 +179,7 @@ def _findings(images: motions.SingleMotions) -> Iterator[_Finding]:
         f"{scale} Δy / (LΔf/f) by (6), with the traced Δf: {grown.value:.5f}; each side by itself is within "
         f"{images.growth_by_side():.1e} of the mean.",
     )
-    yield _Finding(
-        "001.eq7",
-        grown,
-        f"{scale} Δy / (LΔf/f) by (6); Δf is the traced one.",
-    )
+    yield _Finding("001.eq7", grown, f"{scale} Δy / (LΔf/f) by (6); Δf is the traced one.")
     moved = images.over_motion("piston", "paper_single", "d_f", motions.PISTON)
     true = fmean(images.true(camera, "piston", "d_f") for camera in images.cameras) / motions.PISTON
     yield _Finding(

@@ -112,10 +112,7 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
             rows.setdefault(key, []).append(value)
         fits.append(tuple(fitted(a, latitude, bias[:, k], np.diag(sigma[:, k] ** 2)) for k, a in enumerate(BIAS)))
     return Flights(
-        fields=names,
-        latitude=latitude,
-        fits=tuple(fits),
-        **{key: np.array(value) for key, value in rows.items()},
+        fields=names, latitude=latitude, fits=tuple(fits), **{key: np.array(value) for key, value in rows.items()}
     )
 
 

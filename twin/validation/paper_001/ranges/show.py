@@ -437,13 +437,7 @@ def returns_shown(context: Context, found: Sequence[Response], data: dict[str, o
         "returns",
         "Kinds of return",
         "Motion of the spots over that of the line CCD, and corrected readings over truth, by noise-free images.",
-        (
-            "return",
-            "across the line",
-            "along the line",
-            *(f"{SYMBOLS[n]} read / true" for n in turns.NAMES),
-            "remark",
-        ),
+        ("return", "across the line", "along the line", *(f"{SYMBOLS[n]} read / true" for n in turns.NAMES), "remark"),
         rows,
         (None, 4, 4, 4, 4, 4, 4),
     )
