@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from optics.geometry.sag_terms import SAG_TERMS
 from optics.geometry.tree import Motion
 from optics.materials.material import MATERIALS
 from optics.numerics.backend import load_backend
+from optics.raytrace.assembly import Interaction
 from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
@@ -97,6 +99,13 @@ def test_a_calibration_read_back_is_the_computed_one_bit_for_bit(folder: Path) -
     # what is read refers to the files of this job, not of the one that was kept
     assert again.instrument.spec is again.resolved.instrument
     assert again.instrument is not first.instrument
+
+
+def test_members_of_enumerations_are_kept_by_every_python(folder: Path, entry: CacheEntry, monkeypatch) -> None:
+    """Debian 12's Python 3.11.2 writes a call of a function, which the reader refuses."""
+    monkeypatch.setattr(Enum, "__reduce_ex__", lambda self, protocol: (getattr, (type(self), self.name)))
+    entry.write([Interaction.REFLECT])
+    assert entry.read() == [Interaction.REFLECT]
 
 
 @pytest.mark.second
