@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from scenes.models.monitor_layout import (
     resolve_monitor_design,
     start_beams,
 )
+from tests.twin.test_monitor_layouts import FIRST, SECOND
 from twin.design import monitor_design
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts, _OutsideLimitsError
 from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
@@ -29,43 +31,13 @@ from twin.design.layout_search import Candidate, End, Found, merit, optima, spre
 from twin.monitor.information import Information
 from twin.run.procedure import BenchError
 
-STATED = """
-name: mirrors
-causes:
-  mounts: {bodies: base/*/M?, rotate: 1 arcsec, shift: 1 um, reason: mounts}
-  figures: {bodies: base/*/M?, figure: {Z4: 10 nm, Z5: 10 nm, Z6: 10 nm, Z7: 10 nm, Z8: 10 nm}, reason: bonds}
-  heat: {bodies: base/*/monitor/*/prism_180, temperature: {change: 0.1 K, gradient: 20 mK/m}, reason: sun}
-  prisms: {bodies: base/*/monitor/*/prism_180, rotate: 1 arcsec, reason: mounts}
-"""
-DESIGN = """
-instrument: gf7_pair
-name: better
-beams: 2
-disturbances: [mirrors.yaml]
-vary:
-  pupil_x: [30 mm, 250 mm]
-  pupil_y: [-60 mm, 60 mm]
-  width: [24 mm, 60 mm]
-  field: [1.15 deg, 1.30 deg]
-  prism_180_distance: [2.3 m, 2.9 m]
-  prism_0_distance: [0.4 m, 0.9 m]
-  shift: [80 mm, 200 mm]
-  spread_x: [30 mm, 80 mm]
-  spread_y: [30 mm, 120 mm]
-  photons: [1.0e+6, 2.0e+7]
-goal: {angle: 0.05 arcsec, d_f: 2 um}
-"""
-FIRST = Beam(0.22, 0.0, 0.034, np.radians(1.22), 2.4, 0.5, 0.15, 0.06, 0.05)
-SECOND = Beam(0.13, 0.0, 0.034, np.radians(1.25), 2.65, 0.65, 0.1, 0.06, 0.11)
+FILES = Path(__file__).with_name("layouts_differentiated")
 STATED_NAME = "mirrors.yaml"
 
 
 @pytest.fixture(scope="module")
-def setup(tmp_path_factory: pytest.TempPathFactory) -> MonitorDesignSetup:
-    folder: Path = tmp_path_factory.mktemp("design")
-    (folder / STATED_NAME).write_text(STATED, "utf-8")
-    (folder / "design.yaml").write_text(DESIGN, "utf-8")
-    return resolve_monitor_design(folder / "design.yaml")
+def setup() -> MonitorDesignSetup:
+    return resolve_monitor_design(FILES / "design.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -153,10 +125,10 @@ def test_spots_that_fill_their_pixels_are_refused(bench: LayoutBench) -> None:
 
 @pytest.mark.second
 def test_another_area_ccd_counts_the_same_spots_in_other_pixels(bench: LayoutBench, tmp_path: Path) -> None:
-    (tmp_path / STATED_NAME).write_text(STATED, "utf-8")
+    shutil.copy(FILES / STATED_NAME, tmp_path)
     ccds = "area_ccds: {coarse: {detector: monitor_ccd, pitch: 12 um, rows: 96, columns: 96}, "
     ccds += "fine: {detector: monitor_ccd, pitch: 9 um, rows: 128, columns: 128}}\n"
-    (tmp_path / "design.yaml").write_text(DESIGN + ccds, "utf-8")
+    (tmp_path / "design.yaml").write_text((FILES / "design.yaml").read_text("utf-8") + ccds, "utf-8")
     setup = resolve_monitor_design(tmp_path / "design.yaml")
     assert [beam.area_ccd for beam in start_beams(setup)] == ["coarse"]
     rng = np.random.default_rng(1)

@@ -42,29 +42,8 @@ from twin.monitor.monitor_path import MonitorPath
 from twin.run.run_folder import RunFolderError
 from twin.uncertainty.monitor_limits import expected_covariance, find_limits
 
-STATED = """
-name: mirrors
-causes:
-  mounts: {bodies: base/*/M?, rotate: 1 arcsec, shift: 1 um, reason: mounts}
-  figures: {bodies: base/*/M?, figure: {Z4: 10 nm, Z5: 10 nm, Z6: 10 nm, Z7: 10 nm, Z8: 10 nm}, reason: bonds}
-  prisms: {bodies: base/*/monitor/*/prism_180, rotate: 1 arcsec, reason: mounts}
-"""
-DESIGN = """
-instrument: gf7_pair
-name: better
-beams: 2
-disturbances: [mirrors.yaml]
-vary:
-  pupil_x: [90 mm, 150 mm]
-  pupil_y: [0 mm, 20 mm]
-  width: [30 mm, 36 mm]
-  prism_180_distance: [2.55 m, 2.75 m]
-  prism_0_distance: [0.5 m, 0.7 m]
-  spread_y: [100 mm, 112 mm]
-goal: {angle: 0.05 arcsec, d_f: 2 um}
-limits: {pupil_share: 20 percent}
-search: {beams: 2, layouts: 20, rounds: 1, changed: 1, exact: 1, starts: 1}
-"""
+FILES = Path(__file__).with_name("layouts")
+STATED, DESIGN = ((FILES / name).read_text("utf-8") for name in ("mirrors.yaml", "design.yaml"))
 FIRST = Beam(0.22, 0.0, 0.034, np.radians(1.22), 2.4, 0.5, 0.15, 0.06, 0.05)
 SECOND = Beam(0.13, 0.0, 0.034, np.radians(1.25), 2.65, 0.65, 0.1, 0.06, 0.11)
 THIRD = Beam(0.06, 0.0, 0.030, np.radians(1.20), 2.8, 0.8, 0.1, 0.05, 0.1)
@@ -78,8 +57,8 @@ def written(folder: Path, design: str = DESIGN) -> Path:
 
 
 @pytest.fixture(scope="module")
-def setup(tmp_path_factory: pytest.TempPathFactory) -> MonitorDesignSetup:
-    return resolve_monitor_design(written(tmp_path_factory.mktemp("design")))
+def setup() -> MonitorDesignSetup:
+    return resolve_monitor_design(FILES / "design.yaml")
 
 
 @pytest.fixture(scope="module")

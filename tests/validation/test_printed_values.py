@@ -62,32 +62,7 @@ def test_the_papers_files() -> None:
         assert {len(column) for column in columns.values()} == {11}
 
 
-ROWS = """table1:
-  size_um: 2.3
-groups:
-  001.sizes:
-    title: Sizes
-    seconds: 2.0
-    rows:
-      001.table1.size:
-        equation: Table 1
-        statement: The size is as printed
-        unit: µm
-        printed: table1.size_um
-        tolerance: 0.1
-        because: a twentieth
-        comparison: at most
-        tells: 1.0
-        against: half of it
-        basis: chosen
-        explanations:
-          - verdict: refuted
-            text: It is {what} as large.
-      001.fig1:
-        equation: Fig. 1
-        statement: It is a drawing
-        not_checkable: Nothing is printed.
-"""
+ROWS = Path(__file__).with_name("rows.yaml").read_text("utf-8")
 
 
 def test_rows() -> None:
