@@ -7,7 +7,7 @@ server, the first line of a file names its schema: `# yaml-language-server: $sch
 from __future__ import annotations
 
 if __name__ == "__main__":
-    from scenes.yaml.standard_output import end_quietly
+    from scenes.yaml.interrupt import end_quietly
 
     end_quietly()
 

@@ -6,7 +6,7 @@ which aborts the process that uses it, cannot take the doctor with it. Exit code
 """
 
 if __name__ == "__main__":
-    from scenes.yaml.standard_output import end_quietly
+    from scenes.yaml.interrupt import end_quietly
 
     end_quietly()
 

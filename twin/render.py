@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 if __name__ == "__main__":
-    from scenes.yaml.standard_output import end_quietly
+    from scenes.yaml.interrupt import end_quietly
 
     end_quietly()
 

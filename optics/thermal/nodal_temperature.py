@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from optics.geometry.pose import triple
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import LEAST_NODES, NodesError
 
 MOST_WARM_NODES = 200_000

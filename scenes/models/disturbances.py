@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from optics.geometry.tree import ORIGIN, Motion, State, each_composed
-from optics.thermal.deformation import Temperature, Temperatures
+from optics.thermal.heat import Temperature, Temperatures
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll

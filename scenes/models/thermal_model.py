@@ -28,16 +28,9 @@ from optics.materials.glass import WarmGlass, glass
 from optics.materials.material import Material, TemperatureRange, material
 from optics.numerics.array_math import turned
 from optics.numerics.invariants import PhysicalError
-from optics.thermal.deformation import (
-    Displaced,
-    FaceChange,
-    Formula,
-    Temperature,
-    Temperatures,
-    carried_motion,
-    face_change,
-)
+from optics.thermal.deformation import Displaced, FaceChange, Formula, face_change
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
+from optics.thermal.heat import Temperature, Temperatures, carried_motion
 from optics.thermal.thermo_elastic import ElasticBody, Kinematic, free_linear_field
 from scenes.models.instrument_model import Instrument
 from scenes.models.lens_heat import Lens, lenses_of

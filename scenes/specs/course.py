@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.array_math import number_of
 from optics.numerics.frozen_map import FrozenMap
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.yaml import units
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown

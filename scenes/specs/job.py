@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
 from optics.targets.target_shapes import TARGETS
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.specs import job_tables
 from scenes.specs.as_built import InstrumentReference
 from scenes.specs.course import CourseSpec, read_course

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from optics.geometry import zernike
 from optics.numerics.frozen_map import FrozenMap
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import TERMS
 from scenes.specs.course import NO_MOTION, TemperatureChange, TemperatureGradient
 from scenes.yaml import node_table

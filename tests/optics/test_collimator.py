@@ -7,7 +7,7 @@ from optics.geometry import zernike
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
-from optics.targets.target_image import Collimator, TooNarrowError
+from optics.targets.collimator import Collimator, TooNarrowError
 from optics.waves.pupil_stack import PupilFunction
 from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.camera_tests import CameraUnderTestSpec

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.models.disturbances import Component, StatedMotions, motions_of_spec, state_of, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.joint_disturbances import joint_disturbances, joint_files

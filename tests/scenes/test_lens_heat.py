@@ -9,7 +9,7 @@ import pytest
 
 from optics.geometry.tree import State
 from optics.materials.glass import glass
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel

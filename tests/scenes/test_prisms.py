@@ -21,7 +21,7 @@ from optics.geometry.zernike import basis
 from optics.materials.material import material
 from optics.raytrace import reflectors
 from optics.raytrace.assembly import Assembly
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from optics.thermal.thermo_elastic import free_linear_field
 from scenes.models.clearance import LEAST_GAP, find_overlaps, separation
 from scenes.models.obstruction import find_obstructions, rays_taken

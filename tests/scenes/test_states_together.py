@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, State, compose, each_composed
-from optics.thermal.deformation import Temperature, Temperatures
+from optics.thermal.heat import Temperature, Temperatures
 from scenes.models.disturbances import HEAT, UNITS, Component, stated_motions, states_of
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.thermal_model import ThermalModel

@@ -12,7 +12,7 @@ from optics.materials.glass import GLASSES, glass
 from optics.materials.material import MATERIALS, material
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.thermal.deformation import Temperature, carried_motion
+from optics.thermal.heat import Temperature, carried_motion
 from optics.thermal.thermo_elastic import free_linear_field
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument

@@ -156,7 +156,7 @@ def test_a_pair_has_the_same_truth_without_its_monitor(backend) -> None:
     moved = ["forward/M2 shift z 3 um", "backward/focal_plane rotate z 9 arcsec", "forward temperature 1 K"]
     given = resolve_job(validate(JobSpec, YamlFile("", {"instrument": "gf7_pair", "perturb": moved}, {})))
     alone = given.model_copy(update={"instrument": bare, "detector": None, "disturbances": None})
-    with_monitor, without = (render_job(one, backend) for one in (given, alone))
+    with_monitor, without = (render_job.render_job(one, backend) for one in (given, alone))
     assert isinstance(with_monitor, RenderRun)
     assert not isinstance(without, RenderRun)
     first, second = with_monitor.truth_dict(), without.truth_dict()

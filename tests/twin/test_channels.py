@@ -9,7 +9,7 @@ import pytest
 from optics.geometry.tree import Motion, State
 from optics.materials.material import material
 from optics.numerics.backend import Backend
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.specs.resolved import resolve
 from tests.scenes import monitor_layouts
 from tests.tiers import quick

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import twin.render as command
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.specs.course import moment
 from scenes.specs.job import checked_nodes
 from scenes.specs.load import load_job

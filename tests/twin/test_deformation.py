@@ -10,7 +10,7 @@ import pytest
 
 from optics.geometry.surface import GridFigure
 from optics.geometry.tree import Motion, compose
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import nodal_deformation
 from optics.thermal.nodal_temperature import Coverage
 from scenes.models.nodal_bodies import HeatedBody, HeatedFace

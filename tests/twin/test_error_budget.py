@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.units import ARCSEC
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.specs.disturbances import JobDisturbancesSpec
 from scenes.specs.load import load_disturbances, load_error_budget
 from scenes.specs.resolved import resolve_budget

@@ -18,7 +18,7 @@ from analysis.mtf.edge_location import EdgeError
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.aim import AimError
-from optics.targets.target_image import TooNarrowError
+from optics.targets.collimator import TooNarrowError
 from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import FocusSetup, resolve_focus, resolve_focus_test
 from twin.laboratory import focus_run

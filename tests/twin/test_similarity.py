@@ -13,7 +13,7 @@ import pytest
 
 from optics.geometry.tree import Motion, State
 from optics.materials.material import MATERIALS, Material, material
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_builder import build_instrument

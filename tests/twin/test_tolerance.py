@@ -494,11 +494,12 @@ def test_a_corrupt_chunk_of_cameras_is_reported_and_drawn_again(backend, tmp_pat
     bench = ToleranceBench(setup, backend)
     force = Workforce(1, journal=tmp_path / "journal", warn=warned.append)
     first = draw_samples(setup, bench, backend, 20, 3, force)
-    assert warned == []
+    assert not [text for text in warned if "corrupt" in text]
+    warned.clear()
     (chunk, *_) = (tmp_path / "journal").rglob("*.npz")
     chunk.write_bytes(b"x")
     again = draw_samples(setup, bench, backend, 20, 3, force)
-    assert [f"chunk {chunk.name} is corrupt" in text for text in warned] == [True]
+    assert [f"chunk {chunk.name} is corrupt" in text for text in warned].count(True) == 1
     np.testing.assert_array_equal(again.values, first.values)
 
 

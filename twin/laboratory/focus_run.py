@@ -21,7 +21,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.threads import cores
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
-from optics.targets.target_image import TooNarrowError
+from optics.targets.collimator import TooNarrowError
 from scenes.specs.camera_tests import FocusTestSpec, MeasuredFocusSpec
 from scenes.specs.resolved import ExperimentSetup, FocusSetup, MeasuredFocusSetup
 from twin.laboratory import focus_scan

@@ -6,7 +6,7 @@ import numpy as np
 
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from scenes.specs.disturbances import JOINT
 from scenes.specs.perturbation import in_words

@@ -23,7 +23,7 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.invariants import PhysicalError
 from optics.numerics.threads import one_blas_thread
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import NodalDeformation
 from optics.waves.pixel_response import UnsampledImageError
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions

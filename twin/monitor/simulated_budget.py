@@ -19,7 +19,7 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.models.disturbances import states_of
 from scenes.specs.disturbances import ErrorBudgetSpec
 from scenes.specs.instrument import BASE

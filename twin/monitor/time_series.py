@@ -20,7 +20,7 @@ from analysis.spots.spot_positions import NoiseParts, SeriesNoise, SpotError
 from analysis.statistics import limit_of
 from optics.geometry.tree import Motion, State
 from optics.numerics.threads import one_blas_thread
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import CourseSpec, moment

@@ -17,7 +17,7 @@ from analysis.arrays import Array
 from analysis.monitor.disturbances import Disturbances
 from optics.geometry.tree import Body, Motion
 from optics.numerics.frozen_map import FrozenMap
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.models.disturbances import HEAT, Component, state_of, usual_pivot
 from scenes.models.instrument_model import Instrument
 from scenes.models.joint_disturbances import joint_disturbances, joint_files

@@ -25,7 +25,7 @@ from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
-from optics.targets.target_image import Collimator
+from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import StopOutlines, settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field

@@ -18,7 +18,7 @@ from optics.geometry.tree import Body, Motion, State
 from optics.geometry.zernike import noll_to_nm, zernike
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Element
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll

@@ -20,7 +20,7 @@ from analysis.monitor.parameters import ANGLE, ANGLE_GROUP, CAMERA_PARAMETERS, G
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import HeatInputs
 from optics.numerics.backend import load_backend
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.models.disturbances import HEAT, StatedMotions
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.instrument import InstrumentSpec

@@ -20,7 +20,7 @@ from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SeriesNoise, SpotError
 from optics.geometry.tree import State, compose
 from optics.numerics.threads import cores, one_blas_thread
-from optics.thermal.deformation import Temperature
+from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import moment

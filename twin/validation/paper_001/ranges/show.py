@@ -51,7 +51,7 @@ def singles_svg(ranges: Mapping[str, Sequence[turns.Range]]) -> str:
             low, high = first.raw[PRINTED][0, 0] * per, first.lost * per
             axes.axvspan(0.85 * low, min(r.window for r in both) * per, color=LIGHT, alpha=0.55, lw=0)
             grid = np.array([low, high])
-            axes.plot(grid, 0.1 * grid, "--", color=GREY, lw=1.0)
+            axes.plot(grid, 0.01 * grid, "--", color=GREY, lw=1.0)
             axes.axhline(turns.FINE[name] * per, color=INK, lw=1.0, ls=":")
             if turns.CLAIMED[name] != turns.FINE[name]:
                 axes.axhline(turns.CLAIMED[name] * per, color=INK, lw=1.0, ls="-.")

@@ -1,0 +1,65 @@
+"""A collimator as the camera sees it: a plane wave with errors of its own, curved when its target is moved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from optics.geometry import zernike
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.invariants import PhysicalError
+
+
+class TooNarrowError(PhysicalError, ValueError):
+    """The collimator's aperture does not hold the camera's beam."""
+
+
+@dataclass(frozen=True)
+class Collimator:
+    """A collimator with a target at its focus.
+
+    Attributes:
+        focal_length: metres.
+        radius: of its aperture, metres.
+        wavefront: Noll index -> wavefront error over the aperture, metres rms, positive where the wave is ahead.
+    """
+
+    focal_length: float
+    radius: float
+    wavefront: Mapping[int, float] = field(default_factory=FrozenMap)
+
+    def __post_init__(self) -> None:
+        """Freeze the wavefront."""
+        object.__setattr__(self, "wavefront", FrozenMap(self.wavefront))
+
+    def path(self, point: np.ndarray, target_shift: float = 0.0) -> np.ndarray:
+        """Optical path that the beam brings along, beyond that of a plane wave.
+
+        Args:
+            point: transverse coordinates from the collimator's axis, (..., 2), metres.
+            target_shift: of the target out of the focus, along the light's travel (toward the collimator's optics, so
+                that the beam diverges), metres. The camera's image then moves along the light's travel by
+                ``target_shift * (f / focal_length)**2`` (Newton's equation).
+
+        Returns:
+            (...,) metres.
+
+        Raises:
+            TooNarrowError: a point outside the aperture.
+        """
+        square = np.sum(point**2, axis=-1)
+        if np.max(square) > self.radius**2:
+            reach = 2e3 * float(np.sqrt(np.max(square)))
+            raise TooNarrowError(
+                f"the camera's beam is {reach:.0f} mm wide about the collimator's axis, the collimator's aperture "
+                f"{2e3 * self.radius:.0f} mm"
+            )
+        out = 0.5 * target_shift / self.focal_length**2 * square
+        if self.wavefront:
+            terms = np.zeros(max(self.wavefront))
+            for number, size in self.wavefront.items():
+                terms[number - 1] = size
+            out = out - zernike.basis(len(terms), point[..., 0] / self.radius, point[..., 1] / self.radius) @ terms
+        return np.asarray(out)
