@@ -85,7 +85,7 @@ NOT_IN_RUNS = ("twin/validation/",)
 """No run of a study needs these."""
 
 
-ENDINGS = (".css", ".csv", ".html", ".j2", ".js", ".py", ".svg", ".tdm", ".txt", ".yaml", ".zmx")
+ENDINGS = (".css", ".csv", ".html", ".j2", ".js", ".json", ".py", ".svg", ".tdm", ".txt", ".yaml", ".zmx")
 """Endings of the packages' own files, as a wheel holds them."""
 
 
