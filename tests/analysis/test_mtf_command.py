@@ -296,17 +296,26 @@ def test_one_saturated_page_is_enough(tmp_path):
     refused("1 pixels reach the saturation level of 65535", tmp_path / "pages.tiff", *EDGE)
 
 
-def test_bars_that_move_are_refused_and_flat_levels_have_a_sigma(tmp_path):
-    """The mean of bars that move by 0.2 px gave 0.2425 +- 0.0001 for 0.3; levels without noise had no sigma."""
-    still = tifffile.imread(bars_tiff(tmp_path)).astype(float)
+def bars_pages(folder):
+    """Image of bars that stand still, noise of five pages, and these pages."""
+    still = tifffile.imread(bars_tiff(folder)).astype(float)
     noisy = [np.random.default_rng(k).normal(0, 3, still.shape) for k in range(5)]
-    pages = np.stack([np.round(still + noise) for noise in noisy]).astype(np.uint16)
-    words = (*BARS, "--bars", "0.5 cycles/pixel")
+    return still, noisy, np.stack([np.round(still + noise) for noise in noisy]).astype(np.uint16)
+
+
+def test_pages_of_bars_that_stand_still(tmp_path):
+    _, _, pages = bars_pages(tmp_path)
     tifffile.imwrite(tmp_path / "pages.tiff", pages, photometric="minisblack")
-    assert run_json(tmp_path / "pages.tiff", *words)["mtf"] == pytest.approx(0.3, abs=0.003)
+    assert run_json(tmp_path / "pages.tiff", *BARS, "--bars", HALF)["mtf"] == pytest.approx(0.3, abs=0.003)
     # four differences of five pages in each of 4096 rounded pixels: 0.6 per cent
     found = measure_bar_pages(pages[:, :64, :64], pages[:, 5:55, 85:105], pages[:, 5:55, 115:135], 0.5, step=1.0)
     assert found.page_noise[0] == pytest.approx((9 + 1 / 12) ** 0.5, rel=0.025)
+
+
+def test_bars_that_move_are_refused_and_flat_levels_have_a_sigma(tmp_path):
+    """The mean of bars that move by 0.2 px gave 0.2425 +- 0.0001 for 0.3; levels without noise had no sigma."""
+    still, noisy, pages = bars_pages(tmp_path)
+    words = (*BARS, "--bars", HALF)
     for page, noise, shift in zip(pages, noisy, (0.0, 0.3, -0.3, 0.1, 0.2), strict=True):
         page[:, :64] = np.round(bars_mean(shift)[:, :64] + noise[:, :64])
     tifffile.imwrite(tmp_path / "pages.tiff", pages, photometric="minisblack")
@@ -333,6 +342,7 @@ def bars_tiff(folder):
     return folder / "bars.tiff"
 
 
+HALF = "0.5 cycles/pixel"
 BARS = ("--roi", "0,0,64,64", "--pitch", "7 um", "--dark", "5,85,50,20", "--bright", "5,115,50,20")
 
 

@@ -140,8 +140,9 @@ def test_uneven_light_is_fitted_and_reported():
     ],
 )
 def test_light_that_is_no_plane_is_named(light):
-    image = noisy(edge(64, 64, 5, 0.6, light=light), 0.3, np.random.default_rng(1))
-    assert "does not explain" in measure_edge(image).doubt
+    pages = np.stack([noisy(edge(64, 64, 5, 0.6, light=light), 0.3, np.random.default_rng(k)) for k in (1, 2)])
+    assert "does not explain" in measure_edge(pages[0]).doubt
+    assert "does not explain" in " ".join(page_warnings(measure_pages(pages, step=0.0), 0.0))
 
 
 @pytest.mark.second

@@ -95,6 +95,10 @@ def test_vectors_and_scalars(backend) -> None:
     assert backend.vector([1.0, 2.0, 3.0]).z.numpy() == [3.0]
 
 
+def test_a_usable_library_that_is_loaded_stays() -> None:
+    assert llvm._check_loaded() is None
+
+
 def test_unknown_backends_are_explained() -> None:
     with pytest.raises(BackendUnavailable, match="unknown backend 'opencl'; choose one of llvm, cuda"):
         load_backend("opencl")

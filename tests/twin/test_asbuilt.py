@@ -249,8 +249,12 @@ def test_maps_and_tables_hold_the_same(backend, tmp_path, name) -> None:
     measured = {"maps": {**stated, "maps": maps, "reference": f"sphere/{sphere}"}}
     (less,) = bench_of(backend, tmp_path, {"wavefronts": measured}, simulate=None).data()
     np.testing.assert_allclose(less.reshape(2, 8), of_maps, atol=0.01 * np.abs(wanted).max())
+
+
+def test_a_reference_of_another_size_is_refused(backend, tmp_path) -> None:
+    maps = written_maps(tmp_path, np.zeros((2, 8)), Orientation.named("turned 90"))
     fits.PrimaryHDU(np.zeros((50, 50)), fits.Header({"BUNIT": "nm"})).writeto(tmp_path / "small.fits")
-    measured = {"maps": {**stated, "maps": maps, "reference": "small.fits"}}
+    measured = {"maps": {**TEXTS["maps"], "maps": maps, "reference": "small.fits"}}
     with pytest.raises(InputError, match="the reference has another number of points"):
         bench_of(backend, tmp_path, {"wavefronts": measured}, simulate=None).data()
 

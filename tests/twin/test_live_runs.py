@@ -239,6 +239,11 @@ def test_a_run_of_uncertainty_opens_its_job(tmp_path):
 
 
 @pytest.mark.second
+def test_an_orbit_of_drawn_motions_is_no_course():
+    with pytest.raises(InputError, match="there is no course that could be shown"):
+        read_source(str(SCENES / "orbit" / "loop.yaml"))
+
+
 def test_a_monitored_orbit_is_a_course_with_the_motions_of_its_mounts(pair, tmp_path):
     """States of the test itself: temperatures, swings and ramps; poses to rounding."""
     setup = resolve_monitor(SCENES / "orbit" / "monitor.yaml")

@@ -25,16 +25,18 @@ def items(folder: Path, text: str, kind: str, **columns: Any) -> list[Any]:
 def test_quaternions_are_normalised_or_refused(tmp_path: Path) -> None:
     """A length within 1e-3 of 1 is divided out, any other is refused; the sigma is an angle in radians."""
     rows = [f"0,0,{0.6 * size:.6f},{0.8 * size:.6f}" for size in (1.0009, 0.9991, 1.0, 1.0011, 0.9989)]
+    rows += ["0,0,0.6,none", "0,0,inf,1"]
     text = "\n".join(["time,a,b,c,d", *(f"2026-03-05T00:00:0{k}Z,{row}" for k, row in enumerate(rows))])
     column = {"column": ["a", "b", "c", "d"], "unit": "quaternion", "sigma": "2 arcsec"}
     found = items(tmp_path, text, "attitude", tracker=column)
-    assert [isinstance(one, Refused) for one in found] == [False, False, False, True, True]
+    assert [isinstance(one, Refused) for one in found] == 3 * [False] + 4 * [True]
     for one in found[:3]:
         assert sum(v * v for v in one.content["values"]) == pytest.approx(1.0, abs=1e-14)
         assert one.content["sigma"] == pytest.approx(2.0 * 4.84813681e-6, rel=1e-8)
     assert found[0].content["values"] == pytest.approx([0.0, 0.0, 0.6, 0.8], abs=1e-12)
-    assert [one.line for one in found] == [2, 3, 4, 5, 6]
-    assert "not a quaternion of a turn" in found[3].reason
+    assert [one.line for one in found] == [2, 3, 4, 5, 6, 7, 8]
+    for one, reason in ((3, "not a quaternion of a turn"), (5, "not a number"), (6, "not a finite number")):
+        assert reason in found[one].reason
 
 
 def test_readings_are_kept_in_si_units(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED, write_study
 from twin.compare.__main__ import app as compare_app
+from twin.compare.folder_difference import file_difference
 from twin.compare.folder_state import folder_state
 from twin.compare.verification import (
     DIFFERENT,
@@ -282,6 +283,10 @@ def test_arrays_are_compared_by_their_peak(tmp_path) -> None:
     found = pair(tmp_path, "nc", files["same"], files["other"])
     assert (found.state, found.quantities[0].key) == (DIFFERENT, "photons[2, 1]")
     assert pair(tmp_path, "nc", files["same"], b"no netCDF").why.startswith("cannot be read")
+    assert "no PNG" in pair(tmp_path, "png", preview_png(np.eye(60)[None]), b"GIF89a").why
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(InputError, match="loop: cannot be read"):
+        file_difference("a.nc", tmp_path / "loop", tmp_path / "loop")
 
 
 def test_tables_pictures_and_texts(tmp_path) -> None:
@@ -297,7 +302,6 @@ def test_tables_pictures_and_texts(tmp_path) -> None:
     picture[0, 30, 30] = 1.0
     moved = np.roll(picture, 3, axis=1)
     assert pair(tmp_path, "png", preview_png(picture), preview_png(moved)).state == DIFFERENT
-    assert "no PNG" in pair(tmp_path, "png", preview_png(picture), b"GIF89a").why
     drawing = '<svg><path d="M 1.25 2.5 L 3 4"/><text>f</text></svg>'
     assert pair(tmp_path, "svg", drawing.encode(), drawing.replace("2.5", "2.5000000001").encode()).state == ROUNDED
     drawn = (drawing, drawing.replace("2.5", "2.500001"))
