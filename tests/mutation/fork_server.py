@@ -7,6 +7,7 @@ commands that tests start as processes of their own.
 
 from __future__ import annotations
 
+import functools
 import gc
 import importlib
 import json
@@ -126,6 +127,9 @@ def _put_in(source: str, tree: Path, before: bytes) -> bool:
         return False
     codes = {(one[0].co_qualname, one[0].co_firstlineno): one[1] for one in changed if one}
     for one in gc.get_objects():
+        if isinstance(one, functools._lru_cache_wrapper):
+            # what was computed while the tests were loaded is computed again
+            one.cache_clear()
         if isinstance(one, FunctionType) and one.__code__.co_filename == str(path):
             code = codes.get((one.__code__.co_qualname, one.__code__.co_firstlineno))
             if code is not None:

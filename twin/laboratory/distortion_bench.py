@@ -363,13 +363,12 @@ class DistortionBench:
         first = np.rint(spot).astype(int) - test.window // 2
         column = first[..., 0]
         if np.min(column) < 0 or np.max(column) + test.window > self.ccd.band.pixels:
-            most = 1.0 - 2.0 * (test.window + np.max(np.abs(place[..., 0])) / pitch - 0.5 * self.ccd.band.pixels) / (
-                self.ccd.band.pixels
-            )
+            beside = 0.5 * test.window + np.max(np.abs(place[..., 0])) / pitch - 0.5 * self.ccd.band.pixels
+            most = test.reach - 2.0 * max(beside, 0.0) / self.ccd.band.pixels
             raise BenchError(
                 "the first or last spot falls beside the line",
                 ("reach",),
-                f"at most about {min(most, 1.0) * test.reach:.4f} with this zero of the table",
+                f"at most about {most:.4f} with this zero of the table",
             )
         inside = (spot - first) * pitch
         light = np.stack([self.images(w, at) for w, at in zip(self.turn, inside, strict=True)])
