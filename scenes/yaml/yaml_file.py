@@ -32,11 +32,12 @@ which it stands, and a script or a study the same files of the library again and
 SPACES = "spaces, for each level two more"
 _READ_APART = re.compile(
     r"[^\n -~\xa0-\u2027\u202a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]|^%|^[.]{3}"
-    r"|^(--- )? *[|>]|[|>][-+0-9]* *(#|\n *$)",
+    r"|^(--- )? *[|>]|[|>][-+0-9]* *(#|\n *$)|[?]([\s,\]}]|\Z)",
     re.M,
 )
 """What the two parsers may take in different ways: tabs, line ends other than that of Unix, directives, the end of a
-document; a block of text that is all of it, has a comment in its head or begins with an empty line.
+document, keys after a question mark; a text in a block that is all there is, begins with an empty line or has a comment
+in its head.
 """
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,30}")
