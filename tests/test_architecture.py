@@ -76,6 +76,8 @@ def source_files() -> list[Path]:
     return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
 
+STATEMENT = re.compile(r"^ *((?:from [\w.]+ )?import (?:\([^)]*\)|[\w., ]+))(?= *(?:#.*)?$)", re.M)
+"""An import, one on a line as ruff has them: to parse these alone takes a tenth of the time."""
 BY_NAME = re.compile(r"(?:import_module|__import__)\(\s*[\"']([\w.]+)")
 
 
@@ -86,18 +88,13 @@ def imported_modules(path: Path) -> frozenset[str]:
     """
     source = path.read_text("utf-8")
     names = set(BY_NAME.findall(source))
-    left: list[ast.AST] = [ast.parse(source)]
-    while left:
-        node = left.pop()
+    for node in ast.parse("\n".join(STATEMENT.findall(source))).body:
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             # A relative import stays in its package.
             module = (node.module or "") if node.level == 0 else path.relative_to(ROOT).parts[0]
             names |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
-        for block in ("body", "orelse", "finalbody", "handlers", "cases"):
-            # those of an expression are expressions
-            left += below if isinstance(below := getattr(node, block, ()), list) else ()
     return frozenset(names)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from ruamel.yaml import YAML
 
 from docs.figures.studies import STUDIES, Read
+from scenes.yaml.yaml_file import read_yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 FILE = Path(__file__).with_name("figures.yaml")
@@ -266,7 +267,7 @@ def measure(known: Mapping[str, Figure], only: str = "") -> dict[str, Figure]:
 
 def read_figures(file: Path = FILE) -> dict[str, Figure]:
     """The file's figures by name."""
-    tree = YAML(typ="safe").load(file) if file.exists() else {}
+    tree = read_yaml(file).data if file.exists() else {}
     return {name: Figure(**one) for name, one in tree.items()}
 
 

@@ -8,15 +8,14 @@ parser's events, so a refusal comes before anything is unfolded.
 
 import io
 import re
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML, events
-from ruamel.yaml.comments import CommentedSeq
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.scalarstring import DoubleQuotedScalarString
+import yaml
 
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
 from scenes.yaml.input_file import read_text
@@ -31,6 +30,15 @@ KEPT, LONGEST_KEPT = 64, 50_000
 which it stands, and a script or a study the same files of the library again and again.
 """
 SPACES = "spaces, for each level two more"
+_READ_APART = re.compile(
+    r"[^\n -~\xa0-\u2027\u202a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]|^%|^[.]{3}"
+    r"|^(--- )? *[|>]|[|>][-+0-9]* *(#|\n *$)|[?]([\s,\]}]|\Z)",
+    re.M,
+)
+"""What the two parsers may take in different ways: tabs, line ends other than that of Unix, directives, the end of a
+document, keys after a question mark; a text in a block that is all there is, begins with an empty line or has a comment
+in its head.
+"""
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,30}")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]{1,6})?")
@@ -75,11 +83,19 @@ def parse_yaml(text: str, file: str = "") -> YamlFile:
 
 
 def _read(text: str, file: str) -> tuple[Any, dict[KeyPath, int]]:
-    """Data and lines as of `YamlFile`."""
-    builder = _Builder(file)
+    """Data and lines as of `YamlFile`.
+
+    libyaml takes a tenth of the time. Whatever it or the builder refuses is read once more by the parser in Python,
+    which knows YAML 1.2 and has the words and lines of messages.
+    """
+    if not _READ_APART.search(text):
+        with suppress(yaml.YAMLError, InputError):
+            return _built(yaml.parse(text, yaml.CSafeLoader), file)
+    from ruamel.yaml import YAML  # slow to import and seldom needed
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
     try:
-        for event in YAML(typ="safe", pure=True).parse(text):
-            builder.take(event)
+        return _built(YAML(typ="safe", pure=True).parse(text), file)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         if mark and (line := _line_with_tab(text, mark.line, mark.column)) is not None:
@@ -90,6 +106,13 @@ def _read(text: str, file: str) -> tuple[Any, dict[KeyPath, int]]:
         raise InputError(Issue(f"not valid YAML: {problem}", file, mark.line + 1 if mark else None)) from None
     except YAMLError as error:
         raise InputError(Issue(f"not valid YAML: {str(error).splitlines()[0]}", file)) from None
+
+
+def _built(parsed: Iterable[Any], file: str) -> tuple[Any, dict[KeyPath, int]]:
+    """Data and lines of the events of either parser."""
+    builder = _Builder(file)
+    for event in parsed:
+        builder.take(event)
     if builder.root is None:
         raise InputError(Issue("the file is empty", file, 1))
     return builder.root, builder.lines
@@ -120,16 +143,21 @@ def dump_yaml(data: Any) -> str:
 
     Lists of scalars are written on one line, everything else in blocks.
     """
-    yaml = YAML(typ="rt", pure=True)
-    yaml.allow_unicode = True
-    yaml.width = 120
-    yaml.indent(mapping=2, sequence=4, offset=2)
+    from ruamel.yaml import YAML  # slow to import
+
+    writer = YAML(typ="rt", pure=True)
+    writer.allow_unicode = True
+    writer.width = 120
+    writer.indent(mapping=2, sequence=4, offset=2)
     stream = io.StringIO()
-    yaml.dump(_styled(data), stream)
+    writer.dump(_styled(data), stream)
     return stream.getvalue()
 
 
 def _styled(value: Any) -> Any:
+    from ruamel.yaml.comments import CommentedSeq
+    from ruamel.yaml.scalarstring import DoubleQuotedScalarString
+
     if isinstance(value, dict):
         return {_styled(key): _styled(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -163,18 +191,19 @@ class _Builder:
         self._open: list[tuple[dict[str, Any] | list[Any], KeyPath]] = []
         self._key: list[str | None] = []
 
-    def take(self, event: events.Event) -> None:
-        """Take the next event of the parser."""
+    def take(self, event: Any) -> None:
+        """Take the next event of a parser; both call them by the same names."""
         line = event.start_mark.line + 1
-        if isinstance(event, events.DocumentStartEvent):
+        kind = type(event).__name__
+        if kind == "DocumentStartEvent":
             self._documents += 1
             if self._documents > 1:
                 self._refuse("a second document starts here", line, "one document in a file")
             if event.tags:
                 self._refuse("%TAG directives are not allowed", line)
-        elif isinstance(event, events.AliasEvent):
+        elif kind == "AliasEvent":
             self._refuse(f"aliases are not allowed, found *{event.anchor}", line, "writing the value again")
-        elif isinstance(event, events.ScalarEvent | events.MappingStartEvent | events.SequenceStartEvent):
+        elif kind in ("ScalarEvent", "MappingStartEvent", "SequenceStartEvent"):
             if event.anchor:
                 self._refuse(
                     f"anchors are not allowed, found &{event.anchor}", line, "writing the value where it is used"
@@ -185,31 +214,31 @@ class _Builder:
             if self._values > MOST_VALUES:
                 allowed = f"at most {MOST_VALUES} in a file; long lists belong into a CSV table where one can be named"
                 self._refuse("too many keys and values", line, allowed, self._here())
-            self._value(event, line)
-        elif isinstance(event, events.MappingEndEvent | events.SequenceEndEvent):
+            self._value(event, kind, line)
+        elif kind in ("MappingEndEvent", "SequenceEndEvent"):
             self._open.pop()
             self._key.pop()
 
-    def _value(
-        self, event: events.ScalarEvent | events.MappingStartEvent | events.SequenceStartEvent, line: int
-    ) -> None:
+    def _value(self, event: Any, kind: str, line: int) -> None:
         awaits_key = bool(self._open) and isinstance(self._open[-1][0], dict) and self._key[-1] is None
         if awaits_key:
+            if kind != "ScalarEvent":
+                self._refuse("a key must be a plain name", line)
             self._take_key(event, line)
             return
         value: Any
-        if isinstance(event, events.ScalarEvent):
+        if kind == "ScalarEvent":
             value = self._plain(event, line)
         else:
-            value = {} if isinstance(event, events.MappingStartEvent) else []
+            value = {} if kind == "MappingStartEvent" else []
         path = self._place(value, line)
-        if not isinstance(event, events.ScalarEvent):
+        if kind != "ScalarEvent":
             if len(self._open) == DEEPEST:
                 self._refuse("nested too deeply", line, f"at most {DEEPEST} levels")
             self._open.append((value, path))
             self._key.append(None)
 
-    def _plain(self, event: events.ScalarEvent, line: int) -> Any:
+    def _plain(self, event: Any, line: int) -> Any:
         text = event.value
         if (wrong_character := UNWRITABLE.search(text)) is not None:
             issue = Issue(NO_TEXT, self._file, line, self._here(), shown(wrong_character[0]), WRITABLE)
@@ -217,7 +246,8 @@ class _Builder:
         if event.implicit[0] and text[:1] in OTHER_MINUS and not isinstance(_number_or_text("-" + text[1:]), str):
             wrong = foreign_minus(text)
             raise InputError(Issue(wrong.problem, self._file, line, self._here(), wrong.found, wrong.allowed))
-        return _scalar(event)
+        # by the core schema of YAML 1.2; quoted scalars are always text
+        return plain_scalar(text) if event.implicit[0] else text
 
     def _here(self) -> KeyPath:
         """Where the next value will stand."""
@@ -226,11 +256,8 @@ class _Builder:
         container, path = self._open[-1]
         return (*path, self._key[-1] or "") if isinstance(container, dict) else (*path, len(container))
 
-    def _take_key(self, event: events.Event, line: int) -> None:
+    def _take_key(self, event: Any, line: int) -> None:
         mapping, path = self._open[-1]
-        if not isinstance(event, events.ScalarEvent):
-            self._refuse("a key must be a plain name", line)
-            return
         key = event.value
         if UNWRITABLE.search(key):
             self._refuse(NO_TEXT, line, WRITABLE, path)
@@ -261,12 +288,6 @@ class _Builder:
 
     def _refuse(self, problem: str, line: int, allowed: str | None = None, key: KeyPath = ()) -> None:
         raise InputError(Issue(problem, self._file, line, key, allowed=allowed))
-
-
-def _scalar(event: events.ScalarEvent) -> Any:
-    """The value of a scalar by the core schema of YAML 1.2; quoted scalars are always text."""
-    text = event.value
-    return plain_scalar(text) if event.implicit[0] else text
 
 
 def plain_scalar(text: str) -> Any:

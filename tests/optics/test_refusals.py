@@ -36,7 +36,7 @@ BOX = np.array([(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0,
 BEAM = PupilField(*(0.05 * part[None] for part in (NODES.x, NODES.y, 0.0 * NODES.x, NODES.weight)), 650e-9)
 
 
-CASES = yaml.safe_load(Path(__file__).with_name("refusals.yaml").read_text("utf-8"))
+CASES = yaml.load(Path(__file__).with_name("refusals.yaml").read_bytes(), yaml.CSafeLoader)
 
 
 def made(value: Any) -> Any:

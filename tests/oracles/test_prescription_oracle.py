@@ -205,7 +205,7 @@ def test_a_tilted_surface_of_batoid_is_refused() -> None:
         read_batoid(path, 620e-9)
 
 
-@pytest.mark.parametrize("kind", ["rayoptics", "optiland"])
+@pytest.mark.parametrize("kind", quick(1, ["rayoptics", "optiland"]))
 @pytest.mark.parametrize("name", quick(1, ["gf7", "gf7_conic", "gf7_short", "monitor"]))
 def test_our_cameras_as_other_programs_read_them(tmp_path: Path, backend, camera, name: str, kind: str) -> None:
     package(kind)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from ruamel.yaml import YAML
+import yaml
 
 from scenes.specs.load import SCENES
 from tests.robustness.case import JOBS, Case, file_of
@@ -57,7 +57,7 @@ def _content(told: Any) -> bytes:
 
 
 def _listed() -> Iterator[Case]:
-    table = YAML(typ="safe").load(Path(__file__).with_name("cases.yaml").read_text("utf-8"))
+    table = yaml.load(Path(__file__).with_name("cases.yaml").read_bytes(), yaml.CSafeLoader)
     for name, told in table.items():
         program, *words = told["command"].split()
         named = told["files"]

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -214,6 +215,27 @@ def test_a_byte_order_mark_is_fine(tmp_path: Path) -> None:
     path = tmp_path / "input.yaml"
     path.write_bytes(b"\xef\xbb\xbfx: 1\n")
     assert read_yaml(path).data == {"x": 1}
+
+
+def test_both_parsers_read_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """libyaml, which reads YAML 1.1, and the parser in Python: data, order, lines."""
+    places = sorted((Path(yaml_file.__file__).parents[1]).rglob("*.yaml"))[::8]
+    texts = ["|\n# c", "- a\n...\n...", "- [yes, 0o7, 1:30, a:b, 'c' ]", "[\n  ? ]]", "a: {b, c: }", "%YAML 1.1\n--- a"]
+    texts += ["a: >#", "a: |\n \n  b", "a: >-\n  b\n\n   c", "a: |+\n\n  b\n\nc: d # e\n", "--- >\n#", "a: [b\u2028c]"]
+    texts += ["a\tb: c\r\n", 'a: "b\\\n  c\\/\\u2028"', *(place.read_text("utf-8") for place in places)]
+
+    def outcomes() -> list[str]:
+        out = []
+        for text in texts:
+            try:
+                out.append(repr(yaml_file._read(text, "a.yaml")))
+            except InputError as error:
+                out.append(str(error))
+        return out
+
+    fast = outcomes()
+    monkeypatch.setattr(yaml_file, "_READ_APART", re.compile(""))
+    assert outcomes() == fast
 
 
 AWKWARD = ("", "a\nb", *"null|1|1e3|.5|-.inf|.nan|true|a: b|# no| x |*a|&a|!t|ü µm|[|<<|-".split("|"))

@@ -17,9 +17,9 @@ from tests.twin.commands import replaced
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).parent
-TEXTS: dict[str, Any] = yaml.safe_load((HERE / "study_texts.yaml").read_text("utf-8"))
+TEXTS: dict[str, Any] = yaml.load((HERE / "study_texts.yaml").read_bytes(), yaml.CSafeLoader)
 STUDY: str = TEXTS["study"]
-REFUSED: dict[str, list[Any]] = yaml.safe_load((HERE / "refused_inputs.yaml").read_text("utf-8"))
+REFUSED: dict[str, list[Any]] = yaml.load((HERE / "refused_inputs.yaml").read_bytes(), yaml.CSafeLoader)
 
 
 def refusals(group: str) -> list[Any]:

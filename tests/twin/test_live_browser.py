@@ -16,7 +16,6 @@ from twin.run.run_folder import RunFolder, write_manifest
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
 pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
 pytestmark = [pytest.mark.second, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
 
@@ -27,6 +26,7 @@ TURN = "base/backward/focal_plane rotate z"
 
 @pytest.fixture(scope="module")
 def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
     with playwright.sync_playwright() as made:
         browser = made.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         yield browser

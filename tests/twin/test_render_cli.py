@@ -74,6 +74,7 @@ def computed(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(twin.main_job.render_command, "render_job", keep)
+        patch.setenv(LIMIT, "1")  # without a second process, which imports once more what is here already
         done = run(EXAMPLE, "--out", place / "run", "--frames", FRAMES, "--seed", 5, "--json")
     assert done.exit_code == 0, done.stderr
     return place / "run", done.stdout, done.stderr, kept[0]
@@ -155,14 +156,12 @@ def test_the_manifest_has_the_checksum_of_every_file(computed):
 
 
 @pytest.mark.second
-def test_config_repeats_the_run_bit_for_bit(computed, tmp_path, monkeypatch):
-    """The config of a run with --seed and --frames holds both; the run may have a second process or none. Another seed
-    is other noise on the same truth.
+def test_config_repeats_the_run_bit_for_bit(computed, tmp_path):
+    """The config of a run with --seed and --frames holds both; the run may have a second process, as here, or none.
+    Another seed is other noise on the same truth.
     """
     folder = computed[0]
-    with monkeypatch.context() as patch:
-        patch.setenv(LIMIT, "1")  # without a second process
-        again = run(folder / "config.yaml", "--out", tmp_path / "again", "--quiet")
+    again = run(folder / "config.yaml", "--out", tmp_path / "again", "--quiet")
     assert (again.exit_code, again.stdout, again.stderr) == (0, "", "")
     for name in files(folder) - {"manifest.json"}:
         assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name

@@ -12,7 +12,6 @@ from twin.main_job.render_folder import render_report
 from twin.main_job.render_job import render_job
 from twin.pictures.scene_file import write_scene
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
 CHROMIUM = shutil.which("chromium")
 pytestmark = [pytest.mark.second, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
 
@@ -39,6 +38,7 @@ def report(run, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def launcher():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
     with playwright.sync_playwright() as made:
         yield made.chromium
 
