@@ -183,7 +183,9 @@ def test_warnings_of_coverage_and_of_coarse_tables(silica, tmp_path) -> None:
 def test_tables_of_another_body_frame_or_unit_are_refused(silica, tmp_path) -> None:
     points = lattice(silica, M1)
     for wrong in (points + np.array([0.0, 0.0, 3.0]), 1e-3 * points):
-        with pytest.raises(InputError, match="lie outside of the nodes"):
+        low, high = 1e3 * wrong.min(axis=0), 1e3 * wrong.max(axis=0)
+        ends = ", ".join(f"{a:.4g} .. {b:.4g}" for a, b in zip(low, high, strict=True))
+        with pytest.raises(InputError, match=f"lie outside of the nodes, whose x, y, z are {ends} mm"):
             warmed(silica, tmp_path, M1, wrong, quadratic(points))
     flat = np.unique(np.where([True, True, False], points, 0.1), axis=0)
     with pytest.raises(InputError, match="in a plane"):

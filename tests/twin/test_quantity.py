@@ -38,6 +38,7 @@ def test_files_have_numbers_in_the_units_of_their_keys() -> None:
     line = Line(np.array([1e-6, -2.5e-6]), np.pi / 180)
     data = LINE(line)
     assert data["turn_arcsec"] == pytest.approx(3600.0, rel=1e-15)
+    assert in_unit(line.turn, "arcmin") == pytest.approx(60.0, rel=1e-15)
     assert data["covariance_mm2"] == [[pytest.approx(4.0)]]
     assert "focal_length_mm" not in data
     assert LINE(Line(line.places, 0.0, 5.5))["focal_length_mm"] == pytest.approx(5500.0)

@@ -431,8 +431,10 @@ def test_inputs_that_changed_since_end_with_two(compared) -> None:
 
 def test_runs_that_cannot_be_made_again_are_told(tmp_path) -> None:
     """Its folder is gone, its command fails; and what is still being written is no run."""
-    (tmp_path / ".run.0123.partial").mkdir()
     cases = [(tmp_path / ".run.0123.partial", "a run that was broken off, or is still being written")]
+    cases += [(tmp_path / name, "not a run folder") for name in (".hidden", "a.partial")]
+    for place, _ in cases:
+        place.mkdir()
     for name, facts, said in (
         ("gone", {"started_in": str(tmp_path / "none")}, "the folder in which it was started is gone"),
         ("fails", {"started_in": str(tmp_path)}, "config.yaml ended with exit code 1"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.aperture import Circle, Rectangle
-from optics.geometry.surface import ZernikeFigure
+from optics.geometry.surface import Surface, ZernikeFigure
 from optics.materials.glass import ABBE_LINES, N_BK7, common_glasses
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.system import assemble
@@ -17,7 +17,7 @@ from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.camera_reader import camera_of
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import own_glasses, read_catalogue, read_catalogues
-from scenes.lens.prescription import SEQUENCE, Prescription
+from scenes.lens.prescription import SEQUENCE, Prescription, polynomial_of
 from scenes.lens.statements import glass_key
 from scenes.lens.unfolding import unfolded, with_flat_image
 from scenes.lens.zemax_reader import read_zemax
@@ -143,6 +143,12 @@ def test_a_polynomial_of_high_order_keeps_its_sag(tmp_path: Path) -> None:
     base = -0.004 * (x * x + y * y) / (1.0 + math.sqrt(1.0 - 0.004**2 * (x * x + y * y)))
     wanted = base + 0.004 * x / 20.0 + 0.02 * (x / 20.0) ** 5 * y / 20.0
     assert 1e3 * float(surface.sag(x * 1e-3, y * 1e-3)) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_the_polynomial_of_even_powers_has_their_sag() -> None:
+    even, x, y = Surface(even=(2.0, -300.0)), 0.2, 0.3
+    powers = sum(c * x**a * y**b for (a, b), c in polynomial_of(even).items())
+    assert powers == pytest.approx(float(even.sag(x, y)), rel=1e-12)
 
 
 def test_a_codev_file(tmp_path: Path) -> None:
