@@ -1,8 +1,8 @@
-"""Zernike terms of a map over any lit area of a pupil, with their covariance.
+"""Zernike terms of a map over any lit area of a pupil.
 
 Terms are made orthonormal over the pixels that are lit, in Noll's order: over a ring these are Mahajan's annular terms
 up to the pixels, over a cut pupil their like. Coefficients of the circle's terms follow from them; where light is
-missing they share among them what looks alike there, which their covariance says.
+missing they share among them what looks alike there.
 
 Which way round a measured wavefront is: flips, quarter turns and sign, and which of these the data allow.
 """
@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2
 
 from analysis.arrays import Array, UndeterminedError
 from analysis.statistics import chance_beyond
@@ -237,10 +236,6 @@ HELD = 1e-6
 """Share of a term that has to be left beside those before it; below it the light does not tell them apart."""
 _CHUNK = 50_000
 """Pixels at a time, so that large maps take little memory."""
-_BINS = 64
-"""Fewest cells across the pupil in which correlated noise is looked at: terms are smooth over them."""
-_FEWEST_PAIRS, _ROUNDS, _SETTLED = 1e-3, 25, 0.01
-"""Share of pairs of points below which a distance is not looked at; rounds of the noise; change that ends them."""
 _TRIES, _NEAR, _STEP = 400, 1.5, 0.75
 """Circles through three points of the edge that are tried; pixels from one of them within which a point is on it, at
 first and when it is refined: a step lies within half a pixel of the edge.
@@ -259,17 +254,14 @@ class Pupil:
         x: column of its centre, the first is 0.
         y: row of its centre.
         radius: pixels.
-        distortion: of the picture of the pupil, k1, k2...: a point at the relative distance r from the centre of the
-            map belongs to ``r (1 + k1 (r^2 - 1) + k2 (r^4 - 1) + ...)`` in the pupil. The edge stays where it is.
     """
 
     x: float
     y: float
     radius: float
-    distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (all(map(math.isfinite, (self.x, self.y, *self.distortion))) and 0.0 < self.radius < math.inf):
+        if not (math.isfinite(self.x) and math.isfinite(self.y) and 0.0 < self.radius < math.inf):
             raise MapError(f"a pupil at {self.x:g}, {self.y:g} with radius {self.radius:g} pixels: radii are positive")
 
     def unit(self, columns: Array, rows: Array) -> tuple[Array, Array]:
@@ -279,10 +271,7 @@ class Pupil:
             columns: of points, any shape.
             rows: likewise.
         """
-        x, y = (columns - self.x) / self.radius, (rows - self.y) / self.radius
-        square = x**2 + y**2
-        factor = 1.0 + sum((k * (square**power - 1.0) for power, k in enumerate(self.distortion, 1)), start=0.0)
-        return x * factor, y * factor
+        return (columns - self.x) / self.radius, (rows - self.y) / self.radius
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,41 +279,12 @@ class MapFit:
     """Zernike terms of a map.
 
     Attributes:
-        terms: indices of Noll, (Z,).
         coefficients: of the circle's terms, metres rms over the full disk each, (Z,).
-        covariance: of them, (Z, Z), from what the fit leaves; systematic errors of the map are not in it. Where the
-            independent pixels are fewer than some five times the terms, it is itself known to some tens of per cent
-            only, and fewer errors than of a normal distribution lie within a sigma.
         parts: of the terms that are orthonormal over the light, metres rms over it each, (Z,).
-        parts_covariance: likewise.
-        rms: of the map over the light about its mean, metres.
-        residual_rms: that the terms leave, metres.
-        points: lit pixels within the pupil.
-        independent: number of pixels with independent noise that would give the same sigmas; at most ``points``.
-        beyond: lit pixels outside the pupil, which were left out.
-        factor: R, (Z, Z), with ``parts = R @ coefficients``.
-        residual: map (rows, columns) of what is left, metres, NaN outside.
-        pupil: that was used.
     """
 
-    terms: tuple[int, ...]
     coefficients: Array
-    covariance: Array
     parts: Array
-    parts_covariance: Array
-    rms: float
-    residual_rms: float
-    points: int
-    independent: float
-    beyond: int
-    factor: Array
-    residual: Array
-    pupil: Pupil
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations of the coefficients, (Z,)."""
-        return np.sqrt(np.diag(self.covariance))
 
 
 def find_pupil(measured: WavefrontMap) -> Pupil:
@@ -407,7 +367,6 @@ def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = 
     rows, columns = np.nonzero(measured.lit)
     x, y = pupil.unit(columns.astype(float), rows.astype(float))
     inside = x**2 + y**2 <= 1.0 + 1e-9
-    beyond = int(np.count_nonzero(~inside))
     rows, columns, x, y = rows[inside], columns[inside], x[inside], y[inside]
     count, size = len(rows), len(terms)
     if count <= size:
@@ -430,103 +389,8 @@ def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = 
             f"over the lit part of the pupil, Z{terms[int(np.argmax(left < HELD))]} cannot be told from the terms"
             " before it: take fewer terms, or state where the pupil lies"
         )
-    coefficients = np.asarray(np.linalg.solve(factor, parts), dtype=np.float64)
-    residual = np.full(measured.values.shape, np.nan)
-    for part in _chunks(count):
-        fitted = circle_terms(terms, x[part], y[part]) @ coefficients
-        residual[rows[part], columns[part]] = values[part] - fitted
-    rest = residual[rows, columns]
-    covariance = _parts_covariance(residual, pupil, terms, factor)
-    back = np.linalg.inv(factor)
-    variance = float(rest @ rest) / (count - size)
-    mean = float(np.trace(covariance)) / size
-    return MapFit(
-        terms=terms,
-        coefficients=coefficients,
-        covariance=back @ covariance @ back.T,
-        parts=parts,
-        parts_covariance=covariance,
-        rms=float(np.std(values)),
-        residual_rms=math.sqrt(float(rest @ rest) / count),
-        points=count,
-        independent=min(variance / mean, float(count)) if mean > 0.0 else float(count),
-        beyond=beyond,
-        factor=factor,
-        residual=residual,
-        pupil=pupil,
-    )
+    return MapFit(np.asarray(np.linalg.solve(factor, parts), dtype=np.float64), parts)
 
 
 def _chunks(count: int) -> Iterator[slice]:
     return (slice(k, k + _CHUNK) for k in range(0, count, _CHUNK))
-
-
-def _parts_covariance(residual: Array, pupil: Pupil, terms: tuple[int, ...], factor: Array) -> Array:
-    """Covariance of the orthonormal parts (Z, Z) for noise that is alike over the pupil and correlated as the residual.
-
-    The autocovariance C of the noise is summed with the terms over both points. That of the residual is the one of
-    (1 - P) C (1 - P) with the projection P onto the terms; what they have taken out is put back until nothing changes.
-    Beyond the distance at which C is lost in its own noise it counts as zero.
-    """
-    cells = max(_BINS, 6 * noll_to_nm(terms[-1])[0])
-    weight, mean, x, y = _cells(residual, pupil, cells)
-    used, share = weight > 0.0, np.sum(weight)
-    columns = np.zeros((len(terms), *weight.shape))
-    columns[:, used] = np.linalg.solve(factor.T, circle_terms(terms, x[used], y[used]).T)
-    columns *= weight
-    rows, wide = weight.shape
-    shape = (next_fast_len(2 * rows, real=True), next_fast_len(2 * wide, real=True))
-
-    def spectrum(maps: Array) -> Array:
-        return rfft2(maps, shape)
-
-    def correlation(first: Array, second: Array) -> Array:
-        """Of weighted maps given by their spectra, summed over them, for a mean pair of points."""
-        return irfft2(np.sum(first.conj() * second, axis=0).real, shape) / overlap
-
-    pairs = irfft2(np.abs(spectrum(weight)) ** 2, shape)
-    overlap = np.where(pairs > _FEWEST_PAIRS * pairs[0, 0], pairs, np.inf)
-    seen_pairs = np.where(overlap < np.inf, pairs, 0.0).ravel()
-    moved = spectrum(weight * mean)[None]
-    raw = correlation(moved, moved)
-    ring = np.rint(np.hypot(*np.meshgrid(*(n * fftfreq(n) for n in shape), indexing="ij"))).astype(int)
-    ring_pairs = np.maximum(np.bincount(ring.ravel(), seen_pairs), 1e-300)
-    lost_below = np.sqrt(pairs[0, 0] / (np.count_nonzero(used) * ring_pairs))
-    turned = spectrum(columns)
-    white = float(np.nanmean(residual**2)) / np.count_nonzero(np.isfinite(residual))
-    covariance, full = np.zeros((len(terms), len(terms))), raw
-    for _ in range(_ROUNDS):
-        radial = np.bincount(ring.ravel(), full.ravel() * seen_pairs) / ring_pairs
-        lost = np.flatnonzero(radial <= radial[0] * lost_below)
-        reach = min(int(lost[0]) if len(lost) else len(radial), min(rows, wide) // 2)
-        near = np.where(ring < max(reach, 1), full, 0.0)
-        spread = irfft2(turned * spectrum(near), shape)[:, :rows, :wide]
-        before, covariance = covariance, np.tensordot(columns, spread, ((1, 2), (1, 2))) / share**2
-        covariance = 0.5 * (covariance + covariance.T)
-        if np.abs(covariance - before).max() <= _SETTLED * np.abs(covariance).max():
-            break
-        both = 2.0 * correlation(turned, spectrum(weight * spread)) / share
-        size, turn = np.linalg.eigh(covariance)
-        part = np.tensordot(turn.T, turned, 1)
-        full = raw + both - correlation(part * size[:, None, None], part)
-    size, turn = np.linalg.eigh(covariance)
-    # not even noise that is independent from pixel to pixel gives less
-    return (turn * np.maximum(size, white)) @ turn.T
-
-
-def _cells(residual: Array, pupil: Pupil, across: int) -> tuple[Array, Array, Array, Array]:
-    """Cells of the map: share of their pixels that were fitted, mean of these, x and y of their middle on the disk."""
-    step = max(1, math.ceil(2.0 * pupil.radius / across))
-    rows, columns = np.nonzero(np.isfinite(residual))
-    top, left = rows.min(), columns.min()
-    at = ((rows - top) // step, (columns - left) // step)
-    shape = (int(at[0].max()) + 1, int(at[1].max()) + 1)
-    flat = at[0] * shape[1] + at[1]
-
-    def summed(values: Array | None) -> Array:
-        return np.bincount(flat, values, math.prod(shape)).astype(float).reshape(shape)
-
-    number = summed(None)
-    held = np.maximum(number, 1.0)
-    x, y = pupil.unit(summed(columns.astype(float)) / held, summed(rows.astype(float)) / held)
-    return number / step**2, summed(residual[rows, columns]) / held, x, y
