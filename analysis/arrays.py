@@ -11,10 +11,18 @@
 <Spot: rms 2 um; rays 217 x 2, all 0 um>
 
 `OfStates` are results of several states, measurements or spots, whose first axis counts the states.
+
+Units of measured data and results; inside, everything is in radians and metres.
+
+An angle in seconds of arc is ``angle / ARCSEC``, a length in micrometres ``length * UM_PER_M``: the factors are those
+of which one rounding is left.
+
+What measurements do not tell, as against faults of the program.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -24,7 +32,27 @@ from typing import Any, Self, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.units import ARCSEC, MM_PER_M, UM_PER_M
+ARCSEC = math.pi / 180 / 3600
+"""One second of arc, rad."""
+
+ARCMIN = 60.0 * ARCSEC
+"""One minute of arc, rad."""
+
+UM_PER_M, MM_PER_M = 1e6, 1e3
+"""Micrometres and millimetres in a metre."""
+
+
+class MeasurementError(Exception):
+    """What was measured does not say what is asked: no spot, too few readings, a fit that finds no end.
+
+    The base of all errors that say so. Who evaluates many measurements counts such a one as failed; any other error is
+    a fault of the program.
+    """
+
+
+class UndeterminedError(MeasurementError, ValueError):
+    """Measurements that do not settle a number; the message says which and why."""
+
 
 Array = NDArray[np.float64]
 """Array of float64."""

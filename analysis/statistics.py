@@ -1,4 +1,5 @@
-"""Distributions and scales that measurements are judged by: chi-square, shares, robust scales, and Rice's distribution.
+"""Distributions and scales that measurements are judged by: chi-square, shares, robust scales, and Rice's distribution;
+the inverse of least squares.
 
 The functions of chi-square are what ``scipy.stats.chi2`` calls, to the bit, without that package's import, which is a
 tenth of a short command.
@@ -50,6 +51,32 @@ def density(chi_square: Any, degrees: Any) -> Any:
     """
     half = 0.5 * np.asarray(degrees, dtype=np.float64)
     return np.exp(xlogy(half - 1.0, chi_square) - 0.5 * np.asarray(chi_square) - gammaln(half) - np.log(2.0) * half)
+
+
+def p_value(chi_square: float, degrees: int) -> float:
+    """Return the probability of such a chi-square or a larger one; 1 without degrees of freedom."""
+    return float(chdtrc(degrees, chi_square)) if degrees > 0 else 1.0
+
+
+def gain(columns: np.ndarray, root: np.ndarray | None = None, cutoff: float = 1e-15) -> np.ndarray:
+    """Return the least-squares inverse: G of the estimates G y of observations y, with covariance G C G'.
+
+    The columns are scaled to length one, as their units may differ by many orders of magnitude.
+
+    Args:
+        columns: derivatives of the observations by the unknowns, (..., N, P).
+        root: Cholesky factor of the observations' covariance, (..., N, N); None where all are alike.
+        cutoff: share of the largest singular value below which a combination of unknowns is none.
+
+    Returns:
+        (..., P, N).
+    """
+    white: np.ndarray = columns
+    if root is not None:
+        white = np.linalg.solve(root, np.broadcast_to(columns, (*root.shape[:-2], *columns.shape[-2:])))
+    length = np.linalg.norm(white, axis=-2, keepdims=True)
+    inverse = np.linalg.pinv(white / length, rcond=cutoff) / np.swapaxes(length, -1, -2)
+    return np.asarray(inverse if root is None else inverse @ np.linalg.inv(root), dtype=np.float64)
 
 
 def share_interval(met: int, count: int, confidence: float) -> tuple[float, float]:

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
+from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array, Indices
 from analysis.block.block import Block, CameraKnowledge, CamerasKnowledge, Term
-from analysis.block.corrections import Corrections, Part
-from analysis.block.packets import FixedPoints, Heights, LineImage, Packets, Pointings
-from analysis.block.point_reduction import PriorGroup, Reduction
-from analysis.block.processes import BlockError, Support
+from analysis.block.point_reduction import FixedPoints, Heights, LineImage, Packets, Pointings, PriorGroup, Reduction
+from analysis.block.processes import BlockError, Corrections, Part, Support
 from analysis.orbit.three_line_model import BIAS, DRIFT
 
 OFFSET = ("along", "across", "down")
@@ -186,8 +185,7 @@ def _axes(block: Block, name: str) -> Array:
     """(3, 3) the rotation nearest to the mean attitude of a pass."""
     attitudes = [s.rays.attitude for s in block.scenes if s.of == name and len(s.rays.point)]
     attitudes += [f.attitude for f in block.footprints if f.of == name]
-    u, _, vt = np.linalg.svd(np.concatenate(attitudes).mean(axis=0))
-    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt)
+    return np.asarray(Rotation.from_matrix(np.concatenate(attitudes)).mean().as_matrix())
 
 
 def _unit(count: int) -> sparse.csr_matrix:

@@ -27,8 +27,9 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse.linalg import splu
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
+from analysis import statistics
 from analysis.arrays import Array, Indices
 from analysis.block.assembly import Assembly, Process, assembled, group_ranks
 from analysis.block.block import Block
@@ -85,7 +86,7 @@ def check_places(block: Block) -> None:
         bad = (apart > FAR) | (np.sum(look * arm, axis=1) <= 0)
         names = block.points.ids[rays.point[bad]].tolist()
         wrong += [f"{name} in {scene.name}" for name in names]
-        control += _are_control(block, rays.point[bad])
+        control += (block.points.role[rays.point[bad]] == "control").tolist()
     if not wrong:
         return
     shown = ", ".join(wrong[:_NAMED]) + (f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else "")
@@ -95,10 +96,8 @@ def check_places(block: Block) -> None:
     raise BlockError(f"block: these points lie more than {FAR:g} rad from where their images look: {shown}; {hint}")
 
 
-def _are_control(block: Block, points: NDArray[np.intp]) -> list[bool]:
-    return [bool(v) for v in (block.points.role[points] == "control").tolist()]
-
-
+_STEPS = 20
+"""Most Gauss-Newton steps of one round."""
 _CONVERGED = 1e-6
 """Size of the last step, in sigmas of all unknowns together."""
 _DENSE = 2500
@@ -142,7 +141,7 @@ class BlockAdjustment:
     @property
     def p_value(self) -> float:
         """Chance of such a chi-square or a larger one, if the sigmas and laws are right; without robust weights."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     @property
     def factors(self) -> dict[str, float]:
@@ -257,7 +256,6 @@ def adjust_block(
     robust: Literal["huber", "reject"] | None = None,
     variance_components: bool | Collection[str] = False,
     datum: bool = False,
-    iterations: int = 20,
     pool: Pool | None = None,
 ) -> BlockAdjustment:
     """Adjust a block.
@@ -268,7 +266,6 @@ def adjust_block(
             the others so weighed, one good packet in 10 000, and with them points of which too little is left.
         variance_components: estimate a factor on the variances of every group, or of those named.
         datum: look for a shift that all control points have in common.
-        iterations: most Gauss-Newton steps of one round.
         pool: processes that reduce the points; None for this one alone.
 
     Raises:
@@ -292,7 +289,7 @@ def adjust_block(
         _HUBER_ROUNDS if robust else 0,
     )
     try:
-        at, found = settled(_Problem(assembly, points, iterations), at, rule)
+        at, found = settled(_Problem(assembly, points), at, rule)
     except UnsettledError as error:
         raise BlockError(f"block: {error}") from error
     return _result(assembly, at, found)
@@ -321,14 +318,13 @@ class _Problem:
 
     assembly: Assembly
     points: Reduction | SharedReduction
-    iterations: int
 
     def solve(self, at: _At, screening: bool) -> tuple[_At, _Solution]:
         """See `Reweighted`."""
         reduction = self.assembly.reduction
         # weights that will change are not worth more than a step or two
         tolerance = 1e-2 if screening else _CONVERGED
-        at, reduced, factor = _solved(reduction, self.points, at, self.iterations, tolerance)
+        at, reduced, factor = _solved(reduction, self.points, at, tolerance)
         covariance = factor.inverse()
         checked = self.points.checked(at, reduced.spread, _part_of(covariance))
         tests = _tests(reduction, at, covariance, reduced, checked.taken)
@@ -351,11 +347,11 @@ class _Problem:
 
 
 def _solved(
-    reduction: Reduction, points: Reduction | SharedReduction, at: _At, iterations: int, tolerance: float
+    reduction: Reduction, points: Reduction | SharedReduction, at: _At, tolerance: float
 ) -> tuple[_At, Reduced, _Factor]:
     """Gauss-Newton with the weights as they stand, until a step is below so many sigmas."""
     last = np.inf
-    for _ in range(iterations):
+    for _ in range(_STEPS):
         reduced = reduction.with_priors(points.eliminated(at), at)
         total = reduced.data + reduced.prior
         factor = _Factor(total)
@@ -374,7 +370,7 @@ def _solved(
         if not np.isfinite(size):
             break
         last = size
-    raise BlockError(f"block: no convergence in {iterations} steps, the last of {last:.3g} sigmas")
+    raise BlockError(f"block: no convergence in {_STEPS} steps, the last of {last:.3g} sigmas")
 
 
 def _part_of(covariance: Array) -> Callable[[Indices], Array]:

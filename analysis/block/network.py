@@ -19,8 +19,8 @@ from analysis.block.block import Block, Term
 from analysis.block.block_adjustment import BlockAdjustment
 from analysis.block.point_reduction import State
 from analysis.block.processes import Law
-from analysis.orbit.ground_errors import level_axes
-from analysis.orbit.null_space import echelon, shown
+from analysis.orbit.calibration_parameters import echelon, shown
+from analysis.orbit.forward_intersection import level_axes
 
 _SHOWN = 0.25
 """Of the largest part: smaller parts of a combination are not named."""
@@ -111,7 +111,7 @@ def open_combinations(found: BlockAdjustment) -> tuple[Open, ...]:
     """What of the block's unknowns the observations leave to the priors, by name, the widest open first.
 
     What is told to less than a thousandth, and the rest, are a space each, and a combination has an unknown that is in
-    no other one of its space (`null_space.echelon`): the eigenvectors of a space whose eigenvalues are alike are any.
+    no other one of its space (`echelon`): the eigenvectors of a space whose eigenvalues are alike are any.
     """
     plain = assembled(simplified(found.assembly.block))
     ground = np.where(np.isfinite(found.ground), found.ground, found.assembly.block.points.start)

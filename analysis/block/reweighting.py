@@ -12,8 +12,7 @@ from typing import Literal, Protocol, TypeVar
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.arrays import Array
-from analysis.measurement_error import MeasurementError
+from analysis.arrays import Array, MeasurementError
 from analysis.statistics import robust_variance
 
 S = TypeVar("S", bound="Weighted")

@@ -8,6 +8,17 @@ Before an adjustment: do points lie where their image points look, and does a si
 
 Both faults else come out as combinations that the points cannot tell: robust weights give up points that are kilometres
 off, and then too few are left; noise that is larger than what a launch changes leaves everything open.
+
+What the residuals of an adjustment say of terms that the model leaves out.
+
+A term g that moves the misclosures by G g and is not solved for leaves the estimates wrong by C N_xg g, with C their
+covariance and N the normal matrix with g among the unknowns. What the residuals say of it is the gradient s at g = 0,
+of covariance S = N_gg - N_gx C N_xg: the estimate is -S^-1 s, and s' S^-1 s is chi-square where there is no such term
+and the sigmas are right (Lagrange multiplier test; Rao, Proc. Camb. Phil. Soc. 44 (1948) 50). S is the exact
+covariance, so the test holds for six points as for six hundred.
+
+Terms here: rates of the attitude during each field; slow courses along each line, cosines of the exposure time over the
+time of the line, in x and in y, by which residuals of neighbouring exposures are alike; steps within a line.
 """
 
 from __future__ import annotations
@@ -18,33 +29,221 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from analysis import statistics
 from analysis.arrays import Array
-from analysis.block.reweighting import (
-    HUBER,
-    SETTLED,
-    GroupTest,
-    Robust,
-    Rule,
-    UnsettledError,
-    settled,
-    standardised_packets,
-)
-from analysis.calibration.hidden_terms import Courses, HiddenTerms, Rates, Unseen
+from analysis.block import reweighting
 from analysis.calibration.normal_equations import Equations, SharedNoise, State, Weights, assemble
-from analysis.orbit import null_space
-from analysis.orbit.calibration_parameters import (
-    CalibrationError,
-    CalibrationField,
-    Noise,
-    Parameters,
-    Prior,
-    Unknowns,
-    index,
-)
+from analysis.orbit import calibration_parameters
 from analysis.orbit.forward_intersection import ray_covariance
-from analysis.orbit.three_line_model import BIAS, DRIFT, INTERIOR, LineModel, misclosure, partials
+from analysis.orbit.three_line_model import BIAS, DRIFT, INTERIOR, LineModel, Partials, Rays, misclosure, partials
+
+FALSE_ALARM = 5e-5
+"""False-alarm rate of each of the two tests of a run, rates and courses, over all fields together: 1e-4 a run."""
+_WAVES = 4
+_POINTS_PER_WAVE = 4
+_RANK = 1e-9
+"""Smallest eigenvalue of S that counts, relative to the largest. No residual shows a term that the unknowns imitate."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """A drift of the attitude during each field, radians per second about the body's axes, zero at its mean time.
+
+    middles: field -> mean time of its rays, seconds; fields without times are left out.
+    """
+
+    middles: Mapping[str, float]
+
+    @classmethod
+    def of(cls, fields: Sequence[calibration_parameters.CalibrationField]) -> Rates:
+        """Rates of all fields whose rays have times."""
+        times = {f.name: [r.time for r in f.rays.values() if r.time is not None and r.point.size] for f in fields}
+        return cls({name: float(np.mean(np.concatenate(rows))) for name, rows in times.items() if rows})
+
+    @property
+    def size(self) -> int:
+        """Number of terms."""
+        return 3 * len(self.middles)
+
+    def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
+        """(n, 2, size) derivatives of the misclosures.
+
+        Args:
+            field: the pass.
+            line: of the camera.
+            rays: n image points of it.
+            by: derivatives of their misclosures.
+        """
+        found = np.zeros((len(rays.point), 2, self.size))
+        if rays.time is not None and field.name in self.middles:
+            first = 3 * list(self.middles).index(field.name)
+            since = (rays.time - self.middles[field.name])[:, None, None]
+            found[:, :, first : first + 3] = by.attitude * since
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Courses:
+    """Slow courses of x and y along the time of each line of each field, metres in the image: cosines of up to four
+    half periods, the constant apart.
+
+    waves: (field, line) -> (begin, duration, number of the first term, how many of each of x and y).
+    """
+
+    waves: Mapping[tuple[str, str], tuple[float, float, int, int]]
+
+    @classmethod
+    def of(cls, fields: Sequence[calibration_parameters.CalibrationField]) -> Courses:
+        """Courses of all lines with times and enough points."""
+        found: dict[tuple[str, str], tuple[float, float, int, int]] = {}
+        first = 0
+        for one in fields:
+            for line, rays in one.rays.items():
+                if rays.time is None or not rays.point.size or not np.ptp(rays.time):
+                    continue
+                count = min(_WAVES, len(rays.point) // _POINTS_PER_WAVE)
+                if count:
+                    found[one.name, line] = (float(rays.time.min()), float(np.ptp(rays.time)), first, count)
+                    first += 2 * count
+        return cls(found)
+
+    @property
+    def size(self) -> int:
+        """Number of terms."""
+        return sum(2 * count for *_, count in self.waves.values())
+
+    def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
+        """(n, 2, size) derivatives of the misclosures.
+
+        Args:
+            field: the pass.
+            line: of the camera.
+            rays: n image points of it.
+            by: derivatives of their misclosures.
+        """
+        found = np.zeros((len(rays.point), 2, self.size))
+        if (field.name, line) in self.waves and rays.time is not None:
+            begin, span, first, count = self.waves[field.name, line]
+            wave = np.cos(np.pi * np.arange(1, count + 1) * (rays.time[:, None] - begin) / span)
+            found[:, 0, first : first + count] = wave
+            found[:, 1, first + count : first + 2 * count] = wave
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """A step of x and of y within a line, metres: all image points beyond a place of the line are displaced.
+
+    places: (line, y of the place in metres).
+    """
+
+    places: tuple[tuple[str, float], ...]
+
+    @property
+    def size(self) -> int:
+        """Number of terms."""
+        return 2 * len(self.places)
+
+    def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
+        """(n, 2, size) derivatives of the misclosures: an image point displaced by 1 m has one that is 1 m larger.
+
+        Args:
+            field: the pass.
+            line: of the camera.
+            rays: n image points of it.
+            by: derivatives of their misclosures.
+        """
+        found = np.zeros((len(rays.point), 2, self.size))
+        for k, (name, place) in enumerate(self.places):
+            if name == line:
+                beyond = rays.image[:, 1] > place
+                found[beyond, 0, 2 * k] = found[beyond, 1, 2 * k + 1] = -1.0
+        return found
+
+
+HiddenTerms = Rates | Courses | Steps
+
+
+@dataclass(frozen=True, eq=False)
+class Unseen:
+    """What the residuals say of terms that are left out.
+
+    Attributes:
+        terms: which, G of them.
+        score: (G,) gradient. cofactor: (G, G) its covariance, S.
+        moved: (P, G) by how much the estimates are wrong for a term of one unit.
+    """
+
+    terms: HiddenTerms
+    score: Array
+    cofactor: Array
+    moved: Array
+
+    @classmethod
+    def of(cls, terms: HiddenTerms, wide: Equations, covariance: Array) -> Unseen:
+        """Read equations that contain the terms, at a solution.
+
+        Args:
+            terms: G of them.
+            wide: equations of P unknowns and the G terms, which are zero.
+            covariance: of the P unknowns, (P, P), SI.
+        """
+        count = len(covariance)
+        moved = covariance @ wide.reduced[:count, count:]
+        cofactor = wide.reduced[count:, count:] - wide.reduced[count:, :count] @ moved
+        return cls(terms, wide.right[count:], 0.5 * (cofactor + cofactor.T), moved)
+
+    @property
+    def estimate(self) -> Array:
+        """(G,) all terms together; a term that nothing tells is zero."""
+        return np.asarray(-self._inverse @ self.score)
+
+    @property
+    def sigma(self) -> Array:
+        """(G,) of `estimate`; infinite where nothing tells a term."""
+        spread = np.diag(self._inverse)
+        return np.sqrt(np.where(np.diag(self.cofactor) > _RANK * self._largest, spread, np.inf))
+
+    @property
+    def sigma_alone(self) -> Array:
+        """(G,) of each term where there is no other."""
+        own = np.diag(self.cofactor)
+        seen = own > _RANK * self._largest
+        return np.asarray(np.where(seen, 1.0 / np.sqrt(np.where(seen, own, 1.0)), np.inf))
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Number of combinations of the terms that the residuals can show."""
+        return int(np.linalg.matrix_rank(self._unit, tol=1e-6, hermitian=True)) if len(self.score) else 0
+
+    @property
+    def chi_square(self) -> float:
+        """Chi-square of all terms together."""
+        return float(self.score @ self._inverse @ self.score) if len(self.score) else 0.0
+
+    @property
+    def p_value(self) -> float:
+        """Chance of such a chi-square where none of these terms is there; 1 where residuals show none."""
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
+
+    @property
+    def _largest(self) -> float:
+        return float(np.diag(self.cofactor).max(initial=0.0))
+
+    @property
+    def _size(self) -> Array:
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.cofactor), 1e-300)))
+
+    @property
+    def _unit(self) -> Array:
+        return np.asarray(self.cofactor / self._size / self._size[:, None])
+
+    @property
+    def _inverse(self) -> Array:
+        inner = np.linalg.pinv(self._unit, rcond=1e-6, hermitian=True)
+        return np.asarray(inner / self._size / self._size[:, None])
+
 
 FARTHEST = 2e3
 """Metres on the ground. No launch, no datum moves half of the points farther: an arc minute is 150 m, a second of a
@@ -53,11 +252,11 @@ _EXPECTED = 20.0
 """Sigmas of the start values; points that are farther off than these say are not what was photographed."""
 
 
-class FarPointsError(CalibrationError):
+class FarPointsError(calibration_parameters.CalibrationError):
     """Points lie kilometres from where their image points look, or contradict each other beyond repair."""
 
 
-class NoiseError(CalibrationError):
+class NoiseError(calibration_parameters.CalibrationError):
     """A single image point is as uncertain as what is to be found. largest: the source that is most of it, "image",
     "attitude", "slow attitude", "station" or "control".
     """
@@ -67,7 +266,11 @@ class NoiseError(CalibrationError):
         self.largest = largest
 
 
-def single_ray(fields: Sequence[CalibrationField], cameras: Mapping[str, LineModel], noise: Noise) -> dict[str, float]:
+def single_ray(
+    fields: Sequence[calibration_parameters.CalibrationField],
+    cameras: Mapping[str, LineModel],
+    noise: calibration_parameters.Noise,
+) -> dict[str, float]:
     """Source -> standard deviation of one image point in x or y, metres, median of all: each source of noise alone.
 
     Args:
@@ -93,7 +296,9 @@ def single_ray(fields: Sequence[CalibrationField], cameras: Mapping[str, LineMod
 
 
 def check_places(
-    fields: Sequence[CalibrationField], cameras: Mapping[str, LineModel], start: Mapping[str, float] | None = None
+    fields: Sequence[calibration_parameters.CalibrationField],
+    cameras: Mapping[str, LineModel],
+    start: Mapping[str, float] | None = None,
 ) -> None:
     """Do control points lie where their image points look, by the start values?
 
@@ -160,9 +365,9 @@ class Adjustment:
     names: tuple[str, ...]
     values: Array
     covariance: Array
-    gauge: null_space.Gauge
-    open: tuple[null_space.Combination, ...]
-    weak: tuple[null_space.Combination, ...]
+    gauge: calibration_parameters.Gauge
+    open: tuple[calibration_parameters.Combination, ...]
+    weak: tuple[calibration_parameters.Combination, ...]
     from_start: Array
     follow: Array
     cameras: Mapping[str, LineModel]
@@ -175,7 +380,7 @@ class Adjustment:
     factors: Mapping[str, float]
     redundancy: Mapping[str, float]
     iterations: int
-    fields: Sequence[CalibrationField] = field(repr=False)
+    fields: Sequence[calibration_parameters.CalibrationField] = field(repr=False)
     unseen: Callable[[HiddenTerms], Unseen] = field(repr=False)
 
     @property
@@ -200,7 +405,7 @@ class Adjustment:
         """
         given = np.zeros(len(self.gauge.held))
         for name, sigma in start.items():
-            given[index(self.gauge.held, name)] = sigma
+            given[calibration_parameters.index(self.gauge.held, name)] = sigma
         hidden = np.sum((self.follow * given) ** 2, axis=1)
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance) + hidden).tolist(), strict=True))
 
@@ -214,11 +419,11 @@ class Adjustment:
     @property
     def p_value(self) -> float:
         """Chance of such a chi-square or a larger one, if the sigmas are right and no robust weights are on."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     def value(self, name: str) -> float:
         """One unknown. Raises CalibrationError when there is none of that name."""
-        return float(self.values[index(self.names, name)])
+        return float(self.values[calibration_parameters.index(self.names, name)])
 
     def bias(self, field: str) -> Array:
         """(3,) roll, pitch, yaw of a field, radians."""
@@ -240,15 +445,15 @@ _HUBER_ROUNDS = 6
 
 
 def adjust(
-    fields: Sequence[CalibrationField],
+    fields: Sequence[calibration_parameters.CalibrationField],
     cameras: Mapping[str, LineModel],
-    noise: Noise,
+    noise: calibration_parameters.Noise,
     *,
-    unknowns: Unknowns | None = None,
+    unknowns: calibration_parameters.Unknowns | None = None,
     start: Mapping[str, float] | None = None,
-    priors: Sequence[Prior] = (),
-    gauge: null_space.Gauge | None = None,
-    robust: Robust | None = None,
+    priors: Sequence[calibration_parameters.Prior] = (),
+    gauge: calibration_parameters.Gauge | None = None,
+    robust: reweighting.Robust | None = None,
     variance_components: bool | Collection[str] = False,
     iterations: int = 20,
 ) -> Adjustment:
@@ -279,9 +484,11 @@ def adjust(
     """
     noise.check()
     if robust not in (None, "huber", "igg"):
-        raise CalibrationError(f"calibration: robust must be huber or igg, found {robust!r}")
-    parameters = Parameters.of(fields, cameras, unknowns or Unknowns(), start)
-    gauge = gauge or null_space.Gauge()
+        raise calibration_parameters.CalibrationError(f"calibration: robust must be huber or igg, found {robust!r}")
+    parameters = calibration_parameters.Parameters.of(
+        fields, cameras, unknowns or calibration_parameters.Unknowns(), start
+    )
+    gauge = gauge or calibration_parameters.Gauge()
     shared = SharedNoise.of(fields, noise)
     none = np.zeros(sum(len(f.ground) for f in fields), bool)
     estimated = None if isinstance(variance_components, bool) else frozenset(variance_components)
@@ -289,7 +496,7 @@ def adjust(
     groups = ("image", "control", *shared.groups, *dict.fromkeys(p.group for p in priors))
     count = sum(len(r.point) for f in fields for r in f.rays.values())
     if 2 * count < len(parameters.names) - len(gauge.held) - len(priors):
-        raise CalibrationError(
+        raise calibration_parameters.CalibrationError(
             f"calibration: {count} image points are too few for {len(parameters.names) - len(gauge.held)} unknowns"
         )
     check_places(fields, cameras, gauge.start if isinstance(gauge.start, Mapping) else None)
@@ -297,24 +504,28 @@ def adjust(
     state = _Iteration(start_state, Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0, none)
     try:
         return _adjusted(problem, state, robust, bool(variance_components))
-    except null_space.RankError as error:
+    except calibration_parameters.RankError as error:
         raise problem.cause(error) from error
-    except UnsettledError as error:
-        raise CalibrationError(f"calibration: {error}") from error
+    except reweighting.UnsettledError as error:
+        raise calibration_parameters.CalibrationError(f"calibration: {error}") from error
 
 
-def _adjusted(problem: _Problem, at: _Iteration, robust: Robust | None, variance_components: bool) -> Adjustment:
+def _adjusted(
+    problem: _Problem, at: _Iteration, robust: reweighting.Robust | None, variance_components: bool
+) -> Adjustment:
     """Solve with weights and factors that have come to rest."""
     if robust and variance_components:
         # Gross errors are found against the scatter of the others first. Variance components then need good points of
         # full weight: weights that fall with the residual would pass for smaller noise.
-        found, _ = settled(problem, at, Rule("huber", "median", tolerance=0.05))
-        found, _ = settled(problem, found, Rule("accept", "components", problem.estimated))
+        found, _ = reweighting.settled(problem, at, reweighting.Rule("huber", "median", tolerance=0.05))
+        found, _ = reweighting.settled(problem, found, reweighting.Rule("accept", "components", problem.estimated))
         at = replace(at, weights=replace(at.weights, factor=found.factor), steps=found.steps)
     elif variance_components:
-        return problem.result(*settled(problem, at, Rule(None, "components", problem.estimated)), None)
+        return problem.result(
+            *reweighting.settled(problem, at, reweighting.Rule(None, "components", problem.estimated)), None
+        )
     screening = _HUBER_ROUNDS if robust == "igg" else 0
-    return problem.result(*settled(problem, at, Rule(robust, screening=screening)), robust)
+    return problem.result(*reweighting.settled(problem, at, reweighting.Rule(robust, screening=screening)), robust)
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,13 +563,13 @@ class _Solved:
 class _Problem:
     """What does not change while the iteration goes on."""
 
-    fields: Sequence[CalibrationField]
+    fields: Sequence[calibration_parameters.CalibrationField]
     cameras: Mapping[str, LineModel]
-    parameters: Parameters
-    noise: Noise
+    parameters: calibration_parameters.Parameters
+    noise: calibration_parameters.Noise
     shared: SharedNoise
-    priors: tuple[Prior, ...]
-    gauge: null_space.Gauge
+    priors: tuple[calibration_parameters.Prior, ...]
+    gauge: calibration_parameters.Gauge
     iterations: int
     estimated: frozenset[str] | None = None
 
@@ -371,16 +582,16 @@ class _Problem:
     def judged(self, at: _Iteration, found: _Solved) -> tuple[Array, ...]:
         """(M, 2) standardised residuals of the image points."""
         image = found.equations.residuals.image
-        return (standardised_packets(image, found.cofactors, at.weights.image, at.factor["image"]),)
+        return (reweighting.standardised_packets(image, found.cofactors, at.weights.image, at.factor["image"]),)
 
-    def tests(self, at: _Iteration, found: _Solved) -> dict[str, GroupTest]:
+    def tests(self, at: _Iteration, found: _Solved) -> dict[str, reweighting.GroupTest]:
         """Variance groups."""
         return found.equations.tests(found.covariance, found.cofactors, at.weights, self.priors)
 
     def weighed(self, at: _Iteration, weight: tuple[Array, ...], factor: Mapping[str, float]) -> _Iteration:
         """Points without coordinates and with fewer than two rays of any weight are given up, for good."""
         control = np.concatenate([f.control for f in self.fields])
-        rays = np.bincount(self.place[weight[0] > SETTLED], minlength=len(control))
+        rays = np.bincount(self.place[weight[0] > reweighting.SETTLED], minlength=len(control))
         lost = at.lost | (~control & (rays < 2))
         return replace(at, weights=Weights(np.where(lost[self.place], 0.0, weight[0]), factor), lost=lost)
 
@@ -407,8 +618,8 @@ class _Problem:
         equations = self.equations(state)
         try:
             freedom = self.freedom(state, equations)
-        except null_space.RankError as error:
-            lost = int(np.sum(state.weights.image <= SETTLED))
+        except calibration_parameters.RankError as error:
+            lost = int(np.sum(state.weights.image <= reweighting.SETTLED))
             if not lost:
                 raise
             raise FarPointsError(
@@ -422,7 +633,7 @@ class _Problem:
             total = equations.reduced + pull
             right = equations.right + pull @ (state.state.values - self.parameters.start)
             step = np.zeros(len(right))
-            step[kept] = null_space.solved(total[np.ix_(kept, kept)], -right[kept])
+            step[kept] = calibration_parameters.solved(total[np.ix_(kept, kept)], -right[kept])
             size = float(np.sqrt(max(float(step @ total @ step), 0.0)))
             state = replace(state, state=state.state.moved(equations, step), steps=state.steps + 1)
             equations = self.equations(state)
@@ -430,15 +641,15 @@ class _Problem:
                 break
             last = size
         else:
-            raise CalibrationError(
+            raise calibration_parameters.CalibrationError(
                 f"calibration: no convergence in {self.iterations} steps, the last of {size:.3g} sigmas"
             )
         total = (equations.reduced + pull)[np.ix_(kept, kept)]
         spread = np.zeros(pull.shape)
-        spread[np.ix_(kept, kept)] = null_space.solved(total, np.eye(len(kept)))
+        spread[np.ix_(kept, kept)] = calibration_parameters.solved(total, np.eye(len(kept)))
         return state, _Solved(equations, 0.5 * (spread + spread.T))
 
-    def freedom(self, state: _Iteration, equations: Equations) -> null_space.Freedom:
+    def freedom(self, state: _Iteration, equations: Equations) -> calibration_parameters.Freedom:
         """What may be solved for: by the robust weights, but the sigmas as they were given.
 
         Misfit of the measurements would else open what they determine, and then cannot shrink any more.
@@ -451,18 +662,20 @@ class _Problem:
         stated = isinstance(self.gauge.start, Mapping)
         ray = float(np.linalg.norm(list(self.ray.values()))) if stated else np.inf
         told = {next(iter(p.weights)): p.sigma for p in self.priors if len(p.weights) == 1}
-        return null_space.free_basis(equations.reduced, equations.length, scale, names, self.gauge, ray, told)
+        return calibration_parameters.free_basis(
+            equations.reduced, equations.length, scale, names, self.gauge, ray, told
+        )
 
-    def cause(self, error: null_space.RankError) -> CalibrationError:
+    def cause(self, error: calibration_parameters.RankError) -> calibration_parameters.CalibrationError:
         """The error of open combinations, or that of the noise where this leaves them open."""
         ray = float(np.linalg.norm(list(self.ray.values())))
-        if ray < null_space.WORST:
+        if ray < calibration_parameters.WORST:
             return error
         largest = max(self.ray, key=lambda group: self.ray[group])
         parts = ", ".join(f"{group} {1e6 * v:.3g}" for group, v in self.ray.items() if v)
         return NoiseError(
             f"calibration: noise too large: a single image point is uncertain by {1e6 * ray:.3g} um in the image"
-            f" (one sigma; {parts}), more than what is to be found, {1e6 * null_space.WORST:g} um",
+            f" (one sigma; {parts}), more than what is to be found, {1e6 * calibration_parameters.WORST:g} um",
             largest,
         )
 
@@ -470,17 +683,17 @@ class _Problem:
         """(P, k) change of the values with start values of held unknowns, `held` (P, k) columns of ones."""
         return np.asarray(held - covariance @ (equations.reduced @ held))
 
-    def result(self, state: _Iteration, found: _Solved, robust: Robust | None) -> Adjustment:
+    def result(self, state: _Iteration, found: _Solved, robust: reweighting.Robust | None) -> Adjustment:
         equations, covariance = found.equations, found.covariance
         names, scale = self.parameters.names, self.parameters.scale
         freedom = self.freedom(state, equations)
         rows = freedom.rows
-        vectors = null_space.weak_vectors(
+        vectors = calibration_parameters.weak_vectors(
             equations.reduced + rows.T @ rows, equations.length, scale, np.eye(len(names))[:, freedom.kept]
         )
         (standard,) = self.judged(state, found)
         tests = self.tests(state, found)
-        held = np.eye(len(names))[:, [index(names, n) for n in self.gauge.held]]
+        held = np.eye(len(names))[:, [calibration_parameters.index(names, n) for n in self.gauge.held]]
         follow = self.followed(equations, covariance, held)
         pulled = rows @ covariance
         spread_all = np.diag(covariance).copy()
@@ -507,7 +720,7 @@ class _Problem:
             covariance=covariance,
             gauge=self.gauge,
             open=freedom.opened,
-            weak=null_space.combinations(names, scale, vectors, equations.reduced, equations.length),
+            weak=calibration_parameters.combinations(names, scale, vectors, equations.reduced, equations.length),
             from_start=from_start,
             follow=follow,
             cameras={
@@ -545,6 +758,6 @@ def _scores(equations: Equations, standard: Array, weights: Weights) -> Array:
     a gross error really does is the square of the limit, whatever its size (Huber 1981, asymptotic covariance).
     """
     size = np.linalg.norm(standard, axis=1)
-    pull = 0.5 * np.minimum(size, HUBER) ** 2 - weights.image
+    pull = 0.5 * np.minimum(size, reweighting.HUBER) ** 2 - weights.image
     rows = equations.through_points()
     return np.asarray(rows.T @ (np.repeat(pull / weights.factor["image"], 2)[:, None] * rows))

@@ -27,8 +27,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array
-from analysis.block.corrections import Corrections, Part
-from analysis.block.processes import Law, Support
+from analysis.block.processes import Corrections, Law, Part, Support
 from analysis.block.reweighting import GroupTest
 from analysis.orbit.calibration_parameters import (
     CalibrationError,

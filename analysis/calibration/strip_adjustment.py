@@ -34,14 +34,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import splu
-from scipy.stats import chi2
 
+from analysis import statistics
 from analysis.arrays import Array
-from analysis.block.corrections import Corrections
+from analysis.block.processes import Corrections
 from analysis.calibration.normal_equations import Equations, SharedNoise, State, Weights, assemble
-from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, Unknowns
+from analysis.orbit.calibration_parameters import (
+    CalibrationError,
+    CalibrationField,
+    Noise,
+    Parameters,
+    Prior,
+    Unknowns,
+    free_basis,
+    solved,
+)
 from analysis.orbit.forward_intersection import intersect
-from analysis.orbit.null_space import free_basis, solved
 from analysis.orbit.three_line_model import BIAS, LineModel, Rays, bias_rotation
 
 _NAME = "strip"
@@ -84,7 +92,7 @@ class StripAdjustment:
     @property
     def p_value(self) -> float:
         """Chance of such a chi-square or a larger one, if the sigmas are right."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     def corrected(self, rays: Rays) -> Rays:
         """Any rays of the pass, with times, with corrected attitude and station.

@@ -31,8 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.arrays import Array
-from analysis.measurement_error import MeasurementError
+from analysis.arrays import Array, MeasurementError
 from analysis.statistics import chance_beyond
 
 QUARTIC = 0.3

@@ -3,28 +3,449 @@ frames as they are in the file.
 
 The header is read first, so that what would not fit into memory is refused before it is decoded. Of an uncompressed
 TIFF and of a FITS file nothing but what is asked for is read.
+
+What the header of an image file says before anything is decoded: its size, its numbers and its tone curve.
+
+FITS: header and planes of the images in it, primary or extension, cubes, scaled and compressed ones.
+
+A plane's first row is the one stored first (NAXIS2 = 1), wherever a viewer draws it. Values are the physical ones,
+BZERO + BSCALE times stored; 16-bit integers with BZERO 32768 stay integers. Undefined pixels (BLANK) are NaN.
+
+TIFF and BigTIFF of either byte order: header and pages, uncompressed, LZW, deflate and what imagecodecs knows.
 """
 
 from __future__ import annotations
 
+import json
+import logging
 import math
 import os
 import re
 import struct
 import tempfile
-from collections.abc import Callable, Iterator
+import warnings
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 
 from analysis.arrays import Array
-from analysis.images import fits_image, tiff_image
-from analysis.images.image_header import JPEG_MAGIC, PNG_MAGIC, ImageError, ImageHeader, jpeg_header, png_header
+
+
+class ImageError(Exception):
+    """A file, page or region that cannot be read; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """Header of the pages that belong together.
+
+    Attributes:
+        kind: TIFF, FITS, PNG or JPEG.
+        pages: their numbers in the file, the first is 0.
+        rows, columns: of every page.
+        channels: 1 of grey, 2 with alpha, 3 and more of colour.
+        page_bytes: of a decoded page.
+        full_scale: largest grey value that the file's type holds, infinity for signed and real numbers.
+        coded: why grey values probably follow a tone curve and not the light; empty if nothing says so.
+        inverted: the largest value is black.
+        turned: how the file says that rows and columns are to be drawn, where it is not the order in which they are
+            stored; empty if it is.
+    """
+
+    kind: str
+    pages: tuple[int, ...]
+    rows: int
+    columns: int
+    channels: int
+    page_bytes: int
+    full_scale: float
+    coded: str = ""
+    inverted: bool = False
+    turned: str = ""
+
+
+def full_scale(dtype: np.dtype[Any], bits: int | None = None) -> float:
+    """Largest value of a type, of which perhaps not all bits are used; infinity for signed and real numbers.
+
+    Args:
+        dtype: of the decoded pages.
+        bits: of a sample in the file.
+    """
+    if dtype.kind != "u":
+        return math.inf
+    return float(2 ** min(8 * dtype.itemsize, bits or 64) - 1)
+
+
+def different_pages(path: Path, kinds: dict[str, list[int]], choose: str) -> ImageError:
+    """The error for pages that do not belong together.
+
+    Args:
+        path: of the file.
+        kinds: what they are -> their numbers.
+        choose: by which option the user can name one, empty for none.
+    """
+    listed = ", ".join(f"{kind} (first: {numbers[0]})" for kind, numbers in list(kinds.items())[:4])
+    remedy = f"say which with {choose} NUMBER" if choose else "save those that belong together as a file of their own"
+    return ImageError(f"{path} has pages of different sizes or types, {listed}: {remedy}")
+
+
+def no_such_page(path: Path, page: int, count: int, choose: str) -> ImageError:
+    """The error for a page that is not there.
+
+    Args:
+        path: of the file.
+        page: its number.
+        count: of pages.
+        choose: by which option it was named.
+    """
+    return ImageError(f"{choose or 'page'} {page} does not exist: {path} has {count} pages, the first is 0")
+
+
+PNG_MAGIC, JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
+"""Colour type of a PNG -> channels that it is decoded to."""
+
+
+def png_header(path: Path) -> ImageHeader:
+    """Size, type and named tone curve of a PNG.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        ImageError: it is cut off or damaged.
+    """
+    rows = columns = depth = colour = 0
+    coded, name, damaged = "", b"", f"{path} cannot be read as an image: it is cut off or damaged"
+    with path.open("rb") as file:
+        file.seek(8)
+        while name != b"IEND" and len(head := file.read(8)) == 8:
+            length, name = struct.unpack(">I4s", head)
+            data, check = file.read(length), file.read(4)
+            # libpng would tell the terminal of it
+            if len(check) < 4 or struct.unpack(">I", check)[0] != zlib.crc32(data, zlib.crc32(name)):
+                raise ImageError(damaged)
+            if name == b"IHDR" and length == 13:
+                columns, rows, depth, colour = struct.unpack(">IIBB", data[:10])
+            elif not rows:  # something stands before it
+                raise ImageError(damaged)
+            elif name == b"gAMA" and length == 4:
+                gamma = struct.unpack(">I", data)[0] * 1e-5
+                if not coded and abs(gamma - 1.0) > 0.01:
+                    coded = f"it says gamma {gamma:.4g}"
+            elif name in (b"sRGB", b"iCCP"):
+                coded = "it has a colour profile" if name == b"iCCP" else "it says sRGB"
+    if not (rows and columns and name == b"IEND"):
+        raise ImageError(damaged)
+    if colour not in _PNG_CHANNELS:
+        raise ImageError(f"{path} cannot be read as an image: PNG has no colour type {colour}")
+    channels = _PNG_CHANNELS[colour]
+    dtype = np.dtype(np.uint16 if depth == 16 else np.uint8)
+    size = rows * columns * channels * dtype.itemsize
+    return ImageHeader("PNG", (0,), rows, columns, channels, size, full_scale(dtype), coded)
+
+
+def jpeg_header(path: Path) -> ImageHeader:
+    """Size of a JPEG; wherever its tables stand.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        ImageError: it is cut off, damaged, or not of 8 bits.
+    """
+    data = path.read_bytes()
+    place = 2
+    while place + 9 < len(data):
+        if data[place] != 0xFF:
+            break
+        marker = data[place + 1]
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:
+            place += 1 if marker == 0xFF else 2
+            continue
+        # start of frame, but not the tables of Huffman and arithmetic coding
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            depth, rows, columns, channels = struct.unpack(">BHHB", data[place + 4 : place + 10])
+            if not (rows and columns and depth == 8) or data.rfind(b"\xff\xd9") < place:
+                break
+            # three channels, also of four
+            size = rows * columns * min(channels, 3)
+            return ImageHeader("JPEG", (0,), rows, columns, min(channels, 3), size, 255.0, "it is a JPEG of 8 bits")
+        place += 2 + struct.unpack(">H", data[place + 2 : place + 4])[0]
+    raise ImageError(f"{path} cannot be read as an image: it is cut off or damaged, or not a JPEG of 8 bits")
+
+
+FITS_MAGIC = b"SIMPLE  ="
+_SCIENCE = "SCI"
+_MJD_ZERO = datetime(1858, 11, 17, tzinfo=UTC)
+_NOT_IMAGES = {"ERR", "DQ", "VAR", "MASK", "WHT", "UNCERT", "BPM", "QUALITY"}
+"""Names of extensions that go with an image."""
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The file's list of units; what it only grumbles about is no error, but a cut-off file is."""
+    # takes longer to import than most images to be read
+    from astropy.io import fits
+
+    # without a memory map: astropy maps no scaled integers, and sections read what they need anyway
+    # opened here, since astropy leaves a file open that it cannot read
+    with path.open("rb") as file, warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        with fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False) as units:
+            cut = next((str(w.message) for w in told if "truncated" in str(w.message)), "")
+            if cut:
+                raise ImageError(f"{path} cannot be read as an image: it is cut off ({cut})")
+            yield units
+
+
+def _images(units: Any) -> list[Any]:
+    """The units that are images, of those with names the ones that are the measurement."""
+    from astropy.io import fits
+
+    kinds = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
+    found = [unit for unit in units if isinstance(unit, kinds) and len(unit.shape) >= 2 and 0 not in unit.shape]
+    science = [unit for unit in found if str(unit.name).upper() == _SCIENCE]
+    return science or [unit for unit in found if str(unit.name).upper() not in _NOT_IMAGES]
+
+
+def _physical(unit: Any) -> np.dtype[Any]:
+    """Type of a unit's values once they are scaled."""
+    header = unit.header
+    bits, zero, scale = int(header["BITPIX"]), float(header.get("BZERO", 0)), float(header.get("BSCALE", 1))
+    if bits < 0:
+        return np.dtype(f"f{-bits // 8}")
+    if "BLANK" in header:
+        return np.dtype("f8")
+    if bits == 8 and (zero, scale) == (0.0, 1.0):
+        return np.dtype("u1")
+    if bits > 8 and (zero, scale) == (2.0 ** (bits - 1), 1.0):
+        return np.dtype(f"u{bits // 8}")
+    return np.dtype(f"i{bits // 8}") if (zero, scale) == (0.0, 1.0) else np.dtype("f8")
+
+
+def _planes(units: Any) -> list[tuple[Any, tuple[int, ...]]]:
+    """(unit, index of the plane in its cube) in the order of the file."""
+    return [(unit, index) for unit in _images(units) for index in np.ndindex(*unit.shape[:-2])]
+
+
+def fits_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
+    """What the header says of all planes, or of one.
+
+    Args:
+        path: of the file.
+        wanted: number of the one plane, None for all.
+        choose: option that names a plane, for messages.
+
+    Raises:
+        ImageError: no image in it, or planes of several kinds.
+    """
+    with _opened(path) as units:
+        planes = _planes(units)
+        if not planes:
+            raise ImageError(f"{path} holds no image: none of its {len(units)} units has rows and columns")
+        if wanted is not None and not 0 <= wanted < len(planes):
+            raise no_such_page(path, wanted, len(planes), choose)
+        kinds: dict[str, list[int]] = {}
+        for number, (unit, _) in enumerate(planes):
+            if wanted in (None, number):
+                kinds.setdefault(f"{unit.shape[-2]} x {unit.shape[-1]} {_physical(unit)}", []).append(number)
+        if len(kinds) > 1:
+            raise different_pages(path, kinds, choose)
+        (numbers,) = kinds.values()
+        unit = planes[numbers[0]][0]
+        rows, columns = unit.shape[-2:]
+        dtype = _physical(unit)
+        size = math.prod((rows, columns)) * max(dtype.itemsize, 2)
+        return ImageHeader("FITS", tuple(numbers), rows, columns, 1, size, full_scale(dtype))
+
+
+def fits_time(path: Path) -> datetime | None:
+    """When the first image was recorded, by DATE-BEG, DATE-OBS (with TIME-OBS) or MJD-OBS; None where it does not say.
+
+    Args:
+        path: of the file.
+    """
+    with _opened(path) as units:
+        for unit in units:
+            header = unit.header
+            for key in ("DATE-BEG", "DATE-OBS"):
+                text = str(header.get(key, "")).strip()
+                if text and "T" not in text and "TIME-OBS" in header:
+                    text = f"{text}T{str(header['TIME-OBS']).strip()}"
+                if "T" in text:
+                    time = datetime.fromisoformat(text)
+                    return time if time.tzinfo else time.replace(tzinfo=UTC)
+            if "MJD-OBS" in header:
+                return _MJD_ZERO + timedelta(days=float(header["MJD-OBS"]))
+    return None
+
+
+def fits_cards(path: Path, number: int) -> dict[str, Any]:
+    """Keys and values of the header of the unit that holds a plane.
+
+    Args:
+        path: of the file.
+        number: of the plane.
+
+    Raises:
+        ImageError: a header that cannot be read.
+    """
+    try:
+        with _opened(path) as units:
+            header = _planes(units)[number][0].header
+            return {str(key): header[key] for key in header if key}
+    except ImageError:
+        raise
+    # what astropy finds wrong with a spoilt card cannot be foreseen
+    except Exception as error:
+        raise ImageError(f"{path} cannot be read as an image: its header is damaged") from error
+
+
+def fits_planes(path: Path, pages: Iterable[int]) -> Iterator[NDArray[Any]]:
+    """Planes (rows, columns) of physical values.
+
+    Args:
+        path: of the file.
+        pages: their numbers.
+    """
+    with _opened(path) as units:
+        planes = _planes(units)
+        for number in pages:
+            unit, index = planes[number]
+            yield np.asarray(unit.section[(*index, slice(None), slice(None))])
+
+
+# what it logs of a spoilt file would stand beside the sentence in which the file is refused
+tifffile.logger().addHandler(logging.NullHandler())
+
+TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+"""First four bytes."""
+_ICC_PROFILE, _ORIENTATION, _EXIF = 34675, 274, 34665
+_AXES = {"YX": (0, 1, None), "YXS": (0, 1, 2), "SYX": (1, 2, 0)}
+"""Where rows, columns and channels stand in a page."""
+_GREY = {"MINISWHITE", "MINISBLACK", "RGB"}
+_OTHERS = {
+    "PALETTE": "numbers of a palette's colours",
+    "MASK": "a mask",
+    "SEPARATED": "inks (CMYK)",
+    "YCBCR": "YCbCr colours",
+    "CIELAB": "Lab colours",
+}
+
+
+def _page(file: tifffile.TiffFile, number: int) -> tifffile.TiffPage:
+    page = file.pages[number]
+    assert isinstance(page, tifffile.TiffPage)
+    return page
+
+
+def tiff_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
+    """What the header says of all full pages, or of one.
+
+    Args:
+        path: of the file.
+        wanted: number of the one page, None for all but thumbnails and masks.
+        choose: option that names a page, for messages.
+
+    Raises:
+        ImageError: no pages, pages of several kinds, no grey values or colours linear in light.
+    """
+    with tifffile.TiffFile(path) as file:
+        file.pages.useframes = False
+        count = len(file.pages)
+        sizes: dict[tuple[Any, ...], list[int]] = {}
+        for number in range(count) if wanted is None else [wanted] if 0 <= wanted < count else []:
+            page = _page(file, number)
+            # thumbnails and masks say that they are
+            if wanted is not None or not (page.is_reduced or page.is_mask):
+                sizes.setdefault((page.shape, page.dtype, page.axes), []).append(number)
+        if not sizes:
+            raise ImageError(f"{path} has no pages") if wanted is None else no_such_page(path, wanted, count, choose)
+        if len(sizes) > 1:
+            kinds = {f"{' x '.join(map(str, s))} {d}": numbers for (s, d, _), numbers in sizes.items()}
+            raise different_pages(path, kinds, choose)
+        ((shape, dtype, axes), numbers) = next(iter(sizes.items()))
+        page = _page(file, numbers[0])
+        if dtype is None or dtype.kind not in "uif":
+            raise ImageError(f"{path} holds {dtype} values; grey values must be integers or real numbers")
+        if axes not in _AXES:
+            raise ImageError(f"{path} has axes {axes}; pages of rows and columns are needed")
+        compressed = str(page.compression.name)
+        photometric = str(getattr(page.photometric, "name", page.photometric))
+        # the decoder of JPEG turns YCbCr into RGB
+        if photometric not in _GREY and not (photometric == "YCBCR" and "JPEG" in compressed):
+            what = _OTHERS.get(photometric, f"colours of the kind {photometric}")
+            raise ImageError(f"{path} holds {what}; save it as grey values, or as RGB linear in light")
+        bits, coded = 8 * dtype.itemsize, ""
+        if bits == 8 and "JPEG" in compressed:
+            coded = "its 8-bit pages are compressed as JPEG"
+        elif bits == 8 and _ICC_PROFILE in page.tags:
+            coded = "its 8-bit pages have a colour profile"
+        orientation = page.tags.valueof(_ORIENTATION, 1)
+        rows, columns, channels = (1 if place is None else shape[place] for place in _AXES[axes])
+        used = page.bitspersample if isinstance(page.bitspersample, int) else None
+        return ImageHeader(
+            kind="TIFF",
+            pages=tuple(numbers),
+            rows=rows,
+            columns=columns,
+            channels=channels,
+            page_bytes=math.prod(shape) * dtype.itemsize,
+            full_scale=full_scale(dtype, used),
+            coded=coded,
+            inverted=photometric == "MINISWHITE",
+            turned="" if orientation == 1 else f"orientation {orientation}",
+        )
+
+
+def tiff_origin(path: Path) -> tuple[datetime | None, str]:
+    """When the first page was recorded, by Exif's DateTimeOriginal, None where it does not say; and the ``note`` in a
+    description that is JSON, as this program writes it.
+
+    Args:
+        path: of the file.
+    """
+    with tifffile.TiffFile(path) as file:
+        page = _page(file, 0)
+        exif, told = page.tags.valueof(_EXIF) or {}, str(page.description)
+    note = str(json.loads(told).get("note", "")) if told.startswith("{") else ""
+    found = re.fullmatch(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)\0?", str(exif.get("DateTimeOriginal", "")))
+    if found is None:
+        return None, note
+    fraction = re.sub(r"\D", "", str(exif.get("SubsecTimeOriginal", "")))[:6]
+    text = "{}-{}-{}T{}".format(*found.groups()) + (f".{fraction:0<6}" if fraction else "")
+    return datetime.fromisoformat(text).replace(tzinfo=UTC), note
+
+
+def tiff_pages(path: Path, pages: Iterable[int], check: Callable[[], None]) -> Iterator[NDArray[Any]]:
+    """Every page, (rows, columns) or with channels last; of an uncompressed one only what is looked at is read.
+
+    Args:
+        path: of the file.
+        pages: their numbers.
+        check: called before a page is decoded as a whole.
+    """
+    with tifffile.TiffFile(path) as file:
+        for number in pages:
+            page = _page(file, number)
+            if page.is_contiguous and page.dtype is not None:
+                stored = page.dtype.newbyteorder(file.byteorder)
+                data = file.filehandle.memmap_array(stored, page.shape, page.dataoffsets[0])
+            else:
+                check()
+                data = page.asarray()
+            yield np.moveaxis(data, page.axes.index("S"), -1) if "S" in page.axes else data
+
 
 MOST_BYTES = 1 << 29
 """Largest size of one decoded page, and of the frames of one file together."""
@@ -202,11 +623,11 @@ class ImageFile:
 
     def _stored(self) -> Iterator[NDArray[Any]]:
         if self.header.kind == "TIFF":
-            yield from tiff_image.tiff_pages(self.path, self.header.pages, self._check_memory)
+            yield from tiff_pages(self.path, self.header.pages, self._check_memory)
             return
         self._check_memory()
         if self.header.kind == "FITS":
-            yield from fits_image.fits_planes(self.path, self.header.pages)
+            yield from fits_planes(self.path, self.header.pages)
             return
         data, told = _imread(self.path)
         if data is None or told:
@@ -249,10 +670,10 @@ def _imread(path: Path) -> tuple[NDArray[Any] | None, bool]:
 def _header(path: Path, page: int | None, choose: str) -> ImageHeader:
     with path.open("rb") as file:
         start = file.read(16)
-    if start[:4] in tiff_image.MAGIC:
-        return tiff_image.tiff_header(path, page, choose)
-    if start.startswith(fits_image.MAGIC):
-        return fits_image.fits_header(path, page, choose)
+    if start[:4] in TIFF_MAGIC:
+        return tiff_header(path, page, choose)
+    if start.startswith(FITS_MAGIC):
+        return fits_header(path, page, choose)
     if start.startswith(PNG_MAGIC):
         return png_header(path)
     if start.startswith(JPEG_MAGIC):
@@ -325,10 +746,10 @@ def recorded(path: Path) -> tuple[datetime | None, str]:
     try:
         with path.open("rb") as file:
             magic = file.read(9)
-        if magic.startswith(tiff_image.MAGIC):
-            return tiff_image.tiff_origin(path)
-        if magic == fits_image.MAGIC:
-            return fits_image.fits_time(path), ""
+        if magic.startswith(TIFF_MAGIC):
+            return tiff_origin(path)
+        if magic == FITS_MAGIC:
+            return fits_time(path), ""
     except Exception:
         return None, ""
     return None, ""

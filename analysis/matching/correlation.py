@@ -143,7 +143,6 @@ class MatchOptions:
     """What least squares matching solves for, and what is accepted.
 
     Attributes:
-        affine: solve for an affine change beside the shift.
         sharpness: solve for a difference in sharpness along rows and columns (second derivatives of the template).
             They also fit what the smoothing of a noisy template leaves; without it the place of image against image
             is drawn towards whole pixels.
@@ -165,7 +164,6 @@ class MatchOptions:
         saturation: DN from which a pixel counts as saturated; None: the largest value of an integer type.
     """
 
-    affine: bool = True
     sharpness: bool = True
     margin: int = 3
     iterations: int = 20
@@ -187,7 +185,7 @@ class MatchOptions:
         """
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name not in ("affine", "sharpness", "saturation") and not (value > 0 and math.isfinite(value)):
+            if field.name not in ("sharpness", "saturation") and not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"match options: {field.name} must be positive and finite, found {value}")
         for name in ("least_correlation", "largest_ratio", "largest_risk"):
             if getattr(self, name) > 1.0:
@@ -201,7 +199,7 @@ class MatchOptions:
     @property
     def parameters(self) -> int:
         """Unknowns of a fit: place, affine matrix, offset, gain, sharpness."""
-        return 4 + 4 * self.affine + 2 * self.sharpness
+        return 8 + 2 * self.sharpness
 
 
 _SMOOTHING = 1.0

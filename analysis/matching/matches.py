@@ -1,14 +1,23 @@
-"""Matching of templates in an image: search, least squares, thresholds."""
+"""Matching of templates in an image: search, least squares, thresholds.
+
+Rejection of wrong matches: the way from predicted to found places varies smoothly over an image.
+
+Displacements are a polynomial of row and column, and optionally of height. Random minimal samples give candidates; the
+one with the least median distance of all points starts (least median of squares, Rousseeuw 1984), then the scatter,
+the points within its limit and their weighted fit are repeated until they stand. Right matches are lost at the false
+alarm rate; a wrong one stays if it lies in the limit by chance.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.arrays import Array
+from analysis.arrays import Array, Mask, UndeterminedError
 from analysis.matching.correlation import MatchOptions, Reason, checked_image, checked_places, checked_templates, search
 from analysis.matching.least_squares import least_squares
 from analysis.matching.window_checks import FALSE_ALARM, risk
@@ -147,3 +156,199 @@ def _open(reason: NDArray[np.int8]) -> NDArray[np.bool_]:
 def _worst(covariance: Array) -> Array:
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
+
+
+# Of missing every all-right sample while this share is wrong.
+_MISSED, _WRONG = 1e-6, 0.45
+_MOST_SAMPLES = 8000
+# Values of candidates' distances that are held at once.
+_VALUES = 2_000_000
+# Median of chi-square with two degrees of freedom.
+_MEDIAN = 2.0 * math.log(2.0)
+_ROUNDS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class DisplacementField:
+    """Polynomial displacement.
+
+    Attributes:
+        coefficients: (terms, 2) of rows and columns, px: monomials of the scaled place by rising degree, then height.
+        middle: (2,) place that is 0, px.
+        scale: place difference that is 1, px.
+        degree: of the polynomial of row and column.
+        heights: mean and scale of height, or None without it.
+    """
+
+    coefficients: Array
+    middle: Array
+    scale: float
+    degree: int
+    heights: tuple[float, float] | None
+
+    def __call__(self, place: ArrayLike, height: ArrayLike | None = None) -> Array:
+        """Displacement (n, 2), px, at places (n, 2) and heights (n,).
+
+        Raises:
+            ValueError: heights given or missing against the fit.
+        """
+        at = checked_places(place, None, "displacement field")
+        if (height is None) != (self.heights is None):
+            raise ValueError("displacement field: give heights exactly if the fit had them")
+        return _terms(at, height, self) @ self.coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """Which matches agree.
+
+    Attributes:
+        accepted: (n,) bool; none if there is no consensus.
+        field: the fitted displacement of the accepted, or the best candidate.
+        distance: (n,) residual over its standard deviation; NaN where the match is not finite.
+        scatter: px along each axis, of the field beyond the covariances given; in all without them.
+        limit: of distance.
+        text: the outcome in words.
+    """
+
+    accepted: Mask
+    field: DisplacementField
+    distance: Array
+    scatter: float
+    limit: float
+    text: str
+
+
+def consensus(
+    predicted: ArrayLike,
+    found: ArrayLike,
+    *,
+    covariance: ArrayLike | None = None,
+    height: ArrayLike | None = None,
+    degree: int = 2,
+    false_alarm: float = 1e-3,
+    largest_scatter: float = 2.0,
+) -> Consensus:
+    """Matches that follow one smooth displacement.
+
+    Args:
+        predicted: (n, 2) row and column; and found: (n, 2), NaN rows take no part.
+        found: (n, 2).
+        covariance: (n, 2, 2) px^2 of found; the scatter is then what the field needs beyond them.
+        height: (n,) of points, any unit; adds a term for what parallax an unknown tilt leaves.
+        degree: 0 to 3 of the polynomial in row and column together.
+        false_alarm: share of right matches that may be lost (normal errors).
+        largest_scatter: px; above it there is no consensus: unrelated matches over a search window scatter by a third
+            of its reach.
+
+    Raises:
+        ValueError: shapes, too few points (two a term, five at least), degree or rates out of range.
+    """
+    place = checked_places(predicted, None, "consensus")
+    to = checked_places(found, len(place), "consensus")
+    if not (0 <= degree <= 3 and 0 < false_alarm < 0.5 and largest_scatter > 0):
+        raise ValueError(
+            f"consensus: need a degree of 0 to 3, a false alarm rate below 0.5 and a positive largest scatter; found "
+            f"{degree}, {false_alarm}, {largest_scatter}"
+        )
+    spread = np.zeros((len(place), 2, 2)) if covariance is None else np.asarray(covariance, np.float64)
+    heights = None if height is None else np.asarray(height, np.float64)
+    if spread.shape != (len(place), 2, 2) or (heights is not None and heights.shape != (len(place),)):
+        raise ValueError(
+            f"consensus: {len(place)} points need covariances ({len(place)}, 2, 2) and heights ({len(place)},), found "
+            f"{spread.shape} and {None if heights is None else heights.shape}"
+        )
+    usable = np.isfinite(place).all(axis=1) & np.isfinite(to).all(axis=1) & np.isfinite(spread).all(axis=(1, 2))
+    usable &= True if heights is None else np.isfinite(heights)
+    terms = (degree + 1) * (degree + 2) // 2 + (heights is not None)
+    if usable.sum() < max(2 * terms, 5):
+        raise UndeterminedError(
+            f"consensus: {int(usable.sum())} usable matches do not carry {terms} terms; need {max(2 * terms, 5)}: "
+            "match more points or lower the degree"
+        )
+    given = heights[usable] if heights is not None else None
+    empty = _empty(place[usable], given, degree, terms)
+    design, way, noise = _terms(place[usable], given, empty), (to - place)[usable], spread[usable]
+    limit = math.sqrt(-2.0 * math.log(false_alarm))
+    coefficients = _best_candidate(design, way, np.random.default_rng(0))
+    inside, coefficients, scatter, distance = _settled(design, way, noise, coefficients, limit)
+    accepted, apart = np.zeros(len(place), bool), np.full(len(place), np.nan)
+    accepted[usable], apart[usable] = inside, distance
+    share = f"{int(inside.sum())} of {int(usable.sum())} matches agree within {limit:.1f} sigma of {scatter:.3g} px"
+    if scatter > largest_scatter or inside.sum() < max(2 * terms, 5):
+        accepted[:] = False
+        share = f"no consensus: {share}, at most {largest_scatter:g} px allowed; improve prediction or matches"
+    field = DisplacementField(coefficients, empty.middle, empty.scale, degree, empty.heights)
+    return Consensus(accepted, field, apart, scatter, limit, share)
+
+
+def _empty(place: Array, height: Array | None, degree: int, terms: int) -> DisplacementField:
+    middle = 0.5 * (place.min(axis=0) + place.max(axis=0))
+    scale = max(float(np.abs(place - middle).max()), 1.0)
+    heights = None if height is None else (float(height.mean()), max(float(height.std()), 1e-9))
+    return DisplacementField(np.zeros((terms, 2)), middle, scale, degree, heights)
+
+
+def _terms(place: Array, height: ArrayLike | None, field: DisplacementField) -> Array:
+    row, column = ((place - field.middle) / field.scale).T
+    powers = [row ** (total - k) * column**k for total in range(field.degree + 1) for k in range(total + 1)]
+    if field.heights is not None:
+        powers.append((np.asarray(height, np.float64) - field.heights[0]) / field.heights[1])
+    return np.stack(powers, axis=1)
+
+
+def _best_candidate(design: Array, way: Array, rng: np.random.Generator) -> Array:
+    """Through the minimal sample with the least median distance of all points."""
+    count, terms = design.shape
+    samples = min(_MOST_SAMPLES, math.ceil(math.log(_MISSED) / math.log1p(-((1.0 - _WRONG) ** terms))))
+    best, least = np.zeros((terms, 2)), np.inf
+    batch = max(1, _VALUES // (2 * count))
+    for first in range(0, samples, batch):
+        which = rng.random((min(batch, samples - first), count)).argpartition(terms - 1, axis=1)[:, :terms]
+        matrix = design[which]
+        # lstsq-like: points on a line leave some terms open, which a ridge sets to next to nothing
+        square = np.swapaxes(matrix, 1, 2) @ matrix + 1e-10 * np.eye(terms)
+        candidate = np.linalg.solve(square, np.swapaxes(matrix, 1, 2) @ way[which])
+        rest = way - design @ candidate
+        middle = np.median(np.einsum("snk,snk->sn", rest, rest), axis=1)
+        k = int(np.argmin(middle))
+        if middle[k] < least:
+            best, least = candidate[k], float(middle[k])
+    return best
+
+
+def _settled(
+    design: Array, way: Array, noise: Array, coefficients: Array, limit: float
+) -> tuple[Mask, Array, float, Array]:
+    """Accepted points, their fit, the scatter beyond noise and distances, once they do not change any more."""
+    inside = np.ones(len(way), bool)
+    for turn in range(_ROUNDS):
+        rest = way - design @ coefficients
+        scatter = _scatter(rest[inside], noise[inside])
+        distance = np.sqrt(_square(rest, noise, scatter))
+        before, inside = inside, distance < limit
+        # the first round only replaces all points by those near the candidate
+        if inside.sum() < design.shape[1] or (turn and np.array_equal(before, inside)):
+            break
+        weight = 1.0 / np.sqrt(0.5 * np.trace(noise, axis1=1, axis2=2) + scatter**2)[inside, None]
+        coefficients = np.linalg.lstsq(weight * design[inside], weight * way[inside], rcond=None)[0]
+    return inside, coefficients, scatter, distance
+
+
+def _square(rest: Array, noise: Array, scatter: float) -> Array:
+    whole = noise + scatter**2 * np.eye(2)
+    a, b, c = whole[:, 0, 0], whole[:, 0, 1], whole[:, 1, 1]
+    row, column = rest.T
+    return np.asarray((c * row**2 - 2.0 * b * row * column + a * column**2) / np.maximum(a * c - b * b, 1e-300))
+
+
+def _scatter(rest: Array, noise: Array) -> float:
+    """Isotropic standard deviation beyond noise that brings the median square distance to that of chi-square."""
+    high = math.sqrt(max(float(np.median(np.sum(rest**2, axis=1))) / _MEDIAN, 1e-18))
+    if np.median(_square(rest, noise, 1e-9)) <= _MEDIAN:
+        return 1e-9
+    low = 0.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if np.median(_square(rest, noise, middle)) > _MEDIAN else (low, middle)
+    return high

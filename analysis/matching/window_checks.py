@@ -49,6 +49,8 @@ from analysis.arrays import Array
 SPLITS = 4
 # Of the test, a window.
 FALSE_ALARM = 1e-3
+# Largest chi-square of the splits, which have two degrees of freedom each.
+_CRITICAL = 2.0 * math.log(SPLITS / FALSE_ALARM)
 # Between the halves that a window must be able to show, px: what a search of whole pixels takes for another place.
 STEP = 1.0
 
@@ -86,7 +88,7 @@ class WindowHalves:
             worst = (0.5 * (a + d) + np.hypot(0.5 * (a - d), b)).max(axis=1)
         # chi-square of two; the largest of the splits
         chance = np.minimum(SPLITS * np.exp(-0.5 * square), 1.0)
-        return chance, np.asarray(ncx2.sf(_critical(), 2, STEP**2 / worst))
+        return chance, np.asarray(ncx2.sf(_CRITICAL, 2, STEP**2 / worst))
 
 
 def risk(share: float, power: Array) -> Array:
@@ -128,11 +130,6 @@ def window_halves(design: Array, residual: Array, side: int) -> WindowHalves:
         apart[used, k], white[used, k] = found, noise
         effect[used, k] = taken @ both @ np.swapaxes(taken, 1, 2)
     return WindowHalves(apart, white, effect)
-
-
-def _critical() -> float:
-    """Limit of the largest chi-square of the splits, which have two degrees of freedom each."""
-    return 2.0 * math.log(SPLITS / FALSE_ALARM)
 
 
 def _halves(side: int) -> list[NDArray[np.bool_]]:
@@ -203,7 +200,7 @@ def residual_correlation(
         residual: (n, p), grey values; NaN where there is no fit.
         side: of the windows, px, with p = side^2.
         inverse: (n, q, q) of the curvature, by which the unknowns answer to residuals
-            (`analysis.matching.template_noise`); NaN where that is not known. None: of the normal matrix.
+            (`analysis.matching.least_squares`); NaN where that is not known. None: of the normal matrix.
     """
     count, unknowns, pixels = design.shape
     variance = np.full(count, np.nan)

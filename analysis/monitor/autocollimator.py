@@ -28,8 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from analysis.arrays import Array
-from analysis.measurement_error import UndeterminedError
+from analysis.arrays import Array, UndeterminedError
 
 AXES = ("X", "Y", "Z")
 

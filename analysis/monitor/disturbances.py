@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import Array, shows
-from analysis.covariance_root import covariance_root
 from analysis.statistics import chance_beyond, density, limit_of
+from optics.numerics.array_math import covariance_root
 
 FALSE_ALARM = 1e-3
 """Chance that shifts within what is stated are called a contradiction."""

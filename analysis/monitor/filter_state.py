@@ -1,11 +1,53 @@
-"""State of the filter of a series: its readings, their innovations, and the estimate with its covariance."""
+"""State of the filter of a series: its readings, their innovations, and the estimate with its covariance.
+
+Jumps that the readings hint at and that are not told, since chance might explain them: their chances, and what they
+add to the state.
+
+A jump is told where hardly any series without one would look like it; long before that, and where it stays too small
+for ever, one is likelier than none. Score b and information J of a step of independent amounts at one place, of
+variance s^2 each, make it
+
+    B = exp(b' (J + I/s^2)^-1 b / 2) / det(I + s^2 J)^(1/2)
+
+times likelier than none (`jump_detection` has b and J), its amounts then being normal about (J + I/s^2)^-1 b. The
+statement gives the root mean square of the sizes alone, of which few large ones make nearly all: s is one of several
+sizes down to an eighth of that, each as likely. With the gap between readings over the mean time between two jumps as
+chance beforehand, and one jump at most within a window, the chance of one at a place is
+
+    p = w / (1 + sum w),   w = B gap / every,
+
+sums over the places of the window and over bodies.
+
+A reading that is wrong by itself, weighed against a jump whose size is bounded by what is stated.
+
+Both explain a reading that is far from its prediction. Beforehand a reading is bad with a small chance c, a body jumps
+before it with the chance gap / every of a jump, above. A bad reading has errors at some of its D coordinates, of
+variance v each, and none at the others. With nu the difference from the prediction and S its covariance,
+
+    B(bad) = c N(nu; 0, S + V) / N(nu; 0, S)
+
+is averaged over the sizes of errors, over the number of coordinates and over which they are: the worst is added first,
+then the one that explains most of what is left, and so on. For a jump the ratio of likelihoods with it and without it,
+averaged over its size, is that above; sizes well above those stated have small chances of their own, so
+that a very large jump is believed when the next reading shows it once more, and not before. A step of the readings
+that no body explains has a place among jumps, too, with the least chance: several readings that agree with each other
+are not bad.
+
+Reference: Box, Tiao, A Bayesian approach to some outlier problems, Biometrika 55, 1968, 119.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from scipy.special import expit, gammaln, logsumexp
+
 from analysis.arrays import Array
-from analysis.monitor.jump_detection import Jump
+from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.jump_detection import Amounts, Candidate, Jump
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,3 +208,249 @@ class Belief:
     def looking(self) -> Track:
         """The filter that looks for jumps."""
         return self.state if self.search is None else self.search
+
+
+_SCALES = (0.125, 0.25, 0.5, 1.0, 2.0)
+"""Sizes of jumps over those stated."""
+_AGAIN = 2.0
+"""Factor of what a hinted jump adds for a smoother: the readings that said that it came, and how large, pull at it once
+more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Jumper:
+    """A body that jumps at a stated rate.
+
+    Attributes:
+        motions: r numbers of all its motions that jump.
+        spots: (q, r) what independent amounts of unit variance do that make the stated motions.
+        root: (r, r) the motions by these amounts.
+        every_s: mean time between two jumps, seconds.
+    """
+
+    motions: tuple[int, ...]
+    spots: Array
+    root: Array
+    every_s: float
+
+
+def jumpers(stated: Disturbances, may: Sequence[Candidate], otherwise: float | None = None) -> tuple[Jumper, ...]:
+    """Bodies of which all motions that jump do so at a stated rate.
+
+    Args:
+        stated: disturbances.
+        may: what may jump.
+        otherwise: seconds between two jumps of a motion of which no rate is stated; None for bodies with a rate alone.
+    """
+    out = []
+    for body in dict.fromkeys(one.body for one in may):
+        one = max((one for one in may if one.body == body), key=lambda one: len(one.motions))
+        rates = [otherwise if (rate := stated.laws[k].every_s) is None else rate for k in one.motions]
+        every = [rate for rate in rates if rate is not None]
+        if len(every) == len(rates):
+            out.append(Jumper(one.motions, one.spots, one.root, min(every)))
+    return tuple(out)
+
+
+@dataclass(frozen=True, eq=False)
+class Hint:
+    """Of a jump of a body whose size is not known, for each of L places.
+
+    Attributes:
+        log_weight: (L,) logarithm of w.
+        mean: (L, r) of the amounts if it came there.
+        covariance: (L, r, r) of them.
+    """
+
+    log_weight: Array
+    mean: Array
+    covariance: Array
+
+    @classmethod
+    def of(cls, looked: tuple[Array, Array], own: tuple[Array, Array], outputs: Array, expected: Array) -> Hint:
+        """From scores and information.
+
+        Args:
+            looked: score (L, q) and information (L, q, q) by which it is judged.
+            own: likewise, by which its amounts are.
+            outputs: (q, r) what unit amounts do.
+            expected: (L,) mean number of jumps in the gap of each place; 0 where there is no gap.
+        """
+        logs, means, squares = [], [], []
+        for times in _SCALES:
+            amounts = Amounts.of(*own, outputs, times)
+            judged = amounts if looked is own else Amounts.of(*looked, outputs, times)
+            logs.append(judged.log_weight)
+            means.append(amounts.mean)
+            squares.append(amounts.covariance + amounts.mean[:, :, None] * amounts.mean[:, None, :])
+        together = np.logaddexp.reduce(logs, axis=0)
+        share = np.exp(np.array(logs) - together)
+        mean = np.einsum("sk,ski->ki", share, means)
+        square = np.einsum("sk,skij->kij", share, squares)
+        with np.errstate(divide="ignore"):
+            weight = together - np.log(len(_SCALES)) + np.log(expected)
+        return cls(weight, mean, square - mean[:, :, None] * mean[:, None, :])
+
+
+def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
+    """(L,) chance p of a jump of each body at each place, one at most among so many places on either side, or all."""
+    every = np.logaddexp.reduce([one.log_weight for one in hints], axis=0)
+    if window is None:
+        total = np.logaddexp(0.0, np.logaddexp.reduce(every))
+    else:
+        padded = np.pad(every, window, constant_values=-np.inf)
+        near = np.lib.stride_tricks.sliding_window_view(padded, 2 * window + 1)
+        total = np.logaddexp(0.0, np.logaddexp.reduce(near, axis=1))
+    return [np.exp(one.log_weight - total) for one in hints]
+
+
+def blended(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequence[Array]) -> tuple[Array, Array]:
+    """Mean (n,) and covariance (n, n) of states where a jump that is not told counts by its chance.
+
+    Args:
+        mean: (n,) of the states without one.
+        covariance: (n, n) likewise.
+        hints: of each body.
+        moved: (L, n, r) of each body, what unit amounts at each place have done to the states by now.
+    """
+    found = _chances(hints)
+    away = [np.einsum("knr,kr->kn", m, one.mean) for m, one in zip(moved, hints, strict=True)]
+    shift = np.asarray(sum(p @ a for p, a in zip(found, away, strict=True)))
+    out = covariance - np.outer(shift, shift)
+    for chance, each, m, one in zip(found, away, moved, hints, strict=True):
+        inner = np.matmul(chance[:, None, None] * m, one.covariance)
+        out = out + (chance[:, None] * each).T @ each + np.tensordot(inner, m, axes=([0, 2], [0, 2]))
+    return mean + shift, 0.5 * (out + out.T)
+
+
+def added(
+    score: Sequence[Array], information: Sequence[Array], gap: Array, bodies: Sequence[Jumper], window: int
+) -> list[Array]:
+    """(N, r) of each body, what a smoother takes jumps to add that were not told, over the mean square that the motions
+    are stated to have at their rate.
+
+    Args:
+        score: (N, r) of each body, of unit amounts before each of N readings, by all readings.
+        information: (N, r, r) of each, likewise.
+        gap: (N,) seconds from the reading before, 0 where none is.
+        bodies: that jump.
+        window: readings among which one jump is looked for.
+    """
+    if not bodies:
+        return []
+    hints = []
+    for one, b, j in zip(bodies, score, information, strict=True):
+        own = b, j
+        hints.append(Hint.of(own, own, np.eye(len(one.motions)), gap / one.every_s))
+    out = []
+    for one, hint, chance in zip(bodies, hints, _chances(hints, window // 2), strict=True):
+        square = (hint.mean @ one.root.T) ** 2 + np.einsum("ij,kjl,il->ki", one.root, hint.covariance, one.root)
+        over = np.divide(chance * one.every_s, gap, out=np.zeros_like(gap), where=gap > 0.0)
+        out.append(_AGAIN * over[:, None] * square)
+    return out
+
+
+# chance beforehand that a reading is bad
+_SHARE = 1e-3
+# logarithms of the odds above which a reading is set aside, against one to which nothing has happened and against the
+# first one after a jump: the second is low, since an error at one coordinate and a jump of a body that moves spots in
+# any way look alike, and since nobody knows well how often readings are bad
+_UNSURE, _SURE = math.log(0.05 / 0.95), math.log(1e-3)
+# chance at most that a reading which was set aside counts with as the first after a jump, for the same reason
+_MOST_FOR_JUMP = 0.8
+# where so many of the last readings were left out, none more is: then the prior is wrong, and not the readings
+RECENT, _MOST = 10, 5
+# sizes of errors over the noise of a coordinate, each as likely
+_ERRORS = np.array([10.0, 50.0, 250.0, 1250.0, 6250.0])
+# sizes of jumps over those stated, and the logarithms of their chances
+_SIZES = np.array([0.125, 0.25, 0.5, 1.0, 2.0, 8.0, 64.0])
+_LOG_SIZE = np.log([0.2, 0.2, 0.2, 0.2, 0.2, 1e-2, 1e-4])
+# logarithm of the chance of a step that nothing stated explains, over that of a jump of one body in the whole life
+_UNSTATED = math.log(1e-3)
+
+
+def may_be_bad(bad: BadReading | None, log_odds: float, recent: Sequence[bool]) -> bool:
+    """Return whether a reading is set aside until the next one.
+
+    Args:
+        bad: what speaks for it being bad; None where nothing does.
+        log_odds: logarithm of the odds of that against all else.
+        recent: whether each of the last readings was left out.
+    """
+    return bad is not None and bad.log_ratio > _UNSURE and log_odds > _SURE and sum(recent) < _MOST
+
+
+def chance_good(log_odds: float) -> float:
+    """Return the chance with which a reading that is set aside counts as a good one meanwhile.
+
+    Args:
+        log_odds: logarithm of the odds that it is bad.
+    """
+    return min(_MOST_FOR_JUMP, float(expit(-log_odds)))
+
+
+def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
+    """Return a reading as one with errors weighed against one without; None where it cannot be set aside.
+
+    Args:
+        white: (D,) root^-1 times its difference from the prediction.
+        root: (D, D) Cholesky factor of the covariance of that difference.
+        noise: (D, D) of the reading.
+    """
+    count = len(white)
+    if 0.5 * float(white @ white) + math.log(_SHARE) < _UNSURE:  # no errors explain more than all of it
+        return None
+    back = np.linalg.inv(root)
+    precision = back.T @ back
+    pulled = back.T @ white
+    z = pulled / np.sqrt(np.diag(precision))
+    worst = int(np.argmax(np.abs(z)))
+    size = np.diag(noise).copy()
+    size = np.where(size > 0.0, size, 1e-6 * np.diag(root @ root.T))
+    chosen = np.arange(1, count + 1)
+    beforehand = -math.log(count) - (gammaln(count + 1) - gammaln(chosen + 1) - gammaln(count - chosen + 1))
+    logs = [_with_errors(precision, pulled, scale**2 * size) + beforehand for scale in _ERRORS.tolist()]
+    total = float(logsumexp(logs)) - math.log(len(_ERRORS)) + math.log(_SHARE)
+    return BadReading(total, float(z[worst]), worst)
+
+
+def _with_errors(precision: Array, pulled: Array, variance: Array) -> Array:
+    """(D,) log likelihood ratio with errors at the 1, 2, ... coordinates that explain most."""
+    free, total, out = np.ones(len(pulled), bool), 0.0, np.empty(len(pulled))
+    for number in range(len(pulled)):
+        inner = 1.0 + variance * np.diag(precision)
+        gain = np.where(free, 0.5 * (variance * pulled**2 / inner - np.log(inner)), -np.inf)
+        k = int(np.argmax(gain))
+        total += float(gain[k])
+        column, share = precision[:, k], variance[k] / inner[k]
+        precision, pulled = precision - share * np.outer(column, column), pulled - share * column * pulled[k]
+        free[k] = False
+        out[number] = total
+    return out
+
+
+def jump_evidence(track: Track, gap: Array, bodies: Sequence[Jumper], life: float, noise: Array) -> float:
+    """Logarithm of the likelihood of all readings with a jump at one of L places or none, over that with none.
+
+    Args:
+        track: the filter, with what steps at the L places would do.
+        gap: (L,) seconds within which each comes.
+        bodies: that jump.
+        life: seconds in which a step that nothing explains comes with a small chance.
+        noise: (D, D) of the reading, whose multiples are the sizes of such a step.
+    """
+    if not len(gap):
+        return 0.0
+    unstated = np.eye(track.score.shape[1])[:, : len(noise)] * np.sqrt(np.diag(noise))
+    cases = [(unstated, _ERRORS, np.full(len(_ERRORS), _UNSTATED - math.log(len(_ERRORS) * life)))]
+    cases += [(one.spots, _SIZES, _LOG_SIZE - math.log(one.every_s)) for one in bodies]
+    found = [0.0]
+    log_gap = np.log(np.maximum(gap, 1e-300))
+    for outputs, scale, beforehand in cases:
+        values, vectors = np.linalg.eigh(outputs.T @ track.information @ outputs)
+        along = np.einsum("kij,ki->kj", vectors, track.score @ outputs)
+        square = scale[:, None, None] ** 2
+        inner = 1.0 + square * np.maximum(values, 0.0)
+        gain = 0.5 * np.sum(square * along**2 / inner - np.log(inner), axis=2)
+        found.append(float(logsumexp(gain + beforehand[:, None] + log_gap)))
+    return float(logsumexp(found))

@@ -31,7 +31,7 @@ from scipy.special import gammaln, ndtr
 from analysis.arrays import Array
 from analysis.monitor import parameters
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.monitoring import GroundGeometry
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibration, Parameter
 
 
@@ -470,7 +470,8 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
     normal = np.sqrt(np.maximum(pairs.sum(axis=(1, 2)) + by_noise, 0.0))
     mean = degrees / (degrees - 2.0)
     own = np.einsum("qgg->qg", pairs)
-    root = float(np.exp(0.5 * np.log(0.5 * degrees)) * _root_mean(degrees))
+    # the mean of 1 / sqrt(w) is Gamma((nu - 1) / 2) / Gamma(nu / 2) sqrt(nu / 2)
+    root = float(np.exp(0.5 * np.log(0.5 * degrees) + gammaln(0.5 * (degrees - 1.0)) - gammaln(0.5 * degrees)))
     across = pairs.sum(axis=(1, 2)) - own.sum(axis=1)
     return HeavyTail(
         degrees=degrees,
@@ -478,11 +479,6 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
         held=np.stack([_half_widths(sigma, level) for level in _LEVELS]),
         beyond=np.mean(2.0 * ndtr(-3.0 * normal / np.where(sigma > 0.0, sigma, np.inf)), axis=0),
     )
-
-
-def _root_mean(degrees: float) -> float:
-    """Gamma((nu - 1) / 2) / Gamma(nu / 2), which makes the mean of 1 / sqrt(w)."""
-    return float(np.exp(gammaln(0.5 * (degrees - 1.0)) - gammaln(0.5 * degrees)))
 
 
 def _of(error: Array, own: Sequence[int]) -> Array:

@@ -29,10 +29,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from analysis.arrays import Array, shows
-from analysis.measurement_error import MeasurementError, UndeterminedError
+from analysis import statistics
+from analysis.arrays import ARCSEC, UM_PER_M, Array, MeasurementError, UndeterminedError, shows
 from analysis.monitor.disturbances import Disturbances
-from analysis.units import ARCSEC, UM_PER_M
 
 _SHOWN = (
     ("d_alpha", 1 / ARCSEC, '"'),
@@ -90,11 +89,7 @@ def gain(
         root = np.linalg.cholesky(np.eye(len(spots)) if noiseless else spread)
     except np.linalg.LinAlgError as error:
         raise UndeterminedError("model fit: covariance of the shifts is not positive definite") from error
-    white = np.linalg.solve(root, np.broadcast_to(spots, (*root.shape[:-2], *spots.shape)))
-    # pinv by QR-like SVD of the column-scaled matrix: units of motion differ by many orders of magnitude
-    length = np.linalg.norm(white, axis=-2, keepdims=True)
-    inverse = np.linalg.pinv(white / length, rcond=_RANK_TOLERANCE * 1e-3) / np.swapaxes(length, -1, -2)
-    return np.asarray(parameters @ inverse @ np.linalg.inv(root))
+    return np.asarray(parameters @ statistics.gain(spots, root, _RANK_TOLERANCE * 1e-3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +169,7 @@ def observability(
     white = np.linalg.solve(root, spots)
     members = white[:, chosen]
     length = np.linalg.norm(white, axis=0)
-    inverse = np.linalg.pinv(members / length[chosen]) / length[chosen][:, None]
+    inverse = statistics.gain(members)
     reports = []
     for k, name in enumerate(names):
         visible = float(np.max(np.abs(spots[:, k]))) > _INVISIBLE_PX
@@ -351,14 +346,17 @@ def floor(stated: Disturbances, rows: Array) -> Array:
     return np.asarray(effect @ _hidden(stated) @ effect.T)
 
 
-def unseen_modes(stated: Disturbances, rows: Array, scale: Array, least: float = 1e-3) -> tuple[UnseenMode, ...]:
+_LEAST_MODE = 1e-3
+"""Share of the first mode's sigma below which a mode is left out."""
+
+
+def unseen_modes(stated: Disturbances, rows: Array, scale: Array) -> tuple[UnseenMode, ...]:
     """Modes of the floor, the largest first.
 
     Args:
         stated: what moves.
         rows: (Q, P) of the quantities on the parameters.
         scale: (Q,) of each quantity what counts as much as one of another.
-        least: modes of less than this share of the first one's sigma are left out.
     """
     effect = rows @ stated.parameters
     hidden = _hidden(stated)
@@ -366,7 +364,7 @@ def unseen_modes(stated: Disturbances, rows: Array, scale: Array, least: float =
     out = []
     for k in np.argsort(-values):
         sigma = float(np.sqrt(max(values[k], 0.0)))
-        if sigma <= least * np.sqrt(max(values.max(), 0.0)):
+        if sigma <= _LEAST_MODE * np.sqrt(max(values.max(), 0.0)):
             break
         row = vectors[:, k] / scale @ effect
         motions = hidden @ row / sigma

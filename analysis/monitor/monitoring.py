@@ -19,19 +19,37 @@ Three sets of formulas, which differ only where the paper does:
   camera adds three calibrated numbers: its plate scale across the line f_x (d_alpha divides by it, d_gamma carries
   f/f_x) and the gradients of principal distance and of line tilt over the field, which enter d_f by d_alpha and
   d_gamma by d_beta. With f_x = f and no gradients the formulas are those of a distortion-free camera.
+
+Change of the angle between the lines of sight of two cameras, from what their monitors measured (paper 001,
+Fig. 4).
+
+Each camera hangs in the base frame at a look angle: a rotation about Y, positive toward +X (forward). Its line of
+sight turns in its own frame by the rotation vector (d_beta about X, d_alpha about Y, 0); d_gamma turns about the line
+of sight and leaves it. To first order only the rotation about the common axis Y counts:
+change = d_alpha_forward - d_alpha_backward, where "forward" is the camera of the larger look angle. Unless the
+covariance between the two cameras is given, their errors are taken as independent.
+
+What changes of a stereo pair's cameras do to points on the ground that are located with the cameras as they were.
+
+Both cameras fly along one circular orbit over a sphere, look down along the track at their look angles, and see a point
+one after the other; attitude and orbit are known. A ray at the look angle a meets the ground at the incidence i,
+R sin i = (R + h) sin a, after the slant range R sin(i - a) / sin a. A changed camera's ray is the nominal one turned
+and, off the line's middle, scaled by the change of its principal distance; the point is found where both rays are
+nearest to each other (least squares of the distances). Axes on the ground: along the track, across it (to the right),
+up.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from analysis.arrays import Array, OfStates, shows
-from analysis.units import ARCSEC, UM_PER_M
+from analysis.arrays import ARCSEC, UM_PER_M, Array, OfStates, UndeterminedError, shows
 
 FORMULAS = ("paper_single", "paper_joint", "derived")
 PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
@@ -242,3 +260,247 @@ def linear(matrix: Array, before: ArrayLike, after: ArrayLike, covariance: Array
     if not (np.all(np.isfinite(shift)) and np.all(np.isfinite(spread))):
         raise ValueError("monitoring: positions and covariance must be finite")
     return shift @ matrix.T, matrix @ spread @ matrix.T
+
+
+@shows()
+@dataclass(frozen=True, eq=False)
+class IntersectionAngleChange(OfStates):
+    """change_rad: (...) new angle minus nominal angle, rad; sigma_rad: (...) standard deviation of its error;
+    sigma_noise_rad: of that what the noise of the images does, None where that is all.
+    """
+
+    change_rad: Array
+    sigma_rad: Array
+    sigma_noise_rad: Array | None = None
+
+    @property
+    def noise_rad(self) -> Array:
+        """(...) standard deviation by the noise of the images alone, rad."""
+        return self.sigma_rad if self.sigma_noise_rad is None else self.sigma_noise_rad
+
+
+def exact(
+    forward: CameraParameters,
+    backward: CameraParameters,
+    forward_look_rad: float,
+    backward_look_rad: float,
+    across: Array | None = None,
+    across_total: Array | None = None,
+) -> IntersectionAngleChange:
+    """Change of the angle between the two turned lines of sight in space, without approximation.
+
+    Raises ValueError for look angles that are not within +-pi/2 and different.
+
+    Args:
+        forward: changes of the camera of the larger look angle.
+        backward: of the other.
+        forward_look_rad: its look angle, rad.
+        backward_look_rad: likewise.
+        across: (..., 4, 4) covariance of the forward with the backward parameters by noise, None for none.
+        across_total: likewise of the whole error.
+    """
+    for name, look in (("forward", forward_look_rad), ("backward", backward_look_rad)):
+        if not (math.isfinite(look) and abs(look) < math.pi / 2):
+            raise ValueError(f"intersection angle: {name}_look_rad must be within +-pi/2, found {look!r}")
+    nominal = abs(forward_look_rad - backward_look_rad)
+    if nominal < 1e-3:
+        raise UndeterminedError(
+            "intersection angle: the cameras look the same way, their angle has no direction to change in"
+        )
+    rotations = (forward.d_alpha_rad, forward.d_beta_rad, backward.d_alpha_rad, backward.d_beta_rad)
+    given = np.stack(np.broadcast_arrays(*(np.asarray(one, np.float64) for one in rotations)))
+    # the angle as it is, and with each rotation a step further and back
+    step = 1e-5
+    moves = np.concatenate([np.zeros((1, 4)), step * np.eye(4), -step * np.eye(4)]).T
+    d_alpha, d_beta, other_alpha, other_beta = given[:, None] + moves.reshape(4, 9, *(1,) * (given.ndim - 1))
+    angles = _between(
+        _line_of_sight(d_alpha, d_beta, forward_look_rad), _line_of_sight(other_alpha, other_beta, backward_look_rad)
+    )
+    each = (angles[1:5] - angles[5:]) / (2 * step)
+    slopes = [np.stack([each[2 * k], each[2 * k + 1]], axis=-1) for k in range(2)]
+
+    def sigma(own: tuple[Array, Array], shared: Array | None) -> Array:
+        variance: Any = 0.0
+        for slope, covariance in zip(slopes, own, strict=True):
+            variance = variance + np.einsum("...i,...ij,...j->...", slope, covariance[..., :2, :2], slope)
+        if shared is not None:
+            variance = variance + 2 * np.einsum("...i,...ij,...j->...", slopes[0], shared[..., :2, :2], slopes[1])
+        return np.sqrt(variance)
+
+    change = angles[0] - nominal
+    noise = sigma((forward.covariance, backward.covariance), across)
+    if forward.total is None or backward.total is None:
+        return IntersectionAngleChange(change, noise)
+    return IntersectionAngleChange(change, sigma((forward.total, backward.total), across_total), noise)
+
+
+def _between(u: tuple[Array, Array, Array], v: tuple[Array, Array, Array]) -> Array:
+    """Angle between unit vectors given by their components."""
+    (ux, uy, uz), (vx, vy, vz) = u, v
+    sine = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
+    return np.asarray(np.arctan2(sine, ux * vx + uy * vy + uz * vz))
+
+
+def _line_of_sight(d_alpha: Array, d_beta: Array, look: float) -> tuple[Array, Array, Array]:
+    """Components of the unit vector in the base frame: +Z turned by the rotation vector (d_beta, d_alpha, 0), then by
+    the look angle.
+    """
+    turn = np.hypot(d_alpha, d_beta)
+    ratio = np.sinc(turn / np.pi)
+    x, y, z = ratio * d_alpha, -ratio * d_beta, np.cos(turn)
+    c, s = math.cos(look), math.sin(look)
+    return c * x + s * z, y, c * z - s * x
+
+
+EARTH_RADIUS_M = 6_371_000.0
+"""Mean radius (IUGG). The Earth's flattening and turn change the figures here by less than 1 %."""
+_PLACES = 9
+"""Places along the line over which RMS values are taken."""
+
+
+@shows()
+@dataclass(frozen=True, eq=False)
+class GroundError(OfStates):
+    """Errors of points on the ground for S states.
+
+    Attributes:
+        error_m: (S, 3) along the track, across it and up at the middle of the line, when the cameras' changes are
+            ignored: found minus true.
+        sigma_m: (S, 3) what is left of it when the cameras are corrected by the estimate, one standard deviation;
+            sigma_noise_m: of that what the noise does.
+        plan_rms_m, height_rms_m: (S,) likewise, RMS over the line: of both plan axes together, and of the height.
+    """
+
+    error_m: Array
+    sigma_m: Array
+    sigma_noise_m: Array
+    plan_rms_m: Array
+    height_rms_m: Array
+
+
+@dataclass(frozen=True)
+class GroundGeometry:
+    """A pair of line cameras over the ground.
+
+    Attributes:
+        altitude_m: of the orbit.
+        cameras: names of the two, in the calibration's order.
+        looks_rad: their look angles, forward positive.
+        half_field: tangent of half the field across the track that both lines see, of each.
+
+    Raises:
+        ValueError: a camera does not look at the Earth, or both look the same way.
+    """
+
+    altitude_m: float
+    cameras: tuple[str, str]
+    looks_rad: tuple[float, float]
+    half_field: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        """Check the geometry."""
+        if any(abs(math.sin(a)) * (EARTH_RADIUS_M + self.altitude_m) >= EARTH_RADIUS_M for a in self.looks_rad):
+            raise UndeterminedError("ground error: a camera looks past the Earth")
+        if abs(self.looks_rad[0] - self.looks_rad[1]) < 1e-3:
+            raise UndeterminedError("ground error: the cameras look the same way, their rays do not meet in one point")
+
+    @cached_property
+    def incidences_rad(self) -> tuple[float, float]:
+        """Angles of the rays from the vertical at the ground."""
+        ratio = 1.0 + self.altitude_m / EARTH_RADIUS_M
+        first, second = (math.asin(ratio * math.sin(a)) for a in self.looks_rad)
+        return first, second
+
+    @cached_property
+    def ranges_m(self) -> tuple[float, float]:
+        """Slant ranges in the plane of the orbit."""
+        first, second = (
+            EARTH_RADIUS_M * math.sin(i - a) / math.sin(a) if abs(a) > 1e-9 else self.altitude_m
+            for i, a in zip(self.incidences_rad, self.looks_rad, strict=True)
+        )
+        return first, second
+
+    @cached_property
+    def matrices(self) -> Array:
+        """(places, 3, 8): metres along, across and up for changes of the first camera, then of the second: d_alpha,
+        d_beta, d_gamma (rad), d_f / f. The middle of the line is the middle one.
+        """
+        reach = min(r * t for r, t in zip(self.ranges_m, self.half_field, strict=True))
+        return np.stack([self._at(c) for c in np.linspace(-reach, reach, _PLACES)])
+
+    def _at(self, across: float) -> Array:
+        """(3, 8) at one distance across the track, metres."""
+        normal, right = np.zeros((3, 3)), []
+        for incidence, far in zip(self.incidences_rad, self.ranges_m, strict=True):
+            t = across / far
+            ray = np.array([0.0, t, 1.0])
+            # turns (d_beta, d_alpha, d_gamma) about X, Y, Z of the camera; a longer f narrows the field
+            change = np.array([[1.0, 0.0, -t, 0.0], [0.0, -1.0, 0.0, -t], [0.0, t, 0.0, 0.0]])
+            c, s = math.cos(incidence), math.sin(incidence)
+            level = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])  # along, right, down
+            ray, change = level @ ray, level @ change
+            square = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+            normal += square
+            right.append(square @ change * far)
+        # rays are taken to lie where they lay: points are found where the change is missing
+        found = -np.linalg.solve(normal, np.concatenate(right, axis=1))
+        found[2] *= -1.0  # up
+        return found
+
+    def rows(self, principal_distances_m: tuple[float, float]) -> Array:
+        """(places, 3, 8) as `matrices`, for d_f in metres.
+
+        Args:
+            principal_distances_m: of the two cameras.
+        """
+        out = self.matrices.copy()
+        for k, f in enumerate(principal_distances_m):
+            out[..., 4 * k + 3] /= f
+        return out
+
+    def found(self, true: Array, assumed: Array) -> Array:
+        """Error (..., 3) along, across and up of points that are located along assumed rays, exactly.
+
+        Args:
+            true: (..., 2, 3) directions of the two rays in the base frame as they are (X along the track, Z down).
+            assumed: likewise, as they are taken to be.
+        """
+        normal: Any = 0.0
+        right: Any = 0.0
+        for k, (incidence, look, far) in enumerate(
+            zip(self.incidences_rad, self.looks_rad, self.ranges_m, strict=True)
+        ):
+            turn = incidence - look
+            c, s = math.cos(turn), math.sin(turn)
+            level = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+            real, taken = (np.asarray(v, np.float64)[..., k, :] @ level.T for v in (true, assumed))
+            down = np.linalg.norm(taken, axis=-1, keepdims=True)
+            taken = taken / down
+            station = -far * real / np.linalg.norm(real, axis=-1, keepdims=True)
+            square = np.eye(3) - taken[..., :, None] * taken[..., None, :]
+            normal = normal + square
+            right = right + np.einsum("...ij,...j->...i", square, station)
+        out = np.linalg.solve(normal, right[..., None])[..., 0]
+        return np.asarray(out * np.array([1.0, 1.0, -1.0]))
+
+    def error(
+        self, values: Array, noise: Array, total: Array, principal_distances_m: tuple[float, float]
+    ) -> GroundError:
+        """Errors on the ground by estimated changes, and what correcting by them leaves.
+
+        Args:
+            values: (S, 8) estimated changes, rad and m.
+            noise: (S, 8, 8) their covariance by noise.
+            total: (S, 8, 8) of their error.
+            principal_distances_m: of the two cameras.
+        """
+        rows = self.rows(principal_distances_m)
+        middle = rows[_PLACES // 2]
+        left = np.einsum("pai,sij,paj->spa", rows, total, rows)
+        return GroundError(
+            error_m=values @ middle.T,
+            sigma_m=np.sqrt(np.einsum("ai,sij,aj->sa", middle, total, middle)),
+            sigma_noise_m=np.sqrt(np.einsum("ai,sij,aj->sa", middle, noise, middle)),
+            plan_rms_m=np.sqrt(left[..., :2].sum(axis=-1).mean(axis=-1)),
+            height_rms_m=np.sqrt(left[..., 2].mean(axis=-1)),
+        )

@@ -16,12 +16,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from analysis.arrays import Array, shows
-from analysis.monitor.ground_error import GroundGeometry
-from analysis.monitor.monitoring import MonitorGeometry
+from analysis.arrays import ARCSEC, UM_PER_M, Array, shows
+from analysis.monitor.monitoring import GroundGeometry, MonitorGeometry
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
-from analysis.units import ARCSEC, UM_PER_M
 
 PAIR = ("left", "right")
 """Names of the channels at the +Y and at the -Y end of a line, which paper 001 numbers 1 and 2."""

@@ -1,8 +1,27 @@
-"""From the monitor's images to the changes of every camera: centroids, all estimators, the intersection angle."""
+"""From the monitor's images to the changes of every camera: centroids, all estimators, the intersection angle.
+
+What the fits of all spots of a measurement say together: does sigma hold, by how much was it widened, and why.
+
+Three causes make spots differ from the fit, and the place of the difference separates them. Noise that differs from
+the data sheet is in every pixel of every frame, a changed shape in the core of a spot alone, and a wrongly calibrated
+shape in the spots before as in those after.
+
+Are the motions that a reading stands for small enough to be linear? The reading is compared with a retraced state.
+
+An estimator reads parameters by motions x of which it knows, s = A x and p = B x for the spots and the parameters; its
+x = G s are an estimate of them. Traced again, the instrument in the state x has the spots s(x) and the parameters p(x).
+One step of Gauss and Newton about x,
+
+    p(x) + B (x' - x),   x' = G (s - s(x) + A x),
+
+differs from the linear reading B G s by what is not linear. Where that is more than `BEYOND` standard deviations of
+any quantity the steps go on to their end, and the reading is p of it (Nocedal and Wright, Numerical Optimization, 2006,
+sec. 10.3). Derivatives stay those of the instrument at rest: they change by as many parts as the motions are radians.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
@@ -10,19 +29,332 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.arrays import Array, OfStates, shows
-from analysis.monitor import intersection_angle
-from analysis.monitor.curvature import Curvature, LinearReading, MotionModel, read_again
 from analysis.monitor.disturbances import Consistency, Disturbances, consistency
 from analysis.monitor.estimators import PARAMETERS_EACH, Shifts, applicable
-from analysis.monitor.ground_error import GroundError, GroundGeometry
-from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.limits import quantities
-from analysis.monitor.monitoring import CameraParameters
+from analysis.monitor.monitoring import CameraParameters, GroundError, GroundGeometry, IntersectionAngleChange, exact
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
-from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import CENTROIDS, mean_frames
-from analysis.spots.likelihood import FitStates, fit_states, require_rest, widened
+from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, require_rest, widened
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
+
+ALIKE = 2.0
+"""Times that a core's chi-square may be that of the frames' noise where this explains both."""
+LOUD = 1.3
+"""Noise of the frames over the stated one, squared, above which it is too large: 6 sigma of an image's median."""
+NOISE, BEFORE, AFTER = "noise", "before", "shape"
+"""Causes: noise of the frames, the shape of the spots before, their shape after alone."""
+
+
+@dataclass(frozen=True)
+class SpotDoubt:
+    """Why sigma does not hold for a state.
+
+    Attributes:
+        cause: `noise`, `before` or `shape`.
+        spots: which of the C spots do not fit.
+        widening: largest factor by which the sigma of a spot was widened.
+        text: in words, without a sentence's end.
+    """
+
+    cause: str
+    spots: tuple[int, ...]
+    widening: float
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class SpotEvidence:
+    """Fits of C spots in S states.
+
+    Attributes:
+        before: (1, C) or (S, C), of the nominal state.
+        after: (S, C).
+    """
+
+    before: FitStates
+    after: FitStates
+
+    def at(self, states: slice) -> SpotEvidence:
+        """The evidence of some states.
+
+        Args:
+            states: which.
+        """
+        before = self.before if len(self.before.whole) == 1 else self.before.at(states)
+        return SpotEvidence(before, self.after.at(states))
+
+    @classmethod
+    def joined(cls, parts: Sequence[SpotEvidence]) -> SpotEvidence:
+        """The evidence of several series against one nominal state, one after the other.
+
+        Args:
+            parts: at least one.
+        """
+        return cls(parts[0].before, FitStates.joined([one.after for one in parts]))
+
+    @property
+    def holds(self) -> NDArray[np.bool_]:
+        """(S,) whether all spots before and after are as assumed."""
+        return np.asarray(np.all(self.before.fits, axis=1) & np.all(self.after.fits, axis=1))
+
+    @property
+    def widening(self) -> Array:
+        """(S, C) factor of the sigma of each spot's place, before and after whichever is larger."""
+        return np.asarray(np.maximum(self.before.widening, self.after.widening))
+
+    @property
+    def worst(self) -> int:
+        """Number of the state whose spots fit least."""
+        return int(np.argmax(np.max(self.widening, axis=1)))
+
+    def course_doubt(self, moments: Sequence[str], names: Sequence[str]) -> str | None:
+        """Why sigma does not hold at the worst of the states; None where it holds at all.
+
+        Args:
+            moments: of the states, in words.
+            names: of the spots.
+        """
+        told, bad = self.doubt(self.worst, names), int(np.count_nonzero(~self.holds))
+        return None if told is None else f"at {moments[self.worst]}, the worst of {bad} times: {told.text}"
+
+    def doubt(self, state: int = 0, names: Sequence[str] = ()) -> SpotDoubt | None:
+        """Why sigma does not hold for a state; None where it does.
+
+        Args:
+            state: its number.
+            names: of the spots; their numbers if not given.
+        """
+        if self.holds[state]:
+            return None
+        first = self.before.at(slice(0, 1) if len(self.before.whole) == 1 else slice(state, state + 1))
+        last = self.after.at(slice(state, state + 1))
+        off = [~one.fits[0] for one in (first, last)]
+        spots = tuple(np.flatnonzero(off[0] | off[1]).tolist())
+        worst = max((float(one.widening[0, k]), k) for one in (first, last) for k in spots)
+        own = last if off[1][worst[1]] else first
+        whole, core, noise = (float(v[0, worst[1]]) for v in (own.whole, own.core, own.noise))
+        if all(_noisy(one, k) for one, beyond in ((first, off[0]), (last, off[1])) for k in spots if beyond[k]):
+            cause = NOISE
+            why = (
+                f"the noise of the frames is {np.sqrt(noise):.3g} times that of the data sheet, both beside the spots "
+                "and in them: another gain, read-out noise or number of bits, or light that varies"
+            )
+        elif np.any(off[0]):
+            cause = BEFORE
+            why = (
+                "the spots before do not have the calibrated shape either: a camera that is blurred or aberrated "
+                "otherwise than calibrated, a reflection, or stray light"
+            )
+        else:
+            cause = AFTER
+            why = (
+                "the shape of the spots differs from the calibration: a motion blurs or aberrates them, or they "
+                "contain a "
+                "reflection or stray light, and a position on a changed spot is not that on the calibrated one"
+            )
+        named = ", ".join(names[k] if names else str(k) for k in spots)
+        limit = float(own.core_limit[0, worst[1]]), float(own.whole_limit[0, worst[1]])
+        size = (
+            f"reduced chi-square {_number(core)} of the core (limit {limit[0]:.2f}) and {_number(whole)} of the image "
+            f"(limit {limit[1]:.2f}, false-alarm rate {FALSE_ALARM:g} a fit)"
+        )
+        text = (
+            f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of their positions "
+            f"was widened up to {_number(worst[0])} times, which does not cover the effect of a changed shape"
+            if cause != NOISE
+            else f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of "
+            f"their positions was widened up to {_number(worst[0])} times"
+        )
+        return SpotDoubt(cause, spots, worst[0], text)
+
+
+def _noisy(one: FitStates, k: int) -> bool:
+    """Whether the noise of the frames explains the fit of spot k: all pixels have it, its core not much more."""
+    noise, whole, core = (float(v[0, k]) for v in (one.noise, one.whole, one.core))
+    return noise > LOUD and whole < LOUD * noise and core < ALIKE * noise
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if value < 1e3 else f"{value:.0f}"
+
+
+BEYOND = 3.0
+"""Sigmas of a quantity by which a linear reading may be off before it is worked out anew."""
+_REST = 1e-2
+"""Sigmas by which the last step may move a quantity."""
+_MOST_STEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Retraced:
+    """What S states do, exactly.
+
+    Attributes:
+        spots: (S, D) shifts, px; NaN in a state whose light is lost.
+        parameters: (S, 4 K) changes, rad and m, likewise.
+    """
+
+    spots: Array
+    parameters: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MotionModel:
+    """The motions that an estimator knows of.
+
+    Attributes:
+        spots: A, (D, P) px per unit of each motion.
+        parameters: B, (4 K, P) rad and m, likewise.
+        amounts: covariance of the shifts (S, D, D), px^2 -> G, (S, P, D) units per px.
+        states: amounts (S, P) -> the states that they make.
+        trace: S states -> what they do. Models that have the same one are traced together.
+        near_px: states in which no spot moves by more are taken as linear and not traced, px.
+    """
+
+    spots: Array
+    parameters: Array
+    amounts: Callable[[Array], Array]
+    states: Callable[[Array], Sequence[Any]]
+    trace: Callable[[Sequence[Any]], Retraced]
+    near_px: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature(OfStates):
+    """What retraced states say of the linear readings of an estimator in S states.
+
+    Attributes:
+        off: (S, Q) what the linear reading of each quantity is off by, sigmas; NaN where the state cannot be traced.
+        beyond: (S,) whether it is too much, so that the readings are those of the last step.
+        rests: (S,) whether the steps came to rest; true where none were needed.
+    """
+
+    off: Array
+    beyond: NDArray[np.bool_]
+    rests: NDArray[np.bool_]
+
+    @property
+    def holds(self) -> NDArray[np.bool_]:
+        """(S,) whether the readings are right, linear or not."""
+        return self.rests
+
+    def worst(self, state: int = 0) -> tuple[int, float]:
+        """Number of the quantity whose linear reading is off by most, and by how many sigmas."""
+        size = np.abs(self.off[state])
+        if not np.any(np.isfinite(size)):
+            return 0, np.inf
+        worst = int(np.nanargmax(size))
+        return worst, float(size[worst])
+
+
+@dataclass(frozen=True, eq=False)
+class LinearReading:
+    """What an estimator reads by derivatives in S states.
+
+    Attributes:
+        values: (S, 4 K), rad and m.
+        total: (S, 4 K, 4 K) covariance of their errors.
+        model: the motions by which it reads.
+    """
+
+    values: Array
+    total: Array
+    model: MotionModel
+
+
+def read_again(
+    readings: Mapping[str, LinearReading], shift: Array, noise: Array, rows: Array
+) -> dict[str, tuple[Array, Curvature]]:
+    """Readings (S, 4 K) of each estimator, worked out anew where they are not linear, and what was found.
+
+    Args:
+        readings: estimator -> its linear readings.
+        shift: (S, D) px.
+        noise: (S, D, D) px^2 of them.
+        rows: (Q, 4 K) of the quantities that are judged.
+    """
+    steps = {title: _Steps.of(reading, shift, noise, rows) for title, reading in readings.items()}
+    found = _traced_together({title: (own.model, own.x[own.far]) for title, own in steps.items()})
+    return {title: own.judged(readings[title].values, found[title]) for title, own in steps.items()}
+
+
+def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[str, Retraced]:
+    """What the states of amounts (S, P) of each model do."""
+    ways: dict[int, list[str]] = {}
+    for title, (model, _) in wanted.items():
+        ways.setdefault(id(model.trace), []).append(title)
+    out: dict[str, Retraced] = {}
+    for titles in ways.values():
+        states = [state for title in titles for state in wanted[title][0].states(wanted[title][1])]
+        model = wanted[titles[0]][0]
+        nothing = Retraced(np.empty((0, len(model.spots))), np.empty((0, len(model.parameters))))
+        found, end = model.trace(states) if states else nothing, 0
+        for title in titles:
+            own = slice(end, end + len(wanted[title][1]))
+            out[title], end = Retraced(found.spots[own], found.parameters[own]), own.stop
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Steps of Gauss and Newton about the states that S readings of an estimator stand for.
+
+    Attributes:
+        model: of its motions.
+        shift: (S, D) px; gain: G, (S, P, D); x: (S, P) motions that the readings stand for.
+        sigma: (S, Q) of the quantities; rows: theirs, (Q, 4 K).
+        far: states that are traced.
+    """
+
+    model: MotionModel
+    shift: Array
+    gain: Array
+    x: Array
+    sigma: Array
+    rows: Array
+    far: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, reading: LinearReading, shift: Array, noise: Array, rows: Array) -> _Steps:
+        gain = reading.model.amounts(noise)
+        sigma = np.sqrt(np.maximum(np.einsum("qi,sij,qj->sq", rows, reading.total, rows), 0.0))
+        far = np.flatnonzero(np.any(np.abs(shift) > reading.model.near_px, axis=1))
+        return cls(reading.model, shift, gain, np.einsum("spd,sd->sp", gain, shift), sigma, rows, far)
+
+    def in_sigmas(self, change: Array, states: slice | NDArray[np.intp]) -> Array:
+        moved = np.abs(change @ self.rows.T)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(moved == 0.0, 0.0, moved / self.sigma[states])
+
+    def step(self, x: Array, found: Retraced, states: slice | NDArray[np.intp]) -> Array:
+        rest = self.shift[states] - found.spots + x @ self.model.spots.T
+        return np.asarray(np.einsum("spd,sd->sp", self.gain[states], rest))
+
+    def judged(self, values: Array, traced: Retraced) -> tuple[Array, Curvature]:
+        """Readings (S, 4 K), worked out anew where they are not linear, by what the states that are far do."""
+        model, x, every = self.model, self.x, slice(None)
+        found = Retraced(x @ model.spots.T, x @ model.parameters.T)
+        found.spots[self.far], found.parameters[self.far] = traced.spots, traced.parameters
+        # the two are one number where everything is linear
+        curved = found.parameters + (self.step(x, found, every) - x) @ model.parameters.T - x @ model.parameters.T
+        off = self.in_sigmas(curved, every)
+        beyond = ~np.all(off <= BEYOND, axis=1)
+        out, rests = values.copy(), ~beyond
+        left = np.flatnonzero(beyond & np.all(np.isfinite(off), axis=1))
+        x, last = x[left], Retraced(found.spots[left], found.parameters[left])
+        for _ in range(_MOST_STEPS):
+            if not len(left):
+                break
+            x = self.step(x, last, left)
+            now = model.trace(model.states(x))
+            change = self.in_sigmas(now.parameters - last.parameters, left)
+            done = np.all(change <= _REST, axis=1)
+            out[left[done]], rests[left[done]] = now.parameters[done], True
+            on = ~done & np.all(np.isfinite(change), axis=1)
+            left, x, last = left[on], x[on], Retraced(now.spots[on], now.parameters[on])
+        return out, Curvature(off, beyond, rests)
+
 
 MeasuredSpots: TypeAlias = tuple[SpotPositions, FitStates]
 """Spots with how good their fits are."""
@@ -285,7 +617,7 @@ def estimates_of(
             across = noise[..., first, second], None if total is None else total[..., first, second]
             looks = cameras[one].look_rad, cameras[two].look_rad
             both = parameters[one][title], parameters[two][title]
-            angle[title] = intersection_angle.exact(*both, *looks, *across)
+            angle[title] = exact(*both, *looks, *across)
             if ground is not None:
                 distances = [camera.geometry.principal_distance_m for camera in cameras.values()]
                 f = (distances[0], distances[1])

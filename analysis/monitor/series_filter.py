@@ -14,29 +14,71 @@ as a mixture over the readings between which it can have come; so sigma is wide 
 the body that may jump are then free to have done so: what the readings did not tell yet of the others cannot be found
 later, since the places of the jump are given up.
 
-A reading that is more likely bad than the first after a jump is set aside (`untold_jumps`). The next one decides: what
+A reading that is more likely bad than the first after a jump is set aside (`filter_state`). The next one decides: what
 is known without it goes on beside what is known with it, until one of the two foretells that reading better. What is
 known meanwhile is the mixture of both.
 
 Jumps too small to be told are taken for a walk of their mean square, as in `jump_detection.with_unfound`, and what is
-known now and of the future counts those that the last readings hint at by their chances (`untold_jumps`).
+known now and of the future counts those that the last readings hint at by their chances (`filter_state`).
+
+A whole series of readings: forward one by one, as they came, then backward for what all of them say of times past.
+
+The smoother goes backwards over the same readings (Bryson, Frazier; de Jong, J. Am. Stat. Assoc. 84, 1989, 1085): it
+needs no inverse of a covariance, and of the filter only what is of the size of a reading. It is worked in pieces, the
+filter being run a second time in each, so that memory does not grow with states times readings.
+
+On its way it has score and information of a step before every reading, by all readings (de Jong, Penzer, J. Am. Stat.
+Assoc. 93, 1998, 796): a first way back finds what jumps the readings hint at that were not told (`filter_state`), and
+the second takes these for steps of their chances and sizes.
+
+How large a jump has to be to be found: of each body, by simulation of the test that finds it.
+
+After many readings at even intervals, what a step does to the next ones no longer depends on when it comes. With the
+information J of n readings on a step of the outputs (`series_filter`), the score of n readings after a step a is
+
+    b(n) = b(n-1) + N((J(n) - J(n-1)) a, J(n) - J(n-1)),
+
+so that the readings themselves need not be drawn. Directions of a are random as the prior states them, and its size is
+the root mean square of its motions over their stated standard deviations. The jump is found with the first reading at
+which any candidate passes the limit of the search, that of the place before the first reading after it alone: places
+beside it can only find it earlier.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
-from analysis.arrays import Array
-from analysis.measurement_error import UndeterminedError
+from analysis.arrays import Array, UndeterminedError
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track, Whitened
+from analysis.monitor.filter_state import (
+    RECENT,
+    Aside,
+    BadReading,
+    Belief,
+    Hint,
+    Innovation,
+    Jumper,
+    Observed,
+    Track,
+    Whitened,
+    added,
+    bad_reading,
+    blended,
+    chance_good,
+    jump_evidence,
+    jumpers,
+    may_be_bad,
+)
 from analysis.monitor.jump_detection import (
+    UNSEEN,
     Amounts,
     Bodies,
     Candidate,
@@ -50,18 +92,8 @@ from analysis.monitor.jump_detection import (
     untold_share,
 )
 from analysis.monitor.state_space import HeatInputs, StateSpace
-from analysis.monitor.untold_jumps import (
-    RECENT,
-    Hint,
-    Jumper,
-    bad_reading,
-    blended,
-    chance_good,
-    jump_evidence,
-    jumpers,
-    may_be_bad,
-)
 from analysis.statistics import limit_of
+from optics.numerics.array_math import covariance_root
 
 _NEARLY = 1e-11
 """Of the sum of its eigenvalues, by which information is made regular."""
@@ -581,3 +613,279 @@ class SeriesFilter:
 def _even(square: Array) -> Array:
     """A covariance, symmetric to the bit."""
     return np.asarray(0.5 * (square + square.T))
+
+
+T = TypeVar("T")
+_PIECE = 400
+"""Readings whose covariances are held at once."""
+
+
+def hinted(
+    how: SeriesFilter, knowing: SeriesFilter, start: Belief, observed: Sequence[Observed], left: Sequence[Array]
+) -> tuple[Belief, list[Array]]:
+    """What is known before the first reading, and N times (m,) what share of the mean square of jumps could not be
+    told, with jumps that all readings hint at.
+
+    Args:
+        how: the filter that looked for jumps.
+        knowing: the same, which looks for none but knows of those that were told.
+        start: as for `smoothed`.
+        observed: N readings in the order of time.
+        left: as for `smoothed`.
+    """
+    if not how.jumpers or not observed:
+        return start, list(left)
+    at = how.space.level
+    levels = [how.space.level_of(one.motions)[at] @ one.root for one in how.jumpers]
+    scores = np.empty((len(observed), at.stop - at.start))
+    known_of = np.empty((*scores.shape, scores.shape[1]))
+
+    def note(number: int, carried: Array, known: Array) -> None:
+        scores[number], known_of[number] = carried[at], known[at, at]
+
+    plain = replace(knowing, unfound=False)
+    none = np.zeros(0)
+    smoothed(plain, replace(start, left=none), observed, none, [none] * len(observed), knowing.parameters_of, note)
+    score = [scores @ level for level in levels]
+    information = [level.T @ (known_of @ level) for level in levels]
+    first = how.before_s if math.isnan(start.last) else 0.0
+    gap = np.diff([one.time for one in observed], prepend=observed[0].time - first)
+    place = {k: i for i, k in enumerate(how.walking.tolist())}
+    out = np.array(left)
+    for one, more in zip(how.jumpers, added(score, information, gap, how.jumpers, how.window), strict=True):
+        out[:, [place[k] for k in one.motions]] += more
+    return how.with_walk(start, out[0] - left[0], first), list(out)
+
+
+def smoothed(
+    how: SeriesFilter,
+    start: Belief,
+    observed: Sequence[Observed],
+    wanted: ArrayLike,
+    left: Sequence[Array],
+    each: Callable[[Array, Array, float], T],
+    note: Callable[[int, Array, Array], None] = lambda number, score, information: None,
+) -> list[T]:
+    """What all readings say of times past: forward to where pieces begin, then backward piece by piece.
+
+    Args:
+        how: a filter that looks for no jumps, since it knows of them.
+        start: what is known before the first reading.
+        observed: N readings in the order of time.
+        wanted: (T,) times, seconds, in any order, none before ``start``.
+        left: N times (m,) what share of the mean square of jumps could not be told, as the filter had it before each
+            reading: the process is then the filter's, and a part of a series gives what the whole gives.
+        each: (n,) mean and (n, n) covariance of the states at a wanted time, and the time -> what is made of them.
+        note: called with the number of each reading, and score (n,) and information (n, n) of a change of the states
+            just before it by the readings from it on.
+    """
+    times = np.asarray(wanted, np.float64)
+    order = np.argsort(times, kind="stable")
+    beliefs, belief = [start], start
+    for k, one in enumerate(observed):
+        if k and k % _PIECE == 0:
+            beliefs.append(belief)
+        there = how.at(replace(belief, left=left[k]), one.time)
+        belief = replace(there, state=how.taken(there.state, one)[0])
+    out: dict[int, T] = {}
+    size, moved = how.space.size, how.space.moved
+    carried, known = np.zeros(size), np.zeros((size, size))
+    # number of the first reading after each wanted time: it is worked out in the piece of that one
+    behind = np.searchsorted(np.array([one.time for one in observed]), times[order], side="right")
+    for k in order[behind == len(observed)]:  # after the last reading nothing comes to correct the filter
+        there = how.at(belief, times[k])
+        out[int(k)] = each(there.mean, there.covariance, float(times[k]))
+    for piece in reversed(range(len(beliefs))):
+        first, last = piece * _PIECE, min((piece + 1) * _PIECE, len(observed))
+        steps = list(_again(how, beliefs[piece], observed[first:last], left[first:last]))
+        for number in reversed(range(first, last)):
+            before, whitened = steps[number - first]
+            now = observed[number].time
+            # across the reading: (1 - KH)' N (1 - KH) + H' S^-1 H, in the form that stays symmetric to the bit; others
+            # of as little work lose N to rounding
+            away = whitened.gain @ known
+            half = away - 0.5 * (np.eye(len(away)) + away @ whitened.gain.T) @ whitened.rows
+            change = whitened.rows.T @ half
+            known = known - (change + change.T)
+            carried = carried + whitened.rows.T @ (whitened.white - whitened.gain @ carried)
+            note(number, carried, known)
+            for k in order[behind == number]:
+                there = how.at(before, times[k])
+                back = moved(carried[:, None], times[k], now, back=True)[:, 0]
+                both = how.space.moved_both(known, times[k], now, back=True)
+                gained = there.covariance @ both @ there.covariance
+                out[int(k)] = each(there.mean + there.covariance @ back, there.covariance - gained, float(times[k]))
+            carried = moved(carried[:, None], before.time, now, back=True)[:, 0]
+            known = how.space.moved_both(known, before.time, now, back=True)
+    return [out[k] for k in range(len(times))]
+
+
+def jointly(
+    how: SeriesFilter, start: Belief, observed: Sequence[Observed], wanted: ArrayLike, left: Sequence[Array]
+) -> tuple[Array, Array]:
+    """What all readings say of times past together: values (T, P) of the parameters, and their covariance (T, P, T, P).
+
+    The states at the wanted times go along with the filter, as copies that move no more, up to the last of them; what
+    comes after that is what the smoother carries back to it.
+
+    Args:
+        how: a filter that looks for no jumps, since it knows of them.
+        start: what is known before the first reading.
+        observed: N readings in the order of time.
+        wanted: (T,) times, seconds, in order, none before ``start``.
+        left: as of `smoothed`.
+    """
+    times, space = np.asarray(wanted, np.float64), how.space
+    size, ahead = space.size, 0
+    behind = np.searchsorted(np.array([one.time for one in observed]), times, side="right")
+    last = int(behind[-1]) if len(times) else 0
+    means, own = np.empty((0, size)), np.empty((0, size, 0, size))
+    across, belief = np.empty((0, size, size)), start  # of each copy, the states now with it
+    for k in range(last + 1):
+        if k < len(observed):
+            belief = replace(belief, left=left[k])
+        while ahead < len(times) and behind[ahead] == k:
+            across = space.moved(across, belief.time, times[ahead])
+            belief = how.at(belief, times[ahead])
+            own = np.concatenate([own, across.transpose(0, 2, 1)[:, :, None]], axis=2)
+            row = np.concatenate([across.transpose(1, 0, 2), belief.covariance[:, None]], axis=1)
+            own, across = np.concatenate([own, row[None]]), np.concatenate([across, belief.covariance[None]])
+            means = np.concatenate([means, belief.mean[None]])
+            ahead += 1
+        if k == last:
+            break
+        across = space.moved(across, belief.time, observed[k].time)
+        there = how.at(belief, observed[k].time)
+        whitened = how.whitened(there.state, observed[k])
+        gain = whitened.rows @ across
+        means = means + np.einsum("kdn,d->kn", gain, whitened.white)
+        own = own - np.einsum("kdn,ldm->knlm", gain, gain)
+        across = across - whitened.gain.T @ gain
+        belief = replace(there, state=how.taken(there.state, observed[k], whitened)[0])
+    after: list[tuple[Array, Array]] = []
+
+    def note(number: int, carried: Array, known: Array) -> None:
+        if number == 0:
+            after.append((carried, known))
+
+    smoothed(how, belief, observed[last:], np.zeros(0), left[last:], how.parameters_of, note)
+    for carried, known in after:
+        until = observed[last].time
+        back = space.moved(carried[:, None], belief.time, until, back=True)[:, 0]
+        both = space.moved_both(known, belief.time, until, back=True)
+        means = means + np.einsum("kmn,m->kn", across, back)
+        own = own - np.einsum("kmn,mo,lop->knlp", across, both, across, optimize=True)
+    values, covariance = space.outputs_jointly(means, own, times)
+    width = space.width
+    return values[:, width:], covariance[:, width:, :, width:]
+
+
+def _again(
+    how: SeriesFilter, belief: Belief, observed: Sequence[Observed], left: Sequence[Array]
+) -> Iterator[tuple[Belief, Whitened]]:
+    """What is known before each reading of one piece, before it was moved to it, and the reading."""
+    for one, share in zip(observed, left, strict=True):
+        before = replace(belief, left=share)
+        there = how.at(before, one.time)
+        whitened = how.whitened(there.state, one)
+        yield before, whitened
+        belief = replace(there, state=how.taken(there.state, one, whitened)[0])
+
+
+READINGS, SHARES = (1, 3, 10), (0.5, 0.95)
+"""Numbers of readings after a jump within which it is found, and in which share of cases."""
+_SIZES = np.geomspace(0.03, 100.0, 71)
+"""Sizes that are tried, over those stated: 12 percent apart."""
+_DRAWS, _BEFORE = 400, 20
+"""Jumps of each size, by which 95 percent are known to 1.1; and readings before, by which information is steady."""
+
+
+@dataclass(frozen=True, eq=False)
+class Power:
+    """Smallest jumps of a body that are found.
+
+    Attributes:
+        body: whose they are.
+        sizes: (readings, shares) the smallest of which so many are found within so many readings, root mean square of
+            its motions over their stated standard deviations; NaN where the largest that is tried is not.
+    """
+
+    body: str
+    sizes: Array
+
+    @property
+    def plain(self) -> dict[str, float | None]:
+        """Share and number of readings -> size; None for none."""
+        keys = [f"{round(100 * share)}_percent_within_{n}" for n in READINGS for share in SHARES]
+        return {
+            key: size if size == size else None for key, size in zip(keys, self.sizes.ravel().tolist(), strict=True)
+        }
+
+
+def detection_power(how: SeriesFilter, interval: float, noise: Array) -> tuple[Power, ...]:
+    """Return the smallest jump of each body that is found in half and in 95 % of cases within 1, 3 and 10 readings.
+
+    Args:
+        how: the filter that looks for jumps.
+        interval: seconds from one reading of the spots to the next.
+        noise: (D, D) px^2 of a reading.
+    """
+    informations, may = _informations(how, interval, noise), how.candidates
+    if not may:
+        return ()
+    looks = float(how.looks(interval))
+    tests = [[_test(one.spots, j, how.stated.jump_false_alarm / looks) for one in may] for j in informations]
+    out: list[Power] = []
+    for body in dict.fromkeys(one.body for one in may):
+        own = max((one for one in may if one.body == body), key=lambda one: len(one.motions))
+        found = _found(own.spots, informations, tests, np.random.default_rng([0, len(out)]))
+        out.append(Power(body, np.array([[_smallest(found[n - 1], share) for share in SHARES] for n in READINGS])))
+    return tuple(out)
+
+
+def _informations(how: SeriesFilter, interval: float, noise: Array) -> Array:
+    """(N, q, q) on a step, by 1 to N readings after it."""
+    belief, nothing = how.start(0.0), np.zeros(len(noise))
+    out: list[Array] = []
+    for k in range(_BEFORE + READINGS[-1]):
+        belief, _ = how.update(belief, Observed(k * interval, nothing, noise))
+        if k >= _BEFORE and len(belief.until):
+            out.append(belief.looking.information[-1 - (k - _BEFORE)])
+    return np.array(out)
+
+
+def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float]:
+    """(r, q) what makes independent numbers of a score, and the limit of the sum of their squares."""
+    values, vectors = np.linalg.eigh(spots.T @ information @ spots)
+    seen = values > UNSEEN * values.max()
+    return (vectors[:, seen] / np.sqrt(values[seen])).T @ spots.T, float(limit_of(chance, int(np.sum(seen))))
+
+
+def _found(
+    spots: Array, informations: Array, tests: Sequence[Sequence[tuple[Array, float]]], rng: np.random.Generator
+) -> Array:
+    """(N, S) shares of jumps of each size that are found with 1 to N readings."""
+    amounts = rng.standard_normal((_DRAWS, spots.shape[1]))
+    amounts *= np.sqrt(spots.shape[1]) / np.linalg.norm(amounts, axis=1, keepdims=True)
+    step, noise, before = amounts @ spots.T, np.zeros((_DRAWS, len(spots))), np.zeros_like(informations[0])
+    told, out = np.zeros((len(_SIZES), _DRAWS), bool), []
+    for information, those in zip(informations, tests, strict=True):
+        drawn = rng.standard_normal(noise.shape) @ covariance_root(information - before).T
+        noise, before = noise + drawn, information
+        score = _SIZES[:, None, None] * (step @ information) + noise
+        for away, limit in those:
+            told |= np.sum((score @ away.T) ** 2, axis=2) > limit
+        out.append(told.mean(axis=1))
+    return np.array(out)
+
+
+def _smallest(found: Array, share: float) -> float:
+    """Size from which on a share of jumps is found; NaN for none."""
+    less = np.flatnonzero(found < share)
+    first = less[-1] + 1 if len(less) else 0
+    if first == len(_SIZES):
+        return float("nan")
+    if first == 0:
+        return float(_SIZES[0])
+    part = (share - found[first - 1]) / (found[first] - found[first - 1])
+    return float(_SIZES[first - 1] * (_SIZES[first] / _SIZES[first - 1]) ** part)

@@ -33,8 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
-from analysis.arrays import Array
-from analysis.measurement_error import UndeterminedError
+from analysis.arrays import Array, UndeterminedError
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw
 from analysis.monitor.jump_detection import (
     MOST,

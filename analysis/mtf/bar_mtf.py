@@ -31,8 +31,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.arrays import Array
-from analysis.measurement_error import MeasurementError
+from analysis.arrays import Array, MeasurementError
 from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
 from analysis.mtf.edge_pages import different_pages, left_over, mean_page
 from analysis.mtf.slanted_edge import EdgeMtf

@@ -14,8 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from analysis.arrays import Array
-from analysis.measurement_error import MeasurementError
+from analysis.arrays import Array, MeasurementError
 from analysis.statistics import robust_sigma
 
 Axis = Literal["x", "y"]
@@ -200,10 +199,10 @@ def _direction(grey: Array) -> tuple[Axis, int]:
     return "y", 1 if slope_y > 0 else -1
 
 
-def _blocks(grey: Array, size: int = 4) -> Array:
-    """Means of whole blocks of size x size px."""
-    rows, columns = grey.shape[0] // size, grey.shape[1] // size
-    whole = grey[: rows * size, : columns * size].reshape(rows, size, columns, size)
+def _blocks(grey: Array) -> Array:
+    """Means of whole blocks of 4 x 4 px."""
+    rows, columns = grey.shape[0] // 4, grey.shape[1] // 4
+    whole = grey[: rows * 4, : columns * 4].reshape(rows, 4, columns, 4)
     return np.asarray(whole.mean(axis=(1, 3)))
 
 

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
 from analysis.mtf import edge_fit, slanted_edge
+from analysis.mtf.edge_fit import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, locate_edge
-from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.mtf.slanted_edge import EdgeMtf
 from analysis.spots.noise import NoiseModel
 from analysis.statistics import chance_beyond

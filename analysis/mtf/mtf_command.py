@@ -20,8 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from analysis.arrays import Array
-from analysis.images.image_file import ImageFile, Region, tone_curve
-from analysis.images.image_header import ImageError
+from analysis.images.image_file import ImageError, ImageFile, Region, tone_curve
 from analysis.mtf.bar_mtf import BarError, BarMtf, measure_bar_pages, page_warnings
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages

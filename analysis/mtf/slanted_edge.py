@@ -1,7 +1,7 @@
 """Modulation transfer function (MTF) from one slanted edge, after ISO 12233, with the standard deviation by theory.
 
 Steps: the edge's line from row centroids (`edge_location`); all pixels projected on the edge's *normal* and a
-least-squares edge-spread function through them (`edge_spread`); angle, position and a test for curvature by
+least-squares edge-spread function through them (`edge_fit`); angle, position and a test for curvature by
 one Gauss-Newton step on all pixels, twice; the transform of the line-spread function in closed form over the contrast.
 
 ISO 12233 projects along the rows, and its frequencies are counted along the row. Here they are counted along the
@@ -26,9 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from analysis.arrays import Array
-from analysis.mtf.edge_fit import OVERSAMPLING, FittedEdge, fit_edge, path_parts
+from analysis.mtf.edge_fit import OVERSAMPLING, EdgeDesign, EdgeSpread, FittedEdge, fit_edge, path_parts
 from analysis.mtf.edge_location import Axis, EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
-from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread
 from analysis.spots.noise import NoiseModel
 from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal_modulus
 

@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
 
+from analysis import statistics
 from analysis.arrays import Array
 
 Kind = Literal["shift", "affine"]
@@ -69,7 +69,7 @@ class ImageCorrection:
     @property
     def probability(self) -> float:
         """Chance of as large a chi-square if the covariances are true; 1 where nothing tells."""
-        return float(chi2.sf(self.chi_square, self.freedom)) if self.freedom else 1.0
+        return statistics.p_value(self.chi_square, self.freedom)
 
     def _basis(self, line: ArrayLike, sample: ArrayLike) -> Array:
         return _basis(
@@ -135,7 +135,7 @@ def image_correction(
         size_left = _squares(left, variance)
         size_left[~used] = 0.0
         far = int(np.argmax(size_left))
-        if size_left[far] <= chi2.isf(_FALSE_ALARM / count, 2):
+        if size_left[far] <= statistics.limit_of(_FALSE_ALARM / count, 2):
             break
         used[far] = False
     square = float(np.sum(_squares(left, spread)[used]))
@@ -155,9 +155,8 @@ def _solved(rows: Array, off: Array, spread: Array) -> tuple[Array, Array]:
     root = np.linalg.cholesky(spread)
     white = np.linalg.solve(root, rows).reshape(-1, rows.shape[2])
     right = np.linalg.solve(root, off[..., None]).reshape(-1)
-    q, r = np.linalg.qr(white)
-    inverse = np.linalg.inv(r)
-    return np.asarray(inverse @ (q.T @ right)), np.asarray(inverse @ inverse.T)
+    inverse = statistics.gain(white)
+    return np.asarray(inverse @ right), np.asarray(inverse @ inverse.T)
 
 
 def _squares(left: Array, variance: Array) -> Array:

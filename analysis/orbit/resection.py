@@ -25,10 +25,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
-from analysis.arrays import Array
-from analysis.measurement_error import MeasurementError
+from analysis import statistics
+from analysis.arrays import Array, MeasurementError
 from analysis.orbit.planes import Station, Strip
 
 _ATTITUDE = ("roll", "pitch", "yaw")
@@ -127,7 +126,7 @@ class Resection:
     @property
     def p_value(self) -> float:
         """Chance of such a chi-square or a larger one; 1 without redundancy."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom)) if self.degrees_of_freedom > 0 else 1.0
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     @property
     def sigma(self) -> dict[str, float]:
@@ -203,7 +202,7 @@ def resect(
         design, miss, _ = system()
         length = np.linalg.norm(design, axis=0)
         _check_rank(design, length, names)
-        step = -np.linalg.lstsq(design / length, miss, rcond=None)[0] / length
+        step = -statistics.gain(design) @ miss
         attitude = attitude @ Rotation.from_rotvec(step[:3]).as_matrix()
         for name in looks:
             if name != zero:
@@ -220,7 +219,7 @@ def resect(
             )
     design, miss, residual = system()
     length = np.linalg.norm(design, axis=0)
-    inverse = np.linalg.pinv(design / length) / length[:, None]
+    inverse = statistics.gain(design)
     return Resection(
         attitude=attitude,
         looks=looks,

@@ -29,8 +29,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.arrays import Array
-from analysis.measurement_error import UndeterminedError
+from analysis.arrays import Array, UndeterminedError
 
 INTERIOR = ("f", "x", "y")
 BIAS = ("roll", "pitch", "yaw")
@@ -149,7 +148,7 @@ class LineModel:
         square = np.sum(place**2, axis=1)
         grown = 1.0 + square * (self.k1 + self.k2 * square)
         along = np.stack([a / c, b / c], axis=1)
-        own = np.zeros((len(c), 2, 3))
+        own = np.zeros((len(c), 2, 3), np.result_type(c, f))
         own[:, 0, 0] = own[:, 1, 1] = f / c
         own[:, :, 2] = (-f / c)[:, None] * along
         swung = np.concatenate(self._turned_slopes, axis=1)
@@ -311,38 +310,26 @@ def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: 
     Raises:
         ValueError: a ground point behind a camera.
     """
-    f, (x0, y0) = camera.principal_distance, camera.interior[1:]
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
     turn = bias_rotation(bias)
-    mounted = (q @ turn - camera.position) @ camera.to_body
-    a, b, c = (mounted @ camera._turned).T
-    if np.any(c <= 0):
-        raise UndeterminedError("three-line model: a ground point lies behind a camera")
-    x, y = rays.image[:, 0] - x0, rays.image[:, 1] - y0
+    seen = camera.seen(q @ turn, rays.image)
+    x, y = (rays.image - camera.interior[1:]).T
     square = x * x + y * y
     grown = 1.0 + square * (camera.k1 + camera.k2 * square)
     slope = 2.0 * (camera.k1 + 2.0 * camera.k2 * square)
-    kind = np.result_type(a, f, x)
-    interior, image = np.empty((len(c), 2, 3), kind), np.zeros((len(c), 2, 3), kind)
-    interior[:, 0, 0], interior[:, 1, 0] = a / c, b / c
+    interior = np.empty((len(x), 2, 3), np.result_type(seen.by_drift, x))
+    interior[:, :, 0] = seen.by_drift[:, :, 3]
     interior[:, 0, 1], interior[:, 1, 2] = -(grown + slope * x * x), -(grown + slope * y * y)
     interior[:, 1, 1] = interior[:, 0, 2] = -(slope * x * y)
-    image[:, 0, 0] = image[:, 1, 1] = f * (1 / c)
-    image[:, 0, 2], image[:, 1, 2] = f * (-a / c**2), f * (-b / c**2)
-    to_body = image @ camera.axes.T  # by the point in the body frame of the true attitude
-    turned, swung = np.empty((2, len(q), 3, 3), kind)
-    for axis, (by_bias, by_drift) in enumerate(zip(_rotation_slopes(bias), camera._turned_slopes, strict=True)):
-        turned[:, :, axis], swung[:, :, axis] = q @ by_bias, mounted @ by_drift
-    to_measured = to_body @ turn.T  # by the point in the body frame of the measured attitude
-    spun = np.zeros((len(q), 3, 3), kind)  # the products of q with the axes, column by column
-    for axis, (i, j) in enumerate(_NEXT):
-        spun[:, i, axis], spun[:, j, axis] = q[:, j], -q[:, i]
+    turned = np.stack([q @ by_bias for by_bias in _rotation_slopes(bias)], axis=-1)
+    to_measured = seen.by_body @ turn.T  # by the point in the body frame of the measured attitude
+    spun = np.stack([np.cross(q, axis) for axis in _UNIT], axis=-1)
     return Partials(
         interior=interior,
-        bias=to_body @ turned,
+        bias=seen.by_body @ turned,
         ground=to_measured @ np.swapaxes(rays.attitude, 1, 2),
         attitude=to_measured @ spun,
-        drift=np.concatenate([image @ swung, interior[:, :, :1]], axis=2),
+        drift=seen.by_drift,
     )
 
 

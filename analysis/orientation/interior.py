@@ -3,7 +3,7 @@
 Over a narrow field tan^2 W is tiny: an error of 1 um at the edge of +-1.25 deg is 2 mm of p. Paper 004 solves for p all
 the same (eq. 2) and remarks that p is about a pixel; this says with numbers when p = 0 (eq. 3) is the better choice.
 
-`fit_interior_orientation` fits the model of `distortion_model` (paper 004, eqs. 1-4, with a constant and
+`fit_interior_orientation` fits the model below (paper 004, eqs. 1-4, with a constant and
 radial terms). Errors of a turntable are common to many points (eccentricity, graduation, the zero), so the noise is a
 full covariance. The paper weights all points alike; its estimates stay unbiased under such noise, but sigmas from the
 scatter of the residuals are wrong, for a common error hides in the parameters. Here every sigma comes from the given
@@ -14,41 +14,230 @@ A point of the line at y looks, from the camera's Z, at
     tan theta = (y - y0) (1 + k1 (y - y0)^2) / f        (Brown, Photogramm. Eng. 37(8), 1971)
 
 and a test reads W = axis + theta, where `axis` is the reading of the camera's Z, counted from the zero of the test. To
-lowest order these are the terms of `distortion_model`: k1 = -k3 / f^3 (the other sign: a pincushion, k3 > 0, images
+lowest order these are the terms below: k1 = -k3 / f^3 (the other sign: a pincushion, k3 > 0, images
 farther out than f tan W, so that places have to be moved inward), y0 (1 + 3 k3 / f) = p (a shift of the distortion's
 centre is a tan^2 term as well), axis = (y0 - c) / f. The f is that of the model with k3, the slope in the middle of the
 field, and not the balanced one of paper 004's eq. (3), the slope that leaves the smallest distortion: over a field of
 +- W they differ by about 0.6 k3 tan^2 W.
 
 Angles in radians, lengths in metres, k1 in 1/m^2.
+
+Interior orientation and distortion along a line CCD: the equations of paper 004 as printed, and the terms of the
+model that goes beyond them.
+
+A collimator stands still and the camera turns on a turntable. W (rad) is the angle of a direction from the one that
+images to the centre O of the line, L (m) the place of its spot from O. Both count in the same sense, so that f > 0.
+Paper 004 (Li et al., doi 10.3788/IRLA20200143) defines the distortion of a point
+
+    D = L - f tan W + p tan^2 W    (1)
+
+and chooses f and p such that sum D^2 over the points is least (2), f alone with p = 0 (3), or p alone (4).
+
+What (1) means: a camera without distortion whose principal point lies p from O images to
+L = f tan(W - w) + f tan w with tan w = p / f, which is f tan W - p tan^2 W up to terms of the order p^2 / f. There is
+no constant term as long as W counts exactly from the direction that images to O. An error d of that zero of W adds
+-f d (1 + tan^2 W): (3) leaves f d in the distortion of every point, and (2) puts f d (1 + 5 / (3 tan^2 W_edge)) into p,
+which is 3500 f d for a field of +-1.25 deg. The model with a constant is free of this:
+
+    L = c + f tan W - p tan^2 W + k3 tan^3 W
+
+- `constant` c, `principal_distance` f, `principal_point` p: the interior orientation, metres. In one dimension a
+  decentring distortion d2 tan^2 W is the same function as a principal point p = -d2, and so is, to first order, a
+  radial distortion whose centre lies off the zero of W by w: -3 k3 w tan^2 W. No measurement along one line separates
+  them;
+- `radial3` k3, m: radial distortion. With r = f tan W it is K1 r^3, K1 = k3 / f^3 (1/m^2); positive is a pincushion.
+  Software that *adds* a correction to the image has the other sign.
+
+Angles in radians, lengths in metres. Leading axes of L and W are sets.
+
+From the frames and readings of a distortion test to interior orientation and distortion (paper 004, section 3).
+
+1. `locate_spots`: energy centroids on the line CCD, L = (column - middle of the line) * pitch.
+2. `reduce_sets`: repeated sets to one (W, L) per point, gross errors out by Chauvenet's criterion.
+3. `Distortion.measure`: f, p and D = L - c - f tan W + p tan^2 W with a constant c beside eq. (2), which takes up the
+   error of the zero of W, and a smooth model of D. What the points scatter about that model beyond their noise is taken
+   as one more noise, the same at all points and independent from point to point: the subdivision error of the table
+   above all, whose period of arcseconds no calibration follows.
+
+Metres and radians; N points, S sets.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
+from scipy.optimize import brentq
 
-from analysis.arrays import Array
-from analysis.orientation.distortion_model import OrientationError, design, readings, slope
+from analysis.arrays import Array, MeasurementError
+from analysis.spots.centroid import energy_centroid, mean_frames
+from analysis.spots.noise import NoiseModel
+from analysis.statistics import gain
+from analysis.turntable.dividing_error import CalibrationSeries
+
+# power of tan W and sign of each term
+_POWER = {"constant": (0, 1.0), "principal_distance": (1, 1.0), "principal_point": (2, -1.0), "radial3": (3, 1.0)}
+TERMS = tuple(_POWER)
+# Line cameras see a few degrees; beyond this an angle is rather in degrees than in radians.
+_WIDEST = np.pi / 4
+# Determinant of (2) relative to its first product; one part in 1e9 leaves six digits of the sums' rounding.
+_SINGULAR = 1e-9
+
+
+class OrientationError(MeasurementError, ValueError):
+    """The readings do not determine what is asked for; the message says what to change."""
+
+
+def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
+    """L and W as float64 arrays of one shape (..., N), checked.
+
+    Raises OrientationError for sizes that differ, no points, values that are not finite, angles beyond 45 deg.
+    """
+    where, turned = np.asarray(position, dtype=np.float64), np.asarray(angle, dtype=np.float64)
+    if where.ndim == 0 or turned.ndim == 0 or where.shape[-1] != turned.shape[-1]:
+        raise OrientationError(
+            f"interior orientation: {where.shape} spot positions and {turned.shape} angles; give one angle per spot"
+        )
+    try:
+        where, turned = np.broadcast_arrays(where, turned)
+    except ValueError as error:
+        raise OrientationError(
+            f"interior orientation: sets of spot positions {where.shape} and angles {turned.shape} do not match"
+        ) from error
+    if where.size == 0:
+        raise OrientationError("interior orientation: no points; give at least one angle with its spot position")
+    for name, values in (("spot position", where), ("angle", turned)):
+        bad = np.argwhere(~np.isfinite(values))
+        if bad.size:
+            place = ", ".join(str(k) for k in bad[0])
+            raise OrientationError(
+                f"interior orientation: {name} [{place}] is not finite ({len(bad)} in all); leave those points out"
+            )
+    widest = float(np.max(np.abs(turned)))
+    if widest > _WIDEST:
+        raise OrientationError(
+            f"interior orientation: an angle of {np.rad2deg(widest):.6g} deg ({widest:.6g} rad) is beyond 45 deg;"
+            " give radians, counted from the direction that images to the centre of the line"
+        )
+    return where, turned
+
+
+def distortion(
+    position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike, principal_point: ArrayLike = 0.0
+) -> Array:
+    """Distortion (..., N), m, of each point: paper 004, eq. (1).
+
+    Raises OrientationError for bad readings.
+
+    Args:
+        position: (..., N), m.
+        angle: (..., N), rad.
+        principal_distance: (...) m, one per set.
+        principal_point: likewise.
+    """
+    where, turned = readings(position, angle)
+    t = np.tan(turned)
+    f = np.asarray(principal_distance, dtype=np.float64)[..., None]
+    p = np.asarray(principal_point, dtype=np.float64)[..., None]
+    return np.asarray(where - f * t + p * t**2)
+
+
+def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
+    """Principal distance f and point p, each (...), m: paper 004, eq. (2).
+
+    position, angle: (..., N) m, rad, at least two different angles other than zero in each set.
+    Raises OrientationError for bad or too few readings and for angles that count against the positions.
+    """
+    where, turned = readings(position, angle)
+    if where.shape[-1] < 2:
+        raise OrientationError("interior orientation: 1 angle for the 2 unknowns f and p; measure at more angles")
+    t = np.tan(turned)
+    t2, t3, t4 = np.sum(t**2, axis=-1), np.sum(t**3, axis=-1), np.sum(t**4, axis=-1)
+    lt, lt2 = np.sum(where * t, axis=-1), np.sum(where * t**2, axis=-1)
+    determinant = t3**2 - t2 * t4
+    if np.any(np.abs(determinant) <= _SINGULAR * t2 * t4):
+        raise OrientationError(
+            "interior orientation: f and p cannot be separated, for the angles are (nearly) all the same or zero;"
+            " turn the turntable between the readings"
+        )
+    f = (lt2 * t3 - lt * t4) / determinant
+    p = (lt2 * t2 - lt * t3) / determinant
+    _same_sense(f)
+    return np.asarray(f), np.asarray(p)
+
+
+def principal_distance(position: ArrayLike, angle: ArrayLike) -> Array:
+    """Balanced principal distance f (...), m, which leaves the smallest distortion with p = 0: paper 004, eq. (3).
+
+    position, angle: (..., N) m, rad. Raises OrientationError for bad readings, angles that are all zero, and angles
+    that count against the positions.
+    """
+    where, turned = readings(position, angle)
+    t = np.tan(turned)
+    t2 = np.sum(t**2, axis=-1)
+    if np.any(t2 == 0):
+        raise OrientationError("interior orientation: all angles are zero and say nothing of f; turn the turntable")
+    f = np.sum(where * t, axis=-1) / t2
+    _same_sense(f)
+    return np.asarray(f)
+
+
+def principal_point(position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike) -> Array:
+    """Principal point p (...), m, for a known f (...), m: paper 004, eq. (4).
+
+    Raises OrientationError for bad readings and angles that are all zero.
+
+    Args:
+        position: (..., N), m.
+        angle: (..., N), rad.
+        principal_distance: (...), m, one per set.
+    """
+    where, turned = readings(position, angle)
+    t = np.tan(turned)
+    t4 = np.sum(t**4, axis=-1)
+    if np.any(t4 == 0):
+        raise OrientationError("interior orientation: all angles are zero and say nothing of p; turn the turntable")
+    f = np.asarray(principal_distance, dtype=np.float64)
+    return np.asarray((f * np.sum(t**3, axis=-1) - np.sum(where * t**2, axis=-1)) / t4)
+
+
+def design(angle: ArrayLike, terms: Sequence[str]) -> Array:
+    """dL/d(term) (..., P) at angles (...), rad. Raises OrientationError for unknown or repeated terms."""
+    unknown = [term for term in terms if term not in _POWER]
+    if unknown or len(set(terms)) != len(terms):
+        raise OrientationError(f"interior orientation: terms must be different ones of {TERMS}, found {tuple(terms)}")
+    t = np.tan(np.asarray(angle, dtype=np.float64))
+    return np.stack([sign * t**power for power, sign in (_POWER[term] for term in terms)], axis=-1)
+
+
+def slope(angle: ArrayLike, terms: Sequence[str], values: ArrayLike) -> Array:
+    """dL/dW (...), m/rad, of the model with these terms and values (P,) at angles (...), rad.
+
+    Args:
+        angle: (...), rad.
+        terms: names out of `TERMS`.
+        values: of the terms, (P,), m.
+    """
+    t = np.tan(np.asarray(angle, dtype=np.float64))
+    powers = [_POWER[term] for term in terms]
+    steps = np.stack([sign * power * t ** max(power - 1, 0) for power, sign in powers], axis=-1)
+    return np.asarray((steps @ np.asarray(values, dtype=np.float64)) * (1.0 + t**2))
+
+
+def _same_sense(f: Array) -> None:
+    if np.any(f <= 0):
+        raise OrientationError(
+            f"interior orientation: the principal distance comes out as {float(np.min(f)):.6g} m; angles and spot"
+            " positions count in opposite senses, change the sign of one of them"
+        )
+
 
 # With columns of length one, the worst combination of terms has this many times the sigma of the best. Five terms over
 # half a field have 270; f and a constant reach 1000 when the angles lie within 1 % of each other.
 _WORST_CONDITION = 1e3
-
-
-def gain(columns: Array, root: Array | None = None) -> Array:
-    """Least-squares inverse (P, N) of columns (N, P): all points alike, or generalised least squares.
-
-    root: (N, N) from `_noise_root`. Columns are scaled to length one, for powers of tan W differ by magnitudes.
-    """
-    white = columns if root is None else np.linalg.solve(root, columns)
-    length = np.linalg.norm(white, axis=0)
-    inverse = np.linalg.pinv(white / length) / length[:, None]
-    return np.asarray(inverse if root is None else inverse @ np.linalg.inv(root), dtype=np.float64)
 
 
 def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> None:
@@ -199,7 +388,7 @@ _WORST_DISTANCE = 0.1
 class InteriorOrientation:
     """Result of a fit over N points with P terms.
 
-    terms: names as in `analysis.orientation.distortion_model.TERMS`. values: (P,) m. covariance: (P, P) m^2.
+    terms: names as in `analysis.orientation.interior.TERMS`. values: (P,) m. covariance: (P, P) m^2.
     angle, position: (N,) rad, m, as measured. noise: (N, N) m^2, of positions and angles together.
     residual: (N,) m, position - model.
     chi_square: least sum of squares in the metric of the noise; it has degrees_of_freedom = N - P when model and noise
@@ -381,3 +570,206 @@ def line_orientation(fit: InteriorOrientation) -> LineOrientation:
         if np.all(np.abs(step) < 1e-6 * np.sqrt(np.diagonal(spread))):
             return LineOrientation(values, spread)
     raise OrientationError("interior orientation: the line's principal point and distortion do not converge")
+
+
+CALIBRATED = ("constant", "principal_distance", "principal_point")
+"""What distortion is counted from: eq. (2) with a constant."""
+SMOOTH = (*CALIBRATED, "radial3")
+"""The model whose residual tells how well the points fit a smooth curve."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """Spots on the line CCD.
+
+    Attributes:
+        position: L, (N, S), metres.
+        temporal: sigma by noise that is new in each frame, (N, S), metres.
+        fixed: sigma by differences of the line's columns, which stay while the spot does, (N, S), metres.
+        row: of the spot in its image, (N, S), pixels.
+    """
+
+    position: Array
+    temporal: Array
+    fixed: Array
+    row: Array
+
+
+def locate_spots(
+    frames: NDArray[np.uint16],
+    column: ArrayLike,
+    middle: float,
+    pitch: float,
+    noise: NoiseModel,
+    radius: float,
+    offset: ArrayLike = 0.0,
+) -> Spots:
+    """Energy centroids.
+
+    Args:
+        frames: (N, S, frames, H, W).
+        column: of the line, where each image begins, (N, S).
+        middle: column of the line's middle, where L = 0.
+        pitch: metres.
+        noise: of one frame; its pattern is one of columns: every row of a TDI line is collected by the same pixels.
+        radius: of the centroid's window, pixels.
+        offset: energy centroid minus chief ray by the camera's design, (N,), metres; taken off.
+
+    Raises:
+        SpotError: a spot is saturated, absent, or too near the edge of its image.
+    """
+    count, sets, number = frames.shape[:3]
+    spots = energy_centroid(mean_frames(frames).reshape(count * sets, *frames.shape[3:]), number, noise, radius)
+    assert spots.gain_maps is not None
+    assert spots.light_dn is not None
+    influence = spots.gain_maps[:, 1]
+    gain = np.sum(np.sum(influence * spots.light_dn, axis=1) ** 2, axis=-1) * noise.prnu**2
+    dark = np.sum(np.sum(influence, axis=1) ** 2, axis=-1) * noise.dsnu_variance_dn2
+    shape = count, sets
+    place = (np.asarray(column) + spots.column.reshape(shape) - middle) * pitch
+    return Spots(
+        position=place - np.broadcast_to(np.asarray(offset, np.float64), (count,))[:, None],
+        temporal=pitch * np.sqrt(spots.temporal_covariance[:, 1, 1]).reshape(shape),
+        fixed=pitch * np.sqrt(gain + dark).reshape(shape),
+        row=spots.row.reshape(shape),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PointMeans:
+    """Sets reduced to one measurement per point.
+
+    Attributes:
+        keep: exposures that Chauvenet's criterion keeps, (N, S).
+        scatter: sigma of one exposure by the scatter between the sets, or as given if there is one set only, metres.
+        sigma: of the mean of each point, without what is common to all sets, (N,), metres.
+    """
+
+    keep: NDArray[np.bool_]
+    scatter: float
+    sigma: Array
+
+    def mean(self, values: Array) -> Array:
+        """Mean over the sets that are kept, (N, S) to (N,)."""
+        return np.asarray(np.mean(values, axis=1, where=self.keep))
+
+
+def reduce_sets(
+    angle: Array, spots: Spots, principal_distance: float, single: float, present: NDArray[np.bool_] | None = None
+) -> PointMeans:
+    """Find gross errors among the sets and the noise of the means.
+
+    In each set, L - f tan W of a point differs from its mean over the sets by the repeatability of the table and by
+    noise, whose sizes the sets themselves tell.
+
+    Args:
+        angle: W, (N, S), radians, by the readings.
+        spots: as located.
+        principal_distance: about, metres.
+        single: sigma of one exposure, metres, for a test of one set.
+        present: which exposures there are, (N, S), where sets lack points; the others hold any finite numbers. None
+            for all.
+    """
+    rest = spots.position - principal_distance * np.tan(angle)
+    # what does not average out while the spot stays on its pixels
+    fixed = np.sqrt(np.mean(spots.fixed**2, axis=1, where=True if present is None else present))
+    count, sets = rest.shape
+    if sets < 2:
+        own = np.hypot(single, spots.temporal[:, 0])
+        return PointMeans(np.ones(rest.shape, bool), float(np.sqrt(np.mean(own**2))), np.hypot(own, fixed))
+    # the comparison of the table with the camera is a calibration series, if one forgets its units
+    series = CalibrationSeries(np.arange(count, dtype=float), rest, present=present)
+    return PointMeans(series.keep, series.repeatability, np.hypot(series.noise_sigma, fixed))
+
+
+def _white(fitted: Callable[[float], InteriorOrientation]) -> float:
+    """White noise beside the stated one that brings chi-square to its expectation, metres; zero if it is there already.
+
+    The estimator of Paule and Mandel (J. Res. Natl. Bur. Stand. 87, 377 (1982)). Chi-square falls steadily with the
+    noise.
+    """
+    bare = fitted(0.0)
+    if bare.degrees_of_freedom == 0 or bare.chi_square <= bare.degrees_of_freedom:
+        return 0.0
+
+    def beyond(size: float) -> float:
+        fit = fitted(size)
+        return fit.chi_square - fit.degrees_of_freedom
+
+    # white noise of sigma s alone leaves chi-square <= sum(residual^2) / s^2, which is N - P at the upper end
+    most = float(np.sqrt(np.sum(bare.residual**2) / bare.degrees_of_freedom))
+    return float(brentq(beyond, 0.0, most, xtol=1e-11))
+
+
+@dataclass(frozen=True, eq=False)
+class Distortion:
+    """Distortion with one kind of angles (as read, or compensated).
+
+    Attributes:
+        angle: W of each exposure, (N, S), radians.
+        position: L, (N, S), metres.
+        means: how sets were reduced.
+        fit: of the calibrated terms; its residual is the distortion D of the mean of the sets, (N,), metres.
+        smooth: the same with radial distortion; its residual is what is not smooth.
+        white: sigma of each point's position beyond the noise that was stated, metres; it is in the noise of both fits.
+    """
+
+    angle: Array
+    position: Array
+    means: PointMeans
+    fit: InteriorOrientation
+    smooth: InteriorOrientation
+    white: float
+
+    @classmethod
+    def measure(
+        cls, angle: Array, spots: Spots, means: PointMeans, angle_covariance: ArrayLike | None = None
+    ) -> Distortion:
+        """Fit.
+
+        Args:
+            angle: (N, S), radians.
+            spots: as located.
+            means: how sets are reduced.
+            angle_covariance: of the mean angles, (N, N), rad^2: what is common to all sets of a point, without what is
+                independent from point to point.
+
+        Raises:
+            OrientationError: fewer points than unknowns, or angles that do not determine them.
+        """
+        where, turned = means.mean(spots.position), means.mean(angle)
+
+        def fitted(terms: tuple[str, ...], white: float) -> InteriorOrientation:
+            sigma = np.hypot(means.sigma, white)
+            return fit_interior_orientation(where, turned, sigma, terms, angle_covariance=angle_covariance)
+
+        white = _white(lambda size: fitted(SMOOTH, size))
+        fit, smooth = fitted(CALIBRATED, white), fitted(SMOOTH, white)
+        return cls(angle, spots.position, means, fit, smooth, white)
+
+    @property
+    def distortion(self) -> Array:
+        """D, (N,), metres."""
+        return self.fit.residual
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviation of D, (N,), metres."""
+        return np.sqrt(np.maximum(np.diagonal(self.fit.residual_covariance), 0.0))
+
+    @property
+    def zero(self) -> float:
+        """Angle at which the line's middle is imaged, by the constant, radians."""
+        return -self.fit.value("constant") / self.fit.value("principal_distance")
+
+    @property
+    def rms_over_sets(self) -> Array:
+        """RMS of each point's distortion over the sets that are kept, (N,), metres, every set fitted by itself: what
+        Table 2 of paper 004 is called.
+        """
+        out = np.full(self.position.shape, np.nan)
+        for s, keep in enumerate(self.means.keep.T):
+            out[keep, s] = fit_interior_orientation(
+                self.position[keep, s], self.angle[keep, s], self.means.scatter, CALIBRATED
+            ).residual
+        return np.asarray(np.sqrt(np.mean(out**2, axis=1, where=self.means.keep)))

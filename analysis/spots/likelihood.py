@@ -59,7 +59,6 @@ def maximum_likelihood_fit(
     frames: int,
     noise: NoiseModel,
     template: SpotTemplate,
-    index: NDArray[np.intp] | None = None,
     edge_px: float = EDGE_PX,
     keep_maps: bool = True,
     threads: int = 1,
@@ -74,8 +73,7 @@ def maximum_likelihood_fit(
         mean: mean frames, (B, H, W), DN.
         frames: of each mean.
         noise: of the detector.
-        template: T shapes.
-        index: which of them each spot has, (B,); default: spot b has shape b modulo T.
+        template: T shapes; spot b has shape b modulo T.
         edge_px: least distance of a centre from the image's outermost pixel centres.
         keep_maps: keep the influence of every pixel, for covariances of differences.
         threads: the batch is cut into small pieces that fit the cache; results do not depend on the number of threads.
@@ -88,9 +86,7 @@ def maximum_likelihood_fit(
     if threads < 1 or max_iterations < 1:
         raise ValueError(f"maximum likelihood: threads {threads} and max_iterations {max_iterations} must be >= 1")
     rule = _Rule(template, noise, frames)
-    which = np.arange(count) % template.count if index is None else np.asarray(index, dtype=np.intp)
-    if which.shape != (count,) or np.any((which < 0) | (which >= template.count)):
-        raise ValueError(f"maximum likelihood: index must be ({count},) of 0 to {template.count - 1}")
+    which = np.arange(count) % template.count
 
     def measure(part: slice) -> SpotPositions:
         try:

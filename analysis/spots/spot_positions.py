@@ -21,8 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.arrays import Array
-from analysis.measurement_error import MeasurementError
+from analysis.arrays import Array, MeasurementError
 from analysis.spots.noise import NoiseModel
 
 

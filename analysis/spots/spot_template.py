@@ -25,8 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 from scipy.interpolate import BSpline
 
-from analysis.arrays import Array
-from analysis.measurement_error import MeasurementError, UndeterminedError
+from analysis.arrays import Array, MeasurementError, UndeterminedError
 
 _DEGREE = 5
 _TAPS = _DEGREE + 1
@@ -314,12 +313,11 @@ class SmearedShape:
 
     Args:
         template: the shapes.
-        index: which of them.
     """
 
-    def __init__(self, template: SpotTemplate, index: int = 0) -> None:
-        self._template, self._which = template, np.array([index])
-        coefficients = template.row_factors[index] @ template.column_factors[index].T
+    def __init__(self, template: SpotTemplate) -> None:
+        self._template = template
+        coefficients = template.row_factors[0] @ template.column_factors[0].T
         self._spectrum = fft.rfft2(coefficients)
         turns = 2.0 * np.pi * template.oversampling
         self._rows = turns * np.fft.fftfreq(template.grid[0])[:, None]
@@ -349,8 +347,8 @@ class SmearedShape:
             column: likewise.
         """
         template = self._template
-        template.check_range(np.array([row]), np.array([column]), self._which)
-        centre, (height, width) = template.centre[self._which[0]], template.shape
+        template.check_range(np.array([row]), np.array([column]), np.zeros(1, np.intp))
+        centre, (height, width) = template.centre[0], template.shape
         by_row, rows = self._splines(centre[0], row, height)
         by_column, columns = self._splines(centre[1], column, width)
         part = coefficients[rows, columns]
@@ -370,7 +368,7 @@ class SmearedShape:
             column: likewise.
             covariance: as of `smeared`.
         """
-        centre, (height, width) = self._template.centre[self._which[0]], self._template.shape
+        centre, (height, width) = self._template.centre[0], self._template.shape
         by_row, rows = self._splines(centre[0], row, height)
         by_column, columns = self._splines(centre[1], column, width)
         out = np.zeros((len(maps), *self._template.grid))

@@ -29,8 +29,7 @@ from scipy.stats import chi2, norm
 
 from analysis.arrays import Array, Mask
 from analysis.spots import spot_image
-from analysis.spots.frame_movement import FALSE_ALARM
-from analysis.spots.frame_screening import Finding, ScreenedFrames
+from analysis.spots.frame_screening import FALSE_ALARM, Finding, ScreenedFrames
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened, model_parts
 from analysis.spots.spot_positions import SpotError, SpotPositions

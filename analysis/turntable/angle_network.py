@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.arrays import Array
-from analysis.measurement_error import MeasurementError
+from analysis.arrays import Array, MeasurementError
 
 Curve = Callable[[Array], Array]
 

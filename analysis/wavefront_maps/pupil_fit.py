@@ -1,8 +1,10 @@
-"""Zernike terms of a map over any lit area of a pupil, with their covariance.
+"""Zernike terms of a map over any lit area of a pupil.
 
 Terms are made orthonormal over the pixels that are lit, in Noll's order: over a ring these are Mahajan's annular terms
 up to the pixels, over a cut pupil their like. Coefficients of the circle's terms follow from them; where light is
-missing they share among them what looks alike there, which their covariance says.
+missing they share among them what looks alike there.
+
+Which way round a measured wavefront is: flips, quarter turns and sign, and which of these the data allow.
 """
 
 from __future__ import annotations
@@ -10,26 +12,230 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2
 
-from analysis.arrays import Array
-from analysis.measurement_error import UndeterminedError
-from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
+from analysis.arrays import Array, UndeterminedError
+from analysis.statistics import chance_beyond
+from analysis.wavefront_maps.map_files import MapError, WavefrontMap
 from analysis.wavefront_maps.zernike_table import circle_terms, noll_to_nm
+
+_ORIENTATION_NAMES = {
+    (False, 0): "as it is",
+    (False, 1): "turned 90",
+    (False, 2): "turned 180",
+    (False, 3): "turned 270",
+    (True, 0): "mirrored y",
+    (True, 1): "mirrored diagonal",
+    (True, 2): "mirrored x",
+    (True, 3): "mirrored antidiagonal",
+}
+_COSINE = (1, 0, -1, 0)
+"""Of multiples of a quarter turn."""
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """What has to be done to a map so that it lies as its user's pupil does: a mirror, then turns, and a sign.
+
+    Attributes:
+        mirrored: whether y is turned into -y first.
+        quarter_turns: by 90 degrees each, from x to y, 0 to 3.
+        sign: +1 or -1, by which the values are multiplied.
+    """
+
+    mirrored: bool = False
+    quarter_turns: int = 0
+    sign: int = 1
+
+    def __post_init__(self) -> None:
+        if self.quarter_turns not in range(4) or self.sign not in (1, -1):
+            raise ValueError(f"quarter turns are 0 to 3 and signs +1 and -1, not {self.quarter_turns} and {self.sign}")
+
+    @classmethod
+    def named(cls, name: str, sign: int = 1) -> Orientation:
+        """The orientation with a name.
+
+        Args:
+            name: one of ``ORIENTATIONS``, such as ``turned 90``.
+            sign: +1 or -1.
+
+        Raises:
+            MapError: no such name.
+        """
+        for key, known in _ORIENTATION_NAMES.items():
+            if known == name.strip().lower():
+                return cls(*key, sign)
+        raise MapError(f"there is no orientation {name[:40]!r}; {', '.join(_ORIENTATION_NAMES.values())} are known")
+
+    @property
+    def name(self) -> str:
+        """Name of the orientation, without its sign."""
+        return _ORIENTATION_NAMES[self.mirrored, self.quarter_turns]
+
+    @property
+    def matrix(self) -> NDArray[np.int_]:
+        """Where a point (x, y) of the map comes to lie, (2, 2): a feature at p is at ``matrix @ p``."""
+        c, s = _COSINE[self.quarter_turns], _COSINE[(self.quarter_turns + 3) % 4]
+        return np.array([[c, -s], [s, c]]) @ np.diag([1, -1 if self.mirrored else 1])
+
+    @property
+    def inverse(self) -> Orientation:
+        """What takes it back: a mirror is its own inverse."""
+        turns = self.quarter_turns if self.mirrored else -self.quarter_turns % 4
+        return Orientation(self.mirrored, turns, self.sign)
+
+    def __str__(self) -> str:
+        return self.name if self.sign > 0 else f"{self.name}, sign inverted"
+
+    def values(self, values: Array) -> Array:
+        """A map's values as they lie after it.
+
+        Args:
+            values: (rows, columns), y growing with the row.
+        """
+        flipped = values[::-1] if self.mirrored else values
+        # rows grow upwards: what NumPy calls clockwise is from x to y
+        return self.sign * np.rot90(flipped, -self.quarter_turns)
+
+    def apply(self, measured: WavefrontMap) -> WavefrontMap:
+        """A map as it lies after it.
+
+        Args:
+            measured: as the file has it.
+        """
+        return replace(measured, values=self.values(measured.values))
+
+    def of_terms(self, terms: Sequence[int]) -> Array:
+        """What it makes of Zernike coefficients: (Z, Z) with entries 0, 1 and -1.
+
+        Args:
+            terms: indices of Noll, (Z,), with both the cosine and the sine term of every one that turns.
+
+        Raises:
+            MapError: a term without its partner, into which it turns.
+        """
+        place = {int(index): k for k, index in enumerate(terms)}
+        orders = {noll_to_nm(index): k for index, k in place.items()}
+        out = np.zeros((len(place), len(place)))
+        for (n, m), k in orders.items():
+            # the angle at which the old map is looked up is s (angle - turn)
+            c, s = _COSINE[abs(m) * self.quarter_turns % 4], _COSINE[(abs(m) * self.quarter_turns + 3) % 4]
+            kept, turned = (-c if self.mirrored and m < 0 else c), (-s if self.mirrored and m < 0 else s)
+            out[k, k] = kept
+            if turned:
+                partner = orders.get((n, -m))
+                if partner is None:
+                    raise MapError(
+                        f"Z{next(j for j, p in place.items() if p == k)} turns into a term that was not fitted: take"
+                        " both the cosine and the sine term of every order"
+                    )
+                out[partner, k] = turned if m > 0 else -turned
+        return self.sign * out
+
+    def coefficients(self, coefficients: Array, terms: Sequence[int]) -> Array:
+        """Zernike coefficients as they are after it, exactly.
+
+        Args:
+            coefficients: (..., Z).
+            terms: indices of Noll, (Z,).
+        """
+        return np.asarray(coefficients) @ self.of_terms(terms).T
+
+
+ORIENTATIONS = tuple(Orientation(*key) for key in _ORIENTATION_NAMES)
+"""All eight, with the sign of the file."""
+READINGS = tuple(Orientation(o.mirrored, o.quarter_turns, sign) for sign in (1, -1) for o in ORIENTATIONS)
+"""All sixteen with their signs."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingEvidence:
+    """What measured coefficients say of the ways in which they may be read.
+
+    Attributes:
+        readings: the best one first, (K,).
+        chi_square: of each against the prediction, (K,).
+        log_evidence: logarithm of the probability density of the measured coefficients under each, (K,).
+        degrees: of freedom of each chi-square.
+        chance: of a larger chi-square if the reading is right, (K,).
+        allowed: those that the data do not reject at the false-alarm rate.
+        together: those that cannot be told from the best one, which is among them.
+    """
+
+    readings: tuple[Orientation, ...]
+    chi_square: Array
+    log_evidence: Array
+    degrees: int
+    chance: Array
+    allowed: tuple[Orientation, ...]
+    together: tuple[Orientation, ...]
+
+    @property
+    def found(self) -> Orientation | None:
+        """The reading, where the data allow it and tell it from all others; None otherwise."""
+        return self.readings[0] if len(self.together) == 1 and self.readings[0] in self.allowed else None
+
+
+_ODDS = 100.0
+"""Readings less than so many times as probable as the best one are not told from it."""
+
+
+def tellable(
+    measured: Array, expected: Array, covariance: Array, terms: Sequence[int], *, false_alarm: float = 0.01
+) -> ReadingEvidence:
+    """Which readings of measured coefficients agree with a prediction.
+
+    One reading holds for all fields. The covariance is that of prediction and noise together, for coefficients in the
+    frame of the prediction; noise that is equal in both terms of each pair is the same in every reading.
+
+    Args:
+        measured: coefficients as the files have them, (F, Z), metres.
+        expected: coefficients that are predicted, (F, Z), metres.
+        covariance: of measured minus expected, (F*Z, F*Z), square metres, fields before terms.
+        terms: indices of Noll, (Z,); leave out what the measurement leaves free, such as piston and tilt.
+        false_alarm: probability with which the right reading may be rejected.
+
+    Raises:
+        UndeterminedError: a covariance that is none, or numbers that are not finite.
+    """
+    size = np.size(expected)
+    if not (np.isfinite(measured).all() and np.isfinite(expected).all() and np.isfinite(covariance).all()):
+        raise UndeterminedError("coefficients or their covariance are not finite numbers")
+    try:
+        root = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError as error:
+        raise UndeterminedError(
+            "the covariance of measured minus predicted coefficients has no positive determinant: add the noise of the"
+            " measurement to it"
+        ) from error
+    rest = np.stack([(one.coefficients(measured, terms) - expected).ravel() for one in READINGS], axis=-1)
+    chi_square = np.sum(np.linalg.solve(root, rest) ** 2, axis=0)
+    constant = np.sum(np.log(np.diag(root))) + 0.5 * size * math.log(2.0 * math.pi)
+    # a stable sort: of readings that are exactly alike the first in the list is named first
+    ranks = np.argsort(chi_square, kind="stable")
+    ranked = tuple(READINGS[k] for k in ranks)
+    chi_square = chi_square[ranks]
+    chance = np.asarray(chance_beyond(chi_square, size))
+    limit = 2.0 * math.log(_ODDS)
+    return ReadingEvidence(
+        readings=ranked,
+        chi_square=chi_square,
+        log_evidence=-0.5 * chi_square - constant,
+        degrees=size,
+        chance=chance,
+        allowed=tuple(one for one, p in zip(ranked, chance, strict=True) if p >= false_alarm),
+        together=tuple(one for one, c in zip(ranked, chi_square, strict=True) if c - chi_square[0] < limit),
+    )
+
 
 HELD = 1e-6
 """Share of a term that has to be left beside those before it; below it the light does not tell them apart."""
 _CHUNK = 50_000
 """Pixels at a time, so that large maps take little memory."""
-_BINS = 64
-"""Fewest cells across the pupil in which correlated noise is looked at: terms are smooth over them."""
-_FEWEST_PAIRS, _ROUNDS, _SETTLED = 1e-3, 25, 0.01
-"""Share of pairs of points below which a distance is not looked at; rounds of the noise; change that ends them."""
 _TRIES, _NEAR, _STEP = 400, 1.5, 0.75
 """Circles through three points of the edge that are tried; pixels from one of them within which a point is on it, at
 first and when it is refined: a step lies within half a pixel of the edge.
@@ -48,17 +254,14 @@ class Pupil:
         x: column of its centre, the first is 0.
         y: row of its centre.
         radius: pixels.
-        distortion: of the picture of the pupil, k1, k2...: a point at the relative distance r from the centre of the
-            map belongs to ``r (1 + k1 (r^2 - 1) + k2 (r^4 - 1) + ...)`` in the pupil. The edge stays where it is.
     """
 
     x: float
     y: float
     radius: float
-    distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (all(map(math.isfinite, (self.x, self.y, *self.distortion))) and 0.0 < self.radius < math.inf):
+        if not (math.isfinite(self.x) and math.isfinite(self.y) and 0.0 < self.radius < math.inf):
             raise MapError(f"a pupil at {self.x:g}, {self.y:g} with radius {self.radius:g} pixels: radii are positive")
 
     def unit(self, columns: Array, rows: Array) -> tuple[Array, Array]:
@@ -68,10 +271,7 @@ class Pupil:
             columns: of points, any shape.
             rows: likewise.
         """
-        x, y = (columns - self.x) / self.radius, (rows - self.y) / self.radius
-        square = x**2 + y**2
-        factor = 1.0 + sum((k * (square**power - 1.0) for power, k in enumerate(self.distortion, 1)), start=0.0)
-        return x * factor, y * factor
+        return (columns - self.x) / self.radius, (rows - self.y) / self.radius
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,49 +279,19 @@ class MapFit:
     """Zernike terms of a map.
 
     Attributes:
-        terms: indices of Noll, (Z,).
         coefficients: of the circle's terms, metres rms over the full disk each, (Z,).
-        covariance: of them, (Z, Z), from what the fit leaves; systematic errors of the map are not in it. Where the
-            independent pixels are fewer than some five times the terms, it is itself known to some tens of per cent
-            only, and fewer errors than of a normal distribution lie within a sigma.
         parts: of the terms that are orthonormal over the light, metres rms over it each, (Z,).
-        parts_covariance: likewise.
-        rms: of the map over the light about its mean, metres.
-        residual_rms: that the terms leave, metres.
-        points: lit pixels within the pupil.
-        independent: number of pixels with independent noise that would give the same sigmas; at most ``points``.
-        beyond: lit pixels outside the pupil, which were left out.
-        factor: R, (Z, Z), with ``parts = R @ coefficients``.
-        residual: map (rows, columns) of what is left, metres, NaN outside.
-        pupil: that was used.
     """
 
-    terms: tuple[int, ...]
     coefficients: Array
-    covariance: Array
     parts: Array
-    parts_covariance: Array
-    rms: float
-    residual_rms: float
-    points: int
-    independent: float
-    beyond: int
-    factor: Array
-    residual: Array
-    pupil: Pupil
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations of the coefficients, (Z,)."""
-        return np.sqrt(np.diag(self.covariance))
 
 
-def find_pupil(measured: WavefrontMap, distortion: tuple[float, ...] = ()) -> Pupil:
+def find_pupil(measured: WavefrontMap) -> Pupil:
     """The circle about the lit areas, but for specks; holes, spiders and edges that are cut off do not move it.
 
     Args:
         measured: map.
-        distortion: as of ``Pupil``.
 
     Raises:
         UndeterminedError: no light, or an edge that is round in less than half of the full angle.
@@ -152,7 +322,7 @@ def find_pupil(measured: WavefrontMap, distortion: tuple[float, ...] = ()) -> Pu
         raise UndeterminedError(
             "the lit area has no round edge from which centre and radius of the pupil follow: state them in pixels"
         )
-    return Pupil(float(best[0]), float(best[1]), float(best[2]), distortion)
+    return Pupil(float(best[0]), float(best[1]), float(best[2]))
 
 
 def _ends(lit: NDArray[np.bool_]) -> Array:
@@ -197,7 +367,6 @@ def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = 
     rows, columns = np.nonzero(measured.lit)
     x, y = pupil.unit(columns.astype(float), rows.astype(float))
     inside = x**2 + y**2 <= 1.0 + 1e-9
-    beyond = int(np.count_nonzero(~inside))
     rows, columns, x, y = rows[inside], columns[inside], x[inside], y[inside]
     count, size = len(rows), len(terms)
     if count <= size:
@@ -220,103 +389,8 @@ def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = 
             f"over the lit part of the pupil, Z{terms[int(np.argmax(left < HELD))]} cannot be told from the terms"
             " before it: take fewer terms, or state where the pupil lies"
         )
-    coefficients = np.asarray(np.linalg.solve(factor, parts), dtype=np.float64)
-    residual = np.full(measured.values.shape, np.nan)
-    for part in _chunks(count):
-        fitted = circle_terms(terms, x[part], y[part]) @ coefficients
-        residual[rows[part], columns[part]] = values[part] - fitted
-    rest = residual[rows, columns]
-    covariance = _parts_covariance(residual, pupil, terms, factor)
-    back = np.linalg.inv(factor)
-    variance = float(rest @ rest) / (count - size)
-    mean = float(np.trace(covariance)) / size
-    return MapFit(
-        terms=terms,
-        coefficients=coefficients,
-        covariance=back @ covariance @ back.T,
-        parts=parts,
-        parts_covariance=covariance,
-        rms=float(np.std(values)),
-        residual_rms=math.sqrt(float(rest @ rest) / count),
-        points=count,
-        independent=min(variance / mean, float(count)) if mean > 0.0 else float(count),
-        beyond=beyond,
-        factor=factor,
-        residual=residual,
-        pupil=pupil,
-    )
+    return MapFit(np.asarray(np.linalg.solve(factor, parts), dtype=np.float64), parts)
 
 
 def _chunks(count: int) -> Iterator[slice]:
     return (slice(k, k + _CHUNK) for k in range(0, count, _CHUNK))
-
-
-def _parts_covariance(residual: Array, pupil: Pupil, terms: tuple[int, ...], factor: Array) -> Array:
-    """Covariance of the orthonormal parts (Z, Z) for noise that is alike over the pupil and correlated as the residual.
-
-    The autocovariance C of the noise is summed with the terms over both points. That of the residual is the one of
-    (1 - P) C (1 - P) with the projection P onto the terms; what they have taken out is put back until nothing changes.
-    Beyond the distance at which C is lost in its own noise it counts as zero.
-    """
-    cells = max(_BINS, 6 * noll_to_nm(terms[-1])[0])
-    weight, mean, x, y = _cells(residual, pupil, cells)
-    used, share = weight > 0.0, np.sum(weight)
-    columns = np.zeros((len(terms), *weight.shape))
-    columns[:, used] = np.linalg.solve(factor.T, circle_terms(terms, x[used], y[used]).T)
-    columns *= weight
-    rows, wide = weight.shape
-    shape = (next_fast_len(2 * rows, real=True), next_fast_len(2 * wide, real=True))
-
-    def spectrum(maps: Array) -> Array:
-        return rfft2(maps, shape)
-
-    def correlation(first: Array, second: Array) -> Array:
-        """Of weighted maps given by their spectra, summed over them, for a mean pair of points."""
-        return irfft2(np.sum(first.conj() * second, axis=0).real, shape) / overlap
-
-    pairs = irfft2(np.abs(spectrum(weight)) ** 2, shape)
-    overlap = np.where(pairs > _FEWEST_PAIRS * pairs[0, 0], pairs, np.inf)
-    seen_pairs = np.where(overlap < np.inf, pairs, 0.0).ravel()
-    moved = spectrum(weight * mean)[None]
-    raw = correlation(moved, moved)
-    ring = np.rint(np.hypot(*np.meshgrid(*(n * fftfreq(n) for n in shape), indexing="ij"))).astype(int)
-    ring_pairs = np.maximum(np.bincount(ring.ravel(), seen_pairs), 1e-300)
-    lost_below = np.sqrt(pairs[0, 0] / (np.count_nonzero(used) * ring_pairs))
-    turned = spectrum(columns)
-    white = float(np.nanmean(residual**2)) / np.count_nonzero(np.isfinite(residual))
-    covariance, full = np.zeros((len(terms), len(terms))), raw
-    for _ in range(_ROUNDS):
-        radial = np.bincount(ring.ravel(), full.ravel() * seen_pairs) / ring_pairs
-        lost = np.flatnonzero(radial <= radial[0] * lost_below)
-        reach = min(int(lost[0]) if len(lost) else len(radial), min(rows, wide) // 2)
-        near = np.where(ring < max(reach, 1), full, 0.0)
-        spread = irfft2(turned * spectrum(near), shape)[:, :rows, :wide]
-        before, covariance = covariance, np.tensordot(columns, spread, ((1, 2), (1, 2))) / share**2
-        covariance = 0.5 * (covariance + covariance.T)
-        if np.abs(covariance - before).max() <= _SETTLED * np.abs(covariance).max():
-            break
-        both = 2.0 * correlation(turned, spectrum(weight * spread)) / share
-        size, turn = np.linalg.eigh(covariance)
-        part = np.tensordot(turn.T, turned, 1)
-        full = raw + both - correlation(part * size[:, None, None], part)
-    size, turn = np.linalg.eigh(covariance)
-    # not even noise that is independent from pixel to pixel gives less
-    return (turn * np.maximum(size, white)) @ turn.T
-
-
-def _cells(residual: Array, pupil: Pupil, across: int) -> tuple[Array, Array, Array, Array]:
-    """Cells of the map: share of their pixels that were fitted, mean of these, x and y of their middle on the disk."""
-    step = max(1, math.ceil(2.0 * pupil.radius / across))
-    rows, columns = np.nonzero(np.isfinite(residual))
-    top, left = rows.min(), columns.min()
-    at = ((rows - top) // step, (columns - left) // step)
-    shape = (int(at[0].max()) + 1, int(at[1].max()) + 1)
-    flat = at[0] * shape[1] + at[1]
-
-    def summed(values: Array | None) -> Array:
-        return np.bincount(flat, values, math.prod(shape)).astype(float).reshape(shape)
-
-    number = summed(None)
-    held = np.maximum(number, 1.0)
-    x, y = pupil.unit(summed(columns.astype(float)) / held, summed(rows.astype(float)) / held)
-    return number / step**2, summed(residual[rows, columns]) / held, x, y

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 from scipy.special import eval_jacobi
 
 from analysis.arrays import Array
-from analysis.wavefront_maps.text_grids import statements, text_of, unit_agreed
-from analysis.wavefront_maps.wavefront_map import MapError, agreed, length_from, metres_per
+from analysis.wavefront_maps import map_files
 
 HIGHEST_ORDER = 30
 """Radial order of the last supported terms."""
@@ -157,63 +156,51 @@ class ZernikeTable:
     notes: tuple[str, ...]
 
 
-def read_zernikes(
-    path: Path,
-    *,
-    order: str | None = None,
-    normalised: str | None = None,
-    unit: str | None = None,
-    wavelength: float | None = None,
-) -> ZernikeTable:
+def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTable:
     """Coefficients of a table.
 
     Args:
         path: of the file.
-        order: ``noll``, ``fringe`` or ``ansi``, where the file does not say.
-        normalised: ``rms`` or ``peak``, likewise.
-        unit: m, mm, um, nm or waves, likewise.
-        wavelength: metres, likewise.
+        wavelength: metres, where the file does not say.
 
     Raises:
         MapError: no such table, a meaning that is missing or stated in two ways, with what to write.
     """
     path = Path(path)
     if not path.is_file():
-        raise MapError(f"{path} is no file" if path.exists() else f"there is no file {path}")
+        raise map_files.MapError(f"{path} is no file" if path.exists() else f"there is no file {path}")
     try:
-        text = text_of(path)
+        text = map_files.text_of(path)
     except OSError as error:
-        raise MapError(f"{path} cannot be read: {error.strerror or 'input/output error'}") from error
+        raise map_files.MapError(f"{path} cannot be read: {error.strerror or 'input/output error'}") from error
     if len(text) > _MOST_CHARACTERS:
-        raise MapError(f"{path} is too long for a table of Zernike coefficients: {len(text)} characters")
-    said = statements(path, text, ("order", "normalised", "unit", "wavelength"))
-    order = _one(path, "order", order, said.get("order"), ORDER_NAMES)
-    scaled = NORMALISATIONS[
-        _one(path, "normalised", normalised, said.get("normalised"), {n: n for n in NORMALISATIONS})
-    ]
-    found = length_from(path, said["wavelength"], "wavelength") if "wavelength" in said else None
-    wavelength = agreed(path, "wavelength", wavelength, found)
+        raise map_files.MapError(f"{path} is too long for a table of Zernike coefficients: {len(text)} characters")
+    said = map_files.statements(path, text, ("order", "normalised", "unit", "wavelength"))
+    order = _one(path, "order", said.get("order"), ORDER_NAMES)
+    scaled = _one(path, "normalised", said.get("normalised"), NORMALISATIONS)
+    found = map_files.length_from(path, said["wavelength"], "wavelength") if "wavelength" in said else None
+    wavelength = map_files.agreed(path, "wavelength", wavelength, found)
     indices, table, others, in_head = _table(path, text)
     written = {one for one in (said.get("unit"), *in_head) if one}
     if len(written) > 1:
-        raise MapError(f"{path} states more than one unit: {', '.join(sorted(written))[:60]}")
-    named = unit_agreed(path, unit, written.pop() if written else None, "a line '# unit: nm'")
-    metres = metres_per(path, named, wavelength)
+        raise map_files.MapError(f"{path} states more than one unit: {', '.join(sorted(written))[:60]}")
+    named = map_files.unit_written(path, written.pop() if written else None, "a line '# unit: nm'")
+    metres = map_files.metres_per(path, named, wavelength)
     terms, scales = [], []
     for index in indices:
         try:
             n, m = ORDERS[order](index)
         except ValueError as error:
-            raise MapError(f"{path}: {error}") from None
+            raise map_files.MapError(f"{path}: {error}") from None
         terms.append(nm_to_noll(n, m))
         scales.append(metres if scaled else metres / edge_value(n, m))
     sequence = np.argsort(terms)
     if len(set(terms)) != len(terms):
         twice = next(index for index in indices if indices.count(index) > 1)
-        raise MapError(f"{path} has term {twice} more than once")
+        raise map_files.MapError(f"{path} has term {twice} more than once")
     coefficients = table * np.array(scales)
     if not np.isfinite(coefficients).all():
-        raise MapError(f"{path}: a coefficient is not a finite number")
+        raise map_files.MapError(f"{path}: a coefficient is not a finite number")
     size = "unit rms" if scaled else "unit peak"
     return ZernikeTable(
         terms=tuple(terms[k] for k in sequence),
@@ -224,42 +211,35 @@ def read_zernikes(
     )
 
 
-def _one(path: Path, key: str, stated: str | None, found: str | None, known: Mapping[str, str]) -> str:
-    """What file or user say of a key, by its name here."""
-    names = set()
-    for one in (stated, found):
-        if one is not None:
-            if one.strip().lower() not in known:
-                raise MapError(f"{path}: {key} is {one[:40]!r}; {', '.join(dict.fromkeys(known.values()))} are known")
-            names.add(known[one.strip().lower()])
-    if not names:
-        first = next(iter(known))
-        raise MapError(
-            f"{path} does not say its {key}: state it, or add a line '# {key}: {first}' ({', '.join(known)})"
+def _one(path: Path, key: str, found: str | None, known: Mapping[str, Any]) -> Any:
+    """What a file says of a key, by its name here."""
+    if found is None:
+        raise map_files.MapError(
+            f"{path} does not say its {key}: add a line '# {key}: {next(iter(known))}' ({', '.join(known)})"
         )
-    if len(names) > 1:
-        raise MapError(f"{path} says {key} {found}, stated is {stated}: take the statement away")
-    return names.pop()
+    if found.strip().lower() not in known:
+        raise map_files.MapError(f"{path}: {key} is {found[:40]!r}; {', '.join(known)} are known")
+    return known[found.strip().lower()]
 
 
 def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str, ...]], set[str | None]]:
     """Indices (Z,), coefficients (F, Z), other columns, and the units in the heads of the coefficients."""
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"]
     if not lines:
-        raise MapError(f"{path} holds no table")
+        raise map_files.MapError(f"{path} holds no table")
     delimiter = next((one for one in _DELIMITERS if one in lines[0][1]), ",")
     try:
         rows = [(n, [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]) for n, line in lines]
     except csv.Error as error:
-        raise MapError(f"{path} is no table: {error}") from error
+        raise map_files.MapError(f"{path} is no table: {error}") from error
     matches = [_HEAD.fullmatch(cell) for cell in rows[0][1]]
     heads = [(m[1].strip(), m[2]) if m else ("", None) for m in matches]
     body = rows[1:]
     for n, cells in body:
         if len(cells) != len(heads):
-            raise MapError(f"{path}, line {n}: {len(cells)} cells, the head of the table has {len(heads)}")
+            raise map_files.MapError(f"{path}, line {n}: {len(cells)} cells, the head of the table has {len(heads)}")
     if not body:
-        raise MapError(f"{path} holds no row below the head of its table")
+        raise map_files.MapError(f"{path} holds no row below the head of its table")
     names = [name.lower() for name, _ in heads]
     at_index = [k for k, name in enumerate(names) if name in _INDEX]
     at_value = [k for k, name in enumerate(names) if name in _COEFFICIENT]
@@ -269,7 +249,7 @@ def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str
         return indices, np.array([values]), {}, {heads[at_value[0]][1]}
     wide = {k: match for k, name in enumerate(names) if (match := _TERM.fullmatch(name))}
     if not wide:
-        raise MapError(
+        raise map_files.MapError(
             f"{path}, line {rows[0][0]}: the head names neither terms (Z4, Z5) nor the columns index and coefficient"
         )
     table = np.array([[_real(path, n, cells[k]) for k in wide] for n, cells in body])
@@ -280,7 +260,7 @@ def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str
 def _whole(path: Path, line: int, cell: str) -> int:
     match = _TERM.fullmatch(cell) or re.fullmatch(r"([0-9]{1,4})", cell)
     if match is None:
-        raise MapError(f"{path}, line {line}: {cell[:40]!r} is no index of a term")
+        raise map_files.MapError(f"{path}, line {line}: {cell[:40]!r} is no index of a term")
     return int(match[1])
 
 
@@ -290,5 +270,5 @@ def _real(path: Path, line: int, cell: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise MapError(f"{path}, line {line}: {cell[:40]!r} is no coefficient")
+        raise map_files.MapError(f"{path}, line {line}: {cell[:40]!r} is no coefficient")
     return value

@@ -15,8 +15,7 @@ import numpy as np
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface
 from optics.geometry.tree import Body, RigidTree
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.number_tree import Path, leaves, map_leaves, with_leaf
+from optics.numerics.number_tree import FrozenMap, Path, leaves, map_leaves, with_leaf
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import SystemBatch, assemble
 

@@ -21,9 +21,8 @@ from optics.geometry.tree import COMPLEX_STEP
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import RayFan, aim
-from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import assemble
-from optics.raytrace.trace import BeamMissedError, make_rays, trace
+from optics.raytrace.trace import BeamMissedError, jvp, make_rays, trace
 
 LAUNCH_DISTANCE = 9.0
 """How far before the prescription's origin beams start, metres: well before every mirror."""

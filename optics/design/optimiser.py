@@ -21,9 +21,9 @@ from scipy.optimize import nnls
 
 from optics.design.design_variables import BIAS, Prescription, Variable
 from optics.design.merit_function import Beams, Evaluation, MeritFunction, Operands
+from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
 from optics.numerics.constrained_least_squares import Sample, constrained_least_squares
-from optics.numerics.invariants import PhysicalError
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 

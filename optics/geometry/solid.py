@@ -24,7 +24,7 @@ import numpy as np
 
 from optics.geometry.pose import Pose
 from optics.geometry.tree import PlacedBodies
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
 
 if TYPE_CHECKING:  # takes a third of a second
     import trimesh
@@ -297,15 +297,15 @@ def face_plane(face: Face, placed: PlacedBodies, state: int = 0) -> tuple[np.nda
     return pose.apply(scale * face.pose.translation), pose.rotation @ face.pose.rotation[:, 2]
 
 
-def solid_mesh(solid: Solid, placed: PlacedBodies, state: int = 0) -> SolidMesh:
+def solid_mesh(solid: Solid, placed: PlacedBodies) -> SolidMesh:
     """Mesh of the body that the faces enclose.
 
     Raises:
         SolidError: the faces leave no room, leave the body open, or cut off one of them that is more than a ground
             surface.
     """
-    own = placed.pose(solid.path, state).inverse()
-    planes = [face_plane(face, placed, state) for face in solid.faces]
+    own = placed.pose(solid.path).inverse()
+    planes = [face_plane(face, placed, 0) for face in solid.faces]
     normals = np.array([own.rotation @ n for _, n in planes])
     offsets = np.einsum("fi,fi->f", normals, np.array([own.apply(p) for p, _ in planes]))
     try:

@@ -13,7 +13,7 @@ from optics.geometry import zernike
 from optics.geometry.aperture import Aperture
 from optics.geometry.sag_terms import SagTerm, grown
 from optics.geometry.zernike import triangle_order, triangle_polynomial
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 
 
 @dataclass(frozen=True)

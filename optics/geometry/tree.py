@@ -12,7 +12,7 @@ import numpy as np
 from optics.geometry.pose import Pose, rotation_matrix, triple
 from optics.geometry.surface import GridFigure
 from optics.numerics.array_math import product, turned
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 
 ORIGIN = "origin"
 

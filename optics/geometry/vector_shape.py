@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 
 PointMap = Callable[[np.ndarray], np.ndarray]
 """A smooth map of points, (N, 2) -> (N, 2), metres."""

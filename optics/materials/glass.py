@@ -20,8 +20,8 @@ from math import sqrt
 from pathlib import Path
 
 from optics.materials.material import TemperatureRange, unknown_name
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
+from optics.numerics.number_tree import FrozenMap
 
 REFERENCE_TEMPERATURE = 293.15
 """Temperature at which the dispersion formulas hold, kelvin (20 C)."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.geometry.tree import State
+from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError
 from optics.raytrace.assembly import Assembly, Element
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace

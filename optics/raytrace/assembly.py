@@ -14,7 +14,7 @@ from optics.geometry.aperture import Aperture, Edge, outer_edge
 from optics.geometry.pose import Pose
 from optics.geometry.surface import GridFigure, SummedFigure, Surface, ZernikeFigure
 from optics.geometry.tree import AT_REST, Motion, PlacedBodies, RigidTree, State
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 
 
 class Interaction(Enum):

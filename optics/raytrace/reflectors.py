@@ -32,9 +32,8 @@ from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body
-from optics.numerics.array_math import inner, norm
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError, inner, norm
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Element, Interaction
 
 EDGE = 0.003

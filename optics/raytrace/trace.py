@@ -1,9 +1,27 @@
-"""Float64 sequential ray trace on Dr.Jit: positions, directions and optical path lengths through a batch of systems."""
+"""Float64 sequential ray trace on Dr.Jit: positions, directions and optical path lengths through a batch of systems.
+
+Curved rays where the refractive index has a gradient.
+
+With d tau = ds / n the ray equation d/ds (n dr/ds) = grad n becomes r'' = n grad n. For n = n0 + g . (r - r0) the index
+along the ray obeys n'' = |g|^2 n, so that
+
+    n(tau) = n0 cosh x + a/|g| sinh x,    x = |g| tau,  a = g . T0,  T0 = n0 d0,
+    r(tau) = r0 + T0 tau + g [n0 (cosh x - 1) / |g|^2 + a (sinh x / |g| - tau) / |g|^2],
+    optical path = integral of n^2 d tau.
+
+The hyperbolic functions are taken as their power series, which have no 0/0 at g = 0. (Born and Wolf,
+Principles of Optics, section 3.2, for the ray equation.)
+
+Derivatives of a ray trace: Jacobian-vector products (forward mode) and vector-Jacobian products (reverse mode).
+
+One backward pass gives the derivative of a weighted sum of ray coordinates by every number of every system, however
+many there are; forward mode (``optics.raytrace.trace``) gives all rays' derivatives by one parameter.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from threading import local
 from typing import Any
@@ -11,13 +29,107 @@ from typing import Any
 import numpy as np
 
 from optics.geometry.surface import SurfaceNumbers, along, level, newton_step
+from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError
-from optics.numerics.number_tree import map_leaves
+from optics.numerics.number_tree import Path, leaves, map_leaves
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.element_numbers import CoordinateNumbers, ElementNumbers, FrameNumbers, IndexNumbers, Structure
-from optics.raytrace.graded_ray import GradedRay, meeting
 from optics.raytrace.system import SystemBatch, UploadedSystems
+
+
+@dataclass(frozen=True, eq=False)
+class GradedRay:
+    """A curved ray, as Dr.Jit arrays in the frame of the element that it goes to.
+
+    Attributes:
+        origin: r0, metres.
+        tangent: T0 = n0 d0, d0 a unit vector.
+        index: n0 at the origin.
+        gradient: components of g, 1/m.
+        along: a = g . T0.
+        square: |g|^2.
+    """
+
+    origin: Any
+    tangent: Any
+    index: Any
+    gradient: tuple[Any, Any, Any]
+    along: Any
+    square: Any
+
+    @classmethod
+    def start(cls, p: Any, d: Any, index_at_zero: Any, gradient: tuple[Any, Any, Any]) -> GradedRay:
+        """The ray from p along the unit vector d, where the index is index_at_zero + gradient . p."""
+        gx, gy, gz = gradient
+        index = index_at_zero + gx * p.x + gy * p.y + gz * p.z
+        tangent = index * d
+        along = gx * tangent.x + gy * tangent.y + gz * tangent.z
+        return cls(p, tangent, index, gradient, along, gx * gx + gy * gy + gz * gz)
+
+    def detached(self) -> GradedRay:
+        """Return the rays without derivatives."""
+        import drjit as dr
+
+        return GradedRay(
+            dr.detach(self.origin),
+            dr.detach(self.tangent),
+            dr.detach(self.index),
+            tuple(dr.detach(g) for g in self.gradient),
+            dr.detach(self.along),
+            dr.detach(self.square),
+        )
+
+    def position(self, tau: Any) -> Any:
+        """r(tau), metres."""
+        x2 = self.square * tau * tau
+        even = 0.5 * tau * tau * (1.0 + x2 / 12.0 * (1.0 + x2 / 30.0))
+        odd = tau * tau * tau / 6.0 * (1.0 + x2 / 20.0 * (1.0 + x2 / 42.0))
+        return self._add(self.origin + self.tangent * tau, self.index * even + self.along * odd)
+
+    def slope(self, tau: Any) -> Any:
+        """dr/dtau = n times the unit direction."""
+        x2 = self.square * tau * tau
+        odd = tau * (1.0 + x2 / 6.0 * (1.0 + x2 / 20.0))
+        even = 0.5 * tau * tau * (1.0 + x2 / 12.0 * (1.0 + x2 / 30.0))
+        return self._add(self.tangent, self.index * odd + self.along * even)
+
+    def direction(self, tau: Any) -> Any:
+        """Unit direction at r(tau)."""
+        import drjit as dr
+
+        return dr.normalize(self.slope(tau))
+
+    def optical_path(self, tau: Any) -> Any:
+        """Integral of n ds from the origin, metres."""
+        y = 4.0 * self.square * tau * tau
+        first = tau * (1.0 + y / 12.0 * (1.0 + y / 20.0 * (1.0 + y / 42.0)))
+        second = tau * tau * (1.0 + y / 12.0 * (1.0 + y / 30.0))
+        third = tau * tau * tau / 3.0 * (1.0 + y / 20.0 * (1.0 + y / 42.0))
+        n, a = self.index, self.along
+        return n * n * first + a * n * second + a * a * third
+
+    def _add(self, vector: Any, amount: Any) -> Any:
+        gx, gy, gz = self.gradient
+        return type(vector)(vector.x + amount * gx, vector.y + amount * gy, vector.z + amount * gz)
+
+
+def meeting(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool, steps: int) -> Any:
+    """Parameter at which a curved ray meets the surface, by Newton's method from the straight ray's."""
+    import drjit as dr
+
+    def step(ray: GradedRay, tau: Any, numbers: SurfaceNumbers) -> Any:
+        p, slope = ray.position(tau), ray.slope(tau)
+        value, nx, ny, nz = level(p.x, p.y, p.z, numbers, table)
+        return tau - value / dr.fma(nx, slope.x, dr.fma(ny, slope.y, nz * slope.z))
+
+    numbers, ray = surface, curve
+    if attached:
+        numbers = map_leaves(dr.detach, surface)
+        ray, tau = curve.detached(), dr.detach(tau)
+    for _ in range(steps):
+        tau = step(ray, tau, numbers)
+    return step(curve, tau, surface) if attached else tau
+
 
 NEWTON_STEPS = 3
 """Newton steps from the conic to the asphere. The departure of a mirror from its conic is below 1e-4 m and its slope
@@ -589,3 +701,144 @@ def _index_at(p: Any, medium: IndexNumbers) -> Any:
         return medium.index
     gx, gy, gz = medium.gradient
     return dr.fma(gx, p.x, dr.fma(gy, p.y, dr.fma(gz, p.z, medium.index)))
+
+
+DIFFERENTIATED = 1
+"""Elements that one kernel differentiates in forward mode. Its code is several times that of a trace, and the time to
+compile it grows faster than its length: with six elements in one, the kernels of the main job take twice as long to
+compile as one by one, and those of derivatives no less to run."""
+
+
+@dataclass(frozen=True, eq=False)
+class RayTangents:
+    """Derivatives of rays at the last element of a sequence, in its own frame.
+
+    Attributes:
+        position, direction: (B, N, 3), metres and 1 per unit of the parameter.
+        path: optical path, (B, N).
+        hits: element index -> derivative of the local hit there, (B, N, 3), for those asked to be kept.
+        traced: the rays themselves.
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    hits: Mapping[int, np.ndarray]
+    traced: Traced
+
+
+def jvp(
+    backend: Backend,
+    systems: SystemBatch,
+    position: np.ndarray,
+    direction: np.ndarray,
+    position_step: np.ndarray | float = 0.0,
+    direction_step: np.ndarray | float = 0.0,
+    keep: Collection[int] = (),
+) -> RayTangents:
+    """Trace rays and differentiate them by one parameter each.
+
+    Args:
+        backend: where to trace.
+        systems: B systems; derivatives that they carry (``assemble(..., step=...)``) are added.
+        position: launch points, world, (B, N, 3), metres.
+        direction: unit directions, (B, N, 3).
+        position_step: derivative of the launch points, broadcastable to (B, N, 3).
+        direction_step: derivative of the directions, square to them, broadcastable to (B, N, 3).
+        keep: indices of elements whose hits are differentiated too.
+    """
+    import drjit as dr
+
+    uploaded = systems.upload(backend)
+    rays = make_rays(backend, position, direction)
+    steps = [
+        backend.vector(np.broadcast_to(s, direction.shape).reshape(-1, 3)) for s in (position_step, direction_step)
+    ]
+    along = dr.zeros(backend.Float, dr.width(rays.position))
+    dr.make_opaque(along, rays.path, rays.valid)  # the first kernel is that of the others
+    hits: dict[int, Any] = {}
+    slopes: dict[int, Any] = {}
+    for first in range(0, len(uploaded.structure), DIFFERENTIATED):
+        last = min(first + DIFFERENTIATED, len(uploaded.structure))
+        dr.enable_grad(rays.position, rays.direction)
+        dr.set_grad(rays.position, steps[0])
+        dr.set_grad(rays.direction, steps[1])
+        dr.enable_grad(rays.path)
+        dr.set_grad(rays.path, along)
+        own = [i - first for i in keep if first <= i < last]
+        traced = trace(backend, uploaded.section(first, last), rays, keep=own, evaluate=False)
+        local = traced.local
+        met = list(traced.hits.values())
+        # interior gradients are kept: a hit on the way is an input of the rays at the end
+        dr.forward_to(local.position, local.direction, local.path, met, flags=dr.ADFlag.ClearEdges)
+        steps, along = [dr.grad(local.position), dr.grad(local.direction)], dr.grad(local.path)
+        at = [dr.grad(vector) for vector in met]
+        # one launch for all: each array evaluated by itself would trace everything again in a kernel of its own
+        dr.eval(steps, along, at, local.position, local.direction, local.path, local.valid, met)
+        hits.update({first + i: dr.detach(vector) for i, vector in traced.hits.items()})
+        slopes.update({first + i: slope for i, slope in zip(traced.hits, at, strict=True)})
+        place, heading, path = (dr.detach(array) for array in (local.position, local.direction, local.path))
+        rays = Rays(place, heading, path, local.valid, systems.count)
+    return RayTangents(
+        rows(steps[0], systems.count),
+        rows(steps[1], systems.count),
+        along.numpy().reshape(systems.count, -1),
+        {i: rows(slope, systems.count) for i, slope in slopes.items()},
+        Traced(rays, None, hits, systems.count),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RayCotangents:
+    """Derivatives of S_b = sum_n w_bn . r_bn, with r the rays at the last element of system b and w given weights.
+
+    Attributes:
+        values: per element, path of a number -> dS_b/d(number of system b), (B,), for those that were asked for.
+        position: dS_b/d(launch point), (B, N, 3), per metre.
+        direction: dS_b/d(launch direction), (B, N, 3); its part along the ray means nothing by itself.
+    """
+
+    values: tuple[Mapping[Path, np.ndarray], ...]
+    position: np.ndarray
+    direction: np.ndarray
+
+
+def vjp(
+    backend: Backend,
+    systems: SystemBatch,
+    position: np.ndarray,
+    direction: np.ndarray,
+    weight: np.ndarray,
+    names: Sequence[Collection[Path]],
+) -> RayCotangents:
+    """Trace rays and differentiate a weighted sum of where they end by everything they depend on.
+
+    Args:
+        backend: where to trace.
+        systems: B systems; derivatives that they carry are left aside.
+        position: launch points, world, (B, N, 3), metres.
+        direction: unit directions, (B, N, 3).
+        weight: of the positions at the last element, in its own frame, broadcastable to (B, N, 3).
+        names: per element, paths of the numbers in ``systems.values`` to differentiate by.
+
+    Returns:
+        Derivatives; rays that are stopped or lost count as if they went on.
+    """
+    import drjit as dr
+
+    alone = replace(systems, tangents=None, world_tangents=None)
+    uploaded = replace(alone.upload(backend, own=True), differentiable=True)
+    wanted = [leaves(numbers)[path] for numbers, own in zip(uploaded.values, names, strict=True) for path in own]
+    rays = make_rays(backend, position, direction)
+    for variable in (*wanted, rays.position, rays.direction):
+        dr.enable_grad(variable)
+    end = trace(backend, uploaded, rays, evaluate=False).local.position
+    dr.set_grad(end, backend.vector(np.broadcast_to(weight, direction.shape).reshape(-1, 3)))
+    dr.enqueue(dr.ADMode.Backward, end)
+    dr.traverse(dr.ADMode.Backward)
+
+    slopes = [dr.grad(variable) for variable in (*wanted, rays.position, rays.direction)]
+    dr.eval(slopes)  # one launch for all
+    at = iter(slope.numpy() for slope in slopes[:-2])
+    values = tuple({path: next(at) for path in own} for own in names)
+    return RayCotangents(values, rows(slopes[-2], systems.count), rows(slopes[-1], systems.count))

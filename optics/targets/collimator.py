@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from optics.geometry import zernike
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
+from optics.numerics.number_tree import FrozenMap
 
 
 class TooNarrowError(PhysicalError, ValueError):

@@ -21,9 +21,9 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from optics.geometry.vector_shape import Disk, FiniteShape, HalfPlane, Polygon
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
+from optics.numerics.backend import one_blas_thread
 from optics.numerics.quadrature import gauss
-from optics.numerics.threads import one_blas_thread
 from optics.targets.target_shapes import Target
 from optics.waves.diffraction import Grid
 

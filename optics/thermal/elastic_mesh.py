@@ -11,7 +11,7 @@ from skfem import MeshHex1, MeshHex2, MeshTet1
 
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.surface import Surface
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 
 CLOSE = 1e-3
 """Corners nearer to each other than this part of the spacing are one for a mesh: what so small a facet changes is far

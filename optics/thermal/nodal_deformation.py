@@ -28,8 +28,8 @@ from optics.geometry.aperture import Aperture
 from optics.geometry.pose import triple
 from optics.geometry.surface import GridFigure, Surface
 from optics.geometry.tree import Motion
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
+from optics.numerics.number_tree import FrozenMap
 
 if TYPE_CHECKING:  # every file of a job waits for this module, and none for scipy
     from scipy.sparse import sparray

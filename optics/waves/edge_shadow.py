@@ -21,7 +21,7 @@ import numpy as np
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
 from optics.geometry.polygon import area, area_in_disk, compact, intersect, sides, widened
 from optics.numerics import quadrature
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, separate, tiled, without
 from optics.waves.pupil_terms import products, smooth_terms, to_terms
@@ -348,7 +348,9 @@ def _on_the_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """An outline (V, 2) on the surface as seen on the stop of B images, counterclockwise, (B, W, 2); empty where it
     lies outside of the beam.
     """
-    middle, slope = _near_the_middle(terms)
+    # place of the ray through the middle of the stop, and the derivatives of places there
+    values, rise = _followed(terms, np.zeros((len(terms), 1, 2)))
+    middle, slope = values[:, 0], rise[:, 0]
     place = np.broadcast_to(outline, (len(terms), *outline.shape))
     guess = np.einsum("bij,bvj->bvi", np.linalg.inv(slope), place - middle[:, None])
     packed = np.concatenate([guess, place], axis=-1)
@@ -364,12 +366,6 @@ def _on_the_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
         if np.max(np.abs(step), where=~empty[:, None, None], initial=0.0) < _CLOSE:
             break
     return np.where(empty[:, None, None], at[:, :1], at)
-
-
-def _near_the_middle(terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place (B, 2) of the ray through the stop's middle, and the derivatives of places there, (B, 2, 2)."""
-    values, rise = _followed(terms, np.zeros((len(terms), 1, 2)))
-    return values[:, 0], rise[:, 0]
 
 
 def _followed(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:

@@ -27,9 +27,9 @@ from numpy.polynomial import chebyshev, legendre
 from scipy.fft import fft, ifft, irfft, next_fast_len, rfft
 
 from optics.geometry.polygon import area
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
+from optics.numerics.backend import cores, one_blas_thread
 from optics.numerics.quadrature import PupilNodes, gauss, nodes_for
-from optics.numerics.threads import cores, one_blas_thread
 from optics.waves.edge_shadow import StopOutlines
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import EVENLY, PupilFunction

@@ -24,9 +24,9 @@ from optics.geometry.polygon import (
     sides,
     widened,
 )
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.quadrature import gauss
-from optics.waves.pupil_edge import PupilEdge
+from optics.waves.pupil_terms import PupilEdge
 
 RIM_SIDES = 256
 """Sides of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of

@@ -2,7 +2,7 @@
 
 A traced field is a set of nodes that serves one quadrature. A transfer function needs the pupil between the nodes and
 exactly up to its edge, so the field is fitted. In coordinates p, (u, v) = centre + axes @ p, the edge is the unit
-circle but for small harmonics (``optics.waves.pupil_edge``), shadows of bodies that stand in the beam are polygons
+circle but for small harmonics (``optics.waves.pupil_terms``), shadows of bodies that stand in the beam are polygons
 (``optics.waves.pupil_shadow``), and eikonal and amplitude are polynomials in products of Chebyshev's. Through mirrors
 the eikonal in metres does not depend on the wavelength, so one fit serves a whole band.
 
@@ -19,13 +19,12 @@ from functools import cached_property
 
 import numpy as np
 
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
+from optics.numerics.backend import one_blas_thread
 from optics.numerics.quadrature import PupilNodes, gauss, nodes_for
-from optics.numerics.threads import one_blas_thread
 from optics.waves.diffraction import PupilField
-from optics.waves.pupil_edge import PupilEdge
 from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, PupilShadow, in_rows
-from optics.waves.pupil_terms import FAINTLY, orders, polynomials, products, slopes, smooth_terms, to_terms
+from optics.waves.pupil_terms import FAINTLY, PupilEdge, orders, polynomials, products, slopes, smooth_terms, to_terms
 
 DEGREE = 8
 """Degree of the polynomials. The library's gf7 leaves 1e-8 wavelengths of eikonal, nominal or perturbed; with 5 nm of
@@ -208,7 +207,7 @@ class PupilStack:
     @property
     def bend(self) -> np.ndarray:
         """How far each edge is from an ellipse, (B,); ``transfer`` needs at most
-        ``optics.waves.pupil_edge.WORST_BEND``.
+        ``optics.waves.pupil_terms.WORST_BEND``.
         """
         last = len(self.harmonics) // 2
         return np.asarray(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics) - 1.0)

@@ -29,9 +29,9 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import map_coordinates, spline_filter
 
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
+from optics.numerics.backend import cores, one_blas_thread
 from optics.numerics.quadrature import gauss, nodes_for
-from optics.numerics.threads import cores, one_blas_thread
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.pupil_terms import products
 

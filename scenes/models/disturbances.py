@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from optics.geometry.tree import ORIGIN, Motion, State, each_composed
+from optics.numerics.array_math import covariance_root
 from optics.thermal.heat import Temperature, Temperatures
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
@@ -143,15 +144,7 @@ class StatedMotions:
             count: how many states.
         """
         unit = rng.standard_normal((count, len(self.components)))
-        return np.asarray(unit @ correlation_root(self.correlation) * self.sigma)
-
-
-def correlation_root(correlation: np.ndarray) -> np.ndarray:
-    """Symmetric root (M, M) of a correlation matrix, which changes little where the matrix does, as eigenvectors would
-    not, and leaves components without correlations as they are.
-    """
-    values, vectors = np.linalg.eigh(correlation)
-    return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
+        return np.asarray(unit @ covariance_root(self.correlation) * self.sigma)
 
 
 def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotions | None:

@@ -12,7 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.models.disturbances import StatedMotions, correlation_root
+from optics.numerics.array_math import covariance_root
+from scenes.models.disturbances import StatedMotions
 from scenes.specs.disturbances import TimeLawSpec
 
 Array = NDArray[np.float64]
@@ -29,7 +30,7 @@ def drawn_motions(stated: StatedMotions, seconds: Array, source: Callable[[int],
     out = np.zeros((len(seconds), len(stated.components)))
     for number, where in enumerate(causes_of(stated).values()):
         course = drawn_course(stated.laws[where[0]], seconds, source(number), len(where))
-        out[:, where] = course @ correlation_root(stated.correlation[np.ix_(where, where)]) * stated.sigma[where]
+        out[:, where] = course @ covariance_root(stated.correlation[np.ix_(where, where)]) * stated.sigma[where]
     return out
 
 

@@ -9,8 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from analysis.orbit.jitter_lines import search, splined
-from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
+from analysis.orbit.jitter import JitterError, Observations, periodogram, search, splined
 from tests.analysis.refusals import refuses
 
 GAPS = (0.1216, 0.1024)

@@ -12,6 +12,7 @@ import tifffile
 from astropy.io import fits
 from scipy import sparse
 
+from analysis.arrays import UndeterminedError
 from analysis.block import block_adjustment, reweighting
 from analysis.block.block import CamerasKnowledge, Term
 from analysis.block.block_adjustment import adjust_block, pruned
@@ -19,24 +20,20 @@ from analysis.block.processes import BlockError, Law
 from analysis.calibration import normal_equations, strip_adjustment
 from analysis.calibration.adjustment import adjust
 from analysis.calibration.strip_adjustment import adjust_strip
-from analysis.images.fits_image import fits_cards
-from analysis.images.image_file import ImageFile, Region
-from analysis.images.image_header import ImageError
+from analysis.images.image_file import ImageError, ImageFile, Region, fits_cards
 from analysis.matching.correlation import MatchOptions, distinct_points
 from analysis.matching.spline import resampled
-from analysis.measurement_error import UndeterminedError
 from analysis.monitor import limits
 from analysis.monitor.estimators import ESTIMATORS, Posterior, Shifts
 from analysis.monitor.filter_state import Observed
-from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.model_fit import gain, observability
-from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
+from analysis.monitor.monitoring import CameraParameters, GroundGeometry, MonitorGeometry
 from analysis.monitor.recovery import measure_spots, recover
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import StateSpace
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import measure_pages
-from analysis.orbit import forward_intersection, jitter_lines, jitter_spectrum
+from analysis.orbit import forward_intersection, jitter
 from analysis.orbit.calibration_parameters import CalibrationError
 from analysis.orbit.forward_intersection import (
     CalibratedLine,
@@ -47,10 +44,8 @@ from analysis.orbit.forward_intersection import (
     intersect_pair,
 )
 from analysis.orbit.image_correction import image_correction
-from analysis.orbit.jitter_lines import splined
-from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
-from analysis.orientation.distortion_model import OrientationError
-from analysis.orientation.interior import fit_interior_orientation, line_orientation
+from analysis.orbit.jitter import JitterError, Observations, periodogram, splined
+from analysis.orientation.interior import OrientationError, fit_interior_orientation, line_orientation
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.likelihood import maximum_likelihood_fit
@@ -58,8 +53,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import photon_transfer, pixel_correction
 from analysis.spots.spot_positions import difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
-from analysis.turntable.angle_fits import cross_validate, fit
-from analysis.turntable.dividing_error import CalibrationSeries
+from analysis.turntable.dividing_error import CalibrationSeries, cross_validate, fit
 from tests.analysis import test_adjustment
 from tests.analysis.drawn_blocks import Plan, draw
 from tests.analysis.refusals import refuses
@@ -100,7 +94,9 @@ def test_blocks():
     }.items():
         refuses(BlockError, said, adjust_block, replace(block, **changes))
     refuses(BlockError, "no sensor is called 'radar'; there are", block.without, "radar")
-    refuses(BlockError, "no convergence in 1 steps", adjust_block, block, iterations=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(block_adjustment, "_STEPS", 1)
+        refuses(BlockError, "no convergence in 1 steps", adjust_block, block)
     lonely = replace(block.without("control"), scenes=(first,), terrain=None)
     refuses(BlockError, "no point is seen by two scenes, and none is control", pruned, lonely)
 
@@ -232,9 +228,9 @@ def test_jitter(monkeypatch):
     refuses(JitterError, "moments that lie apart", splined, given, 0.0, 1.0)
     once = of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, 0 * time, degree=0)
     refuses(JitterError, "all observations are of one moment", periodogram, once, 0.5, 6.0)
-    refuses(JitterError, "moves nothing", jitter_lines._fitted, given, np.array([2.0]), np.zeros(1))
+    refuses(JitterError, "moves nothing", jitter._fitted, given, np.array([2.0]), np.zeros(1))
     periodogram(given, 0.5, 2.0)
-    monkeypatch.setattr(jitter_spectrum, "BLIND", 2.0)
+    monkeypatch.setattr(jitter, "BLIND", 2.0)
     refuses(JitterError, "all frequencies between 0.5 and 2 Hz are blind", periodogram, given, 0.5, 2.0)
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from analysis.focal_plane import shims
-from analysis.focal_plane.plane_fit import LineLevel, RigidMotion, fit_focal_plane
-from analysis.focal_plane.shims import Mount, ShimError
+from analysis.focal_plane import plane_fit
+from analysis.focal_plane.plane_fit import LineLevel, Mount, RigidMotion, ShimError, fit_focal_plane
 from tests.analysis.refusals import refuses
 from tests.analysis.test_planes import rotation
 
@@ -35,7 +34,7 @@ def make_mount(angle=0.0, azimuth=0.0, count=4, step=STEP, clearance=2 * MM, beh
 
 def shim_plan(wanted, mount, present=10 * MM):
     """Shims for a motion; where nothing else is said, on thick ones of whole steps."""
-    return shims.shim_plan(wanted, mount, present)
+    return plane_fit.shim_plan(wanted, mount, present)
 
 
 def rounding(plan):

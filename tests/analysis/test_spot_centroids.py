@@ -176,12 +176,6 @@ def test_shape_that_does_not_fit_shows_in_chi_square(template, light, before, pl
     assert np.all(maximum_likelihood_fit(ghost, FRAMES, NOISE, template).reduced_chi_square > 2)
 
 
-def test_every_spot_needs_a_template_that_exists(template):
-    mean = record(electrons([(47.3, 48.1), (48.2, 47.7)]), pattern(2, 1), 2)
-    for wrong in ([0, template.count], [-1, 0]):
-        refuses(ValueError, "index must be", maximum_likelihood_fit, mean, FRAMES, NOISE, template, np.array(wrong))
-
-
 def test_influence_maps_predict_small_changes(template, light):
     """Position change from a small random disturbance against the maps; the rest is of second order."""
     clean = (GAIN * light + OFFSET)[:3]

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.wavefront_maps.wavefront_map import MapError
+from analysis.wavefront_maps.map_files import MapError
 from analysis.wavefront_maps.zernike_table import (
     MOST_TERMS,
     ansi_to_nm,
@@ -82,7 +82,7 @@ INDICES = {
 UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "\u03bcm": 1e-6, "nm": 1e-9, "waves": 632.8e-9}
 
 
-def text_of(order: str, size: str, unit: str, form: str, statements: bool = True) -> str:
+def text_of(order: str, size: str, unit: str, form: str) -> str:
     names, values = [], []
     # in no order of its own
     for noll, metres in sorted(WAVE.items(), key=lambda item: item[1]):
@@ -96,7 +96,7 @@ def text_of(order: str, size: str, unit: str, form: str, statements: bool = True
     else:
         body = "field," + ",".join(f"Z{n}" for n in names) + "\nleft," + ",".join(values) + "\n"
         body += "right," + ",".join(f"{2.0 * float(v)!r}" for v in values) + "\n"
-    return (head if statements else "") + body
+    return head + body
 
 
 @pytest.mark.parametrize("order", ["noll", "fringe", "ansi"])
@@ -105,37 +105,35 @@ def text_of(order: str, size: str, unit: str, form: str, statements: bool = True
 def test_tables_of_one_wavefront_are_the_same(tmp_path, order, size, unit):
     path = tmp_path / "z.csv"
     for form in ("long", "wide"):
-        for statements in (True, False):
-            path.write_text(text_of(order, size, unit, form, statements), "utf-8")
-            said = {} if statements else {"order": order, "normalised": size, "unit": unit, "wavelength": 632.8e-9}
-            found = read_zernikes(path, **said)
-            assert found.terms == tuple(WAVE)
-            np.testing.assert_allclose(found.coefficients[0], list(WAVE.values()), rtol=1e-14, atol=0)
-            if form == "wide":
-                np.testing.assert_allclose(found.coefficients[1], 2.0 * np.array(list(WAVE.values())), rtol=1e-14)
-                assert found.others == {"field": ("left", "right")}
+        path.write_text(text_of(order, size, unit, form), "utf-8")
+        found = read_zernikes(path)
+        assert found.terms == tuple(WAVE)
+        np.testing.assert_allclose(found.coefficients[0], list(WAVE.values()), rtol=1e-14, atol=0)
+        if form == "wide":
+            np.testing.assert_allclose(found.coefficients[1], 2.0 * np.array(list(WAVE.values())), rtol=1e-14)
+            assert found.others == {"field": ("left", "right")}
 
 
 def test_the_unit_in_the_head_of_a_column(tmp_path):
     path = tmp_path / "z.csv"
-    path.write_text("x [deg]\tZ4 [nm]\tZ5 [nm]\n-1\t10\t20\n")
-    found = read_zernikes(path, order="noll", normalised="rms")
+    path.write_text("# order: noll\n# normalised: rms\nx [deg]\tZ4 [nm]\tZ5 [nm]\n-1\t10\t20\n")
+    found = read_zernikes(path)
     np.testing.assert_allclose(found.coefficients, [[10e-9, 20e-9]], rtol=1e-15)
     assert found.others == {"x [deg]": ("-1",)}
-    path.write_text("j,value [um]\nZ4,10\n5,20\n")
-    np.testing.assert_allclose(read_zernikes(path, order="osa", normalised="rms").coefficients, [[10e-6, 20e-6]])
+    path.write_text("# order: osa\n# normalised: rms\nj,value [um]\nZ4,10\n5,20\n")
+    np.testing.assert_allclose(read_zernikes(path).coefficients, [[10e-6, 20e-6]])
 
 
 SAID = "# order: noll\n# normalised: rms\n# unit: nm\n"
 BAD = {
-    "order": (
-        "# unit: nm\n# normalised: rms\nZ4\n1\n",
-        "does not say its order: state it, or add a line '# order: noll'",
-    ),
+    "order": ("# unit: nm\n# normalised: rms\nZ4\n1\n", "does not say its order: add a line '# order: noll'"),
     "size": ("# unit: nm\n# order: noll\nZ4\n1\n", "does not say its normalised"),
     "unit": ("# order: noll\n# normalised: rms\nZ4\n1\n", "does not say its unit"),
     "waves": ("# order: noll\n# normalised: rms\n# unit: waves\nZ4\n1\n", "of which wavelength"),
-    "unknown": ("# order: zemax\n# normalised: rms\n# unit: nm\nZ4\n1\n", "order is 'zemax'; noll, fringe, ansi are"),
+    "unknown": (
+        "# order: zemax\n# normalised: rms\n# unit: nm\nZ4\n1\n",
+        "order is 'zemax'; noll, fringe, ansi, osa, osa/ansi are",
+    ),
     "two units": (SAID + "Z4 [um]\n1\n", "more than one unit"),
     "head": (SAID + "a,b\n1,2\n", "line 4: the head names neither terms"),
     "cells": (SAID + "Z4,Z5\n1,2\n1\n", "line 6: 1 cells, the head of the table has 2"),
@@ -169,8 +167,7 @@ def test_tables_without_a_meaning_are_refused(tmp_path, case):
 def test_statements_that_contradict_the_table(tmp_path):
     path = tmp_path / "z.csv"
     path.write_text(text_of("fringe", "peak", "nm", "long"))
-    for said in ({"order": "noll"}, {"normalised": "rms"}, {"unit": "um"}, {"wavelength": 5e-7}):
-        refuses(MapError, "take the statement away", read_zernikes, path, **said)
+    refuses(MapError, "take the statement away", read_zernikes, path, wavelength=5e-7)
     refuses(MapError, "there is no file", read_zernikes, Path(tmp_path / "other.csv"))
     refuses(MapError, "is no file", read_zernikes, tmp_path)
     refuses(MapError, "cannot be read: Input/output error", read_zernikes, "/proc/self/mem")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from optics.numerics import llvm, threads
+from optics.numerics import backend as threads
+from optics.numerics import llvm
 from optics.numerics.backend import BackendUnavailable, load_backend
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm
 

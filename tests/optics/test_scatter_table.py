@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import dblquad, quad
 from scipy.stats import chi2
 
-from optics.materials import finish as finishes
+from optics.materials import scatter as finishes
 from optics.materials.scatter import STEPS, ABg, HarveyShack, ScatterTable, acceptance, sample_distance, total_scatter
 from scenes.models.scenery import MeasuredFinishes
 from scenes.models.scenery_parts import Finishes

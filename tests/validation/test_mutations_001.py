@@ -136,7 +136,7 @@ MUTATIONS = {
         formulas_images, "parts_across", lambda right: lambda one, other: right(one, other)[::-1], "joint",
         "001.eq11.d_alpha 001.eq11.d_gamma"),
     "001.fig4: forward and backward swapped": (
-        recovery.intersection_angle, "exact", lambda right: lambda f, b, *given: right(b, f, *given), "joint",
+        recovery, "exact", lambda right: lambda f, b, *given: right(b, f, *given), "joint",
         "001.fig4.angle"),
     "001.eq12: frames not averaged": (
         budget, "frame_mean", lambda right: lambda error, frames=9: error, "budget_checks",

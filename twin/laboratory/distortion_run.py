@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.arrays import Array
-from analysis.orientation import interior, measurement
-from analysis.orientation.distortion_model import OrientationError, distortion, principal_distance, principal_point
-from analysis.orientation.distortion_model import principal_distance_and_point as distance_and_point
+from analysis.orientation import interior
+from analysis.orientation.interior import OrientationError, distortion, principal_distance, principal_point
+from analysis.orientation.interior import principal_distance_and_point as distance_and_point
 from analysis.spots.spot_positions import SpotError
-from analysis.turntable.angle_fits import FITS
-from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate, covered
+from analysis.turntable.dividing_error import FITS, CalibrationSeries, DividingCompensation, choose, compensate, covered
 from optics.numerics.backend import Backend
 from scenes.specs.camera_tests import DistortionFiles, DistortionTestSpec, MeasuredDistortionSpec
 from scenes.specs.resolved import DistortionSetup, ExperimentSetup, MeasuredDistortionSetup
@@ -97,10 +96,10 @@ class DistortionRun:
     present: NDArray[np.bool_]
     calibration: CalibrationSeries | None
     compensation: DividingCompensation | None
-    spots: measurement.Spots
-    means: measurement.PointMeans
-    raw: measurement.Distortion
-    compensated: measurement.Distortion
+    spots: interior.Spots
+    means: interior.PointMeans
+    raw: interior.Distortion
+    compensated: interior.Distortion
     stated: interior.InteriorOrientation
     readings: SpotReadings | None = None
     tables: tuple[Comparisons, ...] = ()
@@ -145,7 +144,7 @@ class SimulatedDistortion(DistortionRun):
         """The test with all it refers to."""
         return self.bench.setup
 
-    def true_fit(self, terms: Sequence[str] = measurement.CALIBRATED) -> interior.InteriorOrientation:
+    def true_fit(self, terms: Sequence[str] = interior.CALIBRATED) -> interior.InteriorOrientation:
         """Fit of the exact chief rays at the true angles, with the terms and exposures of the measurement."""
         where, turned = self.means.mean(self.truth.place[..., 0]), self.means.mean(self.truth.turn)
         return interior.fit_interior_orientation(where, turned, _EXACT, terms)
@@ -155,14 +154,14 @@ class SimulatedDistortion(DistortionRun):
         """D of the chief rays, (N,), metres."""
         return self.true_fit().residual
 
-    def error(self, measured: measurement.Distortion) -> Array:
+    def error(self, measured: interior.Distortion) -> Array:
         """Measured minus true distortion, (N,), metres."""
         return np.asarray(measured.distortion - self.true_distortion)
 
     @cached_property
     def true_estimates(self) -> Mapping[str, Estimate]:
         """Values of `estimates` from exact chief rays at the true angles."""
-        return _estimates(self.true_fit(), self.true_fit(measurement.SMOOTH), 0.0)
+        return _estimates(self.true_fit(), self.true_fit(interior.SMOOTH), 0.0)
 
 
 def _estimates(
@@ -191,7 +190,7 @@ def _estimates(
 def _calibrated(fit: interior.InteriorOrientation) -> Array:
     """What distortion is counted from: c + f tan W - p tan^2 W of a fit at its angles, (N,), metres."""
     tangent = np.tan(fit.angle)
-    c, f, p = (fit.value(term) for term in measurement.CALIBRATED)
+    c, f, p = (fit.value(term) for term in interior.CALIBRATED)
     return np.asarray(c + f * tangent - p * tangent**2)
 
 
@@ -228,13 +227,13 @@ def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> Sim
         )
     except OrientationError as error:
         raise BenchError(
-            str(error), ("points",), f"{len(measurement.SMOOTH) + 1} or more, over the whole field"
+            str(error), ("points",), f"{len(interior.SMOOTH) + 1} or more, over the whole field"
         ) from error
 
 
 def reduce(
     reading: Array,
-    spots: measurement.Spots,
+    spots: interior.Spots,
     zero: float,
     about: float,
     compensation: DividingCompensation | None,
@@ -263,17 +262,17 @@ def reduce(
     sense = -1.0 if reverse else 1.0
     read = sense * (reading - zero)
     if compensation is None:
-        means = measurement.reduce_sets(read, spots, about, 0.0, present)
+        means = interior.reduce_sets(read, spots, about, 0.0, present)
         common = angle_sigma**2 * np.eye(len(reading))
-        raw = compensated = measurement.Distortion.measure(read, spots, means, common)
+        raw = compensated = interior.Distortion.measure(read, spots, means, common)
     else:
         corrected = sense * (compensation.correct(reading) - float(compensation.correct(zero)))
-        means = measurement.reduce_sets(corrected, spots, about, about * compensation.repeatability, present)
+        means = interior.reduce_sets(corrected, spots, about, about * compensation.repeatability, present)
         # the white part is left to the test's own residuals, which see it at more angles than the calibration's did
         common = replace(compensation, white=0.0).covariance(means.mean(reading))
         raw, compensated = (
-            measurement.Distortion.measure(read, spots, means),
-            measurement.Distortion.measure(corrected, spots, means, common),
+            interior.Distortion.measure(read, spots, means),
+            interior.Distortion.measure(corrected, spots, means, common),
         )
     fit = compensated.fit
     return {
@@ -285,7 +284,7 @@ def reduce(
         "raw": raw,
         "compensated": compensated,
         "stated": interior.fit_interior_orientation(
-            fit.position, fit.angle, means.sigma, measurement.SMOOTH, angle_covariance=common
+            fit.position, fit.angle, means.sigma, interior.SMOOTH, angle_covariance=common
         ),
     }
 
@@ -350,9 +349,9 @@ def _check_angles(files: DistortionFiles, found: SpotReadings, zero: float) -> N
         raise InputError(Issue("an angle beyond any field", found.file.file, line, (found.head,), shown, allowed))
 
 
-def _locate(bench: DistortionBench, record: DistortionRecord) -> measurement.Spots:
+def _locate(bench: DistortionBench, record: DistortionRecord) -> interior.Spots:
     try:
-        return measurement.locate_spots(
+        return interior.locate_spots(
             record.frames,
             record.column,
             bench.middle_column,

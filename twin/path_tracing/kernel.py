@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from optics.materials import finish
+from optics.materials import scatter
 from optics.numerics.backend import Backend
 from twin.path_tracing import clear_ways
 from twin.path_tracing import tables as layout
@@ -361,7 +361,7 @@ def shares(
     if glass:
         after = dr.select(inside, 1.0, place.row[layout.INDEX])
         ratio = dr.select(inside, place.row[layout.INDEX], place.row[layout.INVERSE])
-        bent = finish.cosine_after(incidence, ratio, 1.0)
+        bent = scatter.cosine_after(incidence, ratio, 1.0)
     marks: list[Any] = []
     if features.measured:
         assert tables.measured is not None
@@ -385,7 +385,7 @@ def shares(
             some = met & bare & ~total
 
             def fresnel(reflected: Any, transmitted: Any) -> tuple[Any, Any]:
-                plain = finish.reflectance(incidence, before, after)
+                plain = scatter.reflectance(incidence, before, after)
                 return dr.select(some, plain, reflected), dr.select(some, 1.0 - plain, transmitted)
 
             reflected, transmitted = dr.if_stmt(

@@ -13,9 +13,8 @@ from optics.geometry.aperture import Aperture, DiskNumbers, EllipseNumbers, Rect
 from optics.geometry.sag_terms import SagTerm, kinds_of, of_kinds
 from optics.geometry.surface import FigureNumbers, GridNumbers, SurfaceNumbers
 from optics.geometry.zernike import triangle_size
-from optics.materials import finish, scatter
-from optics.materials.finish import Finish
-from optics.materials.scatter import DrawnScatter
+from optics.materials import scatter
+from optics.materials.scatter import DrawnScatter, Finish
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
 from scenes.models.scenery import Scenery
@@ -55,8 +54,8 @@ class FinishTables:
 
     def shares(self, marks: Sequence[Any], cosine: Any, active: Any) -> tuple[Any, Any]:
         """Reflectance and transmittance of the coatings of paths that have one, by the cosine on the side of air."""
-        number, k, w = self._place(marks[0], cosine, finish.STEPS)
-        first = 2 * ((finish.STEPS + 1) * number + k)
+        number, k, w = self._place(marks[0], cosine, scatter.COATING_STEPS)
+        first = 2 * ((scatter.COATING_STEPS + 1) * number + k)
         has = active & (marks[0] > 0.5)
         low, high = ([self._get(self.coatings, first + n + step, has) for n in (0, 1)] for step in (0, 2))
         return (1.0 - w) * low[0] + w * high[0], (1.0 - w) * low[1] + w * high[1]

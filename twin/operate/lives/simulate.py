@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.arrays import Array
-from scenes.models.disturbances import Component, StatedMotions, correlation_root, states_of
+from optics.numerics.array_math import covariance_root
+from scenes.models.disturbances import Component, StatedMotions, states_of
 from scenes.models.drawn_motions import causes_of, drawn_motions
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.yaml_file import dump_yaml
@@ -166,7 +167,7 @@ def _jumps(
 def _step(stated: StatedMotions, where: Sequence[int], rng: np.random.Generator) -> Array:
     """(M,) SI by which some motions step, together as they are correlated; others by nothing."""
     out = np.zeros(len(stated.components))
-    root = correlation_root(stated.correlation[np.ix_(where, where)])
+    root = covariance_root(stated.correlation[np.ix_(where, where)])
     out[list(where)] = rng.standard_normal(len(where)) @ root * stated.sigma[list(where)]
     return out
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2
 
+from analysis import statistics
 from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import Prior, index
 from analysis.orbit.three_line_model import BIAS
@@ -60,7 +60,7 @@ class LatitudeFit:
     @property
     def p_value(self) -> float:
         """Chance of such a chi-square if latitude is all that matters."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     def curve(self, latitude: np.ndarray) -> np.ndarray:
         """Fitted bias, radians."""

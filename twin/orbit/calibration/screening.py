@@ -12,14 +12,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2, siegelslopes
+from scipy.stats import siegelslopes
 
+from analysis import statistics
 from analysis.block.reweighting import REJECT
 from analysis.calibration.adjustment import Adjustment, FarPointsError
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import Rays, misclosure
 from analysis.statistics import robust_variance
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, Rejected
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.field_images import FieldImages, Screening
@@ -221,7 +222,7 @@ def _without(
     if one.check:
         meeting = intersect(one.check, found.cameras_of(one.name), campaign.noise, bias=found.bias(one.name))
         # three rays are six conditions of three coordinates
-        keep = meeting.chi_square <= chi2.isf(_FALSE_ALARM, 2 * meeting.rays - 3)
+        keep = meeting.chi_square <= statistics.limit_of(_FALSE_ALARM, 2 * meeting.rays - 3)
     return _reduced(one, kept, stays, keep), keep
 
 
@@ -291,7 +292,7 @@ class Meeting:
         """Chance of such a chi-square or a larger one. Points exposed within a few readings err alike, and the
         calibration's own errors are in it.
         """
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
 
 def meeting_of(campaign: Campaign, one: FieldPass, adjustment: Adjustment) -> Meeting:

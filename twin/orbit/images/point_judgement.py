@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.stats import chi2
 
-from optics.numerics.frozen_map import FrozenMap
+from analysis import statistics
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.images.image_points import MatchedPoints
 from twin.orbit.images.patch import Patch
 
@@ -78,7 +78,7 @@ class LineJudgement(MatchCounts):
     @property
     def p_value(self) -> float:
         """Chance of a chi-square as large or larger."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
 
 def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
