@@ -12,7 +12,7 @@ from twin.main_job.render_job import render_job
 from twin.monitor import monitor_memory
 from twin.monitor.monitor_path import MonitorPath
 from twin.study.runs.base_job import BlockResult, Failure, Run, leaf, with_values
-from twin.study.runs.engine import check_responses
+from twin.study.runs.blocks import check_responses
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import JobMaker, quantity_at, read_job
 from twin.study.runs.setup import resolve_study

@@ -19,7 +19,7 @@ import numpy as np
 from scenes.models.monitor_layout import Beam, changed_beam, drawn_beam, kinds_of, start_beams
 from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, combined, touching
 from twin.design.layout_refinement import Ask, ratios, refined
-from twin.design.search_workers import Journal, Workers
+from twin.design.search_workers import Workers, journal_of
 from twin.run.procedure import Advance
 
 FIRST_STEP = 0.15
@@ -159,7 +159,7 @@ class Search:
 
     def __init__(self, bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> None:
         self.bench, self.seed = bench, seed
-        kept = Journal(journal, f"{seed}\n{bench.setup.to_yaml()}")
+        kept = journal_of(journal, f"{seed}\n{bench.setup.to_yaml()}")
         self.workers = Workers(bench, workers, kept, advance)
 
     def run(self) -> Found:

@@ -12,9 +12,9 @@ import xarray as xr
 
 from scenes.specs.study import NOISE
 from twin.run import data_files, reference_frames
+from twin.run.run_folder import RunFolder
 from twin.study.runs.base_job import BlockResult, one_line
 from twin.study.runs.plan import Plan
-from twin.study.runs.study_folder import StudyFolder
 
 RUN = "run"
 FAILED, MESSAGE, SEED = "failed", "message", "seed"
@@ -66,7 +66,7 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         data[SEED] = (RUN, plan.seeds, {"units": "", ROLE: "bookkeeping", "long_name": "seed of the run's noise"})
     attributes = {
         "title": study.name,
-        "study": plan.setup.to_yaml(),
+        "study": plan.config,
         "fingerprint": plan.setup.fingerprint,
         "design": study.design.kind,
         "seed": study.design.seed,
@@ -188,9 +188,8 @@ class Numbers:
     unwritten: tuple[str, ...] = ()
 
 
-def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, folder: StudyFolder) -> Numbers:
-    """Write the data set in all FORMATS, and study.json; the folder is no longer a complete study's until its
-    manifest is written.
+def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, folder: RunFolder) -> Numbers:
+    """Write the data set in all FORMATS, and study.json.
 
     Args:
         plan: the study.
@@ -210,8 +209,7 @@ def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, f
             "worker_seconds": result.seconds,
         },
     )
-    folder.begin_results()
-    folder.write("config.yaml", plan.setup.to_yaml().encode())
+    folder.write_text("config.yaml", plan.config)
     files, unwritten = [], []
     for ending, contents in FORMATS.items():
         try:
@@ -221,6 +219,6 @@ def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, f
             continue
         if content is not None:
             files.append(f"study.{ending}")
-            folder.write(files[-1], content)
+            folder.write_bytes(files[-1], content)
     folder.write_json("study.json", numbers)
     return Numbers(data, numbers, tuple(files), tuple(unwritten))

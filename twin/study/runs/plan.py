@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -64,6 +63,11 @@ class Plan:
         plan.check()
         return plan
 
+    @cached_property
+    def config(self) -> str:
+        """Text of the study's config.yaml."""
+        return self.setup.to_yaml()
+
     @property
     def runs(self) -> int:
         """Number of runs."""
@@ -121,11 +125,6 @@ class Plan:
         values = {place: c.cell(number) for c in self.columns for place in factors[c.name].places}
         self.scaling.apply(values, number)
         return Run(number, tuple(values.items()), None if self.seeds is None else int(self.seeds[number]))
-
-    def runs_of(self, blocks: range) -> Iterator[list[Run]]:
-        """Runs of some blocks, block by block."""
-        for block in blocks:
-            yield [self.run(number) for number in self.block(block)]
 
     def check(self) -> None:
         """Try each factor's smallest and largest value, and every text, in the base, one factor at a time.
@@ -216,7 +215,7 @@ def study_bytes(setup: StudySetup, runs: int) -> float:
 
 def require_study_memory(setup: StudySetup) -> None:
     """See whether the results of all runs fit into the memory that is free and that the study may use. How long they
-    take a first block of runs tells before the others begin (`twin.study.runs.engine`).
+    take a first block of runs tells before the others begin (`twin.study.runs.blocks`).
 
     Args:
         setup: the study.
