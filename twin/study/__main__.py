@@ -19,7 +19,6 @@ from rich.console import Console
 from scenes.kinds.file_kinds import read_for
 from twin.run import cli
 from twin.run.command import Result, run_command
-from twin.study.progress_bar import tell_through
 
 if TYPE_CHECKING:  # help waits for nothing that computes
     from twin.run.procedure import Session
@@ -108,8 +107,11 @@ def main(
             copyfile(out / BLOCKS, place / BLOCKS)
         said = errors if not (quiet or as_json) else Console(quiet=True)
         say = partial(said.print, markup=False, highlight=False, soft_wrap=True)
-        progress = (lambda done, total: None) if progress_fd is None else tell_through(progress_fd)
-        return study_command.run_study(setup, session, place, chosen, say, progress)
+        if progress_fd is None:
+            return study_command.run_study(setup, session, place, chosen, say)
+        from twin.study.scripted import tell_through  # what a script needs
+
+        return study_command.run_study(setup, session, place, chosen, say, tell_through(progress_fd))
 
     # --resume of a finished study makes its report anew
     finished = resume and out is not None and (out / BLOCKS).is_file() and read_manifest(out) is not None

@@ -13,6 +13,7 @@ import xarray as xr
 from scenes.specs.study import NOISE
 from twin.run import data_files, reference_frames
 from twin.run.run_folder import RunFolder
+from twin.study.report.study_statistics import Estimate, describe
 from twin.study.runs.base_job import BlockResult, one_line
 from twin.study.runs.plan import Plan
 
@@ -160,15 +161,12 @@ def _span(values: np.ndarray) -> dict[str, Any]:
 
 def _statistics(values: np.ndarray) -> dict[str, Any]:
     """Over the finite values; std with n - 1; p95 and p997: 95 and 99.7 of 100 runs lie below."""
-    good = values[np.isfinite(values)]
-    n = len(good)
-    return {
-        "count": n,
-        "mean": float(np.mean(good)) if n else None,
-        "std": float(np.std(good, ddof=1)) if n > 1 else None,
-        "p95": float(np.quantile(good, 0.95)) if n else None,
-        "p997": float(np.quantile(good, 0.997)) if n else None,
-    }
+    found = describe(values, False)
+    return {"count": found.count, **{key: _value(getattr(found, key)) for key in ("mean", "std", "p95", "p997")}}
+
+
+def _value(estimate: Estimate | None) -> float | None:
+    return None if estimate is None else estimate.value
 
 
 @dataclass(frozen=True, eq=False)
