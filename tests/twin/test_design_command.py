@@ -25,7 +25,7 @@ from tests.twin.study_bench import TEXTS, refusals
 from twin.design.__main__ import app
 from twin.design.design_run import HELD_BY, _held_text, run_design
 from twin.design.layout_bench import BeamFacts
-from twin.design.search_workers import journal_of
+from twin.design.layout_search import journal_of
 from twin.run.run_folder import RunFolderError
 
 EXAMPLE = EXAMPLES / "design_gf7_short.yaml"

@@ -34,8 +34,8 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import refusals
 from twin.design.__main__ import app
 from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
+from twin.design.layout_search import journal_of
 from twin.design.monitor_design import LAYOUTS, MonitorDesignRun, run_monitor_design
-from twin.design.search_workers import journal_of
 from twin.monitor.information import Information, spot_noise
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
