@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -81,39 +81,25 @@ def _path(key: tuple[str | int, ...]) -> str:
     return " ".join(str(part) for part in key)
 
 
-def table(data: xr.Dataset) -> bytes:
-    """The data set as CSV, a line for each run; heads are the names, with the unit in brackets."""
-    names = [RUN, *(str(name) for name in data.data_vars)]
-    rows = zip(*(_cells(data[name].values) for name in names), strict=True)
-    return data_files.csv_table([[_head(data, name) for name in names], *rows])
-
-
-def _head(data: xr.Dataset, name: str) -> str:
-    units = data[name].attrs.get("units", "")
-    return f"{name} [{units}]" if units else name
-
-
-def _cells(values: np.ndarray) -> list[Any]:
-    """All digits; an empty cell where there is no number."""
-    return ["" if isinstance(value, float) and math.isnan(value) else value for value in values.tolist()]
-
-
-def parquet(data: xr.Dataset) -> bytes | None:
-    """The data set as a Parquet file with units and descriptions; None when pyarrow is not installed."""
+def _as_table(ending: str, data: xr.Dataset) -> bytes | None:
+    """The data set as a table, a line for each run, with units and descriptions; None where a package is missing."""
     columns = []
     for name in (RUN, *map(str, data.data_vars)):
         about = data[name].attrs
         columns.append(data_files.DataColumn(name, data[name].values, about.get("units", ""), about["long_name"]))
-    title, frames = str(data.attrs["title"]), str(data.attrs["reference_frames"])
+    facts = {"reference_frames": str(data.attrs["reference_frames"])}
     try:
-        return data_files.TABLE_FORMATS["parquet"](
-            data_files.DataTable("study", title, tuple(columns), {"reference_frames": frames})
+        return data_files.TABLE_FORMATS[ending](
+            data_files.DataTable("study", str(data.attrs["title"]), tuple(columns), facts)
         )
     except data_files.MissingPackage:
         return None
 
 
-FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {"nc": data_files.netcdf, "csv": table, "parquet": parquet}
+FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {
+    "nc": data_files.netcdf,
+    **{ending: partial(_as_table, ending) for ending in ("csv", "parquet")},
+}
 """Ending of a file of the data set, study.ENDING -> its contents, None where what it needs is not installed. A new one
 is added here.
 """

@@ -32,18 +32,11 @@ DRAWS = "draws"
 class ToleranceBase:
     """``python -m twin.tolerance``: of every camera the merits after its adjustments, and the adjustments."""
 
+    model: type[Spec] = ToleranceSetup
+    block = AT_ONCE
+
     def __init__(self) -> None:
         self._benches: dict[int, tuple[Tree, ToleranceBench]] = {}
-
-    @property
-    def model(self) -> type[Spec]:
-        """A tolerance budget with its instrument."""
-        return ToleranceSetup
-
-    @property
-    def block(self) -> int:
-        """Cameras that are traced together."""
-        return AT_ONCE
 
     def resolve(self, file: Path | str) -> Spec:
         """Read a budget. Raises InputError."""

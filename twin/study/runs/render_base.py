@@ -129,20 +129,13 @@ KEPT = 4
 class RenderBase:
     """``python -m twin.render``, without the crosstalk tables. It keeps instruments from one block to the next."""
 
+    model: type[Spec] = ResolvedJob
+    block = BLOCK
+
     def __init__(self) -> None:
         self._experiments: OrderedDict[str, MonitorExperiment] = OrderedDict()
         self._before: OrderedDict[tuple[str, int, int], np.ndarray] = OrderedDict()
         self._maker: JobMaker | None = None
-
-    @property
-    def model(self) -> type[Spec]:
-        """A job with all it refers to."""
-        return ResolvedJob
-
-    @property
-    def block(self) -> int:
-        """Number of states that are done together."""
-        return BLOCK
 
     def resolve(self, file: Path | str) -> Spec:
         """Read a job with all it refers to. Raises InputError."""
