@@ -9,6 +9,7 @@ if __name__ == "__main__":
 
 from collections.abc import Mapping
 from functools import partial
+from os.path import isfile
 from pathlib import Path
 from shutil import copyfile
 from typing import TYPE_CHECKING, Annotated
@@ -114,7 +115,7 @@ def main(
         return study_command.run_study(setup, session, place, chosen, say, tell_through(progress_fd))
 
     # --resume of a finished study makes its report anew
-    finished = resume and out is not None and (out / BLOCKS).is_file() and read_manifest(out) is not None
+    finished = resume and out is not None and isfile(out / BLOCKS) and read_manifest(out) is not None
     again = f"python -m twin.study {file}{'' if out is None else f' --out {out}'}{' --force' if force else ''}"
     kept = KeptWork(out, file.stem, "blocks", resume, force, again)
     options = cli.Options(out, None, backend, force or finished, as_json, quiet, strict=strict)
