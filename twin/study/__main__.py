@@ -94,11 +94,11 @@ def main(
     from twin.run.run_folder import KeptWork, read_manifest
     from twin.study import study_command
     from twin.study.runs.blocks import BLOCKS
-    from twin.study.runs.setup import resolve_study
+    from twin.study.runs.setup import PROGRAM, resolve_study
 
     def resolve() -> StudySetup:
         refuse_both(workers, scheduler)
-        setup = read_for(study_command.PROGRAM, file, resolve_study)
+        setup = read_for(PROGRAM, file, resolve_study)
         study_command.check_size(setup, yes)
         return setup
 

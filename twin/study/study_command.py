@@ -15,9 +15,8 @@ from twin.run.procedure import WRITE, Session
 from twin.run.run_folder import write_manifest
 from twin.study.runs.blocks import BLOCKS, Engine, journal_of
 from twin.study.runs.plan import Plan, require_study_memory, run_count
-from twin.study.runs.setup import StudySetup, base_of
+from twin.study.runs.setup import PROGRAM, StudySetup, base_of
 
-PROGRAM = "twin.study"
 START = "start the workers and do the first runs"
 
 

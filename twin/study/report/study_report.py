@@ -25,6 +25,7 @@ from twin.study.report.study_analysis import StudyAnalysis
 from twin.study.report.study_statistics import Estimate, Factor, StudyRuns, typeset
 from twin.study.runs.base_job import one_line
 from twin.study.runs.plan import Plan
+from twin.study.runs.setup import PROGRAM
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,7 @@ def report_files(
     contents = {artefact.file: artefact.content() for artefact in report.artefacts if artefact.within is None}
     contents[STATISTICS] = run_folder.json_text(report.told(study_analysis.STATISTICS(found))).encode()
     numbers = page.links((*files, "study.json", STATISTICS, "config.yaml"))
-    contents["report.html"] = page.report_page(report, ("twin.study", "config.yaml"), [("Numbers", numbers)]).encode()
+    contents["report.html"] = page.report_page(report, (PROGRAM, "config.yaml"), [("Numbers", numbers)]).encode()
     return StudyReport(said, contents, undrawn, report.warnings)
 
 

@@ -27,6 +27,7 @@ from scenes.yaml.spec import Source, Spec, validate
 from twin.run.provenance import source_digest, versions
 from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, says_nothing, with_place, with_values
 
+PROGRAM = "twin.study"
 BY_NAME = ("instrument", "disturbances")
 """Keys of a job whose files are parts of the resolved base, beside the job; a change of the name would change nothing.
 """
