@@ -51,8 +51,8 @@ def run_results(
     known |= {"frames": resolved.frames, "seed": resolved.job.render.seed, "warnings": ()}
     if recovery is None:
         return {"truth": JobRun(**known).truth_dict()}
-    images = dict.fromkeys(("photons_before", "photons_after", "before", "after"), np.empty(0))
-    run = RenderRun(**known, **images, recovery=recovery, crosstalk={})
+    known |= dict.fromkeys(("photons_before", "photons_after", "before", "after"), np.empty(0))
+    run = RenderRun(**known, recovery=recovery, crosstalk={})
     return {"truth": run.truth_dict(), "recovered": run.recovered_dict()}
 
 
