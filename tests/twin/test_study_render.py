@@ -67,7 +67,7 @@ def test_one_run_is_what_the_command_gives(study, backend, monkeypatch) -> None:
 @pytest.mark.second
 def test_the_same_block_gives_the_same_bits(study, backend, monkeypatch) -> None:
     """Also where its runs, each with noise of its own, are exposed a few at a time."""
-    runs = next(study.plan.runs_of(range(1, 2)))
+    runs = [study.plan.run(number) for number in study.plan.block(1)]
     assert len({run.seed for run in runs}) == len(runs)
     one = study.setup.job.evaluate(study.setup.tree, runs, backend)
     two = study.setup.job.evaluate(study.setup.tree, runs, backend)
