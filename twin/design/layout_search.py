@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.models.monitor_layout import Beam, changed_beam, drawn_beam, kinds_of, start_beams
 from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, Seen, bench_of, combined, touching
 from twin.design.layout_refinement import Ask, LayoutNumber, Slope, ratios, refined, slope_of

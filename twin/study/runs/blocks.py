@@ -15,8 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from optics.numerics.backend import Backend, load_backend
-from optics.numerics.threads import ONE_THREAD, kernel_threads
+from optics.numerics.backend import ONE_THREAD, Backend, kernel_threads, load_backend
 from scenes.specs.study import NOISE, TOTAL
 from scenes.yaml.errors import InputError, KeyPath, Problem, key_text
 from twin.run import cluster
