@@ -83,7 +83,6 @@ from twin.study.report.study_report import write_report
 from twin.study.runs.base_job import BlockResult
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
-from twin.study.runs.study_folder import StudyFolder
 from twin.study.study_files import write_data
 from twin.targets.target_images import BandPupils, View
 from twin.validation.checks.check import Check
@@ -591,7 +590,7 @@ def study_folder(place: Path, kind: str, runs: int = 12) -> tuple[Plan, Path]:
     plan = Plan.of(setup)
     values = np.stack([np.linspace(0.0, 1.0, runs), np.linspace(0.0, 1.0, runs)], axis=-1)
     result = BlockResult(values, *(np.full(values.shape, s) for s in (0.1, 0.01)), ("",) * runs, 1.0, ("",) * runs)
-    with StudyFolder(place / "run", setup) as folder:
+    with RunFolder(place / "run") as folder:
         numbers = write_data(plan, result, 1.0, runs, folder)
         write_report(numbers.data, plan, folder, numbers.files)
         write_manifest(

@@ -30,7 +30,7 @@ def main(
         bool, typer.Option("--files", help="Only look at the files; make nothing again. A second for most folders.")
     ] = False,
     every: Annotated[
-        bool, typer.Option("--all", help="Of a study make all runs again on all cores, not one chunk of them.")
+        bool, typer.Option("--all", help="Of a study make all runs again on all cores, not one block of them.")
     ] = False,
     keep: Annotated[
         Path | None,
@@ -47,11 +47,11 @@ def main(
         python -m twin.verify runs/perturb-001 --files
 
     **The files.** A changed byte, a file that is gone, and one that the run did not write are named, also in the
-    chunks of a study, and in the manifest itself. Files outside the folder that the run read, such as measured frames,
+    manifest itself. Files outside the folder that the run read, such as measured frames,
     are held against what they were then.
 
-    **The run made again** takes as long as the run did, which is said first; of a study one chunk is computed, a few
-    seconds, and all its chunks are held against study.nc. Every number is the same to the bit, the same but for
+    **The run made again** takes as long as the run did, which is said first; of a study one block of runs is
+    computed, a few seconds, and all are held against study.nc. Every number is the same to the bit, the same but for
     rounding (1e-9 of the largest of its sort, on another processor 1e-6, or 1e-3 of its sigma), or different, with key,
     old and new value.
     Pages are left out: they name the time. What was made by another version of the program, with other packages or on
@@ -75,14 +75,14 @@ def main(
         state = folder_state(run)
         if every and not state.is_study:
             raise cli.InputErrorText("--all is for studies; of other runs everything is made again anyway")
-        chunk = state.is_study and not every and keep is None
+        block = state.is_study and not every and keep is None
         why, made = "" if files else verification.obstacle(state), None
         if not files and not why:
             if not silent:
-                text = "one chunk of the study" if chunk else f"the run, which took {verification.expected_time(state)}"
+                text = "one block of the study" if block else f"the run, which took {verification.expected_time(state)}"
                 errors.print(f"making again {text}", markup=False, highlight=False, soft_wrap=True)
             try:
-                made = verification.repeat_chunk(state) if chunk else _whole(state, keep, silent)
+                made = verification.repeat_block(state) if block else _whole(state, keep, silent)
             except verification.CannotRepeat as error:
                 why = str(error)
         done = verification.Verification(state, made, why)

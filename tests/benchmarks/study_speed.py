@@ -14,8 +14,7 @@ from tests.benchmarks.stopwatch import processor_s
 from tests.benchmarks.workbench import Workbench
 from tests.twin.study_bench import write_study
 from twin.run.cluster import local_workers
-from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.engine import Engine, Progress
+from twin.study.runs.blocks import BLOCKS, Engine, journal_of
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 
@@ -36,13 +35,12 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     with tempfile.TemporaryDirectory() as name:
         study = write_study(Path(name) / "in", *changes, ("responses:", "noise: shared\nresponses:"))
         plan = Plan.of(resolve_study(study))
-        store = ChunkStore(Path(name), plan)
-        store.open()
-        with local_workers(2) as workers:
+        with local_workers(2) as workers, journal_of(plan.setup, Path(name) / BLOCKS) as journal:
             begun, spent = time.monotonic(), processor_s()
-            Engine(plan, store, progress=Progress(done=look)).run(workers)
+            engine = Engine(plan, journal, advance=look)
+            engine.run(workers)
             seconds, spent = time.monotonic() - begun, processor_s() - spent
-        assert np.isfinite(store.result().values).all()
+        assert np.isfinite(engine.result().values).all()
     what = f"study of {runs} monitor states, nine frames, two workers"
     return Speed(
         (

@@ -6,8 +6,8 @@ Left out, since they differ from run to run or from checkout to checkout:
   checksums by file the names are kept;
 - in texts: the paths of the run and of the project, the DURATIONS, and the versions' row of a report;
 - lines by which a study tells its PACE;
-- SKIPPED files: a study's chunks, whose size follows from the pace and whose numbers are in study.nc, and the database
-  of a record, which is written out as tables.
+- SKIPPED files: the journal of a study, whose order follows from the pace and whose numbers are in study.nc, and the
+  database of a record, which is written out as tables.
 """
 
 from __future__ import annotations
@@ -36,13 +36,12 @@ from tests.golden.jobs import ROOT, Done
 LEFT_OUT = {
     "": set("versions started_unix_s wall_time_s seconds worker_seconds states_per_second raised_utc ms".split()),
     "manifest.json": {"workers", "provenance", "digest"},
-    "study_state.json": {"fingerprint", "content", "sources"},
     "study.nc": {"fingerprint"},
 }
 """Keys by file, "" for every file. Words that mean something physical elsewhere, as the sources of stray light, stand
 with the one file in which they do not.
 """
-SKIPPED = re.compile(r"^chunks/|record\.sqlite")
+SKIPPED = re.compile(r"\.journal$|record\.sqlite")
 TAGS = ("DateTime", "Software")
 """Of a TIFF, left out."""
 DURATIONS = (

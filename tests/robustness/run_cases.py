@@ -89,10 +89,8 @@ def run_cases(bases: Path, app_of: Callable[[str], typer.Typer]) -> Iterator[Cas
 
 def _resumed(files: dict[str, bytes], study: typer.Typer) -> Iterator[Case]:
     """A study that goes on from what it kept."""
-    state = next(name for name in files if b'"fingerprint"' in files[name])
-    kept = {name: files[name] for name in files if name.startswith("run/chunks/") or name in (state, "run/config.yaml")}
-    resumed: dict[str, Any] = {"out": "", "whole": 8, "starts": True, "changes": ("run/",)}
-    resumed["options"] = ("--resume", "--workers", "1", "--out", "{here}/run")
-    for target in (state, "run/chunks/index.txt", next(name for name in files if name.endswith(".npz"))):
-        own = {"study.yaml": files["run/config.yaml"], **kept}
-        yield Case(f"resume-{Path(target).stem}", "state of a study", study, (), own, target, **resumed)
+    target = "run.blocks/blocks.journal"
+    own = {"study.yaml": files["run/config.yaml"], "run.blocks/.lock": b"", target: files["run/blocks.journal"]}
+    more: dict[str, Any] = {"out": "", "whole": 8, "starts": True, "changes": ("run.blocks/", "run/", ".run.")}
+    more["options"] = ("--resume", "--workers", "1", "--out", "{here}/run")
+    yield Case("resume-journal", "state of a study", study, (), own, target, **more)

@@ -1,8 +1,8 @@
-"""A process that replaces a run, or a study, in a folder with ``--force`` and is hit at a moment of its writing.
+"""A process that replaces a run in a folder with ``--force`` and is hit at a moment of its writing.
 
-    python -m tests.twin.replacing KIND TARGET STEM MEGABYTES MOMENT SIGNAL
+    python -m tests.twin.replacing TARGET STEM MEGABYTES MOMENT SIGNAL
 
-KIND run or study; the new one holds STEM in which.txt. At its MOMENT-th step on the disk, counted from 1, the process
+The new one holds STEM in which.txt. At its MOMENT-th step on the disk, counted from 1, the process
 gets SIGNAL; 0 for none, and then it prints how many steps there were. It writes as the commands do, what they would
 compute at great length aside.
 """
@@ -76,31 +76,6 @@ def replace_run(target: Path, stem: str, megabytes: float) -> None:
         write_manifest(folder, "twin.test", 1.5e9, 1.0)
 
 
-def replace_study(target: Path, stem: str, megabytes: float, resume: bool = False) -> None:
-    """As a study does, its chunks and results filled with anything."""
-    import numpy as np
-
-    from twin.study.runs.base_job import BlockResult
-    from twin.study.runs.chunk_store import ChunkStore
-    from twin.study.runs.plan import Plan
-    from twin.study.runs.setup import resolve_study
-    from twin.study.runs.study_folder import StudyFolder
-    from twin.study.study_command import broken_by_signals
-
-    setup = resolve_study(Path(os.environ["TWIN_STUDY"]))
-    plan = Plan.of(setup)
-    with broken_by_signals(), StudyFolder(target, setup, resume=resume, force=not resume) as folder:
-        store = ChunkStore(folder.path, plan)
-        store.open()
-        for block in store.missing:
-            n = len(plan.block(block))
-            numbers = np.zeros((n, len(setup.study.responses)))
-            store.write(block, [BlockResult(numbers, numbers, numbers, ("",) * n, 1.0, ("",) * n)])
-        folder.begin_results()
-        folder.write_all(contents(stem, megabytes))
-        write_manifest(folder, "twin.study", 1.5e9, 1.0)
-
-
 def standing(target: Path) -> str | None:
     """What which.txt says of the run at the target, if it is whole: every listed file with its checksum; else None."""
     manifest = read_manifest(target)
@@ -113,11 +88,11 @@ def standing(target: Path) -> str | None:
 
 def main() -> None:
     """See above."""
-    kind, target, stem, megabytes, at, number = sys.argv[1:]
+    target, stem, megabytes, at, number = sys.argv[1:]
     place = Path(target)
     moments = Moments(place.parent, int(at), lambda: os.kill(os.getpid(), int(number)))
     moments.armed = True
-    {"run": replace_run, "study": replace_study}[kind](place, stem, float(megabytes))
+    replace_run(place, stem, float(megabytes))
     moments.end()
     sys.stdout.write(f"{moments.count}\n")
 

@@ -46,16 +46,15 @@ def write_study(folder: Path, *changes: tuple[str, str], text: str = STUDY) -> P
     return path
 
 
-OWN_TO_A_COMMAND = ("study.json", "manifest.json")
-"""Files of a study that name times and numbers of workers; its chunks do, too."""
+OWN_TO_A_COMMAND = ("study.json", "manifest.json", "blocks.journal")
+"""Files of a study that name times and numbers of workers, or whose lines stand as blocks were done."""
 
 
 def same_bytes(folder: Path) -> dict[str, bytes]:
     """Files of a finished study that are the same whoever did it, at once or in parts, and their contents."""
     names = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
-    own = {name for name in names if name in OWN_TO_A_COMMAND or name.startswith("chunks/")}
-    assert {"study.nc", "study.csv", "statistics.json", "report.html", "config.yaml"} <= names.keys() - own
-    return {name: names[name].read_bytes() for name in names.keys() - own}
+    assert {"study.nc", "study.csv", "statistics.json", "report.html", "config.yaml", *OWN_TO_A_COMMAND} <= names.keys()
+    return {name: place.read_bytes() for name, place in names.items() if name not in OWN_TO_A_COMMAND}
 
 
 def start(*arguments: object) -> subprocess.Popen:
@@ -66,10 +65,10 @@ def start(*arguments: object) -> subprocess.Popen:
     )
 
 
-def chunks(folder: Path) -> int:
-    """Number of chunks that are listed as done."""
-    index = folder / "chunks" / "index.txt"
-    return len(index.read_text("utf-8").splitlines()) if index.exists() else 0
+def blocks(folder: Path) -> int:
+    """Number of blocks that are kept beside the folder of a study that runs."""
+    journal = folder.with_name(f"{folder.name}.blocks") / "blocks.journal"
+    return max(0, len(journal.read_bytes().splitlines()) - 1) if journal.exists() else 0
 
 
 def wait_for(condition, seconds: float = 60.0) -> None:

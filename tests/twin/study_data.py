@@ -8,7 +8,7 @@ import xarray as xr
 from scenes.specs.study import StudySpec
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
-from twin.study.runs.sampling import draw
+from twin.study.runs.plan import draw
 
 
 def study_of(factors: str, design: str, responses: str = "{y: {key: [a, b_um]}}", report: str = "{}") -> StudySpec:

@@ -25,7 +25,7 @@ from tests.twin.study_bench import TEXTS, refusals
 from twin.design.__main__ import app
 from twin.design.design_run import HELD_BY, _held_text, run_design
 from twin.design.layout_bench import BeamFacts
-from twin.design.search_workers import Journal
+from twin.design.layout_search import journal_of
 from twin.run.run_folder import RunFolderError
 
 EXAMPLE = EXAMPLES / "design_gf7_short.yaml"
@@ -113,15 +113,15 @@ def test_what_a_report_says_makes_it_again_does(tmp_path, monkeypatch) -> None:
 
 
 def test_a_journal_that_cannot_be_kept_is_reported(tmp_path) -> None:
-    with pytest.raises(RunFolderError, match="Is a directory"), Journal(tmp_path, "design"):
+    with pytest.raises(RunFolderError, match="Is a directory"), journal_of(tmp_path, "design"):
         pass
     beam = Beam(*np.ones(9))
-    with Journal(tmp_path / "journal", "design") as journal:
+    with journal_of(tmp_path / "journal", "design") as journal:
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as on a full disk
         try:
             with pytest.raises(RunFolderError, match="what it holds is kept, go on with --resume"):
-                journal.keep(beam, BeamFacts(beam))
+                journal.keep({repr(beam): BeamFacts(beam)})
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 

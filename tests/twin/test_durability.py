@@ -11,29 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.tiers import quick
-from tests.twin.replacing import FILES, Moments, replace_run, replace_study, standing
-from tests.twin.study_bench import ROOT, write_study
+from tests.twin.replacing import FILES, Moments, replace_run, standing
+from tests.twin.study_bench import ROOT
 from twin.run.run_folder import RunFolderError
-
-REPLACE = {"run": replace_run, "study": replace_study}
-
-
-@pytest.fixture(autouse=True)
-def study_file(tmp_path_factory, monkeypatch) -> None:
-    monkeypatch.setenv("TWIN_STUDY", str(write_study(tmp_path_factory.mktemp("in"))))
 
 
 def hidden(place: Path) -> set[str]:
     return {path.name for path in place.iterdir()} - {"run", "lost+found"}
 
 
-@pytest.mark.parametrize("kind", quick(1, REPLACE))
-def test_a_disk_that_fails_at_any_step(tmp_path, kind) -> None:
+def test_a_disk_that_fails_at_any_step(tmp_path) -> None:
     """No room left from some step on, at a few of all steps by default; then room again."""
     place = tmp_path / "disk"
     place.mkdir()
-    replace, target = REPLACE[kind], place / "run"
+    replace, target = replace_run, place / "run"
     full = [False]
 
     def fail() -> None:
@@ -48,7 +39,7 @@ def test_a_disk_that_fails_at_any_step(tmp_path, kind) -> None:
         moments.armed = False
         steps = moments.count
         assert steps > 2 * FILES
-        for moment in np.linspace(1, steps, 14 if kind == "run" else 6).astype(int):
+        for moment in np.linspace(1, steps, 14).astype(int):
             before = standing(target)
             moments.count, moments.at, moments.armed = 0, int(moment), True
             with suppress(RunFolderError, OSError):
@@ -63,31 +54,28 @@ def test_a_disk_that_fails_at_any_step(tmp_path, kind) -> None:
     assert hidden(place) == set()
 
 
-def begin(
-    kind: str, target: Path, stem: str, megabytes: float, moment: int, number: int
-) -> subprocess.CompletedProcess:
-    words = ["-m", "tests.twin.replacing", kind, str(target), stem, str(megabytes), str(moment), str(number)]
+def begin(target: Path, stem: str, megabytes: float, moment: int, number: int) -> subprocess.CompletedProcess:
+    words = ["-m", "tests.twin.replacing", str(target), stem, str(megabytes), str(moment), str(number)]
     return subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("kind", REPLACE)
-def test_signals_at_three_moments(tmp_path, kind) -> None:
+def test_signals_at_three_moments(tmp_path) -> None:
     """A signal each at the begin, the middle and the end of a command's steps on the disk."""
     place = tmp_path / "disk"
     place.mkdir()
     target = place / "run"
-    REPLACE[kind](target, "old", 0.1)
-    steps = int(begin(kind, target, "again", 0.1, 0, 0).stdout)
+    replace_run(target, "old", 0.1)
+    steps = int(begin(target, "again", 0.1, 0, 0).stdout)
     moments = np.linspace(1, 0.9 * steps, 3).astype(int).tolist()  # the number of steps varies a little
     for moment, number in zip(moments, (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL), strict=True):
         before = standing(target)
-        done = begin(kind, target, f"new {moment}", 0.1, moment, number)
+        done = begin(target, f"new {moment}", 0.1, moment, number)
         assert done.returncode != 0, done.stderr
         assert standing(target) in (before, f"new {moment}"), (moment, done.stderr)
-        if number != signal.SIGKILL and kind == "run":
+        if number != signal.SIGKILL:
             assert hidden(place) == set(), (moment, done.stderr)
-    REPLACE[kind](target, "last", 0.1)
+    replace_run(target, "last", 0.1)
     assert standing(target) == "last"
     assert hidden(place) == set()
 

@@ -34,8 +34,8 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import refusals
 from twin.design.__main__ import app
 from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
+from twin.design.layout_search import journal_of
 from twin.design.monitor_design import LAYOUTS, MonitorDesignRun, run_monitor_design
-from twin.design.search_workers import Journal
 from twin.monitor.information import Information, spot_noise
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
@@ -232,18 +232,18 @@ def test_a_short_search_finds_a_better_layout(whole: MonitorDesignRun, tmp_path:
 
 def test_a_journal_keeps_every_bit_and_is_of_one_search(facts: tuple[BeamFacts, ...], tmp_path: Path) -> None:
     file = tmp_path / "a.search"
-    with Journal(file, "one") as journal:
-        journal.keep(FIRST, facts[0])
+    with journal_of(file, "one") as journal:
+        journal.keep({repr(FIRST): facts[0]})
         kept = file.read_text("utf-8")
     # a line of another layout that was damaged, one that is none, bytes that are no text, and a line that was cut
     damaged = kept.split("\n")[1].replace(str(FIRST), str(SECOND))
     whole_lines = f"{kept}{damaged}\n[]\n".encode() + b"\xff\xfe\n"
     file.write_bytes(whole_lines + b'{"of": "a line that was cut')
-    with pytest.raises(RunFolderError, match="another search"), Journal(file, "two"):
+    with pytest.raises(RunFolderError, match="another search"), journal_of(file, "two"):
         pass
-    with Journal(file, "one") as journal:
-        again = journal.known(FIRST)
-        assert journal.known(SECOND) is None
+    with journal_of(file, "one") as journal:
+        again = journal.known[repr(FIRST)]
+        assert (repr(SECOND) in journal.known, journal.damaged) == (False, 3)
     assert file.read_bytes() == whole_lines  # a search that cannot write its results, on a full disk, does not lose it
     assert again.beam == FIRST
     for name in ("taken", "facets", "light"):

@@ -385,7 +385,7 @@ def test_what_is_refused(case: tuple[Any, ...], tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.parametrize("warnings", [[], ["another version of NumPy"]])
 def test_what_is_to_be_known_of_a_cluster_is_told(warnings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(point_workers, "remote_workers", lambda *_: nullcontext(Ns(warnings=warnings, count=1)))
+    monkeypatch.setattr("twin.run.cluster.remote_workers", lambda *_: nullcontext(Ns(warnings=warnings, count=1)))
     told: list[str] = []
     with point_workers.point_workers(None, "tcp://localhost:1", told.append):
         assert told == warnings

@@ -25,20 +25,14 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from tests.twin import record_bench, replacing, study_bench
+from tests.twin import record_bench, replacing
 from tests.twin.commands import invoke
 from twin.operate.__main__ import app
-from twin.run import durable, owned_files
+from twin.run import owned_files
+from twin.run.journal import Journal
 from twin.run.run_folder import KeptWork, RunFolder, RunFolderError, read_manifest, remove_replaced, write_manifest
-from twin.study.runs.base_job import BlockResult
-from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.plan import Plan
-from twin.study.runs.setup import resolve_study
-from twin.study.runs.study_folder import StudyFolder
-from twin.tolerance.samples import _journal
 
 pytestmark = pytest.mark.second
 ROOT = Path(__file__).resolve().parents[2]
@@ -237,74 +231,25 @@ def check_run(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> 
         assert [path.name for path in target.parent.iterdir()] == ["run"]
 
 
-def replace_study(base: Path, inputs: Path) -> None:
-    write, number = ChunkStore.write, iter(range(1000))
-
-    def acknowledged(store: ChunkStore, first: int, parts: list) -> None:
-        write(store, first, parts)
-        done(f"chunk {next(number)}")
-
-    ChunkStore.write = acknowledged
-    for stem in ("1", "2"):
-        replacing.replace_study(base / "run", stem, 1e-6)
-        done(stem)
-
-
-def check_study(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
-    target, plan = base / "run", _plan()
-    stands = [step for step in steps if step in ("1", "2")]
-    begun = len(steps) - 1 - steps.index(stands[-1]) if stands else len(steps)
-    place = owned_files.successor(target) if stands == ["1"] and owned_files.successor(target).exists() else target
-    found = replacing.standing(target)
-    assert found in ((None, "1"), ("1", "2"), ("2",))[len(stands)], f"{found!r} after {steps}"
-    if found != "2" and begun:
-        store = ChunkStore(place, plan)
-        store.open()
-        assert len(store.done) >= begun, f"{len(store.done)} chunks after {steps}"
-        assert not store.corrupt
-    if len(stands) < 2 and again:
-        begun = (place / "study_state.json").exists() and not (place / "manifest.json").exists()
-        replacing.replace_study(target, "again", 1e-6, resume=begun)
-        assert replacing.standing(target) == "again"
-
-
 def keep_work(base: Path, inputs: Path) -> None:
-    plan = _plan()
     with KeptWork(base / "out", "out", "samples", resume=True) as kept:
-        folder = kept.begin() / "tested"
-        with _journal(folder, "this budget"):
-            store = ChunkStore(folder, plan)
-            store.open()
-            for block in store.missing[:2]:
-                n = len(plan.block(block))
-                numbers = np.zeros((n, len(plan.setup.study.responses)))
-                store.write(block, [BlockResult(numbers, numbers, numbers, ("",) * n, 1.0, ("",) * n)])
-                done(str(block))
-
-
-@cache
-def _plan() -> Plan:
-    return Plan.of(resolve_study(Path(os.environ["TWIN_STUDY"])))
+        with Journal(kept.begin() / "tested.journal", "this budget", "budget", ()) as journal:
+            for piece in range(6):
+                journal.keep({str(piece): [float(piece)] * 40})
+                done(str(piece))
 
 
 def check_kept(base: Path, inputs: Path, steps: tuple[str, ...], again: bool) -> None:
-    folder = base / "out.samples/tested"
+    file = base / "out.samples/tested.journal"
     if steps:
-        with pytest.raises(RunFolderError, match="of another budget"), _journal(folder, "another budget"):
+        with pytest.raises(RunFolderError, match="another budget"), Journal(file, "another", "budget", ()):
             pass
-    with _journal(folder, "this budget"):
-        store = ChunkStore(folder, _plan())
-        store.open()
-        assert len(store.done) >= len(steps), f"{len(store.done)} chunks after {steps}"
-        assert not store.corrupt
+    with Journal(file, "this budget", "budget", ()) as journal:
+        assert {*steps} <= journal.known.keys(), f"{len(journal.known)} pieces after {steps}"
+        assert not journal.damaged
 
 
-SCENARIOS = {
-    "record": (operate, check_record),
-    "run": (replace_run, check_run),
-    "study": (replace_study, check_study),
-    "kept": (keep_work, check_kept),
-}
+SCENARIOS = {"record": (operate, check_record), "run": (replace_run, check_run), "kept": (keep_work, check_kept)}
 
 
 def plant(fault: str) -> None:
@@ -317,15 +262,6 @@ def plant(fault: str) -> None:
             connect(connection, record),
             connection.execute(f"PRAGMA {fault}").close(),
         )
-    elif fault == "rename first":
-
-        def write_one(file: tuple[Path, bytes]) -> None:
-            partial = file[0].with_name(f".{file[0].name}.01234567.partial")
-            partial.write_bytes(file[1])
-            partial.replace(file[0])
-            durable.sync_file(file[0])
-
-        durable._write_one = write_one
     elif fault == "no lock":
         fcntl.flock = lambda file, how: None
 
@@ -346,13 +282,12 @@ def layer(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory) -> Path:
-    """Tables, a run folder and a study."""
+    """Tables and a run folder."""
     folder = tmp_path_factory.mktemp("inputs")
     for name, first in (("a", 0), ("b", 100)):
         (folder / f"{name}_t.csv").write_text(record_bench.table(first, 5))
         (folder / f"{name}.yaml").write_text(record_bench.TELEMETRY.replace("t_*.csv", f"{name}_t.csv"))
     record_bench.run_folder(folder / "recover-1")
-    study_bench.write_study(folder / "study")
     return folder
 
 
@@ -361,11 +296,7 @@ def record_program(scenario: str, fault: str, layer: Path, inputs: Path, folder:
     (folder / "disk").mkdir()
     recorder = Recorder(folder / "disk", folder / "socket", scenario)
     words = [sys.executable, "-m", "tests.twin.test_power_cut", scenario, str(folder / "disk"), str(inputs), fault]
-    own = {
-        "LD_PRELOAD": str(layer),
-        "POWER_CUT": str(folder / "socket"),
-        "TWIN_STUDY": str(inputs / "study/study.yaml"),
-    }
+    own = {"LD_PRELOAD": str(layer), "POWER_CUT": str(folder / "socket")}
     try:
         result = subprocess.run(
             words, cwd=ROOT, env={**os.environ, **own}, capture_output=True, text=True, timeout=120, check=False
@@ -404,11 +335,10 @@ def check_all(scenario: str, recorder: Recorder, inputs: Path, folder: Path, **s
 
 
 @pytest.fixture(autouse=True)
-def quick_checks(monkeypatch, inputs) -> None:
+def quick_checks(monkeypatch) -> None:
     """The checks write nothing through: their disk is no one's."""
     monkeypatch.setattr(os, "fsync", lambda file: None)
     monkeypatch.setattr(replacing, "FILES", 2)
-    monkeypatch.setenv("TWIN_STUDY", str(inputs / "study/study.yaml"))
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
@@ -419,7 +349,6 @@ def test_what_was_acknowledged_outlives_a_power_cut(scenario, recorded, inputs, 
 
 FAULTS = [
     ("record", "synchronous = OFF", {}),
-    ("kept", "rename first", {}),
     *((scenario, "none", {kind: False}) for scenario in SCENARIOS for kind in ("files", "folders")),
 ]
 """Program, what is planted in it, and what of that which it writes through is not."""
@@ -439,8 +368,6 @@ def second_command(scenario: str, base: Path) -> str:
             return invoke(app, "init", base / "record", "gf7_pair", "--simulated").stderr
         if scenario == "run":
             owned_files.sweep(base / "runs", remove_replaced)
-        elif scenario == "study":
-            StudyFolder(base / "run", _plan().setup, resume=True).__enter__()
         else:
             KeptWork(base / "out", "out", "samples", resume=True).begin()
     except RunFolderError as error:
@@ -448,12 +375,7 @@ def second_command(scenario: str, base: Path) -> str:
     return ""
 
 
-LOCKED = {
-    "record": (4, "database is locked"),
-    "run": (3, ""),
-    "study": (12, "another command is working in"),
-    "kept": (6, "is in use by another command"),
-}
+LOCKED = {"record": (4, "database is locked"), "run": (3, ""), "kept": (4, "is in use by another command")}
 """At which sync another command begins, and what it says."""
 
 
@@ -464,7 +386,7 @@ def test_another_command_leaves_all_as_it_is(scenario, recorded) -> None:
     assert LOCKED[scenario][1] in heard
 
 
-@pytest.mark.parametrize("scenario", ["run", "study", "kept"])
+@pytest.mark.parametrize("scenario", ["run", "kept"])
 def test_a_missing_lock_is_noticed(scenario, recorded) -> None:
     """Without it the other command is not refused, or spoils the work."""
     with pytest.raises(AssertionError):

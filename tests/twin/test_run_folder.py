@@ -455,22 +455,20 @@ def test_a_run_that_was_replaced_is_removed(tmp_path):
 
 def chunk(place: Path) -> Path:
     """Write what a run of the engine keeps."""
-    file = place / "samples" / "chunks" / "00000.npz"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    (file.parent / "index.txt").write_text("00000.npz\n")
+    file = place / "samples.journal"
     file.write_bytes(b"numbers")
     return file
 
 
 def test_a_folder_of_the_user_is_refused_and_stays(tmp_path: Path) -> None:
     """A folder of that name that holds anything else is not touched, also with --resume and beside work of ours."""
-    own = tmp_path / "out.samples" / "chunks" / "index.txt"
+    own = tmp_path / "out.samples" / "samples.journal"
     own.parent.mkdir(parents=True)
     own.write_text("my own data")
     for resume in (False, True):
         with (
             KeptWork(tmp_path / "out", "out", "samples", resume) as kept,
-            pytest.raises(RunFolderError, match=r"files that this program did not write: chunks/index\.txt"),
+            pytest.raises(RunFolderError, match=r"files that this program did not write: samples\.journal"),
         ):
             kept.begin()
     assert own.read_text() == "my own data"

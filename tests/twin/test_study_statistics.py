@@ -18,7 +18,7 @@ from twin.study.report.conclusions import warnings
 from twin.study.report.linear_model import linear_model
 from twin.study.report.sensitivity_indices import NoIndices, axis_functions, sensitivity_indices
 from twin.study.report.study_analysis import STATISTICS, StudyAnalysis, convergences, pareto_front, ranks_of
-from twin.study.runs.sampling import quantiles
+from twin.study.runs.plan import quantiles
 
 FALSE_ALARM = 1e-6
 """Of each statistical test; seeds are fixed, so that it passes always or never."""

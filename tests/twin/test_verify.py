@@ -34,16 +34,15 @@ from twin.compare.verification import (
     file_state,
     obstacle,
     redrawn,
-    repeat_chunk,
+    repeat_block,
 )
 from twin.run.data_files import FrameFacts, netcdf, preview_png, tiff
 from twin.run.owned_files import MANIFEST
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.study.runs.base_job import BlockResult
-from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.blocks import BLOCKS, Engine, journal_of
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
-from twin.study.runs.study_folder import StudyFolder
 from twin.study.study_files import write_data
 from twin.verify import app
 
@@ -133,13 +132,11 @@ def study(tmp_path_factory) -> Path:
     place = tmp_path_factory.mktemp("study")
     setup = resolve_study(write_study(place / "in"))
     plan = Plan.of(setup)
-    with StudyFolder(place / "study", setup) as open_folder:
-        store = ChunkStore(open_folder.path, plan)
-        store.open()
-        for first, count in ((0, 1), (1, 2), (3, 1)):
-            store.write(first, [_block(plan, first + k) for k in range(count)])
-        write_data(plan, store.result(), 1.0, plan.runs, open_folder)
-        write_manifest(open_folder, "twin.study", 1.5e9, 2.0, runs=plan.runs, again=["twin.study", "config.yaml"])
+    with RunFolder(place / "study") as made, journal_of(setup, place / BLOCKS) as journal:
+        journal.keep({str(block): _block(plan, block) for block in range(plan.blocks)})
+        write_data(plan, Engine(plan, journal).result(), 1.0, plan.runs, made)
+        made.write_bytes(BLOCKS, (place / BLOCKS).read_bytes())
+        write_manifest(made, "twin.study", 1.5e9, 2.0, runs=plan.runs, again=["twin.study", "config.yaml"])
     return place / "study"
 
 
@@ -152,51 +149,42 @@ def _block(plan: Plan, block: int) -> BlockResult:
 
 
 def test_a_changed_byte_in_each_file_of_a_study_is_found(study, tmp_path) -> None:
-    """Also in its chunks, their index and its lock."""
+    """Also in the journal of its blocks."""
     every = sorted(path.relative_to(study).as_posix() for path in study.rglob("*") if path.is_file())
-    assert {"chunks/00001.npz", "chunks/index.txt", ".lock", "study.nc", "study_state.json"} <= set(every)
+    assert {BLOCKS, "study.nc", "config.yaml"} <= set(every)
     assert folder_state(study).whole
     for name in every:
         copy = tmp_path / "copy"
         shutil.copytree(study, copy)
-        if not (copy / name).stat().st_size:
-            (copy / name).write_bytes(b"x")
-        elif name != MANIFEST:
+        if name != MANIFEST:
             flip(copy / name, (copy / name).stat().st_size // 2)
         else:
             (copy / name).write_text((copy / name).read_text().replace('"runs": 100', '"runs": 101'))
-        assert set(folder_state(copy).changed) - {"chunks/index.txt"} == {name} - {"chunks/index.txt"}
-        assert not folder_state(copy).whole
+        assert folder_state(copy).changed == (name,)
         (copy / name).unlink()
-        if name == ".lock":
-            assert folder_state(copy).whole
-        elif name != MANIFEST:
+        if name != MANIFEST:
             assert folder_state(copy).missing == (name,)
         shutil.rmtree(copy)
 
 
-def test_chunks_that_were_taken_out_with_their_lines_are_missed(study, tmp_path) -> None:
+def test_blocks_that_were_taken_out_are_missed(study, tmp_path) -> None:
     copy = shutil.copytree(study, tmp_path / "copy")
-    index = copy / "chunks/index.txt"
-    index.write_bytes(b"".join(index.read_bytes().splitlines(keepends=True)[:-1]))
-    (copy / "chunks/00003.npz").unlink()
-    assert folder_state(copy).changed == ("chunks/index.txt",)
-    with pytest.raises(CannotRepeat, match="its chunks are not whole; --all makes the whole study again"):
-        repeat_chunk(folder_state(copy))
+    (copy / BLOCKS).write_bytes(b"".join((copy / BLOCKS).read_bytes().splitlines(keepends=True)[:-1]))
+    assert folder_state(copy).changed == (BLOCKS,)
+    with pytest.raises(CannotRepeat, match="its blocks are not whole; --all makes the whole study again"):
+        repeat_block(folder_state(copy))
     (copy / "config.yaml").write_text("name: levels\n")
     with pytest.raises(CannotRepeat, match=r"config\.yaml:1: "):
-        repeat_chunk(folder_state(copy))
-    (copy / "chunks/00007.npz").write_bytes(b"another's")
-    assert folder_state(copy).additional == ("chunks/00007.npz",)
+        repeat_block(folder_state(copy))
 
 
 @pytest.mark.second
 def test_numbers_that_no_run_gave_are_found(study) -> None:
-    """The chunks' checksums are right, and study.nc holds what they hold; only computing tells."""
-    made = repeat_chunk(folder_state(study))
-    assert made.what == "runs 25 to 74 of 100"
+    """The blocks' checksums are right, and study.nc holds what they hold; only computing tells."""
+    made = repeat_block(folder_state(study))
+    assert made.what == "runs 50 to 74 of 100"
     states = {one.file: one.state for one in made.files}
-    assert states == {"chunks/00001.npz": DIFFERENT, "study.nc": SAME, "study.json": SAME}
+    assert states == {f"{BLOCKS}: 2": DIFFERENT, "study.nc": SAME, "study.json": SAME}
     found = next(one for one in made.files[0].quantities if one.key.startswith("true_df["))
     assert abs(float(found.new)) < 5.0  # a draw of 1 um, read exactly
     assert float(found.old) <= -25.0
@@ -319,8 +307,6 @@ def test_tables_pictures_and_texts(tmp_path) -> None:
 
 def test_what_is_no_run_folder_is_refused(tmp_path, folder) -> None:
     (tmp_path / "empty").mkdir()
-    (tmp_path / "begun").mkdir()
-    (tmp_path / "begun/study_state.json").write_text("{}")
     (tmp_path / "other").mkdir()
     (tmp_path / "other/manifest.json").write_text('{"name": "an extension of a browser"}')
     told = json.loads((folder / MANIFEST).read_text())
@@ -330,7 +316,6 @@ def test_what_is_no_run_folder_is_refused(tmp_path, folder) -> None:
         ("none", "no such folder"),
         ("run/config.yaml", "is not a folder"),
         ("empty", "it has no manifest.json of a run; allowed: the folder of a finished run"),
-        ("begun", "a study that is not finished; allowed: the same twin.study command with --resume"),
         ("other", "other/manifest.json: is not the manifest of a run, or is damaged"),
         ("run", "cannot be read: File name too long"),
     ):

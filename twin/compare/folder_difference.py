@@ -500,5 +500,6 @@ READERS: dict[str, Callable[[bytes], Content]] = {
     "png": _png,
     "svg": _drawing,
     "glb": _scene,
+    "journal": lambda content: Content({}, {}, {}),  # of a study, whose numbers stand in study.nc
 }
 """Ending of a file -> what reads it."""

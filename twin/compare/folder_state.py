@@ -10,11 +10,9 @@ from pathlib import Path
 
 from scenes.yaml.errors import InputError, Issue
 from twin.run import run_folder
-from twin.run.owned_files import MANIFEST, PARTIAL, STUDY_LOCK, STUDY_STATE, digest, every_file
+from twin.run.owned_files import MANIFEST, PARTIAL, digest, every_file
 from twin.run.provenance import Provenance
 from twin.run.run_folder import Manifest
-from twin.study.runs.chunk_store import FOLDER, examined
-from twin.study.runs.study_folder import PROGRAM as STUDY
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,8 @@ class FolderState:
 
     @property
     def is_study(self) -> bool:
-        """Whether it is of a study's runs, which has chunks."""
-        return self.manifest.program == STUDY and not self.manifest.gradient
+        """Whether it is of a study's runs, of which a part can be made again."""
+        return self.manifest.program == "twin.study" and not self.manifest.gradient
 
 
 def folder_state(folder: Path) -> FolderState:
@@ -75,15 +73,6 @@ def folder_state(folder: Path) -> FolderState:
     if not whole:
         wrong.append(MANIFEST)
     known = {MANIFEST, *manifest.sha256}
-    if state.is_study:
-        chunks = examined(folder)
-        wrong += chunks.damaged
-        known |= {name for name in every_file(folder) if name.startswith(f"{FOLDER}/")} - set(chunks.unlisted)
-        if not chunks.damaged and sum(chunk.runs for chunk in chunks.whole) != manifest.runs:
-            wrong.append(f"{FOLDER}/index.txt")
-        if (folder / STUDY_LOCK).exists():
-            known.add(STUDY_LOCK)
-            wrong += [STUDY_LOCK] if (folder / STUDY_LOCK).stat().st_size else []
     missing = {name for name in wrong if not os.path.lexists(folder / name)}
     additional = tuple(name for name in every_file(folder) if name not in known)
     return replace(
@@ -117,9 +106,6 @@ def _manifest(folder: Path) -> Manifest:
     elif (folder / MANIFEST).exists():
         text = "is not the manifest of a run, or is damaged: nothing tells what the folder held"
         issue = Issue(text, str(folder / MANIFEST), allowed="a copy of it, or the run made again")
-    elif (folder / STUDY_STATE).exists():
-        allowed = "the same twin.study command with --resume, then verify it"
-        issue = Issue("a study that is not finished", str(folder), allowed=allowed)
     elif broken:
         text = "a run that was broken off, or is still being written"
         issue = Issue(text, str(folder), allowed="the run folder that its command names when it ends")

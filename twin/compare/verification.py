@@ -1,6 +1,6 @@
 """A run repeated from its folder, and the verdict on the folder and the run.
 
-A whole run is repeated by its command in a process of its own; of a study one chunk is computed here.
+A whole run is repeated by its command in a process of its own; of a study one block is computed here.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from twin.compare.folder_difference import ArrayDifference, FileDifference, Leaf
 from twin.compare.folder_state import Elsewhere, FolderState, elsewhere
 from twin.monitor.calibration_cache import recomputed
 from twin.run import cli, provenance, report, run_folder
-from twin.run.owned_files import STUDY_STATE, first_names
-from twin.study.runs import setup, task
+from twin.run.journal import read_pieces
+from twin.run.owned_files import first_names
+from twin.study.runs import blocks, setup
 from twin.study.runs.base_job import BlockResult
-from twin.study.runs.chunk_store import FOLDER, ChunkError, ChunkStore, examined
 from twin.study.runs.plan import Plan
 from twin.study.study_files import make_dataset, summary
 
@@ -46,7 +46,7 @@ GONE, NEW = "only in the run", "only made again"
 LEFT_OUT_FILES: Mapping[str, str] = {
     "html": "a page, which says when and where it was made; its numbers are those of the other files",
     "md": "a page, which says how long it took; its numbers are those of the other files",
-    STUDY_STATE: "says by which program the study was begun, which is told apart",
+    blocks.BLOCKS: "runs in the order in which they were done; their numbers are those of study.nc",
 }
 """Endings or names of files that are not compared, and why."""
 
@@ -297,42 +297,36 @@ def redrawn(files: Sequence[FileState]) -> Iterator[FileState]:
 
 
 @recomputed()
-def repeat_chunk(state: FolderState) -> Repetition:
-    """Repeat one chunk of a study, the one in the middle, and hold all chunks against the study's data set.
+def repeat_block(state: FolderState) -> Repetition:
+    """Repeat one block of a study, the one in the middle, and hold all blocks against the study's data set.
 
     Args:
         state: of its folder; there is no `obstacle`.
 
     Raises:
-        CannotRepeat: its chunks are not there, or not whole; config.yaml cannot be read.
+        CannotRepeat: its blocks are not there, or not whole; config.yaml cannot be read.
     """
     began, folder = time.monotonic(), state.folder
     try:
         plan = Plan.of(setup.resolve_study(folder / CONFIG))
-        store = ChunkStore(folder, plan)
-        store.entries.update({entry.first: entry for entry in examined(folder).whole})
-        whole = store.result() if not store.missing else None
-    except (ChunkError, InputError) as error:
+        content = (folder / blocks.BLOCKS).read_bytes()
+    except (OSError, InputError) as error:
         raise CannotRepeat(str(error)) from error
-    if whole is None:
-        raise CannotRepeat("its chunks are not whole; --all makes the whole study again")
-    entry = store.entries[sorted(store.entries)[len(store.entries) // 2]]
-    runs = [number for block in entry.range for number in plan.block(block)]
-    config, backend = plan.setup.to_yaml(), state.manifest.backend or "llvm"
-    blocks = tuple(tuple(block) for block in plan.runs_of(entry.range))
-    made = BlockResult.joined(
-        task.evaluate(task.Task(config, provenance.source_digest(), backend, entry.first, blocks))
-    )
-    chunk = difference.content_difference(
-        f"{FOLDER}/{entry.file}", _responses(store.read(entry), plan), _responses(made, plan)
-    )
+    with blocks.journal_of(plan.setup, None) as journal:
+        journal.known = read_pieces(content, journal.classes)[1]
+        engine = blocks.Engine(plan, journal, state.manifest.backend or "llvm")
+        if engine.missing:
+            raise CannotRepeat("its blocks are not whole; --all makes the whole study again")
+        middle, whole = plan.blocks // 2, engine.result()
+        kept, made = journal.known[str(middle)], blocks.evaluate(engine.task(middle))
+    block = difference.content_difference(f"{blocks.BLOCKS}: {middle}", _responses(kept, plan), _responses(made, plan))
     where = elsewhere(state.manifest, provenance.Provenance.here(), provenance.versions())
-    files = (judged(chunk), *_data_states(folder, plan, whole))
+    files, runs = (judged(block), *_data_states(folder, plan, whole)), plan.block(middle)
     return Repetition(files, where, time.monotonic() - began, f"runs {runs[0]} to {runs[-1]} of {plan.runs}")
 
 
 def _responses(result: BlockResult, plan: Plan) -> difference.Content:
-    """Return the responses of a chunk, run by run."""
+    """Return the responses of a block, run by run."""
     arrays = {
         f"{response}{ending}": getattr(result, part)[:, r]
         for r, response in enumerate(plan.setup.study.responses)
@@ -343,7 +337,7 @@ def _responses(result: BlockResult, plan: Plan) -> difference.Content:
 
 
 def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileState]:
-    """Compare study.nc and study.json with what the chunks hold."""
+    """Compare study.nc and study.json with what the blocks hold."""
     name = "study.nc"
     try:
         kept = difference.content_of(folder / name, name).arrays
@@ -355,7 +349,7 @@ def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileS
     held = {key: values for key, values in kept.items() if key in made}
     again = summary(data, plan)
     arrays = (name, difference.Content({}, held, {}), difference.Content({}, made, {}))
-    # the data set is the chunks', and the summary that of the data set
+    # the data set is the blocks', and the summary that of the data set
     numbers = ("study.json", difference.plain({key: stored.get(key) for key in again}), difference.plain(again))
     return [judged(difference.content_difference(*pair)) for pair in (arrays, numbers)]
 

@@ -98,12 +98,11 @@ def monitor(
     procedure = PROCEDURES["design monitor"]
 
     def run(*given: Any) -> Any:
-        return procedure.run(*given, workers=count, journal=kept.begin() / "trials.txt")
+        return procedure.run(*given, workers=count, journal=kept.begin() / "trials.journal")
 
     options = Options(out, seed, backend, force, as_json, quiet)
-    with KeptWork(out, file.stem, "search", resume) as kept:
-        run_test(PROGRAM, "monitor", replace(procedure, run=run), file, options)
-        kept.finish()
+    kept = KeptWork(out, file.stem, "search", resume)
+    run_test(PROGRAM, "monitor", replace(procedure, run=run), file, options, kept)
 
 
 if __name__ == "__main__":

@@ -9,17 +9,22 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import combinations, islice, zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from optics.numerics.backend import one_blas_thread
 from scenes.models.monitor_layout import Beam, changed_beam, drawn_beam, kinds_of, start_beams
-from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, combined, touching
-from twin.design.layout_refinement import Ask, ratios, refined
-from twin.design.search_workers import Journal, Workers
+from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, Seen, bench_of, combined, touching
+from twin.design.layout_refinement import Ask, LayoutNumber, Slope, ratios, refined, slope_of
+from twin.run import cluster
+from twin.run.cli import Incomplete
+from twin.run.journal import Journal
 from twin.run.procedure import Advance
 
 FIRST_STEP = 0.15
@@ -146,6 +151,96 @@ def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
     return groups
 
 
+Item = Beam | tuple[Beam, ...] | LayoutNumber
+"""What can be tried."""
+
+
+def journal_of(file: Path | None, config: str) -> Journal:
+    """The journal of a search.
+
+    Args:
+        file: of the journal, None to keep nothing.
+        config: what the search is about.
+    """
+    return Journal(file, config, "search", (Beam, BeamFacts, LayoutFacts, LayoutNumber, Seen, Slope))
+
+
+class Workers:
+    """Context manager; inside it things can be asked for. Results do not depend on the number of processes.
+
+    Args:
+        bench: of the design.
+        count: processes beside this one, 0 for none.
+        journal: keeps what was tried.
+        advance: shows how far it is.
+
+    Raises:
+        RunFolderError: on entering, the journal is another search's, or cannot be written.
+    """
+
+    def __init__(self, bench: LayoutBench, count: int, journal: Journal, advance: Advance) -> None:
+        self.bench, self.count, self.journal, self.advance = bench, count, journal, advance
+        self._config = bench.setup.to_yaml()
+        self._pool: cluster.Workers | None = None
+        self._open = ExitStack()
+
+    def __enter__(self) -> Workers:
+        """Open the journal and start the processes."""
+        with ExitStack() as stack:
+            stack.enter_context(self.journal)
+            self._pool = stack.enter_context(cluster.local_workers(self.count)) if self.count else None
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the processes and close the journal."""
+        self._open.close()
+
+    def ask(self, part: str, items: Sequence[Item]) -> list[Any]:
+        """What comes of every item, in their order; what the journal has is not worked out again.
+
+        Args:
+            part: of the search, for the progress.
+            items: beams to be tried alone, layouts to be built, numbers of layouts by which to differentiate.
+
+        Raises:
+            Incomplete: the processes died.
+        """
+        known, names = self.journal.known, [repr(item) for item in items]
+        missing = {name: item for name, item in zip(names, items, strict=True) if name not in known}
+        done = len(items) - len(missing)
+        self.advance(part, done, len(items))
+        for results in self._results(missing):
+            self.journal.keep(results)
+            done += len(results)
+            self.advance(part, done, len(items))
+        return [known[name] for name in names]
+
+    def _results(self, items: Mapping[str, Item]) -> Iterator[dict[str, Any]]:
+        """What comes of items by their names, as it comes."""
+        if self._pool is None:
+            for name, item in items.items():
+                yield {name: _answer(self.bench, item)}
+            return
+        names = [*items]
+        asked: Iterable[Any] = ((self._config, self.bench.backend.name, item) for item in items.values())
+        for finished in self._pool.each(_there, asked):
+            if any(future.status != "finished" and cluster.killed(future.exception()) for _, future in finished):
+                raise Incomplete("the worker processes died")
+            yield {names[k]: future.result() for k, future in finished}
+
+
+def _there(item: tuple[str, str, Any]) -> Any:
+    return _answer(bench_of(item[0], item[1]), item[2])
+
+
+def _answer(bench: LayoutBench, item: Any) -> Any:
+    with one_blas_thread():
+        if isinstance(item, Beam):
+            return bench.try_beam(item)
+        return slope_of(bench, item) if isinstance(item, LayoutNumber) else bench.try_layout(item)
+
+
 class Search:
     """A search at work, with its starts.
 
@@ -159,7 +254,7 @@ class Search:
 
     def __init__(self, bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> None:
         self.bench, self.seed = bench, seed
-        kept = Journal(journal, f"{seed}\n{bench.setup.to_yaml()}")
+        kept = journal_of(journal, f"{seed}\n{bench.setup.to_yaml()}")
         self.workers = Workers(bench, workers, kept, advance)
 
     def run(self) -> Found:

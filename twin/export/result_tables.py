@@ -26,7 +26,7 @@ POINTS = "artefacts/points.csv"
 NUMBERS = "numbers"
 """Table of every number of the run."""
 _HEADS = ("schema", "reference_frames")
-_OTHER_FILES = (MANIFEST, "study_state.json")
+_OTHER_FILES = (MANIFEST,)
 _HEAD = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]+)\]")
 
 

@@ -17,8 +17,7 @@ from scenes.specs.study import DesignSpec, FactorSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.study.runs.base_job import Tree, with_values
-from twin.study.runs.plan import Plan
-from twin.study.runs.sampling import number_at
+from twin.study.runs.plan import Plan, number_at
 from twin.study.runs.setup import StudySetup
 
 AXES = ("x", "y", "z")

@@ -19,7 +19,6 @@ from rich.console import Console
 from scenes.specs.orbit.sensors import SENSORS
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import Problem
-from scenes.yaml.standard_output import FAILURE, print_error
 from scenes.yaml.units import ANGLE, DISTANCE, parse_quantity
 from twin.run.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed, Strict
 from twin.run.command import Result, add_tests, finished, print_warnings, run_command, run_test
@@ -109,14 +108,8 @@ def adjust(
         with point_workers(workers, scheduler, lambda text: print_warnings(errors, (text,))) as pool:
             return run_adjustment(setup, backend, seed, advance, pool)
 
-    from twin.run.cluster import ClusterError
-
     errors = Console(stderr=True)
-    try:
-        run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve, run=run), file, options)
-    except ClusterError as error:
-        print_error(errors, str(error))
-        raise typer.Exit(FAILURE) from None
+    run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve, run=run), file, options)
 
 
 @app.command("export")

@@ -90,6 +90,18 @@ class InputErrorText(Exception):
     """Bad input that has no file to point at."""
 
 
+class Incomplete(Exception):
+    """Work that could not be completed although nothing is wrong with what was asked; the message says why.
+
+    Attributes:
+        trace: traceback of a fault of the program in another process, as text.
+    """
+
+    def __init__(self, message: str, trace: str = "") -> None:
+        super().__init__(message)
+        self.trace = trace
+
+
 def check_backend(name: str) -> None:
     """Complain about an unknown backend before anything is started.
 
@@ -100,17 +112,35 @@ def check_backend(name: str) -> None:
         raise InputErrorText(f"unknown backend {name!r}; choose {' or '.join(NAMES)}")
 
 
+def nothing_kept() -> str:
+    """What is left of most commands that are broken off."""
+    return "nothing was kept"
+
+
 @contextmanager
-def explained(errors: Console) -> Iterator[None]:
-    """Turn the errors that a user can cause into one sentence on ``errors`` and the command's exit code."""
+def explained(errors: Console, left: Callable[[], str] = nothing_kept) -> Iterator[None]:
+    """Turn the errors that a user can cause into one sentence on ``errors`` and the command's exit code.
+
+    Args:
+        errors: where it is said.
+        left: what is left of the work when it is broken off.
+    """
     try:
         yield
     except (InputError, InputErrorText) as error:
         print_error(errors, str(error))
         raise typer.Exit(BAD_INPUT) from None
     except KeyboardInterrupt:
-        errors.print("interrupted: nothing was kept", style="bold red")
+        _say_broken(errors, f"interrupted: {left()}")
         raise typer.Exit(INTERRUPTED) from None
+    except SystemExit:
+        if left is not nothing_kept:
+            _say_broken(errors, f"terminated: {left()}")
+        raise
+    except Incomplete as error:
+        errors.print(error.trace, end="", markup=False, highlight=False, soft_wrap=True)
+        print_error(errors, f"{error}; {left()}")
+        raise typer.Exit(FAILURE) from None
     except OSError as error:
         if error.errno not in NO_NAME or not error.filename:
             raise
@@ -129,6 +159,10 @@ def explained(errors: Console) -> Iterator[None]:
             raise
         print_error(errors, str(error))
         raise typer.Exit(code_of(error.__cause__) if asked else FAILURE) from None
+
+
+def _say_broken(errors: Console, text: str) -> None:
+    errors.print(text, style="bold red", markup=False, highlight=False, soft_wrap=True)
 
 
 TICK_SECONDS = 8.0

@@ -8,9 +8,10 @@ import queue
 import signal
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,8 @@ from twin.run import cli, durable, owned_files, provenance
 
 if TYPE_CHECKING:  # it takes half a second, and a study's file is read before workers are started
     from distributed import Client
+
+    from scenes.specs.study import LimitsSpec
 
 REACH_SECONDS = 5.0
 """How long a scheduler may take to answer before the user is told that it does not."""
@@ -38,7 +41,11 @@ SCRATCH = "twin-study"
 """Beginning of the names of folders that workers write into."""
 
 
-class ClusterError(Exception):
+AHEAD = 4
+"""Pieces of work that are handed over for each worker: one is done, the others wait."""
+
+
+class ClusterError(cli.Incomplete):
     """The workers cannot be used any longer; the message says why."""
 
 
@@ -99,6 +106,34 @@ class Workers:
             lost = time.monotonic() if lost is None else lost
             if self.client.status in ("closing", "closed") or time.monotonic() - lost > LOST_SECONDS:
                 raise ClusterError("the scheduler is gone")
+
+    def each(self, work: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterator[list[tuple[int, Any]]]:
+        """Do a piece of work with every argument, never more than a few ahead.
+
+        Args:
+            work: function of one argument.
+            arguments: of the pieces.
+
+        Yields:
+            Numbers of the arguments with the futures of their pieces that are done meanwhile, well or not; one at
+            least.
+
+        Raises:
+            ClusterError: as of ``next_finished``.
+        """
+        left = enumerate(arguments)
+        running: dict[Any, tuple[int, Any]] = {}
+        while True:
+            for number, argument in islice(left, max(0, AHEAD * max(1, self.count) - len(running))):
+                future = self.submit(work, argument)
+                running[future.key] = number, future
+            if not running:
+                return
+            finished = [self.next_finished()]
+            while not self._finished.empty():
+                finished.append(self._finished.get())
+            if done := [running.pop(one.key) for one in finished if one.key in running and one.status != "cancelled"]:
+                yield done
 
 
 def killed(error: BaseException) -> bool:
@@ -234,6 +269,39 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
             yield workers
         finally:
             client.close(timeout=2)
+
+
+@contextmanager
+def chosen_workers(
+    count: int | None, scheduler: str | None, warn: Callable[[str], None], limits: LimitsSpec | None = None
+) -> Iterator[Workers]:
+    """Workers that the user chose, inside the block: those of a running cluster, or processes of this machine, as many
+    as fit into the memory.
+
+    Args:
+        count: of processes of this machine, None for one per core.
+        scheduler: address of a running cluster.
+        warn: told what the user should know.
+        limits: of the memory.
+
+    Raises:
+        InputErrorText: both are chosen, or a cluster that cannot be used.
+        ClusterError: a cluster without workers.
+    """
+    refuse_both(count, scheduler)
+    who: AbstractContextManager[Workers]
+    if scheduler is not None:
+        who = remote_workers(scheduler, warn)
+    else:
+        wanted = cores() if count is None else count
+        fit = wanted if limits is None else max(1, min(wanted, int(limits.bytes // LEAST_MEMORY)))
+        if limits is not None and fit < wanted:
+            warn(f"{fit} workers instead of {wanted}: no more fit into the memory of its limits, {limits.memory}")
+        who = local_workers(fit)
+    with who as workers:
+        for text in workers.warnings:
+            warn(text)
+        yield workers
 
 
 def refuse_both(workers: int | None, scheduler: str | None) -> None:

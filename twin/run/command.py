@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from inspect import Signature, signature
 from pathlib import Path
@@ -24,7 +24,7 @@ from twin.run.procedure import Advance, Session, performed
 
 if TYPE_CHECKING:
     from twin.run.report import Report
-    from twin.run.run_folder import RunFolder
+    from twin.run.run_folder import KeptWork, RunFolder
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,11 @@ Given = TypeVar("Given")
 
 
 def run_command(
-    stem: str, options: cli.Options, resolve: Callable[[], Given], work: Callable[[Given, Session], Result]
+    stem: str,
+    options: cli.Options,
+    resolve: Callable[[], Given],
+    work: Callable[[Given, Session], Result],
+    kept: KeptWork | None = None,
 ) -> None:
     """Read what is asked for, do it in a run folder and print what it gave.
 
@@ -78,12 +82,13 @@ def run_command(
         options: what the user chose.
         resolve: reads the files and checks what is asked for. Raises InputError, InputErrorText.
         work: computes and writes all files of the run folder, the manifest last. Raises InputError.
+        kept: where the work is kept meanwhile; it goes when the run folder is complete.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
     """
     errors = Console(stderr=True)
-    with cli.explained(errors):
+    with cli.explained(errors, cli.nothing_kept if kept is None else kept.left), kept or nullcontext():
         cli.check_backend(options.backend)
         given = resolve()
         # a bad file is told before these are imported
@@ -97,6 +102,8 @@ def run_command(
         silent = options.as_json or options.quiet
         with durable.exit_on_terminate(), folder, progress_shown(errors, silent) as advance:
             result = work(given, Session(folder, tracer, advance, started, clock))
+        if kept is not None:
+            kept.finish()
     with to_stdout(errors, f"the run is complete in {folder.target}"):
         if options.as_json:
             print_json(result.numbers)
@@ -198,7 +205,9 @@ def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure)
     app.command(command, help=procedure.about)(test)
 
 
-def run_test(program: str, command: str, procedure: Procedure, file: Path, options: cli.Options) -> None:
+def run_test(
+    program: str, command: str, procedure: Procedure, file: Path, options: cli.Options, kept: KeptWork | None = None
+) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
     Args:
@@ -207,6 +216,7 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
         procedure: the test; ``test`` of its set-up has a ``seed``.
         file: of the test.
         options: what the user chose.
+        kept: see `run_command`.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
@@ -240,7 +250,7 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
         return replace(done, problem=problem)
 
     name = f"{program} {command}"
-    run_command(file.stem, options, lambda: read_for(name, file, procedure.resolve), work)
+    run_command(file.stem, options, lambda: read_for(name, file, procedure.resolve), work, kept)
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:

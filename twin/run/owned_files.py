@@ -3,15 +3,13 @@
 In the folder checksums decide: a file that somebody has changed is theirs. Beside it are hidden names of a folder that
 is being made or replaced, ``.NAME.TOKEN.partial`` (a run that is being written), ``.NAME.TOKEN.old`` (what it replaces)
 and ``.NAME.TOKEN.lock``, which the process holds locked as long as it lives. The lock is the operating system's and
-ends with the process, however that ends; so a name without a held lock is nobody's. A study that is to replace a
-folder, and can be resumed, grows in ``.NAME.next`` (`successor`).
+ends with the process, however that ends; so a name without a held lock is nobody's.
 """
 
 from __future__ import annotations
 
 import fcntl
 import hashlib
-import json
 import os
 import re
 import secrets
@@ -21,32 +19,12 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from twin.run import durable
-
 MANIFEST = "manifest.json"
-STUDY_STATE = "study_state.json"
-"""Says which study a folder belongs to, from the beginning; the manifest is written at the end."""
-STUDY_LOCK = ".lock"
-"""File in the folder of a study that its command holds locked."""
-WRITTEN = ".written"
-"""What the study in a folder has written beside its chunks: a line ``CHECKSUM NAME`` for each file, before the file
-gets its name. It goes when the manifest says the same.
-"""
-SUCCEEDS = ".succeeds"
-"""File in a study's folder that is to take the place of another: the checksum of that one's manifest, empty where there
-is none.
-"""
+KEPT_LOCK = ".lock"
+"""File that a command holds locked in the folder of what it keeps for ``--resume``."""
 
 NAMED = 5
 """Files that a message names at most."""
-_AT_WORK = re.compile(
-    "|".join(map(re.escape, (STUDY_LOCK, WRITTEN, SUCCEEDS)))
-    + r"|chunks/(index\.txt|[0-9]+\.npz(\.corrupt)?)|(.*/)?"
-    + durable.PARTIAL_NAME
-)
-"""What a study keeps for itself; chunks have their checksums in their index."""
-_LAST = (MANIFEST, STUDY_STATE, WRITTEN)
-"""They say whose all else is."""
 
 
 def first_names(names: Sequence[str], most: int = NAMED) -> str:
@@ -68,39 +46,19 @@ def every_file(folder: Path) -> list[str]:
     return sorted(out)
 
 
-def is_study(folder: Path) -> bool:
-    """Whether a folder says that it is a study's."""
-    try:
-        state = json.loads((folder / STUDY_STATE).read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(state, dict) and state.get("program") == "twin.study" and "fingerprint" in state
-
-
-def foreign_files(folder: Path, listed: Mapping[str, str] | None, study: bool | None = None) -> list[str] | None:
-    """Files that a run or study did not write, or not with these contents; None in the folder of neither.
+def foreign_files(folder: Path, listed: Mapping[str, str]) -> list[str]:
+    """Files in the folder of a run that it did not write, or not with these contents.
 
     Args:
         folder: to be looked at.
-        listed: files of the run and their SHA-256, None where there is no manifest.
-        study: whether it is a study's, None to see.
+        listed: files of the run and their SHA-256.
 
     Raises:
         OSError: a file cannot be read.
     """
-    study = is_study(folder) if study is None else study
-    if listed is None and not study:
-        return None
-    known: dict[str, set[str]] = {}
-    for name, check in (*(listed or {}).items(), *(_account(folder) if study else ())):
-        known.setdefault(name, set()).add(check)
 
     def ours(name: str) -> bool:
-        if (listed is not None and name == MANIFEST) or (study and _AT_WORK.fullmatch(name)):
-            return True
-        if name in known:
-            return is_as_written(folder / name, known[name])
-        return study and name == STUDY_STATE  # the last file of a study that was being removed
+        return name == MANIFEST or (name in listed and is_as_written(folder / name, {listed[name]}))
 
     return [name for name in every_file(folder) if not ours(name)]
 
@@ -116,15 +74,6 @@ def digest(place: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _account(folder: Path) -> list[tuple[str, str]]:
-    """Names and checksums of the files that an unfinished study has written."""
-    try:
-        lines = (folder / WRITTEN).read_text("utf-8").splitlines()
-    except (OSError, ValueError):
-        return []
-    return [(name, check) for check, _, name in (line.partition(" ") for line in lines)]
-
-
 def remove_files(folder: Path, kept: set[str]) -> None:
     """Remove all files of a folder but some, and the folder if that was all. What says whose they are goes last.
 
@@ -133,44 +82,16 @@ def remove_files(folder: Path, kept: set[str]) -> None:
         kept: files that stay, paths relative to it.
     """
     names = [name for name in every_file(folder) if name not in kept]
-    for name in sorted(names, key=lambda name: (name in _LAST, name)):
+    for name in sorted(names, key=lambda name: (name == MANIFEST, name)):
         (folder / name).unlink(missing_ok=True)
     for place, _, _ in os.walk(folder, topdown=False):
         with suppress(OSError):  # somebody else has put something there
             os.rmdir(place)
 
 
-def remove_study(folder: Path) -> None:
-    """Remove a study's files from its folder, and the folder if that was all. Raises OSError."""
-    remove_files(folder, {*(foreign_files(folder, None, study=True) or ())})
-
-
-def manifest_digest(folder: Path) -> str:
-    """SHA-256 of a folder's manifest, empty where it has none. Raises OSError."""
-    return digest(folder / MANIFEST) if (folder / MANIFEST).exists() else ""
-
-
-def succeeds(new: Path, old: Path) -> bool:
-    """Whether a study's folder is to take, or has just taken, the place of that other one as it is. Raises OSError.
-
-    Args:
-        new: folder of the study.
-        old: the folder whose place it takes.
-    """
-    place = new / SUCCEEDS
-    return place.exists() and place.read_text("utf-8") == manifest_digest(old)
-
-
 PARTIAL, OLD, LOCK = "partial", "old", "lock"
 
 _NAME = re.compile(rf"\.(?P<name>.+)\.(?P<token>[0-9a-f]{{8}})\.(?:{PARTIAL}|{OLD}|{LOCK})")
-
-
-def successor(target: Path) -> Path:
-    """Where a study grows that is to take the place of ``target``; whoever resumes it finds it there. It is nobody's to
-    clear away, for hours of work may be in it.
-    """
-    return target.with_name(f".{target.name}.next")
 
 
 def _beside(target: Path, token: str) -> dict[str, Path]:

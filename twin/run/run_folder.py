@@ -44,7 +44,7 @@ class Numbered:
     def free(self) -> Path:
         """Return the first that does not exist now."""
         every = (self.folder / f"{self.stem}-{number:03d}" for number in count(1))
-        return next(path for path in every if not os.path.lexists(path) and not owned_files.successor(path).exists())
+        return next(path for path in every if not os.path.lexists(path))
 
 
 def chosen(out: Path | None, stem: str) -> Path | Numbered:
@@ -252,8 +252,7 @@ class Manifest(BaseModel):
         warnings: what the user was told.
         checks: what the run checked of itself, as of `twin.run.provenance.SelfCheck`.
         inputs: absolute path of every file that the run read and that is not in its folder -> checksum.
-        sha256: checksum of every file of the run but this one, by its path in the folder. A study's chunks are not
-            among them: they have theirs in their index.
+        sha256: checksum of every file of the run but this one, by its path in the folder.
         digest: checksum of all else that stands here, see `seal`.
     """
 
@@ -361,11 +360,9 @@ def is_run_folder(folder: Path) -> bool:
 
 
 def unlisted(folder: Path) -> list[str] | None:
-    """Files in the folder of a run or study that it did not write, or not like this; None when it is the folder of
-    neither. Raises OSError.
-    """
+    """Files in the folder of a run that it did not write, or not like this; None when it is none. Raises OSError."""
     manifest = read_manifest(folder)
-    return owned_files.foreign_files(folder, None if manifest is None else manifest.sha256)
+    return None if manifest is None else owned_files.foreign_files(folder, manifest.sha256)
 
 
 def refuse_others(folder: Path, others: Sequence[str]) -> None:
@@ -424,10 +421,9 @@ def reason(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno else str(error)
 
 
-_KEPT = re.compile(
-    rf"{re.escape(owned_files.STUDY_LOCK)}|trials\.txt"
-    rf"|[^/]+/(of\.txt|(chunks/)?{PARTIAL_NAME}|chunks/(index\.txt|[0-9]+\.npz(\.corrupt)?))"
-)
+JOURNAL = ".journal"
+"""Ending of a file with finished pieces of work, `twin.run.journal`."""
+_KEPT = re.compile(rf"{re.escape(owned_files.KEPT_LOCK)}|[^/]+{re.escape(JOURNAL)}|{PARTIAL_NAME}")
 """Files that commands keep there."""
 
 
@@ -442,12 +438,17 @@ class KeptWork:
         out: the run folder that the user chose, None for one below ``runs``.
         stem: name of the run folder where the user chose none.
         ending: what is kept, ``samples`` for instance.
-        resume: go on with what is there; else it is removed first.
+        resume: go on with what is there.
+        force: else remove what is there; where this is false, refuse to begin anew.
+        command: words of the command that goes on, without ``--resume``.
     """
 
-    def __init__(self, out: Path | None, stem: str, ending: str, resume: bool) -> None:
+    def __init__(
+        self, out: Path | None, stem: str, ending: str, resume: bool, force: bool = True, command: str = ""
+    ) -> None:
         self._first = Path("runs") / stem if out is None else out
-        self._chosen, self._ending, self._resume = out is not None, ending, resume
+        self._chosen, self._ending, self._resume, self._force = out is not None, ending, resume, force
+        self._command = command or "the same command"
         self._place: Path | None = None
         self._lock: int | None = None
 
@@ -457,7 +458,7 @@ class KeptWork:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Let others use the folder; where a bad input ends the command before anything was kept, remove it."""
         if self._lock is not None:
-            if kind is not None and self._place and owned_files.every_file(self._place) == [owned_files.STUDY_LOCK]:
+            if kind is not None and self._place and owned_files.every_file(self._place) == [owned_files.KEPT_LOCK]:
                 self.finish()
             os.close(self._lock)
 
@@ -473,18 +474,29 @@ class KeptWork:
                 place = self._first.with_name(f"{self._first.name}{'' if number == 1 else f'.{number}'}.{self._ending}")
                 self._refuse_others(place)
                 make_folders(place)
-                self._lock = owned_files.locked(place / owned_files.STUDY_LOCK)
+                self._lock = owned_files.locked(place / owned_files.KEPT_LOCK)
                 if self._lock is not None:
                     break
                 if self._chosen:
                     text = f"{place} is in use by another command; wait until it has ended, or choose another --out"
                     raise RunFolderError(text)
+            if not (self._resume or self._force) and owned_files.every_file(place) != [owned_files.KEPT_LOCK]:
+                raise RunFolderError(
+                    f"{place} holds what is done of a run that was broken off; go on with it with --resume, begin anew "
+                    "with --force, or choose another --out"
+                )
             self._place = place
             if not self._resume:
-                owned_files.remove_files(place, {owned_files.STUDY_LOCK})
+                owned_files.remove_files(place, {owned_files.KEPT_LOCK})
         except OSError as error:
             raise RunFolderError(f"cannot use {place}: {reason(error)}") from error
         return place
+
+    def left(self) -> str:
+        """What is left of a run that was broken off, for a message."""
+        if self._place is None or not self._place.exists():
+            return "nothing was kept"
+        return f"what is done is kept, go on with: {self._command} --resume"
 
     def finish(self) -> None:
         """Remove what was kept: its results stand in the run folder."""
@@ -498,7 +510,7 @@ class KeptWork:
         if place.is_symlink() or not place.is_dir():
             raise RunFolderError(f"{place} is in the way of what is kept for --resume; choose another --out")
         names = owned_files.every_file(place)
-        known = owned_files.STUDY_LOCK in names
+        known = owned_files.KEPT_LOCK in names
         if others := [name for name in names if not (known and _KEPT.fullmatch(name))]:
             named = owned_files.first_names(others)
             text = f"{place} holds files that this program did not write: {named}; move it, or choose another --out"

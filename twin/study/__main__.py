@@ -7,23 +7,23 @@ if __name__ == "__main__":
 
     end_quietly()
 
-import time
+from collections.abc import Mapping
+from functools import partial
+from os.path import isfile
 from pathlib import Path
+from shutil import copyfile
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
+from scenes.kinds.file_kinds import read_for
 from twin.run import cli
-from twin.study.progress_bar import Told, tell_through
+from twin.run.command import Result, run_command
 
 if TYPE_CHECKING:  # help waits for nothing that computes
-    from twin.study.runs.engine import Estimate
-    from twin.study.runs.engine import Progress as EngineProgress
-    from twin.study.runs.study_folder import StudyFolder
-    from twin.study.study_command import StudyOptions, StudyRun
+    from twin.run.procedure import Session
+    from twin.study.runs.setup import StudySetup
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -67,9 +67,9 @@ def main(
     The folder gets study.nc (netCDF, one dimension `run`), study.csv, study.json, report.html and config.yaml, which
     can be given in place of the file. The numbers do not depend on the number of workers.
 
-    While it runs, finished pieces are kept below DIR/chunks. A study that was broken off, by Ctrl-C or a power
+    While it runs, finished runs are kept in OUT.blocks beside it. A study that was broken off, by Ctrl-C or a power
     failure, is gone on with by the same command and --resume. With --force the folder that is to be replaced stands
-    until the new study is complete; meanwhile that grows in .NAME.next beside it.
+    until the new study is complete.
 
     With --gradient it runs no design: the folder gets the Jacobian at the base's own values, gradient.json and
     gradient.csv, by automatic differentiation and beside it by differences.
@@ -80,140 +80,56 @@ def main(
     Exit codes: 0 success, 2 bad input (nothing is lost), 129, 130 or 143 interrupted, 1 anything else: all runs failed,
     the program did, or a figure could not be drawn.
     """
-    from twin.run.cluster import ClusterError
-    from twin.study import study_command
-    from twin.study.runs.engine import IncompleteError, ProgramFault
-
     errors = Console(stderr=True)
-    options = study_command.StudyOptions(out, workers, scheduler, resume, force, yes, backend)
-    place: list[StudyFolder] = []
     if gradient:
-        _refuse_with_gradient(errors, options)
+        _refuse_with_gradient(
+            errors, {"--workers": workers, "--scheduler": scheduler, "--resume": resume or None, "--yes": yes or None}
+        )
         # drawing libraries are not needed before
         from twin.study.gradient.gradient_report import run_gradient
 
         run_gradient(file, cli.Options(out, None, backend, force, as_json, quiet, strict=strict))
         return
-    with cli.explained(errors):
-        told = (lambda done, total: None) if progress_fd is None else tell_through(progress_fd)
-        display = _Display(errors, quiet or as_json, told)
-        try:
-            with display.bar, display.heartbeat:
-                run = study_command.run_study(file, options, display.progress(), place.append)
-        except (study_command.Broken, ProgramFault, IncompleteError, ClusterError, OSError) as error:
-            if isinstance(error, ProgramFault):
-                errors.print(error.trace, markup=False, highlight=False, soft_wrap=True)
-            said = (error.strerror or error) if isinstance(error, OSError) else error
-            print_error(errors, f"{said}{_how_to_go_on(file, place)}")
-            raise typer.Exit(error.code if isinstance(error, study_command.Broken) else FAILURE) from None
-    with to_stdout(errors, f"the study is complete in {run.folder}"):
-        if as_json:
-            print_json(run.numbers)
-        elif not quiet:
-            _print_result(run)
-    if run.numbers["failed"] == run.numbers["runs"]:
-        print_error(errors, f"all {run.numbers['runs']} runs failed, see {run.folder / 'report.html'}")
-        raise typer.Exit(FAILURE)
-    if run.missing:
-        print_error(errors, f"{'; '.join(run.missing)}; all else is in {run.folder}")
-        raise typer.Exit(FAILURE)
-    if run.fault is not None:
-        # everything is written: only what the file says of a response is wrong
-        with cli.explained(errors):
-            raise run.fault
-    if strict:
-        cli.end_strictly(errors, run.numbers)
+    from twin.run.cluster import refuse_both
+    from twin.run.run_folder import KeptWork, read_manifest
+    from twin.study import study_command
+    from twin.study.runs.blocks import BLOCKS
+    from twin.study.runs.setup import PROGRAM, resolve_study
+
+    def resolve() -> StudySetup:
+        refuse_both(workers, scheduler)
+        setup = read_for(PROGRAM, file, resolve_study)
+        study_command.check_size(setup, yes)
+        return setup
+
+    def work(setup: StudySetup, session: Session) -> Result:
+        place, chosen = kept.begin(), (workers, scheduler)
+        if out is not None and finished and not (place / BLOCKS).exists():
+            copyfile(out / BLOCKS, place / BLOCKS)
+        said = errors if not (quiet or as_json) else Console(quiet=True)
+        say = partial(said.print, markup=False, highlight=False, soft_wrap=True)
+        if progress_fd is None:
+            return study_command.run_study(setup, session, place, chosen, say)
+        from twin.study.scripted import tell_through  # what a script needs
+
+        return study_command.run_study(setup, session, place, chosen, say, tell_through(progress_fd))
+
+    # --resume of a finished study makes its report anew
+    finished = resume and out is not None and isfile(out / BLOCKS) and read_manifest(out) is not None
+    again = f"python -m twin.study {file}{'' if out is None else f' --out {out}'}{' --force' if force else ''}"
+    kept = KeptWork(out, file.stem, "blocks", resume, force, again)
+    options = cli.Options(out, None, backend, force or finished, as_json, quiet, strict=strict)
+    run_command(file.stem, options, resolve, work, kept)
 
 
-def _refuse_with_gradient(errors: Console, options: StudyOptions) -> None:
+def _refuse_with_gradient(errors: Console, options: Mapping[str, object]) -> None:
     """Refuse options that mean nothing with --gradient."""
-    words = ("--workers", "--scheduler", "--resume", "--yes")
-    given = (options.workers, options.scheduler, options.resume or None, options.confirmed or None)
     with cli.explained(errors):
-        for name, value in zip(words, given, strict=True):
+        for name, value in options.items():
             if value is not None:
                 raise cli.InputErrorText(
                     f"--gradient differentiates at the base in this process, so {name} has no meaning"
                 )
-
-
-def _how_to_go_on(file: Path, place: list[StudyFolder]) -> str:
-    if not (place and place[0].resumable):
-        return "; nothing was kept"
-    return f"; what is done is kept, go on with: python -m twin.study {file} --out {place[0].target} --resume"
-
-
-class _Display:
-    """What the user sees while a study runs: lines on stderr, and a bar where it is a terminal."""
-
-    def __init__(self, console: Console, silent: bool, told: Told = lambda done, total: None) -> None:
-        self.console, self.silent, self._told = console, silent, told
-        self.bar = Progress(
-            TextColumn("runs"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(elapsed_when_finished=False),
-            console=console,
-            disable=silent or not console.is_terminal,
-            transient=True,
-        )
-        self._task = self.bar.add_task("runs", total=None, rate="")
-        self._began: tuple[float, int] | None = None
-        self._standing = cli.Standing("start the workers and a pilot")
-        self.heartbeat = cli.heartbeat(console, lambda: str(self._standing), silent)
-
-    def progress(self) -> EngineProgress:
-        """What the engine calls."""
-        from twin.study.runs.engine import Progress as EngineProgress
-
-        return EngineProgress(start=self._start, done=self._done, warn=self._warn)
-
-    def _say(self, text: str) -> None:
-        if not self.silent:
-            self.console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-    def _warn(self, text: str) -> None:
-        self.console.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
-
-    def _start(self, estimate: Estimate) -> None:
-        there = f" ({estimate.there} are there already)" if estimate.there else ""
-        self._say(
-            f"{estimate.runs} runs{there} in {estimate.blocks} blocks and {estimate.chunks} chunks on "
-            f"{estimate.workers} worker{'s' if estimate.workers > 1 else ''}; about {cli.time_text(estimate.seconds)}, "
-            f"{1e-9 * estimate.memory:.1f} GB; {1e3 * estimate.state_seconds:.3g} ms a run"
-        )
-
-    def _done(self, done: int, total: int) -> None:
-        self._told(done, total)
-        now = time.monotonic()
-        if self._began is None:
-            self._began = (now, done)
-        rate = (done - self._began[1]) / max(now - self._began[0], 1e-9)
-        text = f"{rate:.3g}/s" if done > self._began[1] else ""
-        self.bar.update(self._task, completed=done, total=total, rate=text)
-        if done < total:
-            self._standing.advance("runs", done, total)
-        else:
-            self._standing.advance("write the results", 0, 1)
-
-
-def _print_result(run: StudyRun) -> None:
-    from twin.run.artefact import cell_text
-
-    numbers = run.numbers
-    title = f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed"
-    table = cli.result_table(title)
-    for head in ("response", "unit", "mean", "std", "95%", "99.7%"):
-        table.add_column(head, justify="left" if head in ("response", "unit") else "right", no_wrap=True)
-    for name, r in numbers["responses"].items():
-        table.add_row(name, r["unit"], *(cell_text(r[key]) for key in ("mean", "std", "p95", "p997")))
-    console = Terminal()
-    cli.print_verdict(console, run.verdict)
-    cli.print_whole(console, table)
-    cli.print_place(console, run.folder)
 
 
 if __name__ == "__main__":

@@ -8,12 +8,13 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import Any, Protocol
 
 import xarray as xr
 
@@ -25,8 +26,10 @@ from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.run.owned_files import scratch
-from twin.study.progress_bar import Told, shown_bar, tell_all
 from twin.study.runs.base_job import Tree
+
+Told = Callable[[int, int], None]
+"""Told the number of runs that are there, and of all."""
 
 _NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _RANGE = re.compile(rf"\(\s*({_NUMBER})\s*(\.\.|±|\+-)\s*({_NUMBER})\s*\)")
@@ -122,40 +125,71 @@ def study(
 
 def _run(command: list[str], quiet: bool, progress: bool | Told) -> tuple[int, str]:
     """Run a study's command to its end; its exit code, and what it said where nobody is shown that."""
-    with ExitStack() as stack:
-        kept = stack.enter_context(tempfile.TemporaryFile("w+")) if quiet else None
-        told = progress if callable(progress) else shown_bar() if progress and not quiet else None
-        with _telling(command, kept, told is not None) as (done, lines):
-            if told is not None:
-                tell_all(lines, told)
-            code = done.wait()
-        if kept is None:
-            return code, ""
-        kept.seek(0)
-        return code, kept.read()
-
-
-@contextmanager
-def _telling(
-    command: list[str], kept: IO[str] | None, asked: bool
-) -> Iterator[tuple[subprocess.Popen[bytes], IO[str]]]:
-    """A study in a process of its own, and the lines by which it tells how far it is, if it is asked to."""
+    told = progress if callable(progress) else _shown_bar() if progress and not quiet else _silent
     reading, writing = os.pipe()
-    with os.fdopen(reading) as lines:
+    with os.fdopen(reading) as lines, tempfile.TemporaryFile("w+") as kept:
+        words = [*command, "--progress-fd", str(writing)]
         try:
-            more = ["--progress-fd", str(writing)] if asked else []
             done = subprocess.Popen(
-                [*command, *more], stdout=subprocess.DEVNULL, stderr=kept, pass_fds=(writing,) if asked else ()
+                words, stdout=subprocess.DEVNULL, stderr=kept if quiet else None, pass_fds=(writing,)
             )
         finally:
             os.close(writing)
         try:
-            yield done, lines
+            for line in lines:  # until the other end is closed
+                there, runs = line.split()
+                told(int(there), int(runs))
+            code = done.wait()
         except BaseException:
             # what is told may break off the study, and so does Ctrl-C
             done.send_signal(signal.SIGINT)
             done.wait()
             raise
+        kept.seek(0)
+        return code, kept.read()
+
+
+def _silent(done: int, runs: int) -> None:
+    """Tell nobody."""
+
+
+def _shown_bar() -> Told:
+    """A line on stderr that says how far a study is, drawn over the one before: on a terminal and in a notebook's cell;
+    nothing in a file. The command has a bar of its own; this one draws with nothing that a script does not have.
+    """
+    stream = sys.stderr
+    if not (stream.isatty() or "ipykernel" in sys.modules):
+        return _silent
+    begun = time.monotonic()
+
+    def told(done: int, total: int) -> None:
+        full = _WIDTH * done // max(total, 1)
+        spent = time.monotonic() - begun
+        left = f", about {spent * (total - done) / done:.0f} s left" if 0 < done < total else ""
+        bar = f"runs {'#' * full}{'.' * (_WIDTH - full)} {done} of {total}, {spent:.0f} s{left}"
+        # the line before may have been longer
+        stream.write(f"\r{bar:<79}" + ("\n" if done == total else ""))
+        stream.flush()
+
+    return told
+
+
+_WIDTH = 30  # of the bar, characters
+
+
+def tell_through(descriptor: int) -> Told:
+    """Return what writes the numbers into a pipe, a line each time; a reader that is gone ends nothing.
+
+    Args:
+        descriptor: of the pipe, inherited; processes that this one starts do not get it.
+    """
+    os.set_inheritable(descriptor, False)
+
+    def told(done: int, total: int) -> None:
+        with suppress(OSError):
+            os.write(descriptor, f"{done} {total}\n".encode())
+
+    return told
 
 
 def config_text(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,10 @@ import xarray as xr
 
 from scenes.specs.study import NOISE
 from twin.run import data_files, reference_frames
+from twin.run.run_folder import RunFolder
+from twin.study.report.study_statistics import Estimate, describe
 from twin.study.runs.base_job import BlockResult, one_line
 from twin.study.runs.plan import Plan
-from twin.study.runs.study_folder import StudyFolder
 
 RUN = "run"
 FAILED, MESSAGE, SEED = "failed", "message", "seed"
@@ -66,7 +67,7 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         data[SEED] = (RUN, plan.seeds, {"units": "", ROLE: "bookkeeping", "long_name": "seed of the run's noise"})
     attributes = {
         "title": study.name,
-        "study": plan.setup.to_yaml(),
+        "study": plan.config,
         "fingerprint": plan.setup.fingerprint,
         "design": study.design.kind,
         "seed": study.design.seed,
@@ -80,39 +81,25 @@ def _path(key: tuple[str | int, ...]) -> str:
     return " ".join(str(part) for part in key)
 
 
-def table(data: xr.Dataset) -> bytes:
-    """The data set as CSV, a line for each run; heads are the names, with the unit in brackets."""
-    names = [RUN, *(str(name) for name in data.data_vars)]
-    rows = zip(*(_cells(data[name].values) for name in names), strict=True)
-    return data_files.csv_table([[_head(data, name) for name in names], *rows])
-
-
-def _head(data: xr.Dataset, name: str) -> str:
-    units = data[name].attrs.get("units", "")
-    return f"{name} [{units}]" if units else name
-
-
-def _cells(values: np.ndarray) -> list[Any]:
-    """All digits; an empty cell where there is no number."""
-    return ["" if isinstance(value, float) and math.isnan(value) else value for value in values.tolist()]
-
-
-def parquet(data: xr.Dataset) -> bytes | None:
-    """The data set as a Parquet file with units and descriptions; None when pyarrow is not installed."""
+def _as_table(ending: str, data: xr.Dataset) -> bytes | None:
+    """The data set as a table, a line for each run, with units and descriptions; None where a package is missing."""
     columns = []
     for name in (RUN, *map(str, data.data_vars)):
         about = data[name].attrs
         columns.append(data_files.DataColumn(name, data[name].values, about.get("units", ""), about["long_name"]))
-    title, frames = str(data.attrs["title"]), str(data.attrs["reference_frames"])
+    facts = {"reference_frames": str(data.attrs["reference_frames"])}
     try:
-        return data_files.TABLE_FORMATS["parquet"](
-            data_files.DataTable("study", title, tuple(columns), {"reference_frames": frames})
+        return data_files.TABLE_FORMATS[ending](
+            data_files.DataTable("study", str(data.attrs["title"]), tuple(columns), facts)
         )
     except data_files.MissingPackage:
         return None
 
 
-FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {"nc": data_files.netcdf, "csv": table, "parquet": parquet}
+FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {
+    "nc": data_files.netcdf,
+    **{ending: partial(_as_table, ending) for ending in ("csv", "parquet")},
+}
 """Ending of a file of the data set, study.ENDING -> its contents, None where what it needs is not installed. A new one
 is added here.
 """
@@ -160,15 +147,12 @@ def _span(values: np.ndarray) -> dict[str, Any]:
 
 def _statistics(values: np.ndarray) -> dict[str, Any]:
     """Over the finite values; std with n - 1; p95 and p997: 95 and 99.7 of 100 runs lie below."""
-    good = values[np.isfinite(values)]
-    n = len(good)
-    return {
-        "count": n,
-        "mean": float(np.mean(good)) if n else None,
-        "std": float(np.std(good, ddof=1)) if n > 1 else None,
-        "p95": float(np.quantile(good, 0.95)) if n else None,
-        "p997": float(np.quantile(good, 0.997)) if n else None,
-    }
+    found = describe(values, False)
+    return {"count": found.count, **{key: _value(getattr(found, key)) for key in ("mean", "std", "p95", "p997")}}
+
+
+def _value(estimate: Estimate | None) -> float | None:
+    return None if estimate is None else estimate.value
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,9 +172,8 @@ class Numbers:
     unwritten: tuple[str, ...] = ()
 
 
-def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, folder: StudyFolder) -> Numbers:
-    """Write the data set in all FORMATS, and study.json; the folder is no longer a complete study's until its
-    manifest is written.
+def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, folder: RunFolder) -> Numbers:
+    """Write the data set in all FORMATS, and study.json.
 
     Args:
         plan: the study.
@@ -210,8 +193,7 @@ def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, f
             "worker_seconds": result.seconds,
         },
     )
-    folder.begin_results()
-    folder.write("config.yaml", plan.setup.to_yaml().encode())
+    folder.write_text("config.yaml", plan.config)
     files, unwritten = [], []
     for ending, contents in FORMATS.items():
         try:
@@ -221,6 +203,6 @@ def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, f
             continue
         if content is not None:
             files.append(f"study.{ending}")
-            folder.write(files[-1], content)
+            folder.write_bytes(files[-1], content)
     folder.write_json("study.json", numbers)
     return Numbers(data, numbers, tuple(files), tuple(unwritten))

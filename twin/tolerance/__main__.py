@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optics.numerics.backend import cores
 from scenes.kinds.file_kinds import read_for
 from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
@@ -82,16 +81,15 @@ def main(
         from twin.tolerance.samples import Workforce
         from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance
 
-        force = Workforce(cores() if workers is None else workers, scheduler, kept.begin())
+        force = Workforce(workers, scheduler, kept.begin())
         run = run_tolerance(setup, session.backend, setup.test.seed, session.advance, force)
         from twin.tolerance.tolerance_report import tolerance_report
 
         facts = {"config": setup.to_yaml(), "named": setup.plain(), "seed": setup.test.seed}
         return finished(session, "tolerance", tolerance_report(run), TOLERANCE(run), program=PROGRAM, **facts)
 
-    with KeptWork(out, file.stem, "samples", resume) as kept:
-        run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work)
-        kept.finish()
+    kept = KeptWork(out, file.stem, "samples", resume)
+    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work, kept)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,11 @@ from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec, resolve_tolera
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.camera.varied_beams import AT_ONCE
-from twin.run import cluster, durable, memory, run_folder
+from twin.run import cluster, memory
 from twin.run.procedure import Advance, silent
+from twin.run.run_folder import JOURNAL
 from twin.study.runs.base_job import BlockResult, Failure, Outcome, Run, Tree, one_line, with_values
-from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.engine import Engine, Progress, fit_workers
+from twin.study.runs.blocks import Engine, journal_of
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
 from twin.tolerance.tolerance_bench import ToleranceBench
@@ -32,18 +32,11 @@ DRAWS = "draws"
 class ToleranceBase:
     """``python -m twin.tolerance``: of every camera the merits after its adjustments, and the adjustments."""
 
+    model: type[Spec] = ToleranceSetup
+    block = AT_ONCE
+
     def __init__(self) -> None:
         self._benches: dict[int, tuple[Tree, ToleranceBench]] = {}
-
-    @property
-    def model(self) -> type[Spec]:
-        """A tolerance budget with its instrument."""
-        return ToleranceSetup
-
-    @property
-    def block(self) -> int:
-        """Cameras that are traced together."""
-        return AT_ONCE
 
     def resolve(self, file: Path | str) -> Spec:
         """Read a budget. Raises InputError."""
@@ -198,13 +191,13 @@ class Workforce:
     """Who draws cameras.
 
     Attributes:
-        workers: number of processes; 0 for this one alone.
+        workers: number of processes; None for one per core.
         scheduler: address of a running cluster, None for none.
-        journal: folder that keeps what is done, to go on with; None for none, then nothing is kept.
+        journal: folder that keeps what is done, to go on with; None for none, then this process does it alone.
         warn: told what the user should know of how it is done.
     """
 
-    workers: int = 0
+    workers: int | None = None
     scheduler: str | None = None
     journal: Path | None = None
     warn: Callable[[str], None] = field(default=lambda text: None, compare=False)
@@ -234,7 +227,7 @@ def draw_samples(
 
     Raises:
         RunFolderError: the journal is another run's, or cannot be written.
-        IncompleteError, ProgramFault, ClusterError: as the engine of studies.
+        Incomplete: as the engine of studies.
     """
     study = study_of(setup, bench, samples, seed)
     plan = Plan.of(study)
@@ -249,7 +242,7 @@ def draw_samples(
             advance(part, numbers.stop, samples)
         result = BlockResult.joined(found)
     else:
-        result = _by_engine(plan, backend, force, force.journal / part, part, advance)
+        result = _by_engine(plan, backend, force, force.journal / f"{part}{JOURNAL}", part, advance)
     merits, moves = len(bench.merits), len(bench.compensators)
     values = result.values
     return Samples(
@@ -257,58 +250,12 @@ def draw_samples(
     )
 
 
-def _by_engine(
-    plan: Plan, backend: Backend, force: Workforce, folder: Path, part: str, advance: Advance
-) -> BlockResult:
-    with _journal(folder, plan.setup.fingerprint):
-        store = ChunkStore(folder, plan)
-        store.open()
-        _warn_of(force, store.corrupt)
-        progress = Progress(done=lambda done, total: advance(part, done, total), warn=force.warn)
-        engine = Engine(plan, store, backend.name, progress)
-        if store.missing:
-            who = (
-                cluster.remote_workers(force.scheduler, force.warn)
-                if force.scheduler is not None
-                else cluster.local_workers(_workers(plan, force))
-            )
-            with who as workers:
-                _warn_of(force, workers.warnings)
+def _by_engine(plan: Plan, backend: Backend, force: Workforce, file: Path, part: str, advance: Advance) -> BlockResult:
+    with journal_of(plan.setup, file, "budget") as journal:
+        done = partial(advance, part)
+        engine = Engine(plan, journal, backend.name, done, warn=force.warn)
+        if engine.missing:
+            limits = plan.setup.study.limits
+            with cluster.chosen_workers(force.workers, force.scheduler, force.warn, limits) as workers:
                 engine.run(workers, memory.largest_memory())
-        return store.result()
-
-
-def _warn_of(force: Workforce, texts: Sequence[str]) -> None:
-    for text in texts:
-        force.warn(text)
-
-
-def _workers(plan: Plan, force: Workforce) -> int:
-    """Number of worker processes, as many as fit into the memory."""
-    limits, wanted = plan.setup.study.limits, max(1, force.workers)
-    count = fit_workers(wanted, limits.bytes, cluster.LEAST_MEMORY)
-    if count < wanted:
-        force.warn(f"{count} workers instead of {wanted}: no more fit into the budget's {limits.memory}")
-    return count
-
-
-@contextmanager
-def _journal(folder: Path, fingerprint: str) -> Iterator[None]:
-    """Keep a folder for runs of one budget.
-
-    Raises:
-        RunFolderError: it is of another budget, or cannot be written.
-    """
-    try:
-        durable.make_folders(folder)
-        head = folder / "of.txt"
-        if head.exists() and head.read_text("utf-8") != f"{fingerprint}\n":
-            text = "is of another budget, or of another version of this program; remove it to begin anew"
-            raise run_folder.RunFolderError(f"{folder} {text}")
-        if not head.exists():
-            durable.write_safely(head, f"{fingerprint}\n".encode())
-        yield
-    except OSError as error:
-        raise run_folder.RunFolderError(
-            f"{folder}: {error.strerror}; what is done is kept, go on with --resume"
-        ) from error
+        return engine.result()

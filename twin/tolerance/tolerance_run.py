@@ -159,7 +159,7 @@ def run_tolerance(
     Raises:
         InputError: names that do not exist, a designed camera without the light that is asked, or more memory than
             there is.
-        RunFolderError, IncompleteError, ProgramFault, ClusterError: as ``draw_samples``.
+        RunFolderError, Incomplete: as ``draw_samples``.
     """
     test, force = setup.test, force or Workforce()
     told: dict[str, None] = {}  # what is told twice, of the cameras and of those by which an allocation is judged

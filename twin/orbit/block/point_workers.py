@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 from analysis.arrays import MeasurementError
 from optics.numerics.backend import one_blas_thread
-from twin.run.cluster import ClusterError, Workers, local_workers, refuse_both, remote_workers
+from twin.run.cluster import ClusterError, Workers, chosen_workers
 
 _LOST = "a worker was lost with its share of the points; adjust the block again"
 
@@ -79,16 +79,8 @@ def point_workers(
         InputErrorText: both are given, or a cluster that cannot be used.
         ClusterError: a cluster without workers.
     """
-    refuse_both(count, scheduler)
-    who: AbstractContextManager[Workers]
-    if scheduler is not None:
-        who = remote_workers(scheduler, warn)
-    elif count is not None and count > 1:
-        who = local_workers(count)
-    else:
+    if scheduler is None and (count is None or count < 2):
         yield None
         return
-    with who as workers:
-        for text in workers.warnings:
-            warn(text)
+    with chosen_workers(count, scheduler, warn) as workers:
         yield PointWorkers(workers, workers.count)

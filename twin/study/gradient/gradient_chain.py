@@ -28,7 +28,7 @@ from twin.monitor.monitor_derivative import hit_slopes
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion
 from twin.monitor.truth import ACROSS, LINE_POINTS, line_in_world
-from twin.study.runs.render_base import monitor_results, true_results
+from twin.study.runs.render_base import run_results
 
 CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}
 """Largest steps of differences, SI: they move the beam on the mirrors by a few millimetres at most."""
@@ -120,16 +120,15 @@ class Chain:
         alone where there is no monitor.
         """
         truth = self.experiment.sight.told_by(sight[:, None])
-        exposures = self.resolved.frames, self.resolved.job.render.seed
         if not self.experiment.monitored:
-            return true_results(self.resolved, self.experiment, state, *exposures, truth)
+            return run_results(self.resolved, self.experiment, state, truth)
         start, end = self.nominal, spots[None]
         cameras = self.experiment.cameras
         joint = np.zeros((1, 2 * end.shape[1], 2 * end.shape[1]))
         found = estimates(start, end, joint, cameras, self.experiment.disturbances, self.experiment.ground)
         none = np.zeros_like(end)
         recovery = Recovery(start, end, none, none, joint, found.parameters, found.angle, found.ground)
-        return monitor_results(self.resolved, self.experiment, state, *exposures, truth, recovery)
+        return run_results(self.resolved, self.experiment, state, truth, recovery)
 
     def moved(
         self, state: State, at: tuple[np.ndarray, np.ndarray], spots: np.ndarray, sight: np.ndarray

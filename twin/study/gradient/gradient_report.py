@@ -25,8 +25,7 @@ from twin.sensors.area_detector import coarse_warnings
 from twin.study.gradient.study_gradient import AD, Gradient, study_gradient
 from twin.study.report.study_plots import finish
 from twin.study.report.study_statistics import typeset
-from twin.study.runs.setup import StudySetup, base_of, resolve_study
-from twin.study.runs.study_folder import PROGRAM
+from twin.study.runs.setup import PROGRAM, StudySetup, base_of, resolve_study
 
 DOUBTFUL_TEXT = (
     "Differences that are not good to 1% of the response's largest change (their step crosses a bend, or the job "

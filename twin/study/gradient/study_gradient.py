@@ -31,8 +31,8 @@ from twin.run.cli import InputErrorText
 from twin.run.procedure import Advance, silent
 from twin.study.gradient.gradient_chain import CAP, SHARES, Chain, Slopes, extrapolated, motion_slopes, sight_gradient
 from twin.study.runs.base_job import Failure, Run, leaf
+from twin.study.runs.plan import number_at, number_of, ratios, scaled
 from twin.study.runs.render_base import PERTURB, JobMaker
-from twin.study.runs.sampling import number_at, number_of, ratios, scaled
 from twin.study.runs.setup import StudySetup
 
 

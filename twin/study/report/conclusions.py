@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from scenes.specs.samplers import GRID, SAMPLERS
 from twin.run.artefact import decimals_for, fixed, significant
 from twin.run.report import answer
-from twin.study.report.sensitivity_indices import HARMONICS, MANY_FAILED, RESAMPLES, Indices, NoIndices
+from twin.study.report.sensitivity_indices import MANY_FAILED, RESAMPLES, Indices, NoIndices
 from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
 from twin.study.report.study_statistics import LEAST, Description, Estimate, Interval, Response, impossible, typeset
 
@@ -74,20 +74,13 @@ def indices_texts(found: StudyAnalysis) -> list[str]:
     """How the indices were found, and how good that is."""
     if found.runs.sampled:
         out = [
-            f"From the given runs ({design_title(found.runs.kind)}; not a design made for the indices): polynomial "
-            f"chaos, whose squared coefficients are the parts of the variance. Intervals from {RESAMPLES} resamples of "
-            "the runs, for the terms that were chosen and as far into the tails as these runs reach; what the terms "
-            "leave may belong to any factor and counts for every upper end, less the noise that the runs state. What "
-            f"happens in less than {percent(3.7 / max(found.runs.count, 4), 1)} of the factors' distribution may have "
-            "been met by no run and is in no interval. Runs without a number count as any within the range of the "
-            "others. "
-            f"RBD-FAST with {HARMONICS} harmonics beside it."
+            f"From the given runs ({design_title(found.runs.kind)}) by polynomial chaos, with intervals from "
+            f"{RESAMPLES} resamples of the runs. What happens in less than "
+            f"{percent(3.7 / max(found.runs.count, 4), 1)} of the "
+            "factors' distribution may have been met by no run and is in no interval."
         ]
     else:
-        out = [
-            "The grid is complete, so that its variance is taken apart exactly, all combinations being equally likely. "
-            "Noise that differs from run to run counts as an interaction of all factors and raises every total index."
-        ]
+        out = ["The variance of the complete grid is taken apart exactly, all combinations being equally likely."]
     for name, part in found.indices.items():
         if isinstance(part, NoIndices):
             out.append(f"{name}: {part.reason}.")

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from twin.study.report.study_statistics import CONFIDENCE, Estimate, Factor, Interval, Response
-from twin.study.runs.sampling import quantiles
+from twin.study.runs.plan import quantiles
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from matplotlib.text import Text
 
 from scenes.specs.study import FactorSpec, StudySpec
 from scenes.yaml.errors import key_text
-from twin.run import owned_files, page, run_folder, svg
+from twin.run import page, run_folder, svg
 from twin.run.artefact import Cell, SvgFigure, Table, Undrawn, fixed, plain
 from twin.run.report import Report, Section
+from twin.run.run_folder import RunFolder
 from twin.study.report import conclusions as words
 from twin.study.report import study_analysis
 from twin.study.report import study_plots as plots
@@ -24,9 +25,7 @@ from twin.study.report.study_analysis import StudyAnalysis
 from twin.study.report.study_statistics import Estimate, Factor, StudyRuns, typeset
 from twin.study.runs.base_job import one_line
 from twin.study.runs.plan import Plan
-from twin.study.runs.study_folder import PROGRAM, StudyFolder
-
-ARTEFACTS = "artefacts"
+from twin.study.runs.setup import PROGRAM
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +46,7 @@ class StudyReport:
 
 
 def write_report(
-    data: xr.Dataset, plan: Plan, folder: StudyFolder, files: Sequence[str], given: Sequence[str] = ()
+    data: xr.Dataset, plan: Plan, folder: RunFolder, files: Sequence[str], given: Sequence[str] = ()
 ) -> StudyReport:
     """Write ``report.html``, ``statistics.json`` and the folder ``artefacts`` into the study's folder.
 
@@ -62,13 +61,8 @@ def write_report(
         The verdict that it begins with, and what could not be drawn.
     """
     made = report_files(data, plan.setup.study, files, given)
-    contents = made.contents
-    # what an earlier report showed may not be there any more
-    there = [
-        name for name in owned_files.every_file(folder.path) if name.split("/")[0] == ARTEFACTS and name not in contents
-    ]
-    folder.remove(there)
-    folder.write_all(contents)
+    for name, content in made.contents.items():
+        folder.write_bytes(name, content)
     return made
 
 

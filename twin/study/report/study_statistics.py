@@ -15,7 +15,7 @@ from scenes.specs.samplers import GRID
 from scenes.specs.study import NOISE, FactorSpec, StudySpec
 from scenes.yaml.errors import InputError, Issue, key_text
 from twin.run.artefact import significant
-from twin.study.runs.sampling import axes_of
+from twin.study.runs.plan import axes_of
 
 _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"}
 

@@ -294,6 +294,15 @@ class BlockResult:
     seconds: float
     doubts: tuple[str, ...]
 
+    def fits(self, shape: tuple[int, int]) -> bool:
+        """Return whether these are results of so many runs and responses, as a file may hold anything."""
+        arrays = all(
+            isinstance(one, np.ndarray) and one.shape == shape and one.dtype == float
+            for one in (self.values, self.sigmas, self.noises)
+        )
+        texts = (self.messages, self.doubts)
+        return arrays and all(len(one) == shape[0] and all(isinstance(m, str) for m in one) for one in texts)
+
     @property
     def failed(self) -> np.ndarray:
         """(n,) whether a run failed."""

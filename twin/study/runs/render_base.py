@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import ValidationError
 
 from analysis.monitor.recovery import Recovery
 from optics.geometry.tree import State
@@ -22,11 +21,9 @@ from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes
-from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob, resolve
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
-from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Spec, annotation_at, validate
+from scenes.yaml.errors import KeyPath
+from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import QUALITY, quality_dicts
@@ -36,71 +33,31 @@ from twin.monitor.observation import Observing, observe
 from twin.monitor.truth import Truth
 from twin.study.runs.base_job import PHYSICS, Failure, Outcome, Run, Tree, one_line, with_values
 
-_NOTHING = np.empty(0)
 
-
-def monitor_results(
-    resolved: ResolvedJob,
-    experiment: MonitorExperiment,
-    state: State,
-    frames: int,
-    seed: int,
-    truth: Truth,
-    recovery: Recovery,
+def run_results(
+    resolved: ResolvedJob, experiment: MonitorExperiment, state: State, truth: Truth, recovery: Recovery | None = None
 ) -> dict[str, Any]:
-    """``truth`` and ``recovered``: contents of truth.json and recovered.json, made by the code that makes the files.
+    """``truth`` and, with a monitor, ``recovered``: contents of truth.json and recovered.json, made by the code that
+    makes the files.
 
     Args:
         resolved: the job.
         experiment: its instrument.
         state: what the job perturbs.
-        frames: of an exposure.
-        seed: of its noise.
         truth: of this one state.
-        recovery: what its images or spots say.
+        recovery: what its images or spots say, None without a monitor.
     """
-    run = RenderRun(
-        resolved=resolved,
-        experiment=experiment,
-        state=state,
-        frames=frames,
-        seed=seed,
-        truth=truth,
-        photons_before=_NOTHING,
-        photons_after=_NOTHING,
-        before=_NOTHING,
-        after=_NOTHING,
-        recovery=recovery,
-        crosstalk={},
-        warnings=(),
-    )
+    known: dict[str, Any] = {"resolved": resolved, "experiment": experiment, "state": state, "truth": truth}
+    known |= {"frames": resolved.frames, "seed": resolved.job.render.seed, "warnings": ()}
+    if recovery is None:
+        return {"truth": JobRun(**known).truth_dict()}
+    known |= dict.fromkeys(("photons_before", "photons_after", "before", "after"), np.empty(0))
+    run = RenderRun(**known, recovery=recovery, crosstalk={})
     return {"truth": run.truth_dict(), "recovered": run.recovered_dict()}
 
 
-def true_results(
-    resolved: ResolvedJob, experiment: MonitorExperiment, state: State, frames: int, seed: int, truth: Truth
-) -> dict[str, Any]:
-    """``truth`` of an instrument without a monitor: contents of truth.json; arguments as of `monitor_results`."""
-    run = JobRun(
-        resolved=resolved, experiment=experiment, state=state, frames=frames, seed=seed, truth=truth, warnings=()
-    )
-    return {"truth": run.truth_dict()}
-
-
-@dataclass(frozen=True, eq=False)
-class MonitorRun:
-    """One run.
-
-    Attributes:
-        resolved: its job.
-        state: what its job perturbs.
-        frames, seed: of its exposures.
-    """
-
-    resolved: ResolvedJob
-    state: State
-    frames: int
-    seed: int
+MonitorRun = tuple[ResolvedJob, State]
+"""A job, and what it perturbs."""
 
 
 def _run_together(
@@ -118,30 +75,27 @@ def _run_together(
         alone, and those that are good are done together without it.
     """
     out: list[Outcome] = [Failure("not done")] * len(runs)
-    shared = len({run.seed for run in runs}) == 1
+    frames, seeds = runs[0][0].frames, [resolved.job.render.seed for resolved, _ in runs]
 
     def leave(k: int, why: str) -> None:
         out[k] = Failure(why)
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        own = [runs[k] for k in numbers]
-        if shared:
+        own = [seeds[k] for k in numbers]
+        if len({*seeds}) == 1:
             # the same noise after, and the same frames before, which are then measured once
-            frames, seed = own[0].frames, own[0].seed
-            return before(frames, seed), experiment.frames_after(photons, frames, seed, np.zeros(len(own), int))
+            return before(frames, own[0]), experiment.frames_after(photons, frames, own[0], np.zeros(len(own), int))
         first, after = [], []
-        for part in pieces(len(own), photons[0].size * (own[0].frames + _PATTERN_FRAMES)):
-            seeds = [run.seed for run in own[part]]
-            first.append(experiment.frames_before(own[0].frames, seeds))
-            after.append(experiment.frames_after(photons[part], own[0].frames, seeds, np.zeros(len(seeds), int)))
+        for part in pieces(len(own), photons[0].size * (frames + _PATTERN_FRAMES)):
+            first.append(experiment.frames_before(frames, own[part]))
+            after.append(experiment.frames_after(photons[part], frames, own[part], np.zeros(len(own[part]), int)))
         return np.concatenate(first), np.concatenate(after)
 
-    how = Observing(record, runs[0].resolved.job.analysis.centroid, len(runs), leave=leave)
-    for found in observe(experiment, [run.state for run in runs], how):
+    how = Observing(record, runs[0][0].job.analysis.centroid, len(runs), leave=leave)
+    for found in observe(experiment, [state for _, state in runs], how):
         for j, k in enumerate(found.numbers):
-            run, one = runs[k], slice(j, j + 1)
-            told = found.truth.at(one), found.recovery.at(one)
-            out[k] = monitor_results(run.resolved, experiment, run.state, run.frames, run.seed, *told)
+            (resolved, state), one = runs[k], slice(j, j + 1)
+            out[k] = run_results(resolved, experiment, state, found.truth.at(one), found.recovery.at(one))
     return out
 
 
@@ -154,20 +108,19 @@ def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) 
     tried alone.
     """
     try:
-        truth = experiment.sight.truth([run.state for run in runs])
+        truth = experiment.sight.truth([state for _, state in runs])
     except PHYSICS as error:
         if len(runs) == 1:
             return [Failure(one_line(error))]
         return [found for run in runs for found in _traced_together(experiment, [run])]
     return [
-        true_results(run.resolved, experiment, run.state, run.frames, run.seed, truth.at(slice(k, k + 1)))
-        for k, run in enumerate(runs)
+        run_results(resolved, experiment, state, truth.at(slice(k, k + 1))) for k, (resolved, state) in enumerate(runs)
     ]
 
 
 BLOCK = 25
-"""A run's last digits depend on those that it is traced with, its block; and not on the number of workers, the size
-of the chunks or where a study was interrupted.
+"""A run's last digits depend on those that it is traced with, its block; and not on the number of workers
+or where a study was interrupted.
 """
 KEPT = 4
 """Instruments with their calibration that a worker keeps."""
@@ -176,20 +129,13 @@ KEPT = 4
 class RenderBase:
     """``python -m twin.render``, without the crosstalk tables. It keeps instruments from one block to the next."""
 
+    model: type[Spec] = ResolvedJob
+    block = BLOCK
+
     def __init__(self) -> None:
         self._experiments: OrderedDict[str, MonitorExperiment] = OrderedDict()
         self._before: OrderedDict[tuple[str, int, int], np.ndarray] = OrderedDict()
-        self._makers: OrderedDict[int, JobMaker] = OrderedDict()
-
-    @property
-    def model(self) -> type[Spec]:
-        """A job with all it refers to."""
-        return ResolvedJob
-
-    @property
-    def block(self) -> int:
-        """Number of states that are done together."""
-        return BLOCK
+        self._maker: JobMaker | None = None
 
     def resolve(self, file: Path | str) -> Spec:
         """Read a job with all it refers to. Raises InputError."""
@@ -207,7 +153,9 @@ class RenderBase:
         """Outcome of every run: ``truth`` and ``recovered``; if asked for, also ``quality``, and with a course, stray
         light or targets these.
         """
-        maker = self._maker(tree)
+        if self._maker is None or self._maker.tree is not tree:  # the same object from block to block
+            self._maker = JobMaker(tree)
+        maker = self._maker
         out: list[Outcome | None] = [None] * len(runs)
         groups: dict[tuple[Any, ...], list[tuple[int, MonitorRun]]] = {}
         used: dict[str, MonitorExperiment] = {}
@@ -229,8 +177,8 @@ class RenderBase:
                 out[k] = Failure(one_line(error))
                 continue
             used[name] = experiment
-            work = MonitorRun(resolved, state, resolved.frames, resolved.job.render.seed)
-            groups.setdefault((name, work.frames, resolved.job.analysis.centroid), []).append((k, work))
+            key = (name, resolved.frames, resolved.job.analysis.centroid)
+            groups.setdefault(key, []).append((k, (resolved, state)))
         for (name, *_), members in groups.items():
             experiment = used[name]
 
@@ -241,9 +189,7 @@ class RenderBase:
             done = _run_together(experiment, own, before) if experiment.monitored else _traced_together(experiment, own)
             for (k, _), outcome in zip(members, done, strict=True):
                 out[k] = outcome
-            asked = [
-                (k, work.state, work.resolved.job.render.obstructed) for k, work in members if work.resolved.quality
-            ]
+            asked = [(k, state, resolved.job.render.obstructed) for k, (resolved, state) in members if resolved.quality]
             for obstructed in (True, False):
                 part = [(k, state) for k, state, traced in asked if traced == obstructed]
                 found = _qualities(experiment.instrument, backend, [state for _, state in part], obstructed)
@@ -252,13 +198,6 @@ class RenderBase:
                     if not isinstance(so_far, Failure):
                         out[k] = quality if isinstance(quality, Failure) else {**(so_far or {}), "quality": quality}
         return [outcome if outcome is not None else Failure("not done") for outcome in out]
-
-    def _maker(self, tree: Tree) -> JobMaker:
-        """The tree of a study is the same object from block to block."""
-        if id(tree) not in self._makers or self._makers[id(tree)].tree is not tree:
-            self._makers[id(tree)] = JobMaker(tree)
-            _forget(self._makers)
-        return self._makers[id(tree)]
 
     def _experiment(self, resolved: ResolvedJob, backend: Backend) -> tuple[str, MonitorExperiment]:
         """The instrument with its calibration, and what tells it from others."""
@@ -316,24 +255,21 @@ def _forget(kept: OrderedDict[Any, Any]) -> None:
 
 
 PERTURB = ("job", "perturb")
-Reader = Callable[[object], float]
 
 
 class JobMaker:
     """Jobs of the runs of one study.
 
-    A number under ``perturb`` is read by its field's own validator and put into a copy of the base's job, which takes
-    some 10 us; any other value needs the whole job to be read again, 1 ms.
+    Of a run that changes nothing but numbers under ``perturb`` only the perturbations of these bodies are read again,
+    without their tables of displaced nodes, which a study does not vary; of any other the whole job, which takes some
+    ten times as long.
 
     Args:
         tree: plain data of a ResolvedJob; whatever is changed is there.
     """
 
     def __init__(self, tree: Tree) -> None:
-        self.tree = tree
-        self.base = read_job(tree)
-        self._plain = {path: _numbers(what) for path, what in self.base.job.perturb.items()}
-        self._readers: dict[KeyPath, Reader | None] = {}
+        self.tree, self.base = tree, read_job(tree)
 
     def job(self, values: tuple[tuple[KeyPath, Any], ...]) -> ResolvedJob:
         """The job with these values.
@@ -343,107 +279,24 @@ class JobMaker:
         """
         if not values:
             return self.base
-        readers = [self._reader(key) for key, _ in values]
-        if any(reader is None for reader in readers):
-            return read_job(with_values(self.tree, values))
-        changed: dict[str, dict[str, Any]] = {}
-        for (key, value), reader in zip(values, readers, strict=True):
-            node = str(key[2])
-            if node not in changed:
-                changed[node] = _copy(self._plain[node])
-            assert reader is not None
+        tree, perturb = with_values(self.tree, values), dict(self.base.job.perturb)
+        if any(key[:2] != PERTURB or key[2] not in perturb for key, _ in values):
+            return read_job(tree)
+        for node in {str(key[2]) for key, _ in values}:
+            plain = {name: value for name, value in tree["job"]["perturb"][node].items() if name != "deformation"}
             try:
-                _put(changed[node], key[3:], reader(value))
-            except Problem as problem:
-                issue = Issue(problem.problem, "", None, key, problem.found, problem.allowed, problem.suggestion)
-                raise InputError(issue) from None
-        perturb = dict(self.base.job.perturb)
-        perturb.update({node: _spec(parts) for node, parts in changed.items()})
+                changed = PerturbationSpec.model_validate(plain)
+            except ValidationError:
+                return read_job(tree)  # which says where it is wrong
+            perturb[node] = changed.model_copy(update={"deformation": perturb[node].deformation})
         job = self.base.job.model_copy(update={"perturb": FrozenMap(perturb)})
         return self.base.model_copy(update={"job": job})
-
-    def _reader(self, key: KeyPath) -> Reader | None:
-        if key not in self._readers:
-            inside = key[:2] == PERTURB and len(key) > 3 and key[2] in self._plain
-            quantity = quantity_at(PerturbationSpec, key[3:]) if inside else None
-            self._readers[key] = quantity.parse if quantity is not None else None
-        return self._readers[key]
 
 
 def read_job(tree: Tree) -> ResolvedJob:
     """The job that plain data describe. Raises InputError."""
     resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", tree, {}))
     return resolved
-
-
-def quantity_at(model: type[Spec], key: KeyPath) -> Quantity | None:
-    """The quantity that a model has at ``key``: a field, a component of a vector, an entry of a mapping; else None."""
-    for k, part in enumerate(key):
-        owner = annotation_at(model, key[:k])
-        if isinstance(owner, type) and issubclass(owner, BaseModel) and part in owner.model_fields:
-            metadata, rest = owner.model_fields[str(part)].metadata, key[k + 1 :]
-            for item in metadata:
-                if isinstance(item, Quantity) and not rest:
-                    return item
-                if isinstance(item, Vector) and len(rest) == 1:
-                    return item.of
-        elif k == len(key) - 1:
-            return _of_mapping(model, key[:k])
-    return None
-
-
-def _of_mapping(model: type[Spec], key: KeyPath) -> Quantity | None:
-    """The quantity that the entries of the mapping at ``key`` are: ``Annotated[float, Quantity(...)]``."""
-    arguments = getattr(annotation_at(model, key), "__args__", ())
-    metadata = getattr(arguments[-1], "__metadata__", ()) if arguments else ()
-    return next((item for item in metadata if isinstance(item, Quantity)), None)
-
-
-def _numbers(what: PerturbationSpec) -> dict[str, Any]:
-    """A perturbation as nested dictionaries and lists of SI numbers, and its deformation as it is."""
-    heat = what.temperature
-    return {
-        "rotate": list(what.rotate),
-        "shift": list(what.shift),
-        "pivot": what.pivot,
-        "figure": dict(what.figure),
-        **{name: getattr(what, name) for name in ("scale", "radius", "conic", "index", "abbe")},
-        "temperature": None if heat is None else {**dict(heat), "gradient": list(heat.gradient)},
-        "deformation": what.deformation,
-    }
-
-
-def _copy(parts: Mapping[str, Any]) -> dict[str, Any]:
-    heat = parts["temperature"]
-    return {
-        **parts,
-        "rotate": list(parts["rotate"]),
-        "shift": list(parts["shift"]),
-        "figure": dict(parts["figure"]),
-        "temperature": None if heat is None else {**heat, "gradient": list(heat["gradient"])},
-    }
-
-
-def _put(parts: Any, key: KeyPath, value: float) -> None:
-    for part in key[:-1]:
-        parts = parts[part]
-    parts[key[-1]] = value
-
-
-def _spec(parts: Mapping[str, Any]) -> PerturbationSpec:
-    # every number has been read by its own validator, and no validator of the class looks at several at once
-    heat = parts["temperature"]
-    return PerturbationSpec.model_construct(
-        rotate=tuple(parts["rotate"]),
-        shift=tuple(parts["shift"]),
-        pivot=parts["pivot"],
-        figure=FrozenMap(parts["figure"]),
-        **{name: parts[name] for name in ("scale", "radius", "conic", "index", "abbe")},
-        temperature=None
-        if heat is None
-        else TableTemperatureSpec.model_construct(**{**heat, "gradient": tuple(heat["gradient"])}),
-        deformation=parts["deformation"],
-    )
 
 
 def _needs_more(job: JobSpec) -> bool:

@@ -6,7 +6,7 @@ import csv
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +27,7 @@ from scenes.yaml.spec import Source, Spec, validate
 from twin.run.provenance import source_digest, versions
 from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, says_nothing, with_place, with_values
 
+PROGRAM = "twin.study"
 BY_NAME = ("instrument", "disturbances")
 """Keys of a job whose files are parts of the resolved base, beside the job; a change of the name would change nothing.
 """
@@ -286,46 +287,43 @@ def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, 
     """The named columns of a CSV file, each with the key at which it is named; row by row, so that no more of the file
     than these and its text is held.
     """
+
+    def wrong(text: str, allowed: str) -> InputError:
+        return study.error(text, (*key, "file"), allowed=allowed)
+
+    def checked(number: int, cells: Sequence[str]) -> None:
+        if any(yaml_file.UNWRITABLE.search(cell) for cell in cells):
+            raise wrong(f"row {number} of the table {path}: {yaml_file.NO_TEXT}", yaml_file.WRITABLE)
+
     if not is_file(path):
-        raise study.error(unusable(path), (*key, "file"), allowed="a CSV file, relative to this file")
-    rows = csv.reader(lines_of(table_text(path, most=LARGEST_TABLE)))
+        raise wrong(unusable(path), "a CSV file, relative to this file")
+    rows = (row for row in csv.reader(lines_of(table_text(path, most=LARGEST_TABLE))) if row)
     columns: dict[str, list[Any]] = {}
     try:
-        heads = [head.strip() for head in next((row for row in rows if row), [])]
-        missing = next((column for column in named if column not in heads), None)
-        if missing is not None and heads:
-            meant = nearest(missing, heads)
-            text = "no such column"
-            raise study.error(
-                text, (*named[missing], "column"), found=missing, allowed=names_text(heads), suggestion=meant
-            )
-        if any(yaml_file.UNWRITABLE.search(head) for head in heads):
-            raise study.error(
-                f"row 1 of the table {path}: {yaml_file.NO_TEXT}", (*key, "file"), allowed=yaml_file.WRITABLE
-            )
+        heads = [head.strip() for head in next(rows, [])]
+        if heads and (missing := [column for column in named if column not in heads]):
+            text, allowed, meant = "no such column", names_text(heads), nearest(missing[0], heads)
+            place = (*named[missing[0]], "column")
+            raise study.error(text, place, found=missing[0], allowed=allowed, suggestion=meant)
+        checked(1, heads)
         # of columns of one name the last
         places = {head: k for k, head in enumerate(heads) if head in named}
         columns = {head: [] for head in places}
         most = MOST_CELLS // max(len(places), 1)
-        for number, row in enumerate((row for row in rows if row), 2):
+        for number, row in enumerate(rows, 2):
             if len(row) != len(heads):
                 text = f"row {number} of the table {path} has {len(row)} cells, the first {len(heads)}"
-                raise study.error(text, (*key, "file"), allowed="as many cells in every row as names in the first")
+                raise wrong(text, "as many cells in every row as names in the first")
             if number > most + 1:
-                text = f"the table {path} has too many rows for a study"
                 allowed = f"at most {most} with {len(places)} of its columns; draw from a distribution beyond that"
-                raise study.error(text, (*key, "file"), allowed=allowed)
-            if any(yaml_file.UNWRITABLE.search(row[k]) for k in places.values()):
-                raise study.error(
-                    f"row {number} of the table {path}: {yaml_file.NO_TEXT}", (*key, "file"), allowed=yaml_file.WRITABLE
-                )
+                raise wrong(f"the table {path} has too many rows for a study", allowed)
+            checked(number, [row[k] for k in places.values()])
             for head, k in places.items():
                 columns[head].append(_cell(row[k]))
     except csv.Error as error:
-        text = f"the table {path} cannot be read: {error}"
-        raise study.error(text, (*key, "file"), allowed="a CSV file") from None
+        raise wrong(f"the table {path} cannot be read: {error}", "a CSV file") from None
     if not any(columns.values()):
-        raise study.error(f"the table {path} has no rows", (*key, "file"), allowed="names, then a row or more")
+        raise wrong(f"the table {path} has no rows", "names, then a row or more")
     return columns
 
 

@@ -1,1 +1,0 @@
-"""The Jacobian of a study's responses by its factors."""

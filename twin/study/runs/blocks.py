@@ -1,0 +1,346 @@
+"""The blocks of a study that are not there yet, computed by worker processes: first one that tells how long all take.
+
+A worker evaluates whole blocks, on one thread. A finished block is in the study's journal before it counts.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from optics.numerics.backend import ONE_THREAD, Backend, kernel_threads, load_backend
+from scenes.specs.study import NOISE, TOTAL
+from scenes.yaml.errors import InputError, KeyPath, Problem, key_text
+from twin.run import cluster
+from twin.run.cli import Incomplete, time_text
+from twin.run.journal import Journal
+from twin.run.memory import largest_memory
+from twin.run.provenance import source_digest
+from twin.study.runs import base_job
+from twin.study.runs.base_job import BlockResult, Failure, Run
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import StudySetup, study_from_text
+
+BLOCKS = "blocks.journal"
+"""The journal in the folder of a study."""
+LONGEST_REPEAT = 4.0
+"""Seconds: a first block that took longer is not evaluated again for the sake of its time."""
+_ALONE = threading.Lock()
+"""A worker that has several threads still evaluates one block at a time: Dr.Jit's state belongs to the process."""
+
+
+class OtherProgramError(Exception):
+    """The worker does not run the program that the study was started with."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A block of a study with all that a worker needs for it.
+
+    Attributes:
+        config: text of the study's config.yaml.
+        source: checksum of the program's source files, which the worker's must have too.
+        backend: where to trace.
+        runs: of the block.
+    """
+
+    config: str
+    source: str
+    backend: str
+    runs: tuple[Run, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Pilot:
+    """The first block of a study.
+
+    Attributes:
+        result: of the block; its seconds are those of a second evaluation, with everything compiled and calibrated.
+        sample: all results of the first run that did not fail, None if all did.
+        start_seconds: what the first evaluation took longer.
+        memory: largest that the worker's process has been, bytes.
+        refusal: why the study cannot be run at all.
+    """
+
+    result: BlockResult
+    sample: Mapping[str, Any] | None
+    start_seconds: float
+    memory: float
+    refusal: InputError | None = None
+
+
+def evaluate(task: Task) -> BlockResult:
+    """Results of a block. A fault of the program is raised with the runs' numbers in its notes."""
+    with _ALONE:
+        return _block(*_prepared(task), task.runs)[0]
+
+
+def pilot(task: Task) -> Pilot:
+    """Evaluate one block, twice: the first time the instrument is built and kernels are compiled.
+
+    The second evaluation gives the same numbers; it is the one that is timed and kept.
+    """
+    with _ALONE:
+        start = time.monotonic()
+        setup, backend = _prepared(task)
+        try:
+            setup.job.check(setup.tree, backend)
+        except InputError as error:
+            return Pilot(BlockResult.of([], setup.study.responses), None, 0.0, 0.0, setup.blamed(error))
+        result, sample = _block(setup, backend, task.runs)
+        first = time.monotonic() - start
+        if first > 0.5 and result.seconds < LONGEST_REPEAT:
+            result, sample = _block(setup, backend, task.runs)
+        return Pilot(result, sample, max(0.0, first - result.seconds), largest_memory())
+
+
+def _block(setup: StudySetup, backend: Backend, runs: Sequence[Run]) -> tuple[BlockResult, Mapping[str, Any] | None]:
+    start = time.monotonic()
+    try:
+        outcomes = setup.job.evaluate(setup.tree, runs, backend)
+    except Exception as error:
+        error.add_note(f"in runs {runs[0].number} to {runs[-1].number}")
+        raise
+    sample = next((outcome for outcome in outcomes if not isinstance(outcome, Failure)), None)
+    return BlockResult.of(outcomes, setup.study.responses, time.monotonic() - start), sample
+
+
+def _prepared(task: Task) -> tuple[StudySetup, Backend]:
+    if task.source != source_digest():
+        raise OtherProgramError("the worker has other source files than the command: changed since it was started?")
+    _one_thread()
+    return _setup(task.config), load_backend(task.backend)
+
+
+@lru_cache(maxsize=2)
+def _setup(config: str) -> StudySetup:
+    return study_from_text(config)
+
+
+def _one_thread() -> None:
+    """Let this process do everything on the thread that asks for it; workers are as many as there are cores.
+
+    For workers that somebody else has started the environment comes too late, so the libraries are told as well; again
+    for every block, since some are loaded only when they are needed.
+    """
+    from threadpoolctl import ThreadpoolController
+
+    from optics.numerics.llvm import ensure_llvm
+
+    os.environ.update(ONE_THREAD)
+    ensure_llvm()
+    import cv2
+    import scipy.linalg  # noqa: F401 (it brings linear algebra of its own, which is then limited with the rest)
+
+    ThreadpoolController().limit(limits=1)
+    cv2.setNumThreads(1)
+    kernel_threads(1)
+
+
+def journal_of(setup: StudySetup, file: Path | None, noun: str = "study") -> Journal:
+    """The journal of a study's blocks.
+
+    Args:
+        setup: the study.
+        file: of the journal, None to keep nothing.
+        noun: what the study is, for messages.
+    """
+    return Journal(file, setup.content, noun, (BlockResult,))
+
+
+@dataclass(eq=False)
+class Engine:
+    """Computes the blocks of a study that are not in its journal.
+
+    Attributes:
+        plan: all runs.
+        journal: of the study's blocks, open.
+        backend: where to trace.
+        advance: told the number of runs that are there, and of all.
+        say: told how long it will take, once the first block is there.
+        warn: told what the user should know.
+        computed: number of runs that this engine has computed.
+        seconds: that it took for them.
+    """
+
+    plan: Plan
+    journal: Journal
+    backend: str = "llvm"
+    advance: Callable[[int, int], None] = lambda done, total: None
+    say: Callable[[str], None] = lambda text: None
+    warn: Callable[[str], None] = lambda text: None
+    computed: int = 0
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Tell of what the journal has lost."""
+        if lost := self.journal.damaged:
+            lines = "1 line of it is" if lost == 1 else f"{lost} lines of it are"
+            self.warn(f"{self.journal.file}: {lines} corrupt; what it held is computed again")
+
+    def _known(self, block: int) -> BlockResult | None:
+        """The results of a block if it is there."""
+        found = self.journal.known.get(str(block))
+        shape = len(self.plan.block(block)), len(self.plan.setup.study.responses)
+        return found if isinstance(found, BlockResult) and found.fits(shape) else None
+
+    @property
+    def missing(self) -> list[int]:
+        """Numbers of the blocks that are not there, in order."""
+        return [block for block in range(self.plan.blocks) if self._known(block) is None]
+
+    def result(self) -> BlockResult:
+        """Results of all runs, in order; all blocks must be there."""
+        return BlockResult.joined([found for block in range(self.plan.blocks) if (found := self._known(block))])
+
+    def run(self, workers: cluster.Workers, own_memory: float = 0.0) -> None:
+        """Compute whatever is missing.
+
+        Args:
+            workers: who computes.
+            own_memory: of this process, bytes, for the estimate.
+
+        Raises:
+            InputError: the base cannot be run as it is, or a response's key leads nowhere in its results.
+            Incomplete: workers died again and again in some runs; or any error but those that say that a run cannot
+                be. What is done is kept.
+            ClusterError: the scheduler is gone.
+            RunFolderError: a block cannot be kept.
+        """
+        started = time.monotonic()
+        missing = self.missing
+        if not missing:
+            return
+        there = self.plan.runs - self._runs(missing)
+        first = self._first(workers, missing[0])
+        self._estimate(first, missing, there, max(1, workers.count), own_memory)
+        self.advance(there + self.computed, self.plan.runs)
+        suspects = self._all(workers, missing[1:], there)
+        # a block is blamed only when it is alone, for the scheduler suspects all that a worker had when it died
+        if bad := [block for suspect in suspects for block in self._all(workers, [suspect], there)]:
+            parts = ", ".join(f"{runs.start}-{runs.stop - 1}" for runs in map(self.plan.block, bad))
+            raise Incomplete(f"not computed: runs {parts} (the workers died)")
+        self.seconds = time.monotonic() - started
+
+    def _runs(self, blocks: Sequence[int]) -> int:
+        return sum(len(self.plan.block(block)) for block in blocks)
+
+    def _estimate(self, first: Pilot, missing: Sequence[int], there: int, workers: int, own_memory: float) -> None:
+        """Tell what the study will take, by its first block."""
+        runs = self._runs(missing)
+        each = first.result.seconds / len(first.result.messages)
+        seconds = -(-(len(missing) - 1) // workers) * first.result.seconds + first.start_seconds * (workers > 1)
+        memory, limit = own_memory + workers * first.memory, self.plan.setup.study.limits
+        if memory > limit.bytes:
+            self.warn(
+                f"the processes need about {1e-9 * memory:.1f} GB, more than the study's {limit.memory}; use fewer "
+                "--workers"
+            )
+        self.say(
+            f"{runs} runs{f' ({there} are there already)' if there else ''} in {len(missing)} blocks on {workers} "
+            f"worker{'s' if workers > 1 else ''}; about {time_text(seconds)}, {1e-9 * memory:.1f} GB; "
+            f"{1e3 * each:.3g} ms a run"
+        )
+
+    def _first(self, workers: cluster.Workers, block: int) -> Pilot:
+        """Do the first block and see whether the results hold what is asked for."""
+        ((_, future),) = next(workers.each(pilot, [self.task(block)]))
+        if future.status != "finished":
+            if cluster.killed(future.exception()):
+                runs = self.plan.block(block)
+                raise Incomplete(f"the workers died in the first block, runs {runs.start}-{runs.stop - 1}")
+            raise _fault(future)
+        first: Pilot = future.result()
+        if first.refusal is not None:
+            raise first.refusal
+        if first.sample is not None:
+            check_responses(self.plan.setup, first.sample)
+        else:
+            self.warn(f"all runs of the first block fail: {first.result.messages[0]}")
+        self._keep({block: first.result})
+        return first
+
+    def _all(self, workers: cluster.Workers, blocks: Sequence[int], there: int) -> list[int]:
+        """Compute blocks; return those in which workers died."""
+        lost = []
+        for finished in workers.each(evaluate, map(self.task, blocks)):
+            self._keep({blocks[k]: future.result() for k, future in finished if future.status == "finished"})
+            self.advance(there + self.computed, self.plan.runs)
+            for k, future in finished:
+                if future.status != "finished":
+                    if not cluster.killed(future.exception()):
+                        raise _fault(future)
+                    lost.append(blocks[k])
+        return lost
+
+    def _keep(self, results: Mapping[int, BlockResult]) -> None:
+        self.journal.keep({str(block): result for block, result in results.items()})
+        self.computed += self._runs([*results])
+
+    def task(self, block: int) -> Task:
+        """What a worker is given of a block."""
+        runs = tuple(self.plan.run(number) for number in self.plan.block(block))
+        return Task(self.plan.config, source_digest(), self.backend, runs)
+
+
+def _fault(future: Any) -> Incomplete:
+    """What is raised for a task that has failed otherwise than by the death of its worker."""
+    error = future.exception()
+    notes = " ".join(getattr(error, "__notes__", ()))
+    text = f"{type(error).__name__}: {error} {notes}".strip()
+    if isinstance(error, OtherProgramError):
+        return Incomplete(text)
+    trace = "".join(traceback.format_exception(type(error), error, future.traceback()))
+    return Incomplete(f"the program failed: {text}", trace)
+
+
+def check_responses(setup: StudySetup, sample: Any) -> None:
+    """Check that the results hold every response of a study.
+
+    Args:
+        setup: the study.
+        sample: results of one run, by file.
+
+    Raises:
+        InputError: one that they do not, with what there is.
+    """
+    for name, response in setup.study.responses.items():
+        asked = {"key": response.key, "sigma": response.sigma, "noise": response.noise, "minus": response.minus}
+        for key, path in asked.items():
+            if path is None:
+                continue
+            try:
+                base_job.check_response(sample, path)
+            except Problem as problem:
+                place: KeyPath = ("responses", name, key)
+                text = f"the results of {setup.study.base.command!r} do not have this: {problem.problem}"
+                restated = Problem(text, problem.found, problem.allowed, problem.suggestion, problem.within)
+                raise setup.error(restated, place) from None
+            if key == "noise":
+                _check_noise(setup, sample, name, path)
+
+
+def _check_noise(setup: StudySetup, sample: Any, name: str, path: KeyPath) -> None:
+    """Check that the noise of a response is not a total standard deviation beside which that of noise stands.
+
+    Raises:
+        InputError: it is.
+    """
+    place = max((k for k, part in enumerate(path) if isinstance(part, str)), default=0)
+    named = str(path[place])
+    own = (*path[:place], f"{named.removesuffix(TOTAL)}{NOISE}", *path[place + 1 :])
+    if named.endswith(NOISE):
+        return
+    try:
+        base_job.leaf(sample, own)
+    except Problem:
+        return
+    text = "not the noise alone, which stands beside it"
+    raise setup.error(Problem(text, key_text(path), key_text(own)), ("responses", name, "noise"))
