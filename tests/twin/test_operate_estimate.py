@@ -26,8 +26,7 @@ from tests.twin.operation_records import (
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate import operation as operation_module
-from twin.operate.estimate.alarms import alarms_of
-from twin.operate.estimate.following import Course, beyond, widening
+from twin.operate.estimate.following import Course, alarms_of, beyond, widening
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.standing import Scores, Sensor, Standing
 from twin.operate.operated_block import posterior

@@ -21,7 +21,7 @@ from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import share_interval
 from optics.numerics.frozen_map import FrozenMap
-from twin.operate.estimate.alarms import name_of, percent
+from twin.operate.estimate.following import name_of, percent
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of
 from twin.operate.record.schema import ENTRY, SOURCE
@@ -48,11 +48,11 @@ def first_time(history: History) -> int:
     return int(found or 0)
 
 
-def last_time(history: History) -> int | None:
-    """Time of the newest reading of the monitor, microseconds of TAI since 2000; None without any."""
+def last_time(history: History) -> int:
+    """Time of the newest reading of the monitor, microseconds of TAI since 2000; 0 without any."""
     with history.reading() as connection:
         found = connection.execute(select(func.max(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)).scalar()
-    return None if found is None else int(found)
+    return int(found or 0)
 
 
 def readings(history: History, begin: int, end: int, most: int) -> list[dict[str, Any]]:

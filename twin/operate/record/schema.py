@@ -37,8 +37,8 @@ from sqlalchemy import (
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, IntegrityError, NoSuchModuleError
 
+from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
 from twin.operate.record.entries import digest_of_data, utc_text
-from twin.operate.record.place import NotARecord, RecordFailed, file_of, require_file
 
 VERSION = 4
 LAST_CHECKED = 500

@@ -11,19 +11,18 @@ from typing import Any
 
 from optics.numerics.backend import Backend
 from scenes.specs.operation import EVENTS, OperationSetup, read_operation
-from scenes.yaml.errors import KeyPath, Problem, unknown
+from scenes.yaml.errors import KeyPath, unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, SCALE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.operation_model import keep_plan, read_plan
-from twin.operate.lives.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
-from twin.operate.record.entries import one_line, utc_text
+from twin.operate.record.entries import utc_text
 from twin.operate.record.history import History, initialised
-from twin.operate.record.run_readings import CONFIG
-from twin.operate.record.sources import moment_said
 from twin.operate.record.taking import Taken
-from twin.operate.record.telemetry import read_table_file, read_telemetry, tables_of
+from twin.operate.record.telemetry import CONFIG, read_table_file, read_telemetry, tables_of
+from twin.operate.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
+from twin.operate.terminal import moment_said, problems_of
 from twin.run.cli import InputErrorText
 from twin.run.durable import write_safely
 from twin.run.memory import Lowered, require_memory
@@ -134,10 +133,8 @@ def _words(several: Mapping[str, Sequence[str]]) -> Iterator[str]:
 
 
 def _quantity(option: str, text: str, kind: Kind) -> float:
-    try:
+    with problems_of(option):
         return parse_quantity(text, kind)
-    except Problem as problem:
-        raise InputErrorText(f"{option}: {one_line(problem)}") from None
 
 
 def _at(option: str, text: str, known: Collection[str] | None = None) -> tuple[str, int]:
@@ -152,8 +149,9 @@ def _at(option: str, text: str, known: Collection[str] | None = None) -> tuple[s
 
 def _known(option: str, name: str, names: Collection[str]) -> None:
     """Raises InputErrorText: none of these names."""
-    if name not in names:
-        raise InputErrorText(f"{option}: {one_line(unknown('no such name', name, sorted(names)))}")
+    with problems_of(option):
+        if name not in names:
+            raise unknown("no such name", name, sorted(names))
 
 
 class _Options:
@@ -184,6 +182,8 @@ def simulate_into(places: Places, what: Simulation, backend: Backend, advance: A
     plan, target = places.read(), places.folder
     readings = len(what.times)
     require_memory(Lowered(_Options(), ("--every",), readings, "readings", lambda count: count * _READING))
+    if places.out is not None:  # what is there is told before there is a record, which is never altered
+        RunFolder(places.out, places.force)
     advance(CALIBRATE, 0, 1)
     experiment = MonitorExperiment(plan.model, backend)
     experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
