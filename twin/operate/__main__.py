@@ -38,21 +38,12 @@ from twin.operate.terminal import (
     moment_said,
     on_record,
     require_new,
+    show_table,
     tell,
     told,
 )
 from twin.run import durable
-from twin.run.cli import (
-    INTERRUPTED,
-    AsJson,
-    InputErrorText,
-    Quiet,
-    Strict,
-    end_strictly,
-    print_verdict,
-    print_whole,
-    result_table,
-)
+from twin.run.cli import INTERRUPTED, AsJson, InputErrorText, Quiet, Strict, end_strictly, print_verdict
 
 if TYPE_CHECKING:
     from twin.operate.record.history import History
@@ -332,12 +323,8 @@ def _show(data: dict[str, Any], console: Console) -> None:
     )
     for text in data["warnings"]:
         line(console, f"warning: {text}")
-    table = result_table()
-    for head in ("kind", "of", "entries", "first [UTC]", "last [UTC]"):
-        table.add_column(head, justify="right" if head == "entries" else "left")
-    for one in data["streams"]:
-        table.add_row(one["kind"], one["subject"], str(one["entries"]), one["first_utc"], one["last_utc"])
-    print_whole(console, table)
+    rows = ([str(value) for value in one.values()] for one in data["streams"])
+    show_table(console, ("kind", "of", "entries", "first [UTC]", "last [UTC]"), rows, (2,))
     for one in data["refused"]:
         at = "" if one["line"] is None else f":{one['line']}"
         since = " (taken since)" if one["taken_since"] else ""

@@ -10,9 +10,19 @@ import typer
 from rich.console import Console
 
 from scenes.yaml.standard_output import FAILURE, print_error
-from twin.operate.terminal import Call, NewFolder, PlanFile, line, moment_said, on_record, problems_of, require_new
+from twin.operate.terminal import (
+    Call,
+    NewFolder,
+    PlanFile,
+    line,
+    moment_said,
+    on_record,
+    problems_of,
+    require_new,
+    show_table,
+)
 from twin.run import durable
-from twin.run.cli import InputErrorText, print_verdict, print_whole, result_table
+from twin.run.cli import InputErrorText, print_verdict
 
 if TYPE_CHECKING:
     from analysis.monitor.detection_power import Power
@@ -310,25 +320,20 @@ def _show_course(course: Course, console: Console) -> None:
     """A row for each quantity, a column for each time."""
     from twin.operate.estimate.following import name_of, sized
 
-    table = result_table()
-    table.add_column("change of")
-    for time in course.utc:
-        table.add_column(time, justify="right")
+    utc = course.utc
+    rows = []
     for k, one in enumerate(course.quantities):
         cells = zip(course.values[:, k].tolist(), course.sigmas[:, k].tolist(), strict=True)
-        unit = one.parameter.unit
-        table.add_row(name_of(f"{one.group} {one.key}", course.quantities), *(sized(v, s, unit) for v, s in cells))
-    print_whole(console, table)
+        name = name_of(f"{one.group} {one.key}", course.quantities)
+        rows.append([name, *(sized(v, s, one.parameter.unit) for v, s in cells)])
+    show_table(console, ("change of", *utc), rows, range(1, len(utc) + 1))
 
 
 def show_power(found: Sequence[Power], console: Console) -> None:
     """A row for each body: the smallest jumps that are found, over the stated sizes."""
-    table = result_table()
-    for head in ("smallest jump found, over the stated", *(key.replace("_", " ") for key in found[0].plain)):
-        table.add_column(head)
-    for one in found:
-        table.add_row(one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values()))
-    print_whole(console, table)
+    heads = ("smallest jump found, over the stated", *(key.replace("_", " ") for key in found[0].plain))
+    sizes = ([one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values())] for one in found)
+    show_table(console, heads, sizes, ())
 
 
 def show_requirements(following: Following, console: Console) -> None:
@@ -339,17 +344,18 @@ def show_requirements(following: Following, console: Console) -> None:
 
     if not following.breaks:
         return
-    table = result_table()
-    for head in ("has to keep", "limit", "chance beyond", "allowed", "holds now", "expected to break"):
-        table.add_column(head, justify="left" if head in ("has to keep", "holds now") else "right")
+    rows = []
     for one in following.breaks:
         later = "now" if not one.holds_now else "not in the horizon"
-        table.add_row(
-            name_of(one.quantity, following.now.quantities),
-            f"{plain(one.limit)} {one.unit}",
-            percent(one.chance_now),
-            percent(1.0 - one.probability),
-            "yes" if one.holds_now else "no",
-            utc_text(one.breaks_us) if one.holds_now and one.breaks_us is not None else later,
+        rows.append(
+            [
+                name_of(one.quantity, following.now.quantities),
+                f"{plain(one.limit)} {one.unit}",
+                percent(one.chance_now),
+                percent(1.0 - one.probability),
+                "yes" if one.holds_now else "no",
+                utc_text(one.breaks_us) if one.holds_now and one.breaks_us is not None else later,
+            ]
         )
-    print_whole(console, table)
+    heads = ("has to keep", "limit", "chance beyond", "allowed", "holds now", "expected to break")
+    show_table(console, heads, rows, (1, 2, 3, 5))

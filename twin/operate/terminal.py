@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
@@ -17,7 +17,7 @@ from scenes.yaml.errors import Problem
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
 from twin.run import durable
-from twin.run.cli import AsJson, InputErrorText, Quiet, Standing, explained, heartbeat
+from twin.run.cli import AsJson, InputErrorText, Quiet, Standing, explained, heartbeat, print_whole, result_table
 
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup
@@ -99,6 +99,16 @@ def tell(errors: Console, as_json: bool, quiet: bool, data: Any, show: Callable[
 def line(console: Console, text: str) -> None:
     """Print a line as it is."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def show_table(console: Console, heads: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int]) -> None:
+    """Print a table, the columns of these numbers flush right."""
+    table = result_table()
+    for k, head in enumerate(heads):
+        table.add_column(head, justify="right" if k in right else "left")
+    for row in rows:
+        table.add_row(*row)
+    print_whole(console, table)
 
 
 @dataclass(frozen=True)

@@ -70,8 +70,20 @@ class Course:
         return out
 
 
+class _Dated:
+    """Data of which fields ``..._us`` are ``..._utc`` in plain data."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        out = vars(self).copy()
+        for key in [one for one in out if one.endswith("_us")]:
+            time = out.pop(key)
+            out[f"{key.removesuffix('us')}utc"] = None if time is None else utc_text(time)
+        return out
+
+
 @dataclass(frozen=True)
-class FoundJump:
+class FoundJump(_Dated):
     """A jump that was told.
 
     Attributes:
@@ -98,13 +110,8 @@ class FoundJump:
     def to_dict(self) -> dict[str, Any]:
         """Plain data."""
         return {
-            "body": self.body,
-            "after_utc": utc_text(self.after_us),
-            "until_utc": utc_text(self.until_us),
-            "told_utc": utc_text(self.told_us),
+            **super().to_dict(),
             "sizes": [{"name": n, "unit": u, "size": z, "sigma": s} for n, u, z, s in self.sizes],
-            "log_ratio": self.log_ratio,
-            "false_alarm": self.false_alarm,
             "rivals": [{"body": body, "log_ratio": ratio} for body, ratio in self.rivals.items()],
             "carried": [
                 {
@@ -122,7 +129,7 @@ class FoundJump:
 
 
 @dataclass(frozen=True)
-class SensorState:
+class SensorState(_Dated):
     """What a sensor of temperature is worth.
 
     Attributes:
@@ -138,14 +145,9 @@ class SensorState:
     last_us: int
     reason: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
-        times = {"since_utc": utc_text(self.since_us), "last_utc": utc_text(self.last_us)}
-        return {"body": self.body, "state": self.state, "reason": self.reason, **times}
-
 
 @dataclass(frozen=True)
-class Break:
+class Break(_Dated):
     """A requirement.
 
     Attributes:
@@ -163,11 +165,6 @@ class Break:
     chance_now: float
     holds_now: bool
     breaks_us: int | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
-        own = {key: value for key, value in vars(self).items() if key != "breaks_us"}
-        return {**own, "breaks_utc": None if self.breaks_us is None else utc_text(self.breaks_us)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,25 +252,24 @@ class Following:
             "warnings": self.warnings,
             "now": self.now.to_dict(),
             "scores": vars(self.scores),
-            "innovations": [
-                {"time_utc": utc_text(t), "chi_square": square, "degrees_of_freedom": degrees}
-                for t, square, degrees in self.innovations
-            ],
+            "innovations": _rows("chi_square degrees_of_freedom", self.innovations),
             "jumps": [one.to_dict() for one in self.jumps],
-            "events": [{"time_utc": utc_text(t), "name": name, "causes": list(c)} for t, name, c in self.events],
+            "events": _rows("name causes", self.events),
             "sensors": [one.to_dict() for one in self.sensors],
-            "left_out": [
-                {"time_utc": utc_text(t), "kind": kind, "subject": subject, "reason": reason}
-                for t, kind, subject, reason in self.left_out
-            ],
+            "left_out": _rows("kind subject reason", self.left_out),
             "explained": {name: share if np.isfinite(share) else None for name, share in self.explained.items()},
             "widened": self.widened,
             "too_many_jumps": self.too_many_jumps,
-            "bad_readings": [{"time_utc": utc_text(t), "reason": reason} for t, reason in self.bad_readings],
+            "bad_readings": _rows("reason", self.bad_readings),
             "undecided": self.undecided,
             "too_small": list(self.too_small),
             "requirements": [one.to_dict() for one in self.breaks],
         }
+
+
+def _rows(keys: str, rows: Sequence[tuple[Any, ...]]) -> list[dict[str, Any]]:
+    """Plain data of rows that begin with their time."""
+    return [dict(zip(("time_utc", *keys.split()), (utc_text(t), *rest), strict=True)) for t, *rest in rows]
 
 
 def beyond(value: Array, sigma: Array, limit: float) -> Array:

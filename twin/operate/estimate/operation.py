@@ -138,9 +138,9 @@ class Operation:
         reference = np.array([(self._before[spot]["row"], self._before[spot]["column"]) for spot in self.model.spots])
         return Taking(self.model, how, self.epoch, reference, self.history.temperature)
 
-    def _moments(self, after_us: int | None, until_us: int | None = None) -> Iterator[list[dict[str, Any]]]:
+    def _moments(self, after_us: int | None) -> Iterator[list[dict[str, Any]]]:
         """Entries that are used, those of one time together, in the order of time."""
-        own = (one for one in self.history.entries(after_us=after_us, until_us=until_us) if one["kind"] in USED)
+        own = (one for one in self.history.entries(after_us=after_us) if one["kind"] in USED)
         for _, together in groupby(own, key=lambda one: int(one["time_us"])):
             yield [{**one, "content": content_of(one), "decided": self._decisions.get(one["id"])} for one in together]
 
@@ -521,7 +521,9 @@ class Operation:
             kept = self.history.checkpoint(self.key, before_us=time, valid=True)
             if kept is None:
                 return None
-            earlier = [self.epoch + int(one.jump.chances[0][0] * MICRO) for one in last.jumps if one.time > kept.time]
-            if not earlier or min(earlier) >= kept.time:
+            earlier = [
+                self.epoch + int(one.jump.chances[0][0] * MICRO) for one in last.jumps if one.time > kept.time_us
+            ]
+            if not earlier or min(earlier) >= kept.time_us:
                 return Standing.from_bytes(kept.content)
             time = min(earlier)
