@@ -29,10 +29,9 @@ from scenes.yaml.input_file import is_file, why_unreadable
 from twin.export.result_tables import result_tables
 from twin.run.artefact import Cell, Table
 from twin.run.data_files import TABLE_FORMATS, WRITER, DataTable, MissingPackage, ascii_text, read_netcdf
-from twin.run.owned_files import MANIFEST
 from twin.run.procedure import Advance
 from twin.run.report import Report, Section
-from twin.run.run_folder import Manifest, RunFolder, altered, read_manifest
+from twin.run.run_folder import Manifest, RunFolder, altered, finished_manifest
 
 Card = tuple[str, str | int | float, str]
 """Keyword, value, and what it is with its unit in brackets."""
@@ -277,22 +276,15 @@ class Exported:
     described: tuple[DataTable, ...]
     changed: tuple[str, ...]
 
-    @property
-    def kind(self) -> str:
-        """Kind of the run."""
-        return " ".join(filter(None, (self.manifest.program, self.manifest.test)))
-
     def numbers(self) -> dict[str, Any]:
         """Contents of files.json."""
         tables = {
-            table.name: {
-                column.name: {"unit": column.unit, "description": column.description} for column in table.columns
-            }
+            table.name: {one.name: {"unit": one.unit, "description": one.description} for one in table.columns}
             for table in self.described
         }
         return {
             "run": str(self.run),
-            "of": self.kind,
+            "of": self.manifest.kind,
             "frames": self.frames,
             "tables": self.tables,
             "files": [vars(one) for one in self.files],
@@ -306,10 +298,7 @@ def read_source(folder: Path) -> Manifest:
     Raises:
         InputError: no run folder, or files of it are missing.
     """
-    manifest = read_manifest(folder)
-    if manifest is None:
-        problem = "no such folder" if not folder.is_dir() else f"not a run folder: it has no {MANIFEST} of a run"
-        raise InputError(Issue(problem, str(folder), allowed="a folder that a command of the twin has written"))
+    manifest = finished_manifest(folder)
     missing = [name for name in manifest.sha256 if not is_file(folder / name)]
     if missing:
         raise InputError(*(Issue("file of the run is missing", str(folder / name)) for name in missing[:5]))
@@ -339,17 +328,15 @@ def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: R
         with _told(source):
             described = result_tables(source, list(manifest.sha256))
         for k, table in enumerate(described):
+            made_of = table.facts.get("file", "*.json")
             try:
                 content = TABLE_FORMATS[tables](table)
             except MissingPackage as error:
                 raise InputError(Issue(str(error), found=f"--tables {tables}", allowed="csv, fits")) from None
-            files.append(
-                _put(folder, f"tables/{table.name}.{tables}", content, _source_of(table), table.title, table.rows)
-            )
+            files.append(_put(folder, f"tables/{table.name}.{tables}", content, made_of, table.title, table.rows))
             advance("tables", k + 1, len(described))
     if not files:
-        kind = " ".join(filter(None, (manifest.program, manifest.test)))
-        raise InputError(Issue("nothing to export of this run", str(source), found=kind))
+        raise InputError(Issue("nothing to export of this run", str(source), found=manifest.kind))
     return Exported(source, manifest, frames, tables, tuple(files), tuple(described), changed)
 
 
@@ -364,10 +351,6 @@ def _told(place: Path) -> Iterator[None]:
     except Exception as error:
         problem = f"cannot be read as a file of a run: {why_unreadable(error)}"
         raise InputError(Issue(problem, str(place), allowed="the file as the run wrote it")) from None
-
-
-def _source_of(table: DataTable) -> str:
-    return table.facts.get("file", "*.json")
 
 
 def _put(folder: RunFolder, file: str, content: bytes, source: str, what: str, items: int) -> ExportedFile:
@@ -424,7 +407,8 @@ def export_report(done: Exported) -> Report:
             f"{len(images)} files with {count} images as {done.frames.upper()}, read back and the same to the bit"
         )
     if tables:
-        said.append(f"{len(tables)} tables with {sum(one.items for one in tables)} rows as {_spelt(done.tables)}")
+        kind = {"parquet": "Parquet"}.get(done.tables, done.tables.upper())
+        said.append(f"{len(tables)} tables with {sum(one.items for one in tables)} rows as {kind}")
     rows: list[list[Cell]] = [[one.file, one.source, one.what, one.items, 1e-3 * one.bytes] for one in done.files]
     heads = ("file", "of", "what", "images or rows", "size [kB]")
     columns: list[list[Cell]] = [
@@ -443,16 +427,17 @@ def export_report(done: Exported) -> Report:
     ]
     return Report(
         title=f"Files of {done.run}",
-        verdict=f"Of the run of {done.kind} in {done.run}: {'; '.join(said)}.",
+        verdict=f"Of the run of {done.manifest.kind} in {done.run}: {'; '.join(said)}.",
         lead=(),
-        facts=(("run", str(done.run)), ("command", done.kind), ("frames", done.frames), ("tables", done.tables)),
+        facts=(
+            ("run", str(done.run)),
+            ("command", done.manifest.kind),
+            ("frames", done.frames),
+            ("tables", done.tables),
+        ),
         summary=Table(
             "files", "Files", "Of the export, and what of the run each was made of.", heads, rows, (None,) * 4 + (1,)
         ),
         sections=tuple(sections),
         warnings=tuple(warnings),
     )
-
-
-def _spelt(ending: str) -> str:
-    return {"parquet": "Parquet"}.get(ending, ending.upper())

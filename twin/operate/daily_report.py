@@ -362,9 +362,8 @@ def _prediction_section(overview: Overview) -> Section:
         "interval is the exact binomial one."
     )
     artefacts: list[Artefact] = []
-    text = [
-        f"Mean log score of a reading: {_score(overview)}." if told.scores.readings else "Nothing was predicted yet."
-    ]
+    score = f"Mean log score of a reading: {told.scores.log_score:.3f}, larger is better."
+    text = [score if told.scores.readings else "Nothing was predicted yet."]
     if told.innovations:
         above = sum(chi > limit_of(FALSE_ALARM, degrees) for _, chi, degrees in told.innovations)
         text.append(
@@ -375,11 +374,6 @@ def _prediction_section(overview: Overview) -> Section:
     if rows:
         artefacts.append(Table("coverage", "Coverage so far", caption, heads, rows, within=""))
     return Section("Predictions", tuple(text), tuple(artefacts), name="predictions")
-
-
-def _score(overview: Overview) -> str:
-    scores = overview.following.scores
-    return f"{scores.log_score:.3f}, larger is better"
 
 
 def _explained(overview: Overview) -> str:
