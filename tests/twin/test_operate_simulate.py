@@ -356,3 +356,8 @@ def test_a_sensor_on_a_body_that_is_not_stated_to_get_warmer(tmp_path: Path) -> 
     done = run("simulate", PLAN, tmp_path / "record", *WORDS, "--stuck", "base/forward/M7@2027-01-05T00:00:00Z")
     assert (done.exit_code, "--stuck: no such name" in done.stderr) == (2, True), done.stderr
     assert not any(tmp_path.iterdir())
+    done = run("simulate", PLAN, tmp_path / "record", *WORDS, "--out", tmp_path)
+    assert (done.exit_code, f"output folder {tmp_path} exists" in done.stderr.replace("\n", "")) == (2, True), (
+        done.stderr
+    )
+    assert not any(tmp_path.iterdir())

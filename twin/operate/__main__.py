@@ -226,9 +226,9 @@ def _new_alarms(call: Call, page: Path | None) -> list[str]:
         return []
     if page is not None:
         from twin.operate.daily_report import end_of_day
-        from twin.operate.overview import last_time
+        from twin.operate.overview import span_of
 
-        write_report(call, call.history, operation, end_of_day(None, last_time(call.history)), [call.place], page)
+        write_report(call, call.history, operation, end_of_day(None, span_of(call.history)[1]), [call.place], page)
     return [f"alarm: {one.text}" for one in new]
 
 

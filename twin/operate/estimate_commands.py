@@ -210,14 +210,15 @@ def report(
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     from twin.operate.daily_report import end_of_day
-    from twin.operate.overview import first_time, last_time
+    from twin.operate.overview import span_of
     from twin.operate.record.history import History
 
-    if not (newest := last_time(call.history)):
+    first, newest = span_of(call.history)
+    if not newest:
         raise InputErrorText("the record has no reading of the monitor; ingest takes some")
     with problems_of("--day"):
         end = end_of_day(day, newest)
-    if end <= first_time(call.history):
+    if end <= first:
         raise InputErrorText(f"--day: the record has no reading of the monitor before the end of {day}")
     operation, _, _ = call.estimate(plan)
     words = [call.place, *([] if plan is None else [str(plan)]), *([] if day is None else ["--day", day])]

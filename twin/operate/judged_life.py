@@ -52,11 +52,6 @@ class Estimate:
     values: Array
     sigmas: Array
 
-    @classmethod
-    def of(cls, courses: Sequence[Course]) -> Estimate:
-        """Of courses that follow each other."""
-        return cls(np.concatenate([one.values for one in courses]), np.concatenate([one.sigmas for one in courses]))
-
 
 @dataclass(frozen=True, eq=False)
 class JudgedLife:
@@ -77,7 +72,7 @@ class JudgedLife:
     times: NDArray[np.int64]
     quantities: tuple[Quantity, ...]
     true: Array
-    ways: Mapping[str, Estimate]
+    ways: Mapping[str, Estimate | Course]
     horizon: float
     forecast: Estimate
     came: Array
@@ -139,8 +134,12 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
     targets = np.where(there, times[np.minimum(ahead, len(times) - 1)], times)
     dates = np.array([time for time, *_ in following.events], np.int64)
     interrupted = np.any((dates > times[:, None]) & (dates <= targets[:, None]), axis=1)
-    ways = {"ground": ground, "single": single, "filtered": Estimate.of(now), "smoothed": Estimate.of([smoothed])}
-    return JudgedLife(times, quantities, true, ways, horizon, Estimate.of(later), came, interrupted, following)
+    filtered, forecast = (
+        Estimate(*(np.concatenate([getattr(one, part) for one in courses]) for part in ("values", "sigmas")))
+        for courses in (now, later)
+    )
+    ways = {"ground": ground, "single": single, "filtered": filtered, "smoothed": smoothed}
+    return JudgedLife(times, quantities, true, ways, horizon, forecast, came, interrupted, following)
 
 
 def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:

@@ -41,18 +41,12 @@ def _rows() -> Select[Any]:
     return select(*ENTRY.c, SOURCE.c.file).join(SOURCE, ENTRY.c.source_id == SOURCE.c.id).where(ENTRY.c.kind == KIND)
 
 
-def first_time(history: History) -> int:
-    """Time of the first reading of the monitor, microseconds of TAI since 2000; 0 without any."""
+def span_of(history: History) -> tuple[int, int]:
+    """Times of the first and the newest reading of the monitor, microseconds of TAI since 2000; 0 without any."""
+    query = select(func.min(ENTRY.c.time_us), func.max(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)
     with history.reading() as connection:
-        found = connection.execute(select(func.min(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)).scalar()
-    return int(found or 0)
-
-
-def last_time(history: History) -> int:
-    """Time of the newest reading of the monitor, microseconds of TAI since 2000; 0 without any."""
-    with history.reading() as connection:
-        found = connection.execute(select(func.max(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)).scalar()
-    return int(found or 0)
+        first, last = connection.execute(query).one()
+    return int(first or 0), int(last or 0)
 
 
 def readings(history: History, begin: int, end: int, most: int) -> list[dict[str, Any]]:
@@ -216,7 +210,6 @@ class Overview:
         alarms: of the record, as `History.alarms` tells them.
         events: all of the record, (time_us, name, causes that may have stepped then).
         begin: time of the first reading of the monitor, microseconds of TAI since 2000.
-        name: of the instrument.
     """
 
     operation: Operation
@@ -224,7 +217,6 @@ class Overview:
     alarms: tuple[Mapping[str, Any], ...]
     events: tuple[tuple[int, str, tuple[str, ...]], ...]
     begin: int
-    name: str
 
     @classmethod
     def of(cls, history: History, operation: Operation) -> Overview:
@@ -232,8 +224,7 @@ class Overview:
         known = operation.plan.operation.events
         found = ((int(one["time_us"]), str(one["subject"])) for one in history.entries("event"))
         events = tuple((time, name, tuple(known.get(name, ()))) for time, name in found)
-        begin = first_time(history)
-        return cls(operation, operation.follow(), tuple(history.alarms()), events, begin, history.name)
+        return cls(operation, operation.follow(), tuple(history.alarms()), events, span_of(history)[0])
 
     @property
     def time(self) -> int:

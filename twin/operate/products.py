@@ -113,27 +113,13 @@ def validity(
     here = beside or estimates([time])
     ends = {-1: time - low.time, 1: high.time - time}
     found = _looked_at(estimates, here, time, {sign: (0, _distances(0, span)) for sign, span in ends.items()})
-    again = {sign: (one.good, _distances(one.good, one.bad, evenly=True)) for sign, one in found.items()}
+    again = {sign: (good, _distances(good, bad, evenly=True)) for sign, (good, bad, _) in found.items()}
     found |= _looked_at(estimates, here, time, again)
     since, until = (
-        Mark(time + sign * found[sign].good, found[sign].reason) if sign in found else mark
+        Mark(time + sign * found[sign][0], found[sign][2]) if sign in found else mark
         for sign, mark in ((-1, low), (1, high))
     )
     return Validity(since.time, until.time, since.reason, until.reason)
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Where an estimate ceases to hold on one side of a time.
-
-    Attributes:
-        good, bad: distances, microseconds: the last at which it holds and the first at which it does not.
-        reason: why it does not.
-    """
-
-    good: int
-    bad: int
-    reason: str
 
 
 def _distances(good: int, end: int, evenly: bool = False) -> NDArray[np.int64]:
@@ -152,8 +138,9 @@ def _looked_at(
     here: Course,
     time: int,
     sides: Mapping[int, tuple[int, NDArray[np.int64]]],
-) -> dict[int, _Found]:
-    """Where the estimate ceases to hold, by the sign of the side; sides on which it holds are missing.
+) -> dict[int, tuple[int, int, str]]:
+    """Where the estimate ceases to hold, by the sign of the side: the last distance at which it holds and the first at
+    which it does not, microseconds, and why; sides on which it holds are missing.
 
     Args:
         estimates: asked once for the times of all sides.
@@ -179,7 +166,7 @@ def _looked_at(
         moved = abs(course.values[at[k], q] - here.values[0, q]) > course.sigmas[at[k], q] - here.sigmas[0, q]
         what = "its estimate goes on" if moved else "its sigma grows"
         reason = f"{one.group} {one.key} would be wrong by {100.0 * SHARE:g} percent more: {what}"
-        out[sign] = _Found(int(own[k - 1]) if k else good, int(own[k]), reason)
+        out[sign] = int(own[k - 1]) if k else good, int(own[k]), reason
     return out
 
 
@@ -197,8 +184,7 @@ class Products:
         history: the record.
         time: of the estimate, microseconds of TAI since 2000.
         scene_time: when the scene was taken, likewise; None without a scene.
-        newest: time of the newest reading that the estimate rests on.
-        readings: how many these are.
+        following: what the estimate says now, with the readings that it rests on.
         version: SHA-256 of the last entry of the record, of the plan and of the program's version.
         course: the estimate at that time.
         validity: span in which it holds.
@@ -213,8 +199,7 @@ class Products:
     history: History
     time: int
     scene_time: int | None
-    newest: int
-    readings: int
+    following: Following
     version: str
     course: Course
     validity: Validity
@@ -266,7 +251,6 @@ def made(operation: Operation, history: History, time: int, scene: ExportSource 
         allowed = f"a time from {utc_text(ends[0].time)} to {utc_text(ends[1].time)}"
         remedy = "" if early else "; take newer readings, or a longer horizon in the plan"
         raise Problem(text, utc_text(time), allowed + remedy)
-    newest = following.time
     # at the very moment of a reading white motions are known, and a microsecond later they are not
     both = operation.smoothed([time, min(time + 1, ends[1].time)])
     course, beside = _at(both, 0), _at(both, 1)
@@ -279,7 +263,7 @@ def made(operation: Operation, history: History, time: int, scene: ExportSource 
     version = _version(operation, history)
     changes = _changes(operation, course, found, _notes(time, held, following, version))
     remark = f"{history.name} as estimated for {utc_text(time)}, version {version}"
-    about = f"posterior of {following.readings} readings up to {utc_text(newest)}, for {utc_text(time)}"
+    about = f"posterior of {following.readings} readings up to {utc_text(following.time)}, for {utc_text(time)}"
     plan, instrument = operation.plan.operation, operation.experiment.instrument
     state, left = state_file(found, operation.experiment.thermal, plan.instrument, plan.disturbances, remark)
     prior = prior_files(
@@ -287,10 +271,7 @@ def made(operation: Operation, history: History, time: int, scene: ExportSource 
     )
     export = None if scene is None else _exported(scene, backend, changes)
     warnings = _warnings(following, time, at, export, left, prior)
-    return Products(
-        *(history, time, at, newest, following.readings, version, course, held, changes, export),
-        *(state, left, prior, warnings),
-    )
+    return Products(history, time, at, following, version, course, held, changes, export, state, left, prior, warnings)
 
 
 def _components(operation: Operation) -> list[Component]:
@@ -300,11 +281,6 @@ def _components(operation: Operation) -> list[Component]:
     own = {(one.cause, one.name): one for one in stated.components}
     of = operation.model.how.stated
     return [own[key] for key in zip(of.causes, of.labels, strict=True)]
-
-
-def _camera_names(operation: Operation) -> tuple[str, ...]:
-    """Names in the order of the estimate's parameters."""
-    return tuple(dict.fromkeys(camera for camera, _ in operation.model.spots))
 
 
 def _require_own(scene: ExportSource, history: History) -> None:
@@ -373,7 +349,7 @@ def _changes(
     random = prior @ stated.correlation @ prior.T
     values = course.changes[0] - own @ found.mean
     out = {}
-    for k, name in enumerate(_camera_names(operation)):
+    for k, name in enumerate(dict.fromkeys(camera for camera, _ in operation.model.spots)):
         four = slice(4 * k, 4 * k + 4)
         out[name] = EstimatedChange(values[four], constant[four, four], random[four, four], notes)
     return out
@@ -492,8 +468,8 @@ PRODUCTS: Record[Products] = Record(
     Quantity("valid_within_percent", lambda one: SHARE, "by which errors may be larger than at the time itself"),
     Quantity("version", lambda one: one.version, "SHA-256 of the record's last entry, the plan and the program"),
     Quantity("program", lambda one: f"{WRITER} {importlib.metadata.version(WRITER)}", "that wrote it"),
-    Quantity("readings", lambda one: one.readings, "of the monitor that the estimate rests on"),
-    Quantity("newest_utc", lambda one: utc_text(one.newest), "time of the newest of them"),
+    Quantity("readings", lambda one: one.following.readings, "of the monitor that the estimate rests on"),
+    Quantity("newest_utc", lambda one: utc_text(one.following.time), "time of the newest of them"),
     Quantity("estimate", _cameras, "every quantity of every camera and of both together, with its sigma"),
     Quantity(
         "changes",
@@ -539,7 +515,8 @@ def product_files(one: Products) -> tuple[dict[str, bytes], dict[str, Any]]:
 def summary(one: Products) -> str:
     """What there is, for the terminal."""
     lines = [
-        f"{one.history.name} at {utc_text(one.time)}, from {one.readings} readings up to {utc_text(one.newest)}",
+        f"{one.history.name} at {utc_text(one.time)}, from {one.following.readings} readings up to "
+        f"{utc_text(one.following.time)}",
         f"holds from {utc_text(one.validity.since)}: {one.validity.since_reason}",
         f"holds until {utc_text(one.validity.until)}: {one.validity.until_reason}",
     ]

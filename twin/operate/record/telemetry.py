@@ -9,7 +9,6 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -261,9 +260,11 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
             items.append(Refused(f"{table.time}: {one_line(problem)}", number))
             continue
         if table.kind in VALUES:
-            items += _values(table, row, moment, number, history)
+            read = ((one, column, [row[head] for head in column.column]) for one, column in table.columns.items())
+            # cells that are empty say nothing
+            items += [_tried(_reading, table, history, *one, moment, number) for one in read if any(one[2])]
         elif table.kind == EVENT:
-            items.append(_told(partial(_event, table, row, moment, number), number))
+            items.append(_tried(_event, table, row, moment, number))
         else:
             found = run_entries(path.parent / row[str(table.name)], table.kind, moment, history, stated=True)
             frames |= found.frames
@@ -294,15 +295,16 @@ def _keyword_items(
         except Problem as problem:
             items.append(Refused(one_line(problem), number))
             continue
-        items.append(_told(partial(_reading, table, subject, column, [words[1]], moment, number, history), number))
+        items.append(_tried(_reading, table, history, subject, column, [words[1]], moment, number))
     return items
 
 
-def _told(make: Callable[[], Entry], line: int) -> Entry | Refused:
+def _tried(make: Callable[..., Entry], *of: Any) -> Entry | Refused:
+    """Return an entry, or why there is none; the last argument is its line."""
     try:
-        return make()
+        return make(*of)
     except Problem as problem:
-        return Refused(one_line(problem), line)
+        return Refused(one_line(problem), of[-1])
 
 
 def _moment(table: ReadingTableSpec, text: str) -> int:
@@ -312,31 +314,20 @@ def _moment(table: ReadingTableSpec, text: str) -> int:
     return micros_after(table.epoch, table.time_scale, parse_quantity(f"{text} {table.time_unit}", MOMENT))
 
 
-def _values(
-    table: ReadingTableSpec, row: dict[str, str], moment: int, line: int, history: History
-) -> list[Entry | Refused]:
-    """What a row says of each body; cells that are empty say nothing."""
-    items: list[Entry | Refused] = []
-    for subject, column in table.columns.items():
-        cells = [row[head] for head in column.column]
-        if any(cells):
-            items.append(_told(partial(_reading, table, subject, column, cells, moment, line, history), line))
-    return items
-
-
 def _reading(
     table: ReadingTableSpec,
+    history: History,
     subject: str,
     column: ReadingColumnSpec,
     cells: Sequence[str],
     moment: int,
     line: int,
-    history: History,
 ) -> Entry:
     """One reading in SI units. Raises Problem: no number, or one that such a body cannot have."""
     kind, of_sigma = VALUES[table.kind]
     sigma = parse_quantity(column.sigma, of_sigma)
-    if column.unit == QUATERNION:
+    unit = QUATERNION if column.unit == QUATERNION else kind.si
+    if unit == QUATERNION:
         values = [_number(cell) for cell in cells]
         length = math.hypot(*values)
         if not abs(length - 1.0) <= UNIT:
@@ -347,11 +338,7 @@ def _reading(
         values = [parse_quantity(f"{cell} {column.unit}", kind) for cell in cells]
     if table.kind == "temperature":
         _is_warm_enough(subject, values[0], column.unit, history)
-    return Entry(table.kind, subject, moment, {"values": values, "sigma": sigma, "unit": _si(column, kind.si)}, line)
-
-
-def _si(column: ReadingColumnSpec, si: str) -> str:
-    return QUATERNION if column.unit == QUATERNION else si
+    return Entry(table.kind, subject, moment, {"values": values, "sigma": sigma, "unit": unit}, line)
 
 
 def _number(cell: str) -> float:
