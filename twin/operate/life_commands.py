@@ -78,15 +78,14 @@ def simulate(
     with told() as errors, durable.exit_on_terminate():
         check_backend(backend)
         from optics.numerics.backend import load_backend
-        from twin.operate.simulation_run import Places, simulate_into, simulation
+        from twin.operate.simulation_run import simulate_into, simulation
 
         options = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}
         options |= {"--coefficient-error": coefficient_error, "--sensor-sigma": sensor_sigma}
         several = {"--sensor": sensor or [], "--dead": dead or [], "--stuck": stuck or [], "--event": event or []}
         what = simulation(options, several, seed)
-        places = Places(plan, record, out, truth, force)
         with progress_shown(errors, as_json or quiet) as advance:
-            done = simulate_into(places, what, load_backend(backend), advance)
+            done = simulate_into(plan, record, out, truth, force, what, load_backend(backend), advance)
         place = done["record"] or done["files"]
         text = f"{done['readings']} readings of the monitor in {place}"
         lost = "".join(f"\nwarning: {one}" for one in done["lost"])
