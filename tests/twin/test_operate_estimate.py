@@ -259,7 +259,8 @@ def test_a_requirement_that_is_going_to_break(known, tmp_path) -> None:
     estimate = followed(known, tmp_path, entries_of(known, life, 9))
     (found,) = estimate.follow().breaks
     assert (found.quantity, found.unit, found.limit) == ("intersection_angle change_arcsec", "arcsec", 30.0)
-    now, column = estimate.follow().now, estimate.forecast([]).column("intersection_angle", "change_arcsec")
+    now = estimate.follow().now
+    column = [one.name for one in estimate.forecast([]).quantities].index("intersection_angle change_arcsec")
     chance = beyond(now.values[0, column], now.sigmas[0, column], 30.0)
     assert found.chance_now == pytest.approx(float(chance))
     tight = known[0].operation.requirements[0].model_copy(update={"limit": "1 mas"})

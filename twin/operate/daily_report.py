@@ -28,7 +28,6 @@ from twin.operate.overview import (
     Overview,
     Trend,
     carried_text,
-    code_of,
     day_text,
     group_name,
     largest_part,
@@ -282,7 +281,7 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
         f"±{one.limit:g}",
         percent(one.chance_now).removesuffix(" %"),
         percent(1.0 - one.probability).removesuffix(" %"),
-        Marked("yes" if one.holds_now else "no", look=look, key=f"{quantity.group} {quantity.key}"),
+        Marked("yes" if one.holds_now else "no", look=look, key=quantity.name),
         when if one.holds_now else "broken",
     ]
 
@@ -381,9 +380,9 @@ def _explained(overview: Overview) -> str:
     if not known:
         return ""
     parts = [
-        f"{100.0 * known[code_of(one)]:.0f} % of that of {name_of(code_of(one), overview.quantities)}"
+        f"{100.0 * known[one.name]:.0f} % of that of {name_of(one.name, overview.quantities)}"
         for one in overview.quantities
-        if known.get(code_of(one), 0.0) >= 0.005 and (overview.required(one) or not overview.following.breaks)
+        if known.get(one.name, 0.0) >= 0.005 and (overview.required(one) or not overview.following.breaks)
     ]
     if not parts:
         return "Temperatures explain nothing of the scatter of what is required"

@@ -325,7 +325,7 @@ def _show_course(course: Course, console: Console) -> None:
     rows = []
     for k, one in enumerate(course.quantities):
         cells = zip(course.values[:, k].tolist(), course.sigmas[:, k].tolist(), strict=True)
-        name = name_of(f"{one.group} {one.key}", course.quantities)
+        name = name_of(one.name, course.quantities)
         rows.append([name, *(sized(v, s, one.parameter.unit) for v, s in cells)])
     show_table(console, ("change of", *utc), rows, range(1, len(utc) + 1))
 

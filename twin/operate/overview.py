@@ -243,7 +243,7 @@ class Overview:
 
     def required(self, quantity: Quantity) -> Break | None:
         """The requirement on a quantity with what is known of it; None where nothing is required."""
-        return next((one for one in self.following.breaks if one.quantity == code_of(quantity)), None)
+        return next((one for one in self.following.breaks if one.quantity == quantity.name), None)
 
     @property
     def horizon(self) -> int:
@@ -348,7 +348,7 @@ class Overview:
         return name_of(one.quantity, self.quantities)
 
     def _quantity(self, one: Break) -> Quantity:
-        return next(quantity for quantity in self.quantities if code_of(quantity) == one.quantity)
+        return next(quantity for quantity in self.quantities if quantity.name == one.quantity)
 
     def _now(self, one: Break) -> str:
         quantity, now = self._quantity(one), self.following.now
@@ -376,11 +376,6 @@ def _capital(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
 
 
-def code_of(quantity: Quantity) -> str:
-    """A quantity as plans name it: ``GROUP KEY``."""
-    return f"{quantity.group} {quantity.key}"
-
-
 def _limit(one: Break) -> str:
     """The limit with its unit."""
     return f"{one.limit:g} {one.unit}"
@@ -395,12 +390,12 @@ def carried_text(overview: Overview, jump: FoundJump) -> str:
     """What a jump did to the line, of what is required; of all where nothing is; empty where nothing is told of it."""
     parts = []
     for quantity in overview.quantities:
-        told = jump.carried.get(code_of(quantity))
+        told = jump.carried.get(quantity.name)
         if told is not None and (overview.required(quantity) is not None or not overview.following.breaks):
             _, changed, sigma = told
             if abs(changed) + sigma < SAME:  # the body is none of that camera
                 continue
-            name = name_of(code_of(quantity), overview.quantities)
+            name = name_of(quantity.name, overview.quantities)
             parts.append(f"{name} {with_sigma(changed, sigma, quantity.parameter.unit)}")
     return ", ".join(parts)
 

@@ -165,7 +165,7 @@ def _looked_at(
         one = here.quantities[q]
         moved = abs(course.values[at[k], q] - here.values[0, q]) > course.sigmas[at[k], q] - here.sigmas[0, q]
         what = "its estimate goes on" if moved else "its sigma grows"
-        reason = f"{one.group} {one.key} would be wrong by {100.0 * SHARE:g} percent more: {what}"
+        reason = f"{one.name} would be wrong by {100.0 * SHARE:g} percent more: {what}"
         out[sign] = int(own[k - 1]) if k else good, int(own[k]), reason
     return out
 

@@ -57,10 +57,6 @@ class Course:
         """The times."""
         return tuple(utc_text(int(time)) for time in self.times)
 
-    def column(self, group: str, key: str) -> int:
-        """Number of a quantity. Raises ValueError."""
-        return [(one.group, one.key) for one in self.quantities].index((group, key))
-
     def to_dict(self) -> dict[str, Any]:
         """Plain data: group -> key -> values at all times, with sigmas beside them."""
         out: dict[str, Any] = {"times_utc": list(self.utc)}
@@ -374,8 +370,8 @@ def name_of(quantity: str, quantities: Sequence[Quantity]) -> str:
         quantity: group and key.
         quantities: all that are read.
     """
-    group, _, key = quantity.partition(" ")
-    symbol = next(one.parameter.symbol for one in quantities if (one.group, one.key) == (group, key))
+    group = quantity.partition(" ")[0]
+    symbol = next(one.parameter.symbol for one in quantities if one.name == quantity)
     return {ANGLE_GROUP: f"{symbol} between the cameras", GROUND_GROUP: f"{symbol} on the ground"}.get(
         group, f"{symbol} of {group}"
     )

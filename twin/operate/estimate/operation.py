@@ -120,10 +120,6 @@ class Operation:
         """All that is read."""
         return self.model.quantities
 
-    @property
-    def _names(self) -> list[str]:
-        return [f"{one.group} {one.key}" for one in self.quantities]
-
     @cached_property
     def events(self) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
         """(time_us, name, causes) of the record's events that step something."""
@@ -244,7 +240,7 @@ class Operation:
             self.events,
             tuple(sorted(sensors, key=lambda one: one.body)),
             standing.left_out,
-            dict(zip(self._names, standing.explained.tolist(), strict=True)),
+            {one.name: share for one, share in zip(self.quantities, standing.explained.tolist(), strict=True)},
             self._widened,
             self.too_many_jumps,
             self._breaks(),
@@ -279,7 +275,8 @@ class Operation:
         width = self.model.how.space.width
         read, changed = rows @ (self.model.reading @ change[:width]), rows @ change[width:]
         sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, spread[width:, width:], rows))
-        carried = dict(zip(self._names, zip(read.tolist(), changed.tolist(), sigma.tolist(), strict=True), strict=True))
+        each = zip(self.quantities, read.tolist(), changed.tolist(), sigma.tolist(), strict=True)
+        carried = {one.name: (was, now, spread) for one, was, now, spread in each}
         return FoundJump(jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals, carried)
 
     def _breaks(self) -> tuple[Break, ...]:
@@ -290,7 +287,7 @@ class Operation:
         ahead = self.forecast([start + round(k * operation.horizon * MICRO / days) for k in range(days + 1)])
         out = []
         for one in operation.requirements:
-            k = ahead.column(one.group, one.key)
+            k = [each.name for each in ahead.quantities].index(one.name)
             chance = beyond(ahead.values[:, k], ahead.sigmas[:, k], one.largest)
             broken = np.flatnonzero(chance > 1.0 - one.probability)
             breaks = int(ahead.times[broken[0]]) if len(broken) else None
