@@ -21,7 +21,7 @@ from analysis.monitor.limits import Quantity
 from analysis.statistics import limit_of
 from scenes.models.disturbances import HEAT
 from scenes.yaml.errors import Problem
-from twin.operate.estimate.following import name_of, percent
+from twin.operate.estimate.following import name_of, percent, with_sigma
 from twin.operate.overview import (
     CONFIDENCE,
     DAY,
@@ -33,7 +33,6 @@ from twin.operate.overview import (
     largest_part,
     minute_text,
     trend,
-    with_sigma,
 )
 from twin.operate.record.entries import MICRO, micros, utc_text
 from twin.operate.record.history import History
@@ -42,7 +41,7 @@ from twin.run.artefact import Artefact, Cell, Marked, OwnDecimals, SvgFigure, Ta
 from twin.run.report import Report, Section, answer
 
 if TYPE_CHECKING:
-    from twin.operate.estimate.following import FoundJump
+    pass
 
 BANDS = ((1.9600, 0.22, "95 %"), (0.9945, 0.42, "68 %"))
 """Sigmas, opacity and name of the bands, the wide one first."""
@@ -397,18 +396,17 @@ def _jump_section(overview: Overview) -> Section | None:
     full: list[list[Cell]] = []
     for jump in sorted(told.jumps, key=lambda one: -one.until_us):
         label, unit, size, sigma = largest_part(jump)
-        part, others = label.removeprefix(f"{jump.body} "), rivals_text(jump)
+        part, rivals = label.removeprefix(f"{jump.body} "), sorted(jump.rivals.items(), key=lambda one: -one[1])
+        others = ", ".join(f"{body} ({ratio:.1f})" for body, ratio in rivals[:3])
         row: list[Cell] = [Marked(minute_text(jump.until_us), f"after {minute_text(jump.after_us)}", "text")]
         row += [minute_text(jump.told_us), jump.body]
-        row += [
-            Marked(part, with_sigma(size, sigma, unit.replace("um", "µm")), "text"),
-            carried_text(overview, jump) or _NOT,
-        ]
+        row += [Marked(part, with_sigma(size, sigma, unit), "text"), carried_text(overview, jump) or _NOT]
         rows.append([*row, OwnDecimals(jump.log_ratio, 1), f"{jump.false_alarm:.1g}", others or _NOT])
         when = [utc_text(time) for time in (jump.after_us, jump.until_us, jump.told_us)]
         full.append([*when, jump.body, part, size, sigma, unit, jump.log_ratio, jump.false_alarm, others])
     events = [
-        f"{minute_text(time)}: {name.replace('_', ' ')}{_causes(causes)}" for time, name, causes in overview.events
+        f"{minute_text(time)}: {name.replace('_', ' ')}" + (f", which may step {', '.join(causes)}" if causes else "")
+        for time, name, causes in overview.events
     ]
     artefacts: list[Artefact] = []
     if rows:
@@ -423,16 +421,6 @@ def _jump_section(overview: Overview) -> Section | None:
         artefacts.append(Text("events", "Events of the record", "", events[::-1][:MOST_SHOWN], within=""))
     words = () if artefacts else ("No jump was found, and the record has no event.",)
     return Section("Jumps and events", words, tuple(artefacts), name="jumps")
-
-
-def rivals_text(jump: FoundJump) -> str:
-    """Other bodies that a jump may be of, the likeliest first, with their log ratios."""
-    others = sorted(jump.rivals.items(), key=lambda one: -one[1])[:3]
-    return ", ".join(f"{body} ({ratio:.1f})" for body, ratio in others)
-
-
-def _causes(causes: Sequence[str]) -> str:
-    return f", which may step {', '.join(causes)}" if causes else ""
 
 
 def _newest(name: str, title: str, caption: str, heads: Sequence[str], rows: list[list[Cell]]) -> Table:

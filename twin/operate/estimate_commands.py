@@ -284,7 +284,6 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
         rows: alarms of the record.
         console: the terminal.
     """
-    from twin.operate.estimate.following import sized
     from twin.operate.record.entries import utc_text
 
     scores, count = following.scores, following.readings
@@ -298,9 +297,7 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
     for text in following.warnings:
         line(console, f"warning: {text}")
     for jump in following.jumps:
-        between = f"between {utc_text(jump.after_us)} and {utc_text(jump.until_us)}"
-        sizes = ", ".join(f"{name.removeprefix(f'{jump.body} ')} {sized(z, s, u)}" for name, u, z, s in jump.sizes)
-        line(console, f"jump of {jump.body} {between}: {sizes}")
+        line(console, f"jump of {jump.body} {jump.found}")
     bad = [one for one in following.sensors if one.state != "ok"]
     if following.sensors:
         line(console, f"sensors: {len(following.sensors) - len(bad)} of {len(following.sensors)} are as they should be")
@@ -319,14 +316,14 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
 
 def _show_course(course: Course, console: Console) -> None:
     """A row for each quantity, a column for each time."""
-    from twin.operate.estimate.following import name_of, sized
+    from twin.operate.estimate.following import name_of, with_sigma
 
     utc = course.utc
     rows = []
     for k, one in enumerate(course.quantities):
         cells = zip(course.values[:, k].tolist(), course.sigmas[:, k].tolist(), strict=True)
         name = name_of(one.name, course.quantities)
-        rows.append([name, *(sized(v, s, one.parameter.unit) for v, s in cells)])
+        rows.append([name, *(with_sigma(v, s, one.parameter.unit, sign=True) for v, s in cells)])
     show_table(console, ("change of", *utc), rows, range(1, len(utc) + 1))
 
 

@@ -21,11 +21,11 @@ from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import share_interval
 from optics.numerics.frozen_map import FrozenMap
-from twin.operate.estimate.following import name_of, percent
+from twin.operate.estimate.following import name_of, percent, with_sigma
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of
 from twin.operate.record.schema import ENTRY, SOURCE
-from twin.run.artefact import SAME, decimals_for, fixed
+from twin.run.artefact import SAME
 
 if TYPE_CHECKING:
     from twin.operate.estimate.following import Break, Course, Following, FoundJump
@@ -97,12 +97,6 @@ def day_text(time: int) -> str:
 def minute_text(time: int) -> str:
     """UTC date, hour and minute."""
     return utc_text(time)[:16].replace("T", " ")
-
-
-def with_sigma(value: float, sigma: float, unit: str) -> str:
-    """A number with its standard deviation, two digits of it, and its unit."""
-    places = decimals_for(sigma)
-    return f"{fixed(value, places)} ± {fixed(sigma, places)} {unit}"
 
 
 @dataclass(frozen=True)
@@ -262,7 +256,7 @@ class Overview:
         for jump in told.jumps:
             label, unit, size, sigma = largest_part(jump)
             text = f"a jump of {jump.body} between {minute_text(jump.after_us)} and {minute_text(jump.until_us)}"
-            text += f": {label} {with_sigma(size, sigma, unit.replace('um', 'µm'))}"
+            text += f": {label} {with_sigma(size, sigma, unit)}"
             yield Happening(jump.told_us, "jump", text)
         for time, name, _ in self.events:
             yield Happening(time, "event", f"the event {name.replace('_', ' ')}")

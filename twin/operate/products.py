@@ -29,7 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import select
 
-from analysis.arrays import Array
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
@@ -339,7 +338,8 @@ def _changes(
     """Camera -> its change at the course's one time, without white motions."""
     stated = operation.model.how.stated
     white = np.array([law.white for law in stated.laws])
-    rows = _by_motions(operation, found)
+    size = np.array([one.unit_size for one in found.components]) * stated.sigmas
+    rows = stated.parameters / np.where(size > 0.0, size, np.inf)  # (4 K, M) per SI unit of each motion
     other, own = rows * ~white, rows * white
     # p = p_other + p_white: their covariance goes out with that of the white part
     across = own @ found.covariance @ other.T
@@ -373,13 +373,6 @@ def _exported(scene: ExportSource, backend: Backend, changes: Mapping[str, Estim
         return run_export(replace(scene, setup=setup), backend, _heights(scene), changes=changes)
     except BenchError as error:
         raise InputError(*test.error(str(error), error.key, allowed=error.remedy).issues) from error
-
-
-def _by_motions(operation: Operation, found: EstimatedMotions) -> Array:
-    """(4 K, M) parameters per SI unit of each motion."""
-    stated = operation.model.how.stated
-    size = np.array([one.unit_size for one in found.components]) * stated.sigmas
-    return np.asarray(stated.parameters / np.where(size > 0.0, size, np.inf))
 
 
 def _heights(scene: ExportSource) -> tuple[float, float] | None:

@@ -103,6 +103,12 @@ class FoundJump(_Dated):
     rivals: Mapping[str, float]
     carried: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
+    @property
+    def found(self) -> str:
+        """When it came and how large it is, in words."""
+        own = (f"{n.removeprefix(f'{self.body} ')} {with_sigma(z, s, u, sign=True)}" for n, u, z, s in self.sizes)
+        return f"between {utc_text(self.after_us)} and {utc_text(self.until_us)}: {', '.join(own)}"
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data."""
         return {
@@ -397,18 +403,16 @@ def _of_requirement(one: Break, time: int, quantities: Sequence[Quantity]) -> Al
 
 
 def _of_jump(one: FoundJump) -> Alarm:
-    sizes = ", ".join(f"{name.removeprefix(f'{one.body} ')} {sized(z, s, unit)}" for name, unit, z, s in one.sizes)
-    between = f"between {utc_text(one.after_us)} and {utc_text(one.until_us)}"
     near = [body for body, ratio in one.rivals.items() if ratio > one.log_ratio - _CLOSE][:3]
     rivals = f"; {', '.join(near)} would explain it nearly as well" if near else ""
     content = {**one.to_dict(), "after_us": one.after_us, "until_us": one.until_us}
-    return Alarm(JUMP, one.body, one.until_us, f"{one.body} jumped {between}: {sizes}{rivals}", content)
+    return Alarm(JUMP, one.body, one.until_us, f"{one.body} jumped {one.found}{rivals}", content)
 
 
-def sized(value: float, sigma: float, unit: str) -> str:
-    """A number with its standard deviation, two digits of it."""
+def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str:
+    """A number, with its sign or where it is below zero, its standard deviation, two digits of it, and its unit."""
     places = decimals_for(sigma)
-    return f"{fixed(value, places, sign=True)} ± {fixed(sigma, places)} {unit.replace('um', 'µm')}"
+    return f"{fixed(value, places, sign)} ± {fixed(sigma, places)} {unit.replace('um', 'µm')}"
 
 
 def _of_bad(bad: tuple[int, str]) -> Alarm:
