@@ -138,7 +138,8 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
         Estimate(*(np.concatenate([getattr(one, part) for one in courses]) for part in ("values", "sigmas")))
         for courses in (now, later)
     )
-    ways = {"ground": ground, "single": single, "filtered": filtered, "smoothed": smoothed}
+    ways: dict[str, Estimate | Course] = {"ground": ground, "single": single}
+    ways |= {"filtered": filtered, "smoothed": smoothed}
     return JudgedLife(times, quantities, true, ways, horizon, forecast, came, interrupted, following)
 
 
