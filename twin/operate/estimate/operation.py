@@ -479,9 +479,7 @@ class Operation:
         said = {one["id"]: taking.observed(one) for one in every if one["id"] in wanted}
         observed = [said[number] for number in used.tolist()]
         belief = (taking.start(self._begin()) if start is None else start).belief
-        belief = replace(
-            belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
-        )
+        belief = _alone(belief)
         knowing = replace(taking.how, steps=steps, window=0)
         belief, with_hints = hinted(taking.how, knowing, belief, observed, list(left))
         return knowing, belief, observed, with_hints
@@ -502,8 +500,8 @@ class Operation:
     @cached_property
     def _every_span(self) -> list[Standing]:
         last = self.standing  # what is new is taken and kept first
-        kept = [one for one in self.history.checkpoints(self.key) if one.number > _HEAD]
-        return [*(Standing.from_bytes(one.content) for one in kept), last]
+        kept = (Standing.from_bytes(one.content) for one in self.history.checkpoints(self.key) if one.number > _HEAD)
+        return [*(replace(one, belief=_alone(one.belief)) for one in kept), last]
 
     def _begin(self) -> int:
         return min(int(one["time_us"]) for kind in USED if (one := self.history.first(kind)) is not None)
@@ -521,3 +519,9 @@ class Operation:
             if not earlier or min(earlier) >= kept.time_us:
                 return Standing.from_bytes(kept.content)
             time = min(earlier)
+
+
+def _alone(belief: Belief) -> Belief:
+    """What is known without the steps that are looked for, which take most of its memory."""
+    state, none = belief.state.alone(), belief.after[:0]
+    return replace(belief, state=state, search=None, after=none, until=none, aside=None)
