@@ -9,6 +9,7 @@ if __name__ == "__main__":
 
 import time
 from collections import Counter
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -184,8 +185,7 @@ def ingest(
                 before = totals["new"]
                 for given in sources.look(call.history):
                     taken = call.history.take(given, late)
-                    totals.update(new=taken.new, known=taken.known, refused=len(taken.refused) - taken.refused_before)
-                    totals.update(refused_before=taken.refused_before)
+                    totals.update(taken.counts)
                     first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
                     if listed:
                         files_told.append(_taken(taken))
@@ -203,8 +203,8 @@ def ingest(
             if not watch:  # a watching command has no other end
                 print_error(call.errors, "interrupted: the files that were told are in the record, the others are not")
                 raise typer.Exit(INTERRUPTED) from None
-        text = _counted(totals["new"], totals["known"], totals["refused"], totals["refused_before"])
-        call.tell({**totals, "files": files_told, "alarms": raised}, partial(print_verdict, verdict=text))
+        done = {**totals, "files": files_told, "alarms": raised}
+        call.tell(done, partial(print_verdict, verdict=_counted(totals)))
         if refused := totals["refused"] + totals["refused_before"]:
             if call.quiet or call.as_json:
                 print_error(call.errors, f"{refused} refused, the first in {first}")
@@ -246,13 +246,13 @@ def _is_stated(instrument: str | None, history: History) -> bool:
     return True
 
 
-def _counted(new: int, known: int, refused: int, before: int) -> str:
-    return f"{new} taken, {known} known already, {refused} refused" + (f", {before} refused before" if before else "")
+def _counted(counts: Mapping[str, int]) -> str:
+    text = "{new} taken, {known} known already, {refused} refused".format(**counts)
+    return text + (f", {before} refused before" if (before := counts["refused_before"]) else "")
 
 
 def _line(taken: Taken) -> str:
-    new = len(taken.refused) - taken.refused_before
-    lines = [f"{taken.file}: {_counted(taken.new, taken.known, new, taken.refused_before)}"]
+    lines = [f"{taken.file}: {_counted(taken.counts)}"]
     shown = [f"  refused{'' if line is None else f', line {line}'}: {reason}" for line, reason in taken.refused[:10]]
     more = len(taken.refused) - len(shown)
     return "\n".join([*lines, *shown, *([f"  and {more} more; status shows all"] if more else [])])
@@ -260,8 +260,7 @@ def _line(taken: Taken) -> str:
 
 def _taken(one: Taken) -> dict[str, Any]:
     refused = [{"line": line, "reason": reason} for line, reason in one.refused]
-    counts = {"new": one.new, "known": one.known, "refused": refused, "refused_before": one.refused_before}
-    return {"file": one.file, **counts, "before": one.before}
+    return {"file": one.file, **one.counts, "refused": refused, "before": one.before}
 
 
 @app.command()

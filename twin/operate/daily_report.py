@@ -288,10 +288,9 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
 def _changed_section(overview: Overview, begin: int, end: int) -> Section:
     found = [one for one in overview.changed(begin, end) if not one.again]
     lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in found)
-    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC."
-    if not lines:
-        return Section("What changed", (f"{what} Nothing happened.",), name="changed")
-    return Section("What changed", (what,), (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),), name="changed")
+    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing happened.'}"
+    shown = (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),) if lines else ()
+    return Section("What changed", (what,), shown, name="changed")
 
 
 def _trend_section(history: History, overview: Overview, last: int) -> Section:
