@@ -25,7 +25,7 @@ from twin.run import durable
 from twin.run.cli import InputErrorText, print_verdict
 
 if TYPE_CHECKING:
-    from analysis.monitor.detection_power import Power
+    from analysis.monitor.series_filter import Power
     from twin.operate.estimate.following import Course, Following
     from twin.operate.estimate.operation import Operation
     from twin.operate.record.history import History
