@@ -79,7 +79,8 @@ def main(
         why, made = "" if files else verification.obstacle(state), None
         if not files and not why:
             if not silent:
-                text = "one block of the study" if block else f"the run, which took {verification.expected_time(state)}"
+                took = cli.time_text(state.manifest.wall_time_s)
+                text = "one block of the study" if block else f"the run, which took {took}"
                 errors.print(f"making again {text}", markup=False, highlight=False, soft_wrap=True)
             try:
                 made = verification.repeat_block(state) if block else _whole(state, keep, silent)

@@ -54,6 +54,11 @@ class Quantity:
         """In results, ends in its unit."""
         return self.parameter.key
 
+    @property
+    def name(self) -> str:
+        """Group and key, as plans of operation name it: ``forward d_f_um``."""
+        return f"{self.group} {self.parameter.key}"
+
 
 def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry | None = None) -> tuple[Quantity, ...]:
     """All that is read of an instrument: every parameter; of a pair the intersection angle; where its altitude is

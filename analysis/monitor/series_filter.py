@@ -637,17 +637,23 @@ def hinted(
         return start, list(left)
     at = how.space.level
     levels = [how.space.level_of(one.motions)[at] @ one.root for one in how.jumpers]
-    scores = np.empty((len(observed), at.stop - at.start))
+    score = [np.empty((len(observed), level.shape[1])) for level in levels]
+    information = [np.empty((*one.shape, one.shape[1])) for one in score]
+    scores = np.empty((_PIECE, at.stop - at.start))
     known_of = np.empty((*scores.shape, scores.shape[1]))
 
     def note(number: int, carried: Array, known: Array) -> None:
-        scores[number], known_of[number] = carried[at], known[at, at]
+        place = number % _PIECE
+        scores[place], known_of[place] = carried[at], known[at, at]
+        if place == 0:  # readings come from the last to the first
+            there = slice(number, min(number + _PIECE, len(observed)))
+            count = there.stop - number
+            for level, one, more in zip(levels, score, information, strict=True):
+                one[there], more[there] = scores[:count] @ level, level.T @ (known_of[:count] @ level)
 
     plain = replace(knowing, unfound=False)
     none = np.zeros(0)
     smoothed(plain, replace(start, left=none), observed, none, [none] * len(observed), knowing.parameters_of, note)
-    score = [scores @ level for level in levels]
-    information = [level.T @ (known_of @ level) for level in levels]
     first = how.before_s if math.isnan(start.last) else 0.0
     gap = np.diff([one.time for one in observed], prepend=observed[0].time - first)
     place = {k: i for i, k in enumerate(how.walking.tolist())}

@@ -16,9 +16,9 @@ from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.record_bench import A_DAY, START, given, made
 from twin.operate.estimate.operation import Operation
+from twin.operate.record import FILE
 from twin.operate.record.entries import Entry
 from twin.operate.record.history import History
-from twin.operate.record.place import FILE
 
 DAYS = 365
 REPEATS = 41
@@ -59,7 +59,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
             for year in years:
                 done = _filled(history, done, DAYS * A_DAY * year)
                 estimate = Operation(history, plan)
-                estimate.standing()
+                assert estimate.standing
                 clock, spent, more = [], [], []
                 for _ in range(REPEATS):
                     start, begun = time.process_time(), time.perf_counter()
@@ -67,7 +67,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
                     taken = time.process_time()
                     clock.append(time.perf_counter() - begun)
                     estimate = estimate.again()
-                    estimate.standing()
+                    assert estimate.standing
                     spent.append(taken - start)
                     more.append(time.process_time() - taken)
                     done += 1

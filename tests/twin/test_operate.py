@@ -22,13 +22,12 @@ from tests.twin.commands import invoke
 from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair, run_folder, spots, table, temperatures
 from tests.twin.study_bench import REFUSED as INPUTS
 from twin.operate.__main__ import _record_warnings, app
-from twin.operate.record import schema
+from twin.operate.record import FILE, NotARecord, RecordFailed, schema
 from twin.operate.record.entries import Alarm, Entry, Given, digest_of_job, instrument_digest, micros, now, utc_text
 from twin.operate.record.history import History, content_of, initialised
-from twin.operate.record.place import FILE, NotARecord, RecordFailed
 from twin.operate.record.record_tables import tables
-from twin.operate.record.sources import time_of_name
 from twin.operate.record.taking import Taking
+from twin.operate.record.telemetry import time_of_name
 
 
 def run(*words: object):

@@ -17,8 +17,7 @@ from tests.twin.operation_records import START, entries_of, given, life_of, plan
 from tests.twin.study_bench import REFUSED
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
-from twin.operate.estimate.alarms import AGAIN, alarms_of, raise_alarms
-from twin.operate.estimate.following import Break, Following, FoundJump, SensorState
+from twin.operate.estimate.following import AGAIN, Break, Following, FoundJump, SensorState, alarms_of, raise_alarms
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.operation_model import keep_plan
 from twin.operate.record.entries import MICRO, Entry, utc_text

@@ -26,8 +26,7 @@ from tests.twin.operation_records import (
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate import operation as operation_module
-from twin.operate.estimate.alarms import alarms_of
-from twin.operate.estimate.following import Course, beyond, widening
+from twin.operate.estimate.following import Course, alarms_of, beyond, widening
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.standing import Scores, Sensor, Standing
 from twin.operate.operated_block import posterior
@@ -107,7 +106,7 @@ def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> N
     for k in range(0, len(entries), 7):
         history.take(given(f"piece{k}", entries[k : k + 7]))
         estimate = Operation(history, plan) if estimate is None else estimate.again()
-        estimate.standing()
+        assert estimate.standing
     assert estimate is not None
     assert estimate.follow().to_dict() == result
     assert estimate.smoothed(life.times).to_dict() == past
@@ -116,7 +115,7 @@ def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> N
     history.take(given("first", [one for one in entries if one not in late]))
     Operation(history, plan).follow()
     estimate = Operation(history, plan)
-    estimate.standing()
+    assert estimate.standing
     history.take(given("late", late), late=True)
     assert Operation(history, plan).follow().to_dict() == result
     assert estimate.again().follow().to_dict() == result
@@ -260,7 +259,8 @@ def test_a_requirement_that_is_going_to_break(known, tmp_path) -> None:
     estimate = followed(known, tmp_path, entries_of(known, life, 9))
     (found,) = estimate.follow().breaks
     assert (found.quantity, found.unit, found.limit) == ("intersection_angle change_arcsec", "arcsec", 30.0)
-    now, column = estimate.follow().now, estimate.forecast([]).column("intersection_angle", "change_arcsec")
+    now = estimate.follow().now
+    column = [one.name for one in estimate.forecast([]).quantities].index("intersection_angle change_arcsec")
     chance = beyond(now.values[0, column], now.sigmas[0, column], 30.0)
     assert found.chance_now == pytest.approx(float(chance))
     tight = known[0].operation.requirements[0].model_copy(update={"limit": "1 mas"})
@@ -447,12 +447,12 @@ def test_a_contradicted_start_stays_in_sigma(known, tmp_path) -> None:
     """All motions are twelve times as large as stated: the first readings say so, and sigma still does at the end."""
     entries, life = readings(known, 24, 0.0, scale=12.0)
     estimate = followed(known, tmp_path, entries)
-    squares = estimate._unexplained(estimate.standing().first)
+    squares = estimate._unexplained(estimate.standing.first)
     start = operation_module.widening(np.zeros((30, 2)), [30], False, [(0, squares)])[0]
     assert start > 2.0
     told = estimate.follow()
     assert told.widened >= start
-    plain = estimate.standing().belief
+    plain = estimate.standing.belief
     _, covariance = estimate.model.how.parameters_of(plain.mean, plain.covariance, plain.time)
     assert np.allclose(told.now.covariance[0], told.widened**2 * covariance, rtol=1e-9)
     assert np.all(off(estimate, life) < 6.0)

@@ -29,9 +29,9 @@ from tests.twin.test_durability import mounted
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.operation import Operation
+from twin.operate.record import FILE, RecordFailed
 from twin.operate.record.entries import Alarm
 from twin.operate.record.history import History, initialised
-from twin.operate.record.place import FILE, RecordFailed
 from twin.operate.record.record_tables import tables
 from twin.run.data_files import TABLE_FORMATS
 

@@ -32,12 +32,10 @@ from twin.operate.__main__ import app as operate
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.operation_model import keep_plan
 from twin.operate.estimated_motions import EstimatedMotions, perturbation, prior_files, state_file
-from twin.operate.product_files import product_files
-from twin.operate.products import Products, _warnings
+from twin.operate.products import Mark, Products, _warnings, product_files, validity
 from twin.operate.products import made as products_of
 from twin.operate.record.entries import MICRO, Entry, micros, utc_text
 from twin.operate.record.history import History, initialised
-from twin.operate.validity import Mark, validity
 from twin.orbit.export.export_run import ExportSource, read_source
 from twin.orbit.flight.line_camera import corrected_line, traced_line_cameras
 

@@ -19,13 +19,14 @@ from tests.twin.policed_page import breaches
 from tests.twin.record_bench import START, given, made
 from twin.operate import daily_report as daily
 from twin.operate.__main__ import app
-from twin.operate.daily_report import _warnings, daily_report, end_of_day, report_html, state_table
-from twin.operate.estimate.alarms import percent
+from twin.operate.daily_report import _warnings, daily_report, end_of_day, state_table
+from twin.operate.estimate.following import percent
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.operation_model import kept_plan
-from twin.operate.overview import Overview, coverage, first_time, last_time, points_of, readings, spread, trend
+from twin.operate.overview import Overview, coverage, points_of, readings, span_of, spread, trend
 from twin.operate.record.entries import Alarm, Entry, micros
-from twin.operate.record.history import History, PastHistory, content_of, initialised
+from twin.operate.record.history import History, content_of, initialised
+from twin.run.page import report_page
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def overview(history: History) -> Overview:
 @pytest.fixture(scope="module")
 def page(history: History, overview: Overview) -> str:
     made = daily_report(history, overview, end_of_day(None, overview.time))
-    return report_html(made, ("twin.operate", "report", "record")).decode()
+    return report_page(made, ("twin.operate", "report", "record"))
 
 
 def shown(page: str, words: str) -> bool:
@@ -199,9 +200,8 @@ def test_points_are_what_the_readings_say(history, overview):
 def test_of_many_readings_some_are_shown_and_the_newest_is_one(history):
     found = [one["time_us"] for one in readings(history, START, START + 40 * DAY, 25)]
     assert len(found) <= 25
-    assert found[-1] == last_time(history)
+    assert (START, found[-1]) == span_of(history)
     assert len(set(np.diff(found))) == 1
-    assert first_time(history) == START
 
 
 def test_a_trend_has_times_at_both_sides_of_a_jump(history, overview):
@@ -221,7 +221,7 @@ def test_the_past_is_without_what_came_later_and_takes_nothing(tmp_path: Path):
         history.raise_alarm(Alarm("jump", "x", until, "then"))
         history.save_checkpoint("p", 1, until - HOUR, 99, b"early")
         history.save_checkpoint("p", 2, until + HOUR, 99, b"late")
-        with PastHistory(str(tmp_path / "record"), until) as past:
+        with History(str(tmp_path / "record"), until) as past:
             assert max(one["time_us"] for one in past.entries("monitor")) == until
             assert [one["text"] for one in past.alarms()] == ["then"]
             assert [one.content for one in past.checkpoints("p")] == [b"early"]
@@ -270,7 +270,7 @@ def test_the_report_of_a_past_day_is_what_was_known_then(life, tmp_path):
     # a record that ended then says the same, to the last digit of the table of the state
     with History(str(record)) as history:
         end = end_of_day("2026-04-25", 0)
-        with PastHistory(str(record), end) as past:
+        with History(str(record), end) as past:
             then = state_table(Overview.of(past, Operation(past, kept_plan(history)))).content()
         initialised(str(tmp_path / "short"), kept_plan(history).model, True)
         with History(str(tmp_path / "short")) as short:

@@ -21,15 +21,14 @@ from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
 from tests.twin.commands import invoke
 from tests.twin.study_bench import refusals
+from twin.operate import simulation_run
 from twin.operate.__main__ import app
-from twin.operate.lives import simulation_run
-from twin.operate.lives.judged_life import covered
-from twin.operate.lives.judged_report import likely_shares
-from twin.operate.lives.simulate import Life, Simulation, drawn_life, sensed_temperatures
-from twin.operate.lives.simulation_run import take_files
+from twin.operate.judged_life import covered, likely_shares
 from twin.operate.record.entries import MICRO, micros
 from twin.operate.record.history import History, content_of, initialised
 from twin.operate.record.telemetry import WITHIN
+from twin.operate.simulate import Life, Simulation, drawn_life, sensed_temperatures
+from twin.operate.simulation_run import take_files
 from twin.verify import app as verify
 
 PLAN = EXAMPLES / "operation.yaml"
@@ -356,4 +355,9 @@ def test_readings_that_could_not_be_are_told(tmp_path: Path, monkeypatch: pytest
 def test_a_sensor_on_a_body_that_is_not_stated_to_get_warmer(tmp_path: Path) -> None:
     done = run("simulate", PLAN, tmp_path / "record", *WORDS, "--stuck", "base/forward/M7@2027-01-05T00:00:00Z")
     assert (done.exit_code, "--stuck: no such name" in done.stderr) == (2, True), done.stderr
+    assert not any(tmp_path.iterdir())
+    done = run("simulate", PLAN, tmp_path / "record", *WORDS, "--out", tmp_path)
+    assert (done.exit_code, f"output folder {tmp_path} exists" in done.stderr.replace("\n", "")) == (2, True), (
+        done.stderr
+    )
     assert not any(tmp_path.iterdir())

@@ -18,7 +18,7 @@ from scenes.specs.resolved import resolve
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import ROOT
 from twin.export.__main__ import app
-from twin.export.fits_frames import RecordedFrames, expected_fits, frames_fits, read_frames
+from twin.export.export_run import RecordedFrames, expected_fits, frames_fits, read_frames
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_files import write_data
 from twin.main_job.render_job import render_job

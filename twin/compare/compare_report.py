@@ -16,9 +16,8 @@ from scenes.yaml.yaml_file import read_yaml
 from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import NOISE, ArrayDifference, Leaf, NumberDifference, is_sigma
 from twin.run.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, significant
-from twin.run.owned_files import MANIFEST
 from twin.run.report import Report, Section, answer
-from twin.run.run_folder import Manifest, read_manifest
+from twin.run.run_folder import Manifest, finished_manifest
 from twin.run.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
 
 MOST_BARS = 30
@@ -88,7 +87,7 @@ def _warnings(comparison: Comparison) -> tuple[str, ...]:
 def _artefacts(reference: Run, run: Run, found: Differences, names: tuple[str, str], k: int) -> tuple[Artefact, ...]:
     out: list[Artefact] = []
     if found.inputs:
-        rows: list[list[Cell]] = [[one.key, _text(one.reference), _text(one.other)] for one in found.inputs]
+        rows: list[list[Cell]] = [[_text(value) for value in one.values()] for one in found.inputs]
         out.append(Table(f"inputs-{k}", "Inputs", "Keys of config.yaml.", ("key", *names), rows))
     figure = _changes(found, names, k)
     if figure is not None:
@@ -204,32 +203,18 @@ PROGRAM = "twin.compare"
 KIND = "compare"
 
 
-@dataclass(frozen=True)
-class InputDifference:
-    """A key of config.yaml with different values.
-
-    Attributes:
-        key: ``job.perturb.base/forward/M2.shift[2]``.
-        reference, other: both values; None where there is none.
-    """
-
-    key: str
-    reference: Leaf
-    other: Leaf
-
-
 @dataclass(frozen=True, eq=False)
 class Differences:
     """One run against the reference.
 
     Attributes:
-        inputs: keys of config.yaml.
+        inputs: keys of config.yaml with different values: ``key``, ``reference``, ``other``; None where there is none.
         numbers: results that are not the same to the tolerance.
         arrays: images that are not the same to the tolerance of their peak.
         compared: how many numbers and arrays both runs have.
     """
 
-    inputs: tuple[InputDifference, ...]
+    inputs: tuple[Mapping[str, Leaf], ...]
     numbers: tuple[NumberDifference, ...]
     arrays: tuple[ArrayDifference, ...]
     compared: int
@@ -248,11 +233,6 @@ class Run:
     manifest: Manifest
     inputs: Mapping[str, Leaf]
 
-    @property
-    def kind(self) -> str:
-        """Kind of the run: its program, and the kind of a test."""
-        return " ".join(filter(None, (self.manifest.program, self.manifest.test)))
-
     def file(self, name: str) -> Path | None:
         """Return a file of the run, None where it has none of that name."""
         return self.folder / name if name in self.manifest.sha256 else None
@@ -264,10 +244,7 @@ def read_run(folder: Path) -> Run:
     Raises:
         InputError: it is none, or config.yaml cannot be read.
     """
-    manifest = read_manifest(folder)
-    if manifest is None:
-        problem = "no such folder" if not folder.is_dir() else f"not a run folder: it has no {MANIFEST} of a run"
-        raise InputError(Issue(problem, str(folder), allowed="a folder that a command of the twin has written"))
+    manifest = finished_manifest(folder)
     config = read_yaml(folder / "config.yaml").data if "config.yaml" in manifest.sha256 else {}
     return Run(folder, manifest, dict(difference.leaves(config, series=False)))
 
@@ -287,13 +264,13 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
     Raises:
         InputError: they are of two kinds, or a file cannot be read.
     """
-    if reference.kind != other.kind:
-        kinds = f"{reference.kind} and {other.kind}"
+    if reference.manifest.kind != other.manifest.kind:
+        kinds = f"{reference.manifest.kind} and {other.manifest.kind}"
         raise InputError(Issue("runs of two kinds", str(other.folder), found=kinds, allowed="runs of one command"))
     inputs = [
-        InputDifference(key, reference.inputs.get(key), other.inputs.get(key))
+        {"key": key, "reference": here, "other": there}
         for key in dict.fromkeys((*reference.inputs, *other.inputs))
-        if not _same_input(reference.inputs.get(key), other.inputs.get(key))
+        if not _same_input(here := reference.inputs.get(key), there := other.inputs.get(key))
     ]
     names = dict.fromkeys((*reference.manifest.sha256, *other.manifest.sha256))
     results = [name for name in names if difference.ending(name) == "json" and "/" not in name]
@@ -387,16 +364,13 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
                 "run": str(run.folder),
                 "same": found.same,
                 "compared": found.compared,
-                "inputs": [vars(one) for one in found.inputs],
-                "numbers": [
-                    {**_values(one, _NUMBER), "difference": _finite(one.difference), "in_sigma": _finite(one.in_sigma)}
-                    for one in found.numbers
-                ],
-                "arrays": [_values(one, _ARRAY) for one in found.arrays],
+                "inputs": found.inputs,
+                "numbers": [_plain(one, "scale", "difference", "in_sigma") for one in found.numbers],
+                "arrays": [_plain(one, "where reference other depth") for one in found.arrays],
             }
         )
     return {
-        "kind": comparison.runs[0].kind,
+        "kind": comparison.runs[0].manifest.kind,
         "reference": str(comparison.runs[0].folder),
         "same": comparison.same,
         "rtol": comparison.rtol,
@@ -405,16 +379,11 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
     }
 
 
-_NUMBER = ("file", "key", "reference", "other", "sigma", "sigma_of")
-_ARRAY = ("file", "name", "shape", "other_shape", "largest", "rms", "peak", "share")
-
-
-def _values(of: object, keys: Sequence[str]) -> dict[str, Any]:
-    return {key: getattr(of, key) for key in keys}
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and abs(value) < float("inf") else None
+def _plain(one: NumberDifference | ArrayDifference, without: str, *derived: str) -> dict[str, Any]:
+    """Fields of a difference and numbers that follow from them, which are None where they are not finite."""
+    values = {key: value for key, value in vars(one).items() if key not in without.split()}
+    more = {key: getattr(one, key) for key in derived}
+    return values | {key: value if value is not None and abs(value) < math.inf else None for key, value in more.items()}
 
 
 def verdict(comparison: Comparison) -> list[str]:

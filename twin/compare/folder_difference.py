@@ -226,8 +226,10 @@ def array_difference(file: str, name: str, here: np.ndarray | None, there: np.nd
     share = float(unlike.mean())
     if not numeric:
         where = tuple(int(k) for k in np.argwhere(unlike)[0])
-        texts = (str(one[where]), str(two[where]))
-        return ArrayDifference(file, name, here.shape, there.shape, share=share, where=where, **_pair(*texts))
+        here_text, there_text = str(one[where]), str(two[where])
+        return ArrayDifference(
+            file, name, here.shape, there.shape, share=share, where=where, reference=here_text, other=there_text
+        )
     finite = np.isfinite(one) & np.isfinite(two)
     delta = np.zeros_like(one)
     with np.errstate(over="ignore"):  # numbers at the end of the range differ by infinity
@@ -238,13 +240,9 @@ def array_difference(file: str, name: str, here: np.ndarray | None, there: np.nd
     peak = float(np.max(np.abs(one), where=np.isfinite(one), initial=0.0))
     worst = np.where(unlike & ~finite, np.inf, np.abs(delta))
     where = tuple(int(k) for k in np.unravel_index(int(np.argmax(worst)), worst.shape))
-    values = _pair(one[where].item(), two[where].item())
     depth = here.dtype.itemsize if here.dtype.kind == "u" else 0
-    return ArrayDifference(file, name, here.shape, there.shape, largest, rms, peak, share, where, depth=depth, **values)
-
-
-def _pair(reference: Leaf, other: Leaf) -> dict[str, Any]:
-    return {"reference": reference, "other": other}
+    far = (one[where].item(), two[where].item())
+    return ArrayDifference(file, name, here.shape, there.shape, largest, rms, peak, share, where, *far, depth)
 
 
 def _same_bytes(one: Path, two: Path) -> bool:

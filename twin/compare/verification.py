@@ -24,7 +24,7 @@ from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import ArrayDifference, FileDifference, Leaf, NumberDifference
 from twin.compare.folder_state import Elsewhere, FolderState, elsewhere
 from twin.monitor.calibration_cache import recomputed
-from twin.run import cli, provenance, report, run_folder
+from twin.run import provenance, report, run_folder
 from twin.run.journal import read_pieces
 from twin.run.owned_files import first_names
 from twin.study.runs import blocks, setup
@@ -425,7 +425,7 @@ class Verification:
         manifest = state.manifest
         return {
             "run": str(state.folder),
-            "of": " ".join(filter(None, (manifest.program, manifest.test))),
+            "of": manifest.kind,
             "whole": state.whole,
             "files": len(manifest.sha256),
             **{name: list(getattr(state, name)) for name in ("changed", "missing", "additional")},
@@ -471,11 +471,6 @@ class Verification:
                 sigma = "" if quantity.in_sigma is None else f", {quantity.in_sigma:.2g} sigma"
                 out.append(f"    {quantity.key}: {quantity.old!r} then, {quantity.new!r} now{size}{sigma}")
         return out
-
-
-def expected_time(state: FolderState) -> str:
-    """Return how long repeating a run will take, in words."""
-    return cli.time_text(state.manifest.wall_time_s)
 
 
 def _largest(files: Sequence[FileState]) -> str:

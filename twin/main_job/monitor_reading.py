@@ -252,7 +252,7 @@ class MonitorReading:
         quantity = self._quantities[worst]
         return {
             "off_in_sigma": round(size, OFF) if math.isfinite(size) else None,
-            "of": f"{quantity.group} {quantity.key}" if size >= 1.0 else "",
+            "of": quantity.name if size >= 1.0 else "",
             "relinearised": bool(found.beyond[0] and found.holds[0]),
             "holds": bool(found.holds[0]),
         }

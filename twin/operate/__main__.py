@@ -9,6 +9,7 @@ if __name__ == "__main__":
 
 import time
 from collections import Counter
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,25 +18,33 @@ import typer
 from rich.console import Console
 
 from scenes.yaml.errors import InputError, nearest
-from scenes.yaml.standard_output import BAD_INPUT, FAILURE, print_error
-from twin.operate.estimate_commands import alarms, estimate_of, exclude, forecast, show_estimate, show_power
-from twin.operate.followed import PlanFile, planned
-from twin.operate.life_commands import judge, simulate
-from twin.operate.products_command import products
-from twin.operate.report_command import report, write_report
-from twin.operate.terminal import Place, line, require_record, tell, told
-from twin.run import durable
-from twin.run.cli import (
-    INTERRUPTED,
-    AsJson,
-    InputErrorText,
-    Quiet,
-    Strict,
-    end_strictly,
-    print_verdict,
-    print_whole,
-    result_table,
+from scenes.yaml.standard_output import BAD_INPUT, print_error
+from twin.operate.estimate_commands import (
+    alarms,
+    exclude,
+    forecast,
+    products,
+    report,
+    show_estimate,
+    show_power,
+    write_report,
 )
+from twin.operate.life_commands import judge, simulate
+from twin.operate.terminal import (
+    Call,
+    NewFolder,
+    Place,
+    PlanFile,
+    line,
+    moment_said,
+    on_record,
+    require_new,
+    show_table,
+    tell,
+    told,
+)
+from twin.run import durable
+from twin.run.cli import INTERRUPTED, AsJson, InputErrorText, Quiet, Strict, end_strictly, print_verdict
 
 if TYPE_CHECKING:
     from twin.operate.record.history import History
@@ -64,7 +73,7 @@ def main() -> None:
     """
 
 
-@app.command("init")
+@app.command()
 def init(
     record: Place,
     instrument: Annotated[str, typer.Argument(help="Name of an instrument in the library, or path of its file.")],
@@ -104,15 +113,15 @@ def init(
             what = f"version {', '.join(map(str, passed))}" if passed else "as it was"
             what += "" if plan is None else f"; the plan {plan} counts" if kept else f"; the plan {plan} counted before"
             text = f"record of {history.name} ({history.sha256[:12]}) in {history.url}: {what}"
-            data: dict[str, Any] = {"record": history.url, "instrument": history.name}
-            data["instrument_sha256"] = history.sha256
-        data |= {"versions": list(passed), "plan": None if plan is None else str(plan.absolute()), "new_plan": kept}
-        tell(errors, as_json, quiet, data, lambda console: line(console, text))
+            data = {"record": history.url, "instrument": history.name, "instrument_sha256": history.sha256}
+            made = {"versions": list(passed), "plan": None if plan is None else str(plan.absolute()), "new_plan": kept}
+        tell(errors, as_json, quiet, data | made, lambda console: line(console, text))
 
 
-@app.command("ingest")
+@app.command()
+@on_record
 def ingest(
-    record: Place,
+    call: Call,
     files: Annotated[
         list[Path],
         typer.Argument(
@@ -143,8 +152,6 @@ def ingest(
             help="Write the daily report to this file, and anew whenever something was taken.",
         ),
     ] = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Take readings and events into a record: from tables, as a YAML file says what their columns are, and from run
     folders of twin.recover, twin.render and twin.orbit.
@@ -162,77 +169,67 @@ def ingest(
 
     Exit codes: 0 success, 2 bad input or something was refused (all else is taken), 1 anything else.
     """
-    require_record(record)
-    from twin.operate.record.history import History
-    from twin.operate.record.sources import Sources, moment_said
+    from twin.operate.record.telemetry import Sources
 
-    with told() as errors, durable.exit_on_terminate(), History(record) as history:
+    listed = call.as_json and not watch
+    with durable.exit_on_terminate():
         start = None if moment is None else moment_said("--time", moment)
         if page is not None:
-            planned(history, None)
-        sources = Sources(files, start, _is_stated(instrument, history), watch)
+            call.planned(None)
+        sources = Sources(files, start, _is_stated(instrument, call.history), watch)
         totals, files_told, first = Counter({"new": 0, "known": 0, "refused": 0, "refused_before": 0}), [], ""
         raised: list[str] = []
         stale = page is not None
         try:
             while True:
                 before = totals["new"]
-                for given in sources.look(history):
-                    taken = history.take(given, late)
-                    totals.update(new=taken.new, known=taken.known, refused=len(taken.refused) - taken.refused_before)
-                    totals.update(refused_before=taken.refused_before)
+                for given in sources.look(call.history):
+                    taken = call.history.take(given, late)
+                    totals.update(taken.counts)
                     first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
-                    if watch or not as_json:
-                        tell(errors, as_json, quiet, _taken(taken), partial(line, text=_line(taken)))
-                    else:
+                    if listed:
                         files_told.append(_taken(taken))
+                    else:
+                        call.tell(_taken(taken), partial(line, text=_line(taken)))
                 if totals["new"] > before or stale:
-                    new = _new_alarms(errors, history, record, page, quiet or as_json)
-                    stale = False
+                    new, stale = _new_alarms(call, page), False
                     raised += new
-                    if new and (watch or not as_json):
-                        tell(errors, as_json, quiet, {"alarms": new}, partial(line, text="\n".join(new)))
+                    if new and not listed:
+                        call.tell({"alarms": new}, partial(line, text="\n".join(new)))
                 if not watch:
                     break
                 time.sleep(POLL)
         except KeyboardInterrupt:
             if not watch:  # a watching command has no other end
-                print_error(errors, "interrupted: the files that were told are in the record, the others are not")
+                print_error(call.errors, "interrupted: the files that were told are in the record, the others are not")
                 raise typer.Exit(INTERRUPTED) from None
-        text = _counted(totals["new"], totals["known"], totals["refused"], totals["refused_before"])
-        tell(
-            errors,
-            as_json,
-            quiet,
-            {**totals, "files": files_told, "alarms": raised},
-            partial(print_verdict, verdict=text),
-        )
+        done = {**totals, "files": files_told, "alarms": raised}
+        call.tell(done, partial(print_verdict, verdict=_counted(totals)))
         if refused := totals["refused"] + totals["refused_before"]:
-            if quiet or as_json:
-                print_error(errors, f"{refused} refused, the first in {first}")
+            if call.quiet or call.as_json:
+                print_error(call.errors, f"{refused} refused, the first in {first}")
             raise typer.Exit(BAD_INPUT)
 
 
-def _new_alarms(errors: Console, history: History, record: str, page: Path | None, quiet: bool) -> list[str]:
+def _new_alarms(call: Call, page: Path | None) -> list[str]:
     """Return the alarms that the estimate under the record's plan raises with what was taken, after the report is
     written. What keeps it from being worked out is printed, and is no fault of what was taken.
     """
-    from twin.operate.overview import last_time
-
-    try:
-        found = estimate_of(errors, history, None, quiet)
-    except (InputErrorText, InputError) as error:
-        print_error(errors, f"what was taken is in the record, and the estimate cannot be worked out: {error}")
-        return []
-    if found is None:
+    if not call.has_estimate:
         if page is not None:
-            print_error(errors, "no report: no reading of the monitor is in the record")
+            print_error(call.errors, "no report: no reading of the monitor is in the record")
         return []
-    if page is not None and (newest := last_time(history)) is not None:
+    try:
+        operation, _, new = call.estimate()
+    except (InputErrorText, InputError) as error:
+        print_error(call.errors, f"what was taken is in the record, and the estimate cannot be worked out: {error}")
+        return []
+    if page is not None:
         from twin.operate.daily_report import end_of_day
+        from twin.operate.overview import span_of
 
-        write_report(history, found[0], end_of_day(None, newest), [record], page, errors)
-    return [f"alarm: {one.text}" for one in found[2]]
+        write_report(call, call.history, operation, end_of_day(None, span_of(call.history)[1]), [call.place], page)
+    return [f"alarm: {one.text}" for one in new]
 
 
 def _is_stated(instrument: str | None, history: History) -> bool:
@@ -249,13 +246,13 @@ def _is_stated(instrument: str | None, history: History) -> bool:
     return True
 
 
-def _counted(new: int, known: int, refused: int, before: int) -> str:
-    return f"{new} taken, {known} known already, {refused} refused" + (f", {before} refused before" if before else "")
+def _counted(counts: Mapping[str, int]) -> str:
+    text = "{new} taken, {known} known already, {refused} refused".format(**counts)
+    return text + (f", {before} refused before" if (before := counts["refused_before"]) else "")
 
 
 def _line(taken: Taken) -> str:
-    new = len(taken.refused) - taken.refused_before
-    lines = [f"{taken.file}: {_counted(taken.new, taken.known, new, taken.refused_before)}"]
+    lines = [f"{taken.file}: {_counted(taken.counts)}"]
     shown = [f"  refused{'' if line is None else f', line {line}'}: {reason}" for line, reason in taken.refused[:10]]
     more = len(taken.refused) - len(shown)
     return "\n".join([*lines, *shown, *([f"  and {more} more; status shows all"] if more else [])])
@@ -263,19 +260,17 @@ def _line(taken: Taken) -> str:
 
 def _taken(one: Taken) -> dict[str, Any]:
     refused = [{"line": line, "reason": reason} for line, reason in one.refused]
-    counts = {"new": one.new, "known": one.known, "refused": refused, "refused_before": one.refused_before}
-    return {"file": one.file, **counts, "before": one.before}
+    return {"file": one.file, **one.counts, "refused": refused, "before": one.before}
 
 
-@app.command("status")
+@app.command()
+@on_record
 def status(
-    record: Place,
+    call: Call,
     plan: PlanFile = None,
     check_all: Annotated[
         bool, typer.Option("--check-all", help="Compare every entry with its digest, not the newest 500 alone.")
     ] = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
     strict: Strict = False,
 ) -> None:
     """Tell what a record holds, what was refused and why; and, under its plan of operation or another one, how the
@@ -289,29 +284,25 @@ def status(
     Exit codes: 0 success, whether alarms are open or not, 2 bad input, 3 with --strict where the last readings
     contradict what is stated, 1 anything else.
     """
-    require_record(record)
-    from twin.operate.record.history import History
+    found = call.estimate(plan) if plan is not None or call.has_estimate else None
+    rows = call.history.alarms()
+    opened = sum(one["acknowledged"] is None for one in rows)
+    power = () if found is None else found[0].power()
+    jumps_found = {one.body: one.plain for one in power}
+    estimate = None if found is None else {**found[1].to_dict(), "jumps_found": jumps_found}
+    held = call.history.status(check_all)
+    data = {**held, "warnings": _record_warnings(held), "estimate": estimate, "open_alarms": opened}
 
-    with told() as errors, History(record) as history:
-        found = estimate_of(errors, history, plan, quiet or as_json)
-        rows = history.alarms()
-        opened = sum(one["acknowledged"] is None for one in rows)
-        power = () if found is None else found[0].power()
-        jumps_found = {one.body: one.plain for one in power}
-        estimate = None if found is None else {**found[1].to_dict(), "jumps_found": jumps_found}
-        held = history.status(check_all)
-        data = {**held, "warnings": _record_warnings(held), "estimate": estimate, "open_alarms": opened}
+    def show(console: Console) -> None:
+        _show(data, console)
+        if found is not None:
+            show_estimate(found[1], rows, console)
+        if power:
+            show_power(power, console)
 
-        def show(console: Console) -> None:
-            _show(data, console)
-            if found is not None:
-                show_estimate(found[1], rows, console)
-            if power:
-                show_power(power, console)
-
-        tell(errors, as_json, quiet, data, show)
-        if strict:
-            end_strictly(errors, data)
+    call.tell(data, show)
+    if strict:
+        end_strictly(call.errors, data)
 
 
 def _record_warnings(held: dict[str, Any]) -> list[str]:
@@ -331,27 +322,20 @@ def _show(data: dict[str, Any], console: Console) -> None:
     )
     for text in data["warnings"]:
         line(console, f"warning: {text}")
-    table = result_table()
-    for head in ("kind", "of", "entries", "first [UTC]", "last [UTC]"):
-        table.add_column(head, justify="right" if head == "entries" else "left")
-    for one in data["streams"]:
-        table.add_row(one["kind"], one["subject"], str(one["entries"]), one["first_utc"], one["last_utc"])
-    print_whole(console, table)
+    rows = ([str(value) for value in one.values()] for one in data["streams"])
+    show_table(console, ("kind", "of", "entries", "first [UTC]", "last [UTC]"), rows, (2,))
     for one in data["refused"]:
         at = "" if one["line"] is None else f":{one['line']}"
         since = " (taken since)" if one["taken_since"] else ""
         line(console, f"refused{since}: {one['file']}{at}: {one['reason']}")
 
 
-@app.command("export")
+@app.command()
+@on_record
 def export(
-    record: Place,
+    call: Call,
     tables: Annotated[str, typer.Option(help="Format of the tables: csv, parquet or fits.")] = "csv",
-    out: Annotated[Path, typer.Option(readable=False, help="Folder for them; it must not be there yet.")] = Path(
-        "tables"
-    ),
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    out: NewFolder = Path("tables"),
 ) -> None:
     """Write a record as tables that other programs read, one for each sort of reading; every column says its unit.
 
@@ -359,39 +343,26 @@ def export(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    require_record(record)
-    from twin.operate.record.history import History
     from twin.operate.record.record_tables import tables as all_tables
     from twin.run.data_files import TABLE_FORMATS, MissingPackage
 
-    with told() as errors, History(record) as history:
-        if tables not in TABLE_FORMATS:
-            near = nearest(tables, TABLE_FORMATS)
-            meant = f"; did you mean {near!r}?" if near else ";"
-            raise InputErrorText(f"--tables: no such format, {tables!r}{meant} allowed: {', '.join(TABLE_FORMATS)}")
-        if out.exists():
-            raise InputErrorText(f"--out: {out} is there already; name a folder that is not")
-        try:
-            made = [(f"{one.name}.{tables}", TABLE_FORMATS[tables](one), one.rows) for one in all_tables(history)]
-            durable.make_folders(out)
-            durable.write_all_safely((out / name, content) for name, content, _ in made)
-        except MissingPackage as error:
-            raise InputErrorText(str(error)) from None
-        except OSError as error:
-            print_error(errors, f"{out}: {error.strerror or error}; what is there is not all of the record")
-            raise typer.Exit(FAILURE) from None
-        data = {"out": str(out), "tables": [{"file": name, "rows": rows} for name, _, rows in made]}
-        text = "\n".join(f"{out / name}: {rows} rows" for name, _, rows in made)
-        tell(errors, as_json, quiet, data, lambda console: line(console, text or "the record is empty"))
+    if tables not in TABLE_FORMATS:
+        near = nearest(tables, TABLE_FORMATS)
+        meant = f"; did you mean {near!r}?" if near else ";"
+        raise InputErrorText(f"--tables: no such format, {tables!r}{meant} allowed: {', '.join(TABLE_FORMATS)}")
+    require_new(out)
+    try:
+        made = [(f"{one.name}.{tables}", TABLE_FORMATS[tables](one), one.rows) for one in all_tables(call.history)]
+    except MissingPackage as error:
+        raise InputErrorText(str(error)) from None
+    call.write_new(out, {name: content for name, content, _ in made}, "record")
+    data = {"out": str(out), "tables": [{"file": name, "rows": rows} for name, _, rows in made]}
+    text = "\n".join(f"{out / name}: {rows} rows" for name, _, rows in made)
+    call.tell(data, lambda console: line(console, text or "the record is empty"))
 
 
-app.command("forecast")(forecast)
-app.command("alarms")(alarms)
-app.command("exclude")(exclude)
-app.command("products")(products)
-app.command("simulate")(simulate)
-app.command("judge")(judge)
-app.command("report")(report)
+for command in (forecast, alarms, exclude, products, simulate, judge, report):
+    app.command()(command)
 
 
 if __name__ == "__main__":

@@ -1,42 +1,174 @@
-"""The daily report of an instrument in operation: one page that needs no other file, to be kept or sent by mail."""
+"""The daily report of an instrument in operation: one page that needs no other file, to be kept or sent by mail.
+
+Figures of an instrument in operation: courses of quantities with their bands, innovations against their limit.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
 from analysis.statistics import limit_of
 from scenes.models.disturbances import HEAT
 from scenes.yaml.errors import Problem
-from twin.operate.daily_plots import courses_svg, innovations_svg
-from twin.operate.estimate.alarms import name_of, percent
+from twin.operate.estimate.following import name_of, percent, with_sigma
 from twin.operate.overview import (
     CONFIDENCE,
     DAY,
     Overview,
+    Trend,
     carried_text,
-    code_of,
     day_text,
     group_name,
     largest_part,
     minute_text,
     trend,
-    with_sigma,
 )
-from twin.operate.record.entries import micros, utc_text
+from twin.operate.record.entries import MICRO, micros, utc_text
 from twin.operate.record.history import History
+from twin.run import svg
 from twin.run.artefact import Artefact, Cell, Marked, OwnDecimals, SvgFigure, Table, Text, decimals_for
-from twin.run.page import report_page
 from twin.run.report import Report, Section, answer
 
 if TYPE_CHECKING:
-    from twin.operate.estimate.following import FoundJump
+    pass
+
+BANDS = ((1.9600, 0.22, "95 %"), (0.9945, 0.42, "68 %"))
+"""Sigmas, opacity and name of the bands, the wide one first."""
+_FEW = 60
+"""Single readings that are drawn with their sigma; more would hide the course."""
+_SEEN = 3.0
+"""A limit is drawn where it lies within so many times the reach of the course; farther out it would flatten it."""
+
+
+def dates(times: np.ndarray) -> np.ndarray:
+    """Matplotlib's dates of times in microseconds of TAI since 2000, in UTC as it is at the first of them.
+
+    A leap second within a figure moves what comes after it by a second, which no figure shows.
+    """
+    if not len(times):
+        return np.zeros(0)
+    text = utc_text(int(times[0])).replace(":60", ":59").rstrip("Z")
+    first = datetime.fromisoformat(text).replace(tzinfo=UTC)
+    return np.asarray(date2num(first), np.float64) + (times - times[0]) / (86_400.0 * MICRO)
+
+
+def courses_svg(name: str, overview: Overview, trend: Trend, quantities: Sequence[Quantity], wide: int = 1) -> str:
+    """Courses of quantities over one span, a panel each.
+
+    Args:
+        name: of the figure.
+        overview: of the operation, for requirements, jumps and events.
+        trend: of all quantities.
+        quantities: that are drawn.
+        wide: panels beside each other.
+    """
+    with svg.look(f"operate-{name}"):
+        height = 2.3 if wide == 1 else 1.9
+        figure, panels = svg.panels([height] * len(quantities), wide)
+        figure.set_figheight(figure.get_figheight() + 0.5)
+        for axes, quantity in zip(panels, quantities, strict=True):
+            _course(axes, overview, trend, quantity)
+        svg.shared_legend(figure, panels[0], columns=4)
+        return svg.to_svg(figure)
+
+
+def _course(axes: Axes, overview: Overview, trend: Trend, quantity: Quantity) -> None:
+    q = overview.quantities.index(quantity)
+    parts = [("estimate", trend.past, svg.BLUE, svg.SKY, "-")]
+    if trend.future is not None:
+        parts.append(("forecast", trend.future, svg.VERMILION, svg.ORANGE, "--"))
+    reach = 0.0
+    for what, course, line, band, style in parts:
+        at, value, sigma = dates(course.times), course.values[:, q], course.sigmas[:, q]
+        for times, alpha, share in BANDS:
+            low, high = value - times * sigma, value + times * sigma
+            axes.fill_between(at, low, high, color=band, alpha=alpha, lw=0, label=f"{share} of the {what}")
+            reach = max(reach, float(np.nanmax(np.abs(np.concatenate([low, high])), initial=0.0)))
+        axes.plot(at, value, style, color=line, lw=1.1, label=what)
+    _points(axes, trend, q)
+    _happened(axes, overview, trend)
+    required = overview.required(quantity)
+    title = f"{group_name(quantity.group)} {quantity.parameter.label}"
+    if required is not None:
+        if required.limit <= _SEEN * reach:
+            for sign in (1.0, -1.0):
+                label = "requirement" if sign > 0.0 else None
+                axes.axhline(sign * required.limit, color=svg.INK, lw=1.0, ls=(0, (6, 3)), label=label)
+        else:
+            title += f", limit ±{required.limit:g} beyond the figure"
+    axes.axhline(0.0, color=svg.LIGHT, lw=0.8, zorder=0)
+    axes.set_title(title, loc="left")
+    _dated(axes)
+
+
+def _points(axes: Axes, trend: Trend, q: int) -> None:
+    points = trend.points
+    known = np.isfinite(points.values[:, q])
+    if not known.any():
+        return
+    at, value, sigma = dates(points.times)[known], points.values[known, q], points.sigmas[known, q]
+    label = "each reading by itself"
+    if len(at) <= _FEW:
+        axes.errorbar(at, value, sigma, fmt="o", color=svg.GREY, ms=2.5, elinewidth=0.7, label=f"{label}, ±σ")
+    else:
+        axes.plot(at, value, ".", color=svg.GREY, ms=2.0, alpha=0.6, label=label)
+
+
+def _happened(axes: Axes, overview: Overview, trend: Trend) -> None:
+    """Jumps as bands from the reading before to the one after, events as lines."""
+    begin, end = int(trend.past.times[0]), int(trend.past.times[-1])
+    jumps = [jump for jump in overview.following.jumps if begin <= jump.until_us and jump.after_us <= end]
+    for k, jump in enumerate(jumps):
+        low, high = dates(np.array([jump.after_us, jump.until_us]))
+        axes.axvspan(low, high, color=svg.PURPLE, alpha=0.35, lw=1.0, label=None if k else "jump")
+    events = [time for time, *_ in overview.events if begin <= time <= end]
+    for k, time in enumerate(events):
+        axes.axvline(dates(np.array([time]))[0], color=svg.GREEN, lw=0.9, ls=":", label=None if k else "event")
+
+
+def _dated(axes: Axes) -> None:
+    locator = AutoDateLocator(minticks=3, maxticks=9)
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    axes.margins(x=0.01)
+    svg.gridded(axes, "y")
+
+
+def innovations_svg(overview: Overview) -> str:
+    """What the newest readings departed from their predictions by, chi-square with its limit."""
+    with svg.look("operate-innovations"):
+        told = overview.following.innovations
+        times = np.array([one[0] for one in told], np.int64)
+        chi = np.array([one[1] for one in told], np.float64)
+        degrees = np.array([one[2] for one in told], np.float64)
+        limit = np.array([limit_of(FALSE_ALARM, one) for one in degrees])
+        figure = svg.new_figure(2.6)
+        axes = figure.subplots()
+        at, above = dates(times), chi > limit
+        axes.plot(at, limit, color=svg.INK, lw=1.0, ls=(0, (6, 3)), label="limit, chance 0.1 %")
+        axes.plot(at, degrees, color=svg.GREY, lw=0.9, label="mean where predictions are right")
+        axes.plot(at[~above], chi[~above], ".", color=svg.BLUE, ms=4, label="reading")
+        axes.plot(at[above], chi[above], "D", color=svg.VERMILION, ms=4, label="above the limit")
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.set_ylabel("chi-square")
+        _dated(axes)
+        svg.shared_legend(figure, axes)
+        return svg.to_svg(figure)
+
 
 RECENT = 30 * DAY
 """Before the newest reading, of the second figure of courses."""
@@ -95,16 +227,6 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
     )
 
 
-def report_html(report: Report, words: Sequence[str]) -> bytes:
-    """The report as one page.
-
-    Args:
-        report: of a day.
-        words: of the command that makes it again.
-    """
-    return report_page(report, words).encode()
-
-
 def end_of_day(text: str | None, newest: int) -> int:
     """The end of a day of UTC, microseconds of TAI since 2000; by default of the newest reading's.
 
@@ -158,7 +280,7 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
         f"±{one.limit:g}",
         percent(one.chance_now).removesuffix(" %"),
         percent(1.0 - one.probability).removesuffix(" %"),
-        Marked("yes" if one.holds_now else "no", look=look, key=f"{quantity.group} {quantity.key}"),
+        Marked("yes" if one.holds_now else "no", look=look, key=quantity.name),
         when if one.holds_now else "broken",
     ]
 
@@ -166,10 +288,9 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
 def _changed_section(overview: Overview, begin: int, end: int) -> Section:
     found = [one for one in overview.changed(begin, end) if not one.again]
     lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in found)
-    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC."
-    if not lines:
-        return Section("What changed", (f"{what} Nothing happened.",), name="changed")
-    return Section("What changed", (what,), (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),), name="changed")
+    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing happened.'}"
+    shown = (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),) if lines else ()
+    return Section("What changed", (what,), shown, name="changed")
 
 
 def _trend_section(history: History, overview: Overview, last: int) -> Section:
@@ -238,9 +359,8 @@ def _prediction_section(overview: Overview) -> Section:
         "interval is the exact binomial one."
     )
     artefacts: list[Artefact] = []
-    text = [
-        f"Mean log score of a reading: {_score(overview)}." if told.scores.readings else "Nothing was predicted yet."
-    ]
+    score = f"Mean log score of a reading: {told.scores.log_score:.3f}, larger is better."
+    text = [score if told.scores.readings else "Nothing was predicted yet."]
     if told.innovations:
         above = sum(chi > limit_of(FALSE_ALARM, degrees) for _, chi, degrees in told.innovations)
         text.append(
@@ -253,19 +373,14 @@ def _prediction_section(overview: Overview) -> Section:
     return Section("Predictions", tuple(text), tuple(artefacts), name="predictions")
 
 
-def _score(overview: Overview) -> str:
-    scores = overview.following.scores
-    return f"{scores.log_score:.3f}, larger is better"
-
-
 def _explained(overview: Overview) -> str:
     known = {name: share for name, share in overview.following.explained.items() if math.isfinite(share)}
     if not known:
         return ""
     parts = [
-        f"{100.0 * known[code_of(one)]:.0f} % of that of {name_of(code_of(one), overview.quantities)}"
+        f"{100.0 * known[one.name]:.0f} % of that of {name_of(one.name, overview.quantities)}"
         for one in overview.quantities
-        if known.get(code_of(one), 0.0) >= 0.005 and (overview.required(one) or not overview.following.breaks)
+        if known.get(one.name, 0.0) >= 0.005 and (overview.required(one) or not overview.following.breaks)
     ]
     if not parts:
         return "Temperatures explain nothing of the scatter of what is required"
@@ -280,18 +395,17 @@ def _jump_section(overview: Overview) -> Section | None:
     full: list[list[Cell]] = []
     for jump in sorted(told.jumps, key=lambda one: -one.until_us):
         label, unit, size, sigma = largest_part(jump)
-        part, others = label.removeprefix(f"{jump.body} "), rivals_text(jump)
+        part, rivals = label.removeprefix(f"{jump.body} "), sorted(jump.rivals.items(), key=lambda one: -one[1])
+        others = ", ".join(f"{body} ({ratio:.1f})" for body, ratio in rivals[:3])
         row: list[Cell] = [Marked(minute_text(jump.until_us), f"after {minute_text(jump.after_us)}", "text")]
         row += [minute_text(jump.told_us), jump.body]
-        row += [
-            Marked(part, with_sigma(size, sigma, unit.replace("um", "µm")), "text"),
-            carried_text(overview, jump) or _NOT,
-        ]
+        row += [Marked(part, with_sigma(size, sigma, unit), "text"), carried_text(overview, jump) or _NOT]
         rows.append([*row, OwnDecimals(jump.log_ratio, 1), f"{jump.false_alarm:.1g}", others or _NOT])
         when = [utc_text(time) for time in (jump.after_us, jump.until_us, jump.told_us)]
         full.append([*when, jump.body, part, size, sigma, unit, jump.log_ratio, jump.false_alarm, others])
     events = [
-        f"{minute_text(time)}: {name.replace('_', ' ')}{_causes(causes)}" for time, name, causes in overview.events
+        f"{minute_text(time)}: {name.replace('_', ' ')}" + (f", which may step {', '.join(causes)}" if causes else "")
+        for time, name, causes in overview.events
     ]
     artefacts: list[Artefact] = []
     if rows:
@@ -306,16 +420,6 @@ def _jump_section(overview: Overview) -> Section | None:
         artefacts.append(Text("events", "Events of the record", "", events[::-1][:MOST_SHOWN], within=""))
     words = () if artefacts else ("No jump was found, and the record has no event.",)
     return Section("Jumps and events", words, tuple(artefacts), name="jumps")
-
-
-def rivals_text(jump: FoundJump) -> str:
-    """Other bodies that a jump may be of, the likeliest first, with their log ratios."""
-    others = sorted(jump.rivals.items(), key=lambda one: -one[1])[:3]
-    return ", ".join(f"{body} ({ratio:.1f})" for body, ratio in others)
-
-
-def _causes(causes: Sequence[str]) -> str:
-    return f", which may step {', '.join(causes)}" if causes else ""
 
 
 def _newest(name: str, title: str, caption: str, heads: Sequence[str], rows: list[list[Cell]]) -> Table:

@@ -1,4 +1,4 @@
-"""What commands show of an estimate: how the instrument stands now, the forecast, and the alarms."""
+"""Commands on an estimate: the forecast, alarms, decisions, products and the daily report; how an instrument stands."""
 
 from __future__ import annotations
 
@@ -9,31 +9,40 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from scenes.yaml.errors import Problem
-from twin.operate.followed import PlanFile, followed, known_of, operation_of, plan_of
-from twin.operate.terminal import Place, line, require_record, tell, told
-from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict, print_whole, result_table
+from scenes.yaml.standard_output import FAILURE, print_error
+from twin.operate.terminal import (
+    Call,
+    NewFolder,
+    PlanFile,
+    line,
+    moment_said,
+    on_record,
+    problems_of,
+    require_new,
+    show_table,
+)
+from twin.run import durable
+from twin.run.cli import InputErrorText, print_verdict
 
 if TYPE_CHECKING:
     from analysis.monitor.series_filter import Power
     from twin.operate.estimate.following import Course, Following
     from twin.operate.estimate.operation import Operation
-    from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
+    from twin.run.report import Report
 
 STEPS = 4
 """Columns of a forecast after the first, now."""
 
 
+@on_record
 def forecast(
-    record: Place,
+    call: Call,
     plan: PlanFile = None,
     until: Annotated[
         str | None, typer.Option(metavar="UTC", help="End of the forecast. Default: the plan's horizon.")
     ] = None,
     steps: Annotated[int, typer.Option(min=1, max=1000, help="Times of it, evenly spaced.")] = STEPS,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Tell what is expected of every quantity until the horizon, with sigmas, and when a requirement will break.
 
@@ -44,51 +53,37 @@ def forecast(
 
     Exit codes: 0 success, 2 bad input, 1 anything else.
     """
-    require_record(record)
-    from twin.operate.record.history import History
+    from twin.operate.record.entries import MICRO
 
-    with told() as errors, History(record) as history:
-        operation = operation_of(history, plan, errors, quiet)
-        following = operation.follow()
-        end = _end(until, following.time, operation.plan.operation.horizon)
-        times = [following.time + round((end - following.time) * k / steps) for k in range(steps + 1)]
-        course = operation.forecast(times)
-        requirements = [one.to_dict() for one in following.breaks]
-        data = {"record": history.url, "instrument": history.name, **course.to_dict(), "requirements": requirements}
-        data["warnings"] = following.warnings
-
-        def show(console: Console) -> None:
-            print_verdict(console, f"{history.name}: forecast from {course.utc[0]} to {course.utc[-1]}")
-            _show_course(course, console)
-            show_requirements(following, console)
-            for text in following.warnings:
-                line(console, f"warning: {text}")
-
-        tell(errors, as_json, quiet, data, show)
-
-
-def _end(until: str | None, start: int, horizon: float) -> int:
-    """Microseconds of the end of a forecast. Raises InputErrorText: it is not after its beginning."""
-    from twin.operate.record.entries import MICRO, utc_text
-    from twin.operate.record.sources import moment_said
-
-    if until is None:
-        return start + round(horizon * MICRO)
-    end = moment_said("--until", until)
+    operation = call.followed(call.planned(plan))
+    following = operation.follow()
+    start, horizon = following.time, round(operation.plan.operation.horizon * MICRO)
+    end = start + horizon if until is None else moment_said("--until", until)
     if end <= start:
-        raise InputErrorText(f"--until: {until} is not after the newest reading, {utc_text(start)}")
-    return end
+        raise InputErrorText(f"--until: {until} is not after the newest reading, {following.now.utc[0]}")
+    course = operation.forecast([start + round((end - start) * k / steps) for k in range(steps + 1)])
+    requirements = [one.to_dict() for one in following.breaks]
+    name, warnings = call.history.name, following.warnings
+    data = {"record": call.history.url, "instrument": name, **course.to_dict(), "requirements": requirements}
+
+    def show(console: Console) -> None:
+        print_verdict(console, f"{name}: forecast from {course.utc[0]} to {course.utc[-1]}")
+        _show_course(course, console)
+        show_requirements(following, console)
+        for text in warnings:
+            line(console, f"warning: {text}")
+
+    call.tell({**data, "warnings": warnings}, show)
 
 
+@on_record
 def alarms(
-    record: Place,
+    call: Call,
     acknowledge: Annotated[
         int | None, typer.Option(metavar="ID", help="Say that somebody has seen this alarm.")
     ] = None,
     by: Annotated[str | None, typer.Option(metavar="NAME", help="Who has seen it.")] = None,
     note: Annotated[str, typer.Option(metavar="TEXT", help="What is done about it.")] = "",
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """List the alarms of a record, those first that nobody has acknowledged; or acknowledge one.
 
@@ -99,41 +94,32 @@ def alarms(
 
     Exit codes: 0 success, whether alarms are open or not, 2 bad input, 1 anything else.
     """
-    require_record(record)
-    from twin.operate.record.entries import one_line
-    from twin.operate.record.history import History
+    if acknowledge is not None:
+        if not (by and by.strip()):
+            raise InputErrorText("--acknowledge: who has seen the alarm? --by NAME")
+        with problems_of("--acknowledge"):
+            call.history.acknowledge(acknowledge, by.strip(), note)
+    elif by is not None or note:
+        raise InputErrorText("--by and --note: which alarm? --acknowledge ID")
+    rows = call.history.alarms()
+    opened = sum(one["acknowledged"] is None for one in rows)
 
-    with told() as errors, History(record) as history:
-        if acknowledge is not None:
-            if not (by and by.strip()):
-                raise InputErrorText("--acknowledge: who has seen the alarm? --by NAME")
-            try:
-                history.acknowledge(acknowledge, by.strip(), note)
-            except Problem as problem:
-                raise InputErrorText(f"--acknowledge: {one_line(problem)}") from None
-        elif by is not None or note:
-            raise InputErrorText("--by and --note: which alarm? --acknowledge ID")
-        rows = history.alarms()
-        opened = sum(one["acknowledged"] is None for one in rows)
-        data = {"open": opened, "alarms": rows}
+    def show(console: Console) -> None:
+        print_verdict(console, f"{call.history.name}: {_open_text(opened)}, {len(rows)} in all")
+        for one in sorted(rows, key=lambda one: (one["acknowledged"] is not None, -one["time_us"])):
+            line(console, alarm_line(one))
 
-        def show(console: Console) -> None:
-            print_verdict(console, f"{history.name}: {_open_text(opened)}, {len(rows)} in all")
-            for one in sorted(rows, key=lambda one: (one["acknowledged"] is not None, -one["time_us"])):
-                line(console, alarm_line(one))
-
-        tell(errors, as_json, quiet, data, show)
+    call.tell({"open": opened, "alarms": rows}, show)
 
 
+@on_record
 def exclude(
-    record: Place,
+    call: Call,
     entry: Annotated[int, typer.Argument(metavar="ENTRY", min=1, help="Number of the entry, as status says.")],
     why: Annotated[str, typer.Option(metavar="TEXT", help="The reason, which the record keeps.")],
     include: Annotated[
         bool, typer.Option("--include", help="Include it again, or although the estimate left it out as a bad one.")
     ] = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Exclude a reading from the estimate, or include it, with the reason. The record keeps the reading and all
     decisions; the newest counts.
@@ -145,20 +131,138 @@ def exclude(
 
     Exit codes: 0 success, 2 bad input (nothing is decided), 1 anything else.
     """
-    require_record(record)
-    from twin.operate.record.entries import one_line
+    if not why.strip():
+        raise InputErrorText("--why: a decision needs a reason, which the record keeps")
+    with problems_of("ENTRY"):
+        made = call.history.decide(entry, include, why.strip())
+    text = "entry {entry}, {kind} of {subject} at {time_utc}, is ".format(**made)
+    text += f"{'included' if include else 'excluded'}: {made['why']}"
+    call.tell(made, lambda console: print_verdict(console, text))
+
+
+@on_record
+def products(
+    call: Call,
+    plan: PlanFile = None,
+    moment: Annotated[
+        str | None,
+        typer.Option("--time", metavar="UTC", help="Of the estimate; that of the scene where it is not given."),
+    ] = None,
+    scene: Annotated[
+        Path | None,
+        typer.Option(
+            readable=False,
+            help="YAML file of a test of intersection angles with the instrument, or its run folder: camera, orbit and "
+            "attitude of a scene whose camera models are wanted.",
+        ),
+    ] = None,
+    out: NewFolder = Path("products"),
+) -> None:
+    """Write what the estimate says for one time: models of a scene's cameras as they were then (ISD and RPC00B with
+    ERR_BIAS and ERR_RAND), the state of the instrument as a job for twin.render (state.yaml), and what is uncertain of
+    it as a prior for twin.asbuilt (prior.yaml). products.json says from when to when they hold.
+
+    Example: `python -m twin.operate products record --scene scenes/orbit/angle_gf7.yaml --time 2026-03-05T03:05:00Z`
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+    from optics.numerics.backend import load_backend
+    from twin.operate.products import made, product_files, scene_time, summary
+    from twin.orbit.export.export_run import read_source
+
+    require_new(out)
+    source = None if scene is None else read_source(scene)
+    if moment is not None:
+        time = moment_said("--time", moment)
+    elif source is not None:
+        with problems_of("--scene"):
+            time = scene_time(source)
+    else:
+        raise InputErrorText("of which time? --time UTC, or --scene FILE, which has one")
+    operation = call.followed(call.planned(plan))
+    with problems_of():
+        one = made(operation, call.history, time, source, load_backend())
+    files, numbers = product_files(one)
+    call.write_new(out, files, "products")
+    call.tell(numbers, lambda console: line(console, summary(one)))
+
+
+@on_record
+def report(
+    call: Call,
+    plan: PlanFile = None,
+    day: Annotated[
+        str | None, typer.Option(metavar="UTC", help="Day of the report, 2028-03-05. Default: of the newest reading.")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE.html", readable=False, help="The report; a file of that name is replaced.")
+    ] = Path("report.html"),
+) -> None:
+    """Write the daily report: one page that needs no other file, to be kept or to be sent by mail.
+
+    Two sentences say first how the instrument stands against its requirements, and what changed on the day. Then come
+    every quantity with its sigma, its requirement, its chance to keep it and the day on which it is expected to break;
+    trends, jumps, predictions and whether they came true, sensors, alarms, and what was left out and why. Of a day that
+    is past it is the report as it would have been then.
+
+    Example: `python -m twin.operate report record --day 2028-03-05 --out report.html`
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+    from twin.operate.daily_report import end_of_day
+    from twin.operate.overview import span_of
     from twin.operate.record.history import History
 
-    with told() as errors, History(record) as history:
-        if not why.strip():
-            raise InputErrorText("--why: a decision needs a reason, which the record keeps")
-        try:
-            made = history.decide(entry, include, why.strip())
-        except Problem as problem:
-            raise InputErrorText(f"ENTRY: {one_line(problem)}") from None
-        text = "entry {entry}, {kind} of {subject} at {time_utc}, is ".format(**made)
-        text += f"{'included' if include else 'excluded'}: {made['why']}"
-        tell(errors, as_json, quiet, made, lambda console: print_verdict(console, text))
+    first, newest = span_of(call.history)
+    if not newest:
+        raise InputErrorText("the record has no reading of the monitor; ingest takes some")
+    with problems_of("--day"):
+        end = end_of_day(day, newest)
+    if end <= first:
+        raise InputErrorText(f"--day: the record has no reading of the monitor before the end of {day}")
+    operation, _, _ = call.estimate(plan)
+    words = [call.place, *([] if plan is None else [str(plan)]), *([] if day is None else ["--day", day])]
+    with History(call.place, end) as then:
+        own = then if end <= newest else call.history
+        if own is then:  # it goes on from what was kept of the whole record before the day's end
+            operation = call.followed(operation.plan, then)
+        made = write_report(call, own, operation, end, words, out)
+    data = {"report": str(out), "verdict": made.verdict, "warnings": list(made.warnings)}
+
+    def show(console: Console) -> None:
+        print_verdict(console, made.verdict)
+        line(console, f"report: {out}")
+
+    call.tell(data, show)
+
+
+def write_report(
+    call: Call, history: History, operation: Operation, end: int, words: Sequence[str], out: Path
+) -> Report:
+    """Write the report of a day.
+
+    Args:
+        call: the command.
+        history: its record, or that as it was.
+        operation: the estimate from it.
+        end: of the day, microseconds of TAI since 2000.
+        words: after ``twin.operate report``, of the command that makes it again.
+        out: file, which is replaced.
+
+    Raises:
+        typer.Exit: it cannot be written, which has been told.
+    """
+    from twin.operate.daily_report import daily_report
+    from twin.operate.overview import Overview
+    from twin.run.page import report_page
+
+    made = daily_report(history, Overview.of(history, operation), end)
+    try:
+        durable.write_safely(out, report_page(made, ("twin.operate", "report", *words)).encode())
+    except OSError as error:
+        print_error(call.errors, f"the report {out} cannot be written: {error.strerror or error}")
+        raise typer.Exit(FAILURE) from None
+    return made
 
 
 def _open_text(count: int) -> str:
@@ -172,25 +276,6 @@ def alarm_line(row: Mapping[str, Any]) -> str:
     return f"alarm {row['id']}, {row['time_utc']}, {row['kind']} ({state}): {row['text']}"
 
 
-def estimate_of(
-    errors: Console, history: History, plan: Path | None = None, quiet: bool = False
-) -> tuple[Operation, Following, list[Alarm]] | None:
-    """The estimate under a plan, what it says, and the alarms that are new, which are then in the record; None where
-    there is no plan or nothing to follow.
-
-    Args:
-        errors: where it is told how far it is.
-        history: the record.
-        plan: file; None for the plan that the record keeps.
-        quiet: whether that is not told.
-    """
-    setup = plan_of(history, plan)
-    if setup is None or (plan is None and history.first("monitor") is None):
-        return None
-    operation = followed(history, setup, errors, quiet)
-    return (operation, *known_of(operation))
-
-
 def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], console: Console) -> None:
     """The head of the estimate: now, predictions and whether they came true, jumps, sensors, what was left out, alarms.
 
@@ -199,7 +284,6 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
         rows: alarms of the record.
         console: the terminal.
     """
-    from twin.operate.estimate.alarms import sized
     from twin.operate.record.entries import utc_text
 
     scores, count = following.scores, following.readings
@@ -213,9 +297,7 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
     for text in following.warnings:
         line(console, f"warning: {text}")
     for jump in following.jumps:
-        between = f"between {utc_text(jump.after_us)} and {utc_text(jump.until_us)}"
-        sizes = ", ".join(f"{name.removeprefix(f'{jump.body} ')} {sized(z, s, u)}" for name, u, z, s in jump.sizes)
-        line(console, f"jump of {jump.body} {between}: {sizes}")
+        line(console, f"jump of {jump.body} {jump.found}")
     bad = [one for one in following.sensors if one.state != "ok"]
     if following.sensors:
         line(console, f"sensors: {len(following.sensors) - len(bad)} of {len(following.sensors)} are as they should be")
@@ -234,48 +316,44 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
 
 def _show_course(course: Course, console: Console) -> None:
     """A row for each quantity, a column for each time."""
-    from twin.operate.estimate.alarms import name_of, sized
+    from twin.operate.estimate.following import name_of, with_sigma
 
-    table = result_table()
-    table.add_column("change of")
-    for time in course.utc:
-        table.add_column(time, justify="right")
+    utc = course.utc
+    rows = []
     for k, one in enumerate(course.quantities):
         cells = zip(course.values[:, k].tolist(), course.sigmas[:, k].tolist(), strict=True)
-        unit = one.parameter.unit
-        table.add_row(name_of(f"{one.group} {one.key}", course.quantities), *(sized(v, s, unit) for v, s in cells))
-    print_whole(console, table)
+        name = name_of(one.name, course.quantities)
+        rows.append([name, *(with_sigma(v, s, one.parameter.unit, sign=True) for v, s in cells)])
+    show_table(console, ("change of", *utc), rows, range(1, len(utc) + 1))
 
 
 def show_power(found: Sequence[Power], console: Console) -> None:
     """A row for each body: the smallest jumps that are found, over the stated sizes."""
-    table = result_table()
-    for head in ("smallest jump found, over the stated", *(key.replace("_", " ") for key in found[0].plain)):
-        table.add_column(head)
-    for one in found:
-        table.add_row(one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values()))
-    print_whole(console, table)
+    heads = ("smallest jump found, over the stated", *(key.replace("_", " ") for key in found[0].plain))
+    sizes = ([one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values())] for one in found)
+    show_table(console, heads, sizes, ())
 
 
 def show_requirements(following: Following, console: Console) -> None:
     """A row for each requirement."""
-    from twin.operate.estimate.alarms import name_of, percent
+    from twin.operate.estimate.following import name_of, percent
     from twin.operate.record.entries import utc_text
     from twin.run.artefact import plain
 
     if not following.breaks:
         return
-    table = result_table()
-    for head in ("has to keep", "limit", "chance beyond", "allowed", "holds now", "expected to break"):
-        table.add_column(head, justify="left" if head in ("has to keep", "holds now") else "right")
+    rows = []
     for one in following.breaks:
         later = "now" if not one.holds_now else "not in the horizon"
-        table.add_row(
-            name_of(one.quantity, following.now.quantities),
-            f"{plain(one.limit)} {one.unit}",
-            percent(one.chance_now),
-            percent(1.0 - one.probability),
-            "yes" if one.holds_now else "no",
-            utc_text(one.breaks_us) if one.holds_now and one.breaks_us is not None else later,
+        rows.append(
+            [
+                name_of(one.quantity, following.now.quantities),
+                f"{plain(one.limit)} {one.unit}",
+                percent(one.chance_now),
+                percent(1.0 - one.probability),
+                "yes" if one.holds_now else "no",
+                utc_text(one.breaks_us) if one.holds_now and one.breaks_us is not None else later,
+            ]
         )
-    print_whole(console, table)
+    heads = ("has to keep", "limit", "chance beyond", "allowed", "holds now", "expected to break")
+    show_table(console, heads, rows, (1, 2, 3, 5))

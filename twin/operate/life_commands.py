@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from scenes.yaml.json_file import read_json
+from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.operate.terminal import line, tell, told
 from twin.run import durable
-from twin.run.cli import LARGEST_SEED, AsJson, BackendName, Force, Options, Out, Quiet, check_backend
+from twin.run.cli import LARGEST_SEED, AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet, check_backend
+from twin.run.command import Result, finished, progress_shown, run_command
+from twin.run.procedure import Session
+
+if TYPE_CHECKING:
+    from scenes.specs.operation import OperationSetup
 
 
 def simulate(
@@ -71,16 +78,14 @@ def simulate(
     with told() as errors, durable.exit_on_terminate():
         check_backend(backend)
         from optics.numerics.backend import load_backend
-        from twin.operate.lives.simulation_run import Places, simulate_into, simulation
-        from twin.run.command import progress_shown
+        from twin.operate.simulation_run import simulate_into, simulation
 
         options = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}
         options |= {"--coefficient-error": coefficient_error, "--sensor-sigma": sensor_sigma}
         several = {"--sensor": sensor or [], "--dead": dead or [], "--stuck": stuck or [], "--event": event or []}
         what = simulation(options, several, seed)
-        places = Places(plan, record, out, truth, force)
         with progress_shown(errors, as_json or quiet) as advance:
-            done = simulate_into(places, what, load_backend(backend), advance)
+            done = simulate_into(plan, record, out, truth, force, what, load_backend(backend), advance)
         place = done["record"] or done["files"]
         text = f"{done['readings']} readings of the monitor in {place}"
         lost = "".join(f"\nwarning: {one}" for one in done["lost"])
@@ -107,6 +112,37 @@ def judge(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    from twin.operate.judge_command import judge_life
 
-    judge_life(life, truth, Options(out, None, "llvm", force, as_json, quiet))
+    def resolve() -> tuple[OperationSetup, Path, Path]:
+        from scenes.specs.operation import OperationSetup
+        from scenes.yaml.spec import validate
+        from twin.operate.simulate import FOLDER, LIFE, TELEMETRY
+
+        files = life / FOLDER if (life / FOLDER).is_dir() else life
+        known = files / f"{LIFE}.json" if truth is None else truth
+        if not (files / TELEMETRY).is_file():
+            raise InputErrorText(f"no simulated life in {life}; python -m twin.operate simulate makes one")
+        if not known.is_file():
+            raise InputErrorText(f"no truth in {known}; --truth names the file that simulate wrote")
+        _truth(known)  # a wrong one is told before anything is followed
+        return validate(OperationSetup, read_yaml(files / "config.yaml")), files / TELEMETRY, known
+
+    def work(given: tuple[OperationSetup, Path, Path], session: Session) -> Result:
+        from twin.operate.judged_life import judged, judged_numbers, judged_report
+
+        plan, telemetry, known = given
+        done = judged(plan, telemetry, _truth(known), session.advance)
+        facts: dict[str, Any] = {"config": dump_yaml(plan.plain()), "command": "judge", "given": (telemetry, known)}
+        facts["again"] = ("twin.operate", "judge", str(life), *(() if truth is None else ("--truth", str(truth))))
+        report = judged_report(done, plan.model.instrument.name)
+        return finished(session, "judged", report, judged_numbers(done), program="twin.operate", **facts)
+
+    run_command("judged", Options(out, None, "llvm", force, as_json, quiet), resolve, work)
+
+
+def _truth(file: Path) -> dict[str, Any]:
+    """Plain data of a truth. Raises InputErrorText, InputError: it cannot be read, or is none."""
+    data = read_json(file)
+    if not isinstance(data, dict) or not {"times_us", "cameras"} <= set(data):
+        raise InputErrorText(f"{file}: not the truth of a simulated life")
+    return data

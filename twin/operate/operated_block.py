@@ -27,9 +27,9 @@ from scenes.specs.orbit.adjust import MonitorRecordSpec
 from scenes.yaml.errors import InputError, Problem, unknown
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.operation_model import kept_plan, read_plan
+from twin.operate.record import NotARecord, RecordFailed
 from twin.operate.record.entries import micros, utc_text
 from twin.operate.record.history import History
-from twin.operate.record.place import NotARecord, RecordFailed
 from twin.orbit.block.block_run import BlockRun, run_adjustment
 from twin.run.procedure import Advance, silent
 
@@ -57,7 +57,7 @@ class Posterior:
     @property
     def names(self) -> tuple[str, ...]:
         """Group and key of each: ``forward d_alpha_arcsec``."""
-        return tuple(f"{one.group} {one.key}" for one in self.quantities)
+        return tuple(one.name for one in self.quantities)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data: times, names and numbers."""
@@ -92,7 +92,7 @@ def posterior(
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
         raise Problem("times out of order", utc_text(int(times[late[0] + 1])), "each time later than the one before")
-    known = {f"{one.group} {one.key}": one for one in operation.quantities}
+    known = {one.name: one for one in operation.quantities}
     cameras = dict.fromkeys(camera for camera, _ in operation.model.spots)
     wanted = [name for name, one in known.items() if one.group in cameras] if names is None else list(names)
     for name in wanted:

@@ -22,10 +22,11 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import share_interval
 from optics.numerics.number_tree import FrozenMap
 from twin.operate.estimate.alarms import name_of, percent
+from twin.operate.estimate.following import name_of, percent, with_sigma
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of
 from twin.operate.record.schema import ENTRY, SOURCE
-from twin.run.artefact import SAME, decimals_for, fixed
+from twin.run.artefact import SAME
 
 if TYPE_CHECKING:
     from twin.operate.estimate.following import Break, Course, Following, FoundJump
@@ -41,18 +42,12 @@ def _rows() -> Select[Any]:
     return select(*ENTRY.c, SOURCE.c.file).join(SOURCE, ENTRY.c.source_id == SOURCE.c.id).where(ENTRY.c.kind == KIND)
 
 
-def first_time(history: History) -> int:
-    """Time of the first reading of the monitor, microseconds of TAI since 2000; 0 without any."""
+def span_of(history: History) -> tuple[int, int]:
+    """Times of the first and the newest reading of the monitor, microseconds of TAI since 2000; 0 without any."""
+    query = select(func.min(ENTRY.c.time_us), func.max(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)
     with history.reading() as connection:
-        found = connection.execute(select(func.min(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)).scalar()
-    return int(found or 0)
-
-
-def last_time(history: History) -> int | None:
-    """Time of the newest reading of the monitor, microseconds of TAI since 2000; None without any."""
-    with history.reading() as connection:
-        found = connection.execute(select(func.max(ENTRY.c.time_us)).where(ENTRY.c.kind == KIND)).scalar()
-    return None if found is None else int(found)
+        first, last = connection.execute(query).one()
+    return int(first or 0), int(last or 0)
 
 
 def readings(history: History, begin: int, end: int, most: int) -> list[dict[str, Any]]:
@@ -103,12 +98,6 @@ def day_text(time: int) -> str:
 def minute_text(time: int) -> str:
     """UTC date, hour and minute."""
     return utc_text(time)[:16].replace("T", " ")
-
-
-def with_sigma(value: float, sigma: float, unit: str) -> str:
-    """A number with its standard deviation, two digits of it, and its unit."""
-    places = decimals_for(sigma)
-    return f"{fixed(value, places)} ± {fixed(sigma, places)} {unit}"
 
 
 @dataclass(frozen=True)
@@ -216,7 +205,6 @@ class Overview:
         alarms: of the record, as `History.alarms` tells them.
         events: all of the record, (time_us, name, causes that may have stepped then).
         begin: time of the first reading of the monitor, microseconds of TAI since 2000.
-        name: of the instrument.
     """
 
     operation: Operation
@@ -224,7 +212,6 @@ class Overview:
     alarms: tuple[Mapping[str, Any], ...]
     events: tuple[tuple[int, str, tuple[str, ...]], ...]
     begin: int
-    name: str
 
     @classmethod
     def of(cls, history: History, operation: Operation) -> Overview:
@@ -232,8 +219,7 @@ class Overview:
         known = operation.plan.operation.events
         found = ((int(one["time_us"]), str(one["subject"])) for one in history.entries("event"))
         events = tuple((time, name, tuple(known.get(name, ()))) for time, name in found)
-        begin = first_time(history)
-        return cls(operation, operation.follow(), tuple(history.alarms()), events, begin, history.name)
+        return cls(operation, operation.follow(), tuple(history.alarms()), events, span_of(history)[0])
 
     @property
     def time(self) -> int:
@@ -252,7 +238,7 @@ class Overview:
 
     def required(self, quantity: Quantity) -> Break | None:
         """The requirement on a quantity with what is known of it; None where nothing is required."""
-        return next((one for one in self.following.breaks if one.quantity == code_of(quantity)), None)
+        return next((one for one in self.following.breaks if one.quantity == quantity.name), None)
 
     @property
     def horizon(self) -> int:
@@ -271,7 +257,7 @@ class Overview:
         for jump in told.jumps:
             label, unit, size, sigma = largest_part(jump)
             text = f"a jump of {jump.body} between {minute_text(jump.after_us)} and {minute_text(jump.until_us)}"
-            text += f": {label} {with_sigma(size, sigma, unit.replace('um', 'µm'))}"
+            text += f": {label} {with_sigma(size, sigma, unit)}"
             yield Happening(jump.told_us, "jump", text)
         for time, name, _ in self.events:
             yield Happening(time, "event", f"the event {name.replace('_', ' ')}")
@@ -357,7 +343,7 @@ class Overview:
         return name_of(one.quantity, self.quantities)
 
     def _quantity(self, one: Break) -> Quantity:
-        return next(quantity for quantity in self.quantities if code_of(quantity) == one.quantity)
+        return next(quantity for quantity in self.quantities if quantity.name == one.quantity)
 
     def _now(self, one: Break) -> str:
         quantity, now = self._quantity(one), self.following.now
@@ -385,11 +371,6 @@ def _capital(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
 
 
-def code_of(quantity: Quantity) -> str:
-    """A quantity as plans name it: ``GROUP KEY``."""
-    return f"{quantity.group} {quantity.key}"
-
-
 def _limit(one: Break) -> str:
     """The limit with its unit."""
     return f"{one.limit:g} {one.unit}"
@@ -404,12 +385,12 @@ def carried_text(overview: Overview, jump: FoundJump) -> str:
     """What a jump did to the line, of what is required; of all where nothing is; empty where nothing is told of it."""
     parts = []
     for quantity in overview.quantities:
-        told = jump.carried.get(code_of(quantity))
+        told = jump.carried.get(quantity.name)
         if told is not None and (overview.required(quantity) is not None or not overview.following.breaks):
             _, changed, sigma = told
             if abs(changed) + sigma < SAME:  # the body is none of that camera
                 continue
-            name = name_of(code_of(quantity), overview.quantities)
+            name = name_of(quantity.name, overview.quantities)
             parts.append(f"{name} {with_sigma(changed, sigma, quantity.parameter.unit)}")
     return ", ".join(parts)
 

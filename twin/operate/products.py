@@ -5,19 +5,30 @@ Motions whose stated law in time is `white` are others in every image and every 
 orbit to the next. No reading tells them for an image that was not taken just then, and none is: an image takes seconds.
 Camera models are not corrected by them, and their stated sizes make ERR_RAND, the error that images do not have in
 common. All else is corrected as estimated, and what is uncertain of it makes ERR_BIAS.
+
+They hold from one time to another. Used at another time t', the estimate p(t) of a time t is wrong by p(t) - P(t'),
+P the truth. p(t') is the mean of P(t') given the same readings and p(t) follows from these readings, so that the mean
+square of the error is exactly
+
+    sigma(t')^2 + (p(t') - p(t))^2.
+
+The estimate holds as long as the root of this is at most 1 + `SHARE` times sigma(t) for every quantity, within the
+readings and the forecast, and not across what is known to have changed the instrument.
 """
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import select
 
-from analysis.arrays import Array
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
@@ -25,11 +36,13 @@ from twin.operate.estimate.operation_model import plan_digest
 from twin.operate.estimated_motions import EstimatedMotions, LeftOut, Prior, prior_files, state_file
 from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
 from twin.operate.record.schema import ENTRY
-from twin.operate.validity import Mark, Validity, validity
 from twin.orbit.export.estimated_change import EstimatedChange
+from twin.orbit.export.export_report import LINE, export_files
 from twin.orbit.export.export_run import USUAL_HEIGHTS, Export, run_export
 from twin.run.data_files import WRITER
 from twin.run.procedure import BenchError
+from twin.run.quantity import Quantity, Record
+from twin.run.reference_frames import described
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -38,6 +51,123 @@ if TYPE_CHECKING:
     from twin.operate.estimate.operation import Operation
     from twin.operate.record.history import History
     from twin.orbit.export.export_run import ExportSource
+
+SHARE = 0.2
+"""By which an error may be larger than at the time of the estimate."""
+_FIRST = MICRO
+"""Microseconds: the shortest time that is looked at."""
+_STEPS = 48
+"""Times on either side, one after the other by equal factors; then as often between the last that holds and the first
+that does not."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What an estimate does not hold across.
+
+    Attributes:
+        time: microseconds of TAI since 2000.
+        reason: in words.
+    """
+
+    time: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Validity:
+    """Span in which an estimate holds.
+
+    Attributes:
+        since, until: microseconds of TAI since 2000.
+        since_reason, until_reason: why it does not hold before and after.
+    """
+
+    since: int
+    until: int
+    since_reason: str
+    until_reason: str
+
+
+def validity(
+    estimates: Callable[[Sequence[int]], Course],
+    time: int,
+    first: Mark,
+    last: Mark,
+    marks: Sequence[Mark] = (),
+    beside: Course | None = None,
+) -> Validity:
+    """The span in which the estimate of a time holds.
+
+    Args:
+        estimates: at times in ascending order.
+        time: of the estimate.
+        first: from when on there are estimates.
+        last: until when.
+        marks: what lies between; one at the time itself counts as before it.
+        beside: the estimate just beside the time, in place of that at it.
+    """
+    low = max((one for one in (first, *marks) if one.time <= time), key=lambda one: one.time)
+    high = min((one for one in (last, *marks) if one.time > time), key=lambda one: one.time, default=last)
+    here = beside or estimates([time])
+    ends = {-1: time - low.time, 1: high.time - time}
+    found = _looked_at(estimates, here, time, {sign: (0, _distances(0, span)) for sign, span in ends.items()})
+    again = {sign: (good, _distances(good, bad, evenly=True)) for sign, (good, bad, _) in found.items()}
+    found |= _looked_at(estimates, here, time, again)
+    since, until = (
+        Mark(time + sign * found[sign][0], found[sign][2]) if sign in found else mark
+        for sign, mark in ((-1, low), (1, high))
+    )
+    return Validity(since.time, until.time, since.reason, until.reason)
+
+
+def _distances(good: int, end: int, evenly: bool = False) -> NDArray[np.int64]:
+    """Distances beyond one at which an estimate holds, up to an end, microseconds, increasing."""
+    if end <= good:
+        return np.empty(0, np.int64)
+    if evenly:
+        away = np.linspace(good, end, _STEPS + 1)[1:]
+    else:
+        away = np.geomspace(min(_FIRST, end), end, _STEPS)
+    return np.unique(np.round(away).astype(np.int64))
+
+
+def _looked_at(
+    estimates: Callable[[Sequence[int]], Course],
+    here: Course,
+    time: int,
+    sides: Mapping[int, tuple[int, NDArray[np.int64]]],
+) -> dict[int, tuple[int, int, str]]:
+    """Where the estimate ceases to hold, by the sign of the side: the last distance at which it holds and the first at
+    which it does not, microseconds, and why; sides on which it holds are missing.
+
+    Args:
+        estimates: asked once for the times of all sides.
+        here: the estimate.
+        time: of it.
+        sides: sign -> a distance at which it holds, and those to look at, (T,), increasing.
+    """
+    times = np.unique(np.concatenate([np.empty(0, np.int64), *(time + sign * own for sign, (_, own) in sides.items())]))
+    if not len(times):
+        return {}
+    course = estimates(times.tolist())
+    sigma = np.where(here.sigmas[0] > 0.0, here.sigmas[0], np.inf)
+    error = np.hypot(course.sigmas, course.values - here.values[0]) / sigma
+    out = {}
+    for sign, (good, own) in sides.items():
+        at = np.searchsorted(times, time + sign * own)
+        over = np.flatnonzero(np.max(error[at], axis=1, initial=0.0) > 1.0 + SHARE)
+        if not over.size:
+            continue
+        k = int(over[0])
+        q = int(np.argmax(error[at[k]]))
+        one = here.quantities[q]
+        moved = abs(course.values[at[k], q] - here.values[0, q]) > course.sigmas[at[k], q] - here.sigmas[0, q]
+        what = "its estimate goes on" if moved else "its sigma grows"
+        reason = f"{one.name} would be wrong by {100.0 * SHARE:g} percent more: {what}"
+        out[sign] = int(own[k - 1]) if k else good, int(own[k]), reason
+    return out
+
 
 STATE, PRIOR = "state", "prior"
 """Names of the files."""
@@ -53,8 +183,7 @@ class Products:
         history: the record.
         time: of the estimate, microseconds of TAI since 2000.
         scene_time: when the scene was taken, likewise; None without a scene.
-        newest: time of the newest reading that the estimate rests on.
-        readings: how many these are.
+        following: what the estimate says now, with the readings that it rests on.
         version: SHA-256 of the last entry of the record, of the plan and of the program's version.
         course: the estimate at that time.
         validity: span in which it holds.
@@ -69,8 +198,7 @@ class Products:
     history: History
     time: int
     scene_time: int | None
-    newest: int
-    readings: int
+    following: Following
     version: str
     course: Course
     validity: Validity
@@ -122,7 +250,6 @@ def made(operation: Operation, history: History, time: int, scene: ExportSource 
         allowed = f"a time from {utc_text(ends[0].time)} to {utc_text(ends[1].time)}"
         remedy = "" if early else "; take newer readings, or a longer horizon in the plan"
         raise Problem(text, utc_text(time), allowed + remedy)
-    newest = following.time
     # at the very moment of a reading white motions are known, and a microsecond later they are not
     both = operation.smoothed([time, min(time + 1, ends[1].time)])
     course, beside = _at(both, 0), _at(both, 1)
@@ -135,7 +262,7 @@ def made(operation: Operation, history: History, time: int, scene: ExportSource 
     version = _version(operation, history)
     changes = _changes(operation, course, found, _notes(time, held, following, version))
     remark = f"{history.name} as estimated for {utc_text(time)}, version {version}"
-    about = f"posterior of {following.readings} readings up to {utc_text(newest)}, for {utc_text(time)}"
+    about = f"posterior of {following.readings} readings up to {utc_text(following.time)}, for {utc_text(time)}"
     plan, instrument = operation.plan.operation, operation.experiment.instrument
     state, left = state_file(found, operation.experiment.thermal, plan.instrument, plan.disturbances, remark)
     prior = prior_files(
@@ -143,10 +270,7 @@ def made(operation: Operation, history: History, time: int, scene: ExportSource 
     )
     export = None if scene is None else _exported(scene, backend, changes)
     warnings = _warnings(following, time, at, export, left, prior)
-    return Products(
-        *(history, time, at, newest, following.readings, version, course, held, changes, export),
-        *(state, left, prior, warnings),
-    )
+    return Products(history, time, at, following, version, course, held, changes, export, state, left, prior, warnings)
 
 
 def _components(operation: Operation) -> list[Component]:
@@ -156,11 +280,6 @@ def _components(operation: Operation) -> list[Component]:
     own = {(one.cause, one.name): one for one in stated.components}
     of = operation.model.how.stated
     return [own[key] for key in zip(of.causes, of.labels, strict=True)]
-
-
-def _cameras(operation: Operation) -> tuple[str, ...]:
-    """Names in the order of the estimate's parameters."""
-    return tuple(dict.fromkeys(camera for camera, _ in operation.model.spots))
 
 
 def _require_own(scene: ExportSource, history: History) -> None:
@@ -219,7 +338,8 @@ def _changes(
     """Camera -> its change at the course's one time, without white motions."""
     stated = operation.model.how.stated
     white = np.array([law.white for law in stated.laws])
-    rows = _by_motions(operation, found)
+    size = np.array([one.unit_size for one in found.components]) * stated.sigmas
+    rows = stated.parameters / np.where(size > 0.0, size, np.inf)  # (4 K, M) per SI unit of each motion
     other, own = rows * ~white, rows * white
     # p = p_other + p_white: their covariance goes out with that of the white part
     across = own @ found.covariance @ other.T
@@ -229,7 +349,7 @@ def _changes(
     random = prior @ stated.correlation @ prior.T
     values = course.changes[0] - own @ found.mean
     out = {}
-    for k, name in enumerate(_cameras(operation)):
+    for k, name in enumerate(dict.fromkeys(camera for camera, _ in operation.model.spots)):
         four = slice(4 * k, 4 * k + 4)
         out[name] = EstimatedChange(values[four], constant[four, four], random[four, four], notes)
     return out
@@ -253,13 +373,6 @@ def _exported(scene: ExportSource, backend: Backend, changes: Mapping[str, Estim
         return run_export(replace(scene, setup=setup), backend, _heights(scene), changes=changes)
     except BenchError as error:
         raise InputError(*test.error(str(error), error.key, allowed=error.remedy).issues) from error
-
-
-def _by_motions(operation: Operation, found: EstimatedMotions) -> Array:
-    """(4 K, M) parameters per SI unit of each motion."""
-    stated = operation.model.how.stated
-    size = np.array([one.unit_size for one in found.components]) * stated.sigmas
-    return np.asarray(stated.parameters / np.where(size > 0.0, size, np.inf))
 
 
 def _heights(scene: ExportSource) -> tuple[float, float] | None:
@@ -294,3 +407,116 @@ def _warnings(
         text = f"{PRIOR}.yaml does not have the {len(prior.left_out)} components that matter least"
         out.append(f"{text}; none makes more than {100.0 * most:.2g} percent of the variance of a spot or a parameter")
     return tuple(out)
+
+
+NUMBERS = "products.json"
+
+
+def _cameras(one: Products) -> dict[str, dict[str, float]]:
+    """Group -> its quantities with their sigmas, in the units that their keys end in."""
+    out: dict[str, dict[str, float]] = {}
+    for k, quantity in enumerate(one.course.quantities):
+        group = out.setdefault(quantity.group, {})
+        group[quantity.key] = float(one.course.values[0, k])
+        group[f"{quantity.key}_sigma"] = float(one.course.sigmas[0, k])
+    return out
+
+
+LEFT_OUT: Record[LeftOut] = Record(
+    "A component that a file does not have.",
+    Quantity("component", lambda one: one.name, "body, kind and axis"),
+    Quantity("amount", lambda one: one.amount / one.unit_size, "estimated amount, of a prior its standard deviation"),
+    Quantity("unit", lambda one: one.unit, "of the amount"),
+    Quantity(
+        "share", lambda one: one.share, "largest of the variance of a spot or a parameter, of a prior", where_known=True
+    ),
+)
+STATE_FILE: Record[Products] = Record(
+    "The job of the estimated state.",
+    Quantity("file", lambda one: f"{STATE}.yaml", "for python -m twin.render"),
+    Quantity("left_out", lambda one: list(one.state_left_out), "motions that a job cannot say", record=LEFT_OUT),
+)
+PRIOR_FILE: Record[Products] = Record(
+    "What is uncertain of that state.",
+    Quantity("file", lambda one: f"{PRIOR}.yaml", "for disturbances of a job or of python -m twin.asbuilt"),
+    Quantity("components", lambda one: len(one.prior.components), "that it has"),
+    Quantity("left_out", lambda one: list(one.prior.left_out), "that it does not have", record=LEFT_OUT),
+)
+PRODUCTS: Record[Products] = Record(
+    "products.json. What an operation's estimate says for one time.",
+    Quantity("record", lambda one: one.history.url, "of the instrument"),
+    Quantity("instrument", lambda one: one.history.name, "of the record"),
+    Quantity("instrument_sha256", lambda one: one.history.sha256, "by which it is recognised"),
+    Quantity("time_utc", lambda one: utc_text(one.time), "of the estimate"),
+    Quantity(
+        "scene_utc",
+        lambda one: None if one.scene_time is None else utc_text(one.scene_time),
+        "when the scene was taken, where there is one",
+        where_known=True,
+    ),
+    Quantity("valid_from_utc", lambda one: utc_text(one.validity.since), "from when on it holds"),
+    Quantity("valid_until_utc", lambda one: utc_text(one.validity.until), "until when it holds"),
+    Quantity("valid_from_reason", lambda one: one.validity.since_reason, "why not before"),
+    Quantity("valid_until_reason", lambda one: one.validity.until_reason, "why not after"),
+    Quantity("valid_within_percent", lambda one: SHARE, "by which errors may be larger than at the time itself"),
+    Quantity("version", lambda one: one.version, "SHA-256 of the record's last entry, the plan and the program"),
+    Quantity("program", lambda one: f"{WRITER} {importlib.metadata.version(WRITER)}", "that wrote it"),
+    Quantity("readings", lambda one: one.following.readings, "of the monitor that the estimate rests on"),
+    Quantity("newest_utc", lambda one: utc_text(one.following.time), "time of the newest of them"),
+    Quantity("estimate", _cameras, "every quantity of every camera and of both together, with its sigma"),
+    Quantity(
+        "changes",
+        lambda one: {name: np.asarray(change.values) for name, change in one.changes.items()},
+        "camera -> d_alpha, d_beta, d_gamma in rad and d_f in m that its models have been corrected by",
+        converted=False,
+    ),
+    Quantity("cameras", lambda one: list(one.changes), "in the order of the covariance"),
+    Quantity(
+        "covariance",
+        lambda one: one.course.covariance[0],
+        "of the changes of one camera after the other, rad and m",
+        converted=False,
+    ),
+    Quantity(
+        "models",
+        lambda one: None if one.export is None else one.export.lines,
+        "camera -> its models of the scene",
+        record=LINE,
+        where_known=True,
+    ),
+    Quantity("state", STATE_FILE, "the estimated state as a job"),
+    Quantity("prior", PRIOR_FILE, "what is uncertain of it"),
+    Quantity("warnings", lambda one: list(one.warnings), "in words"),
+)
+
+
+def product_files(one: Products) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Path in the folder -> contents, and the numbers of `NUMBERS`, which tells the checksums of all others.
+
+    Args:
+        one: all products of a time.
+    """
+    files: dict[str, bytes] = {} if one.export is None else export_files(one.export)
+    files[f"{STATE}.yaml"] = one.state.encode()
+    files |= {name: text.encode() for name, text in one.prior.files.items()}
+    digests: Mapping[str, str] = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    numbers = {**described("products", PRODUCTS(one)), "sha256": dict(digests)}
+    files[NUMBERS] = (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode()
+    return files, numbers
+
+
+def summary(one: Products) -> str:
+    """What there is, for the terminal."""
+    lines = [
+        f"{one.history.name} at {utc_text(one.time)}, from {one.following.readings} readings up to "
+        f"{utc_text(one.following.time)}",
+        f"holds from {utc_text(one.validity.since)}: {one.validity.since_reason}",
+        f"holds until {utc_text(one.validity.until)}: {one.validity.until_reason}",
+    ]
+    for name, line in (one.export.lines if one.export is not None else {}).items():
+        if line.ground is not None:
+            text = f"{name}: wrong on the ground by {line.ground.bias_m:.2f} m (ERR_BIAS)"
+            lines.append(
+                f"{text} and by {line.ground.random_m:.2f} m otherwise in every image (ERR_RAND), without the orbit"
+            )
+    return "\n".join([*lines, *(f"warning: {text}" for text in one.warnings)])

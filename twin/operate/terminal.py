@@ -1,17 +1,30 @@
-"""What the commands of `twin.operate` share: where the record is, errors in one sentence, results in the terminal."""
+"""What the commands of `twin.operate` share: the record, the estimate under its plan, errors and results in words."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any
+from dataclasses import dataclass
+from functools import wraps
+from inspect import Parameter, Signature, signature
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
+from scenes.yaml.errors import Problem
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.operate.record.place import NotARecord, RecordFailed, file_of, require_file
-from twin.run.cli import InputErrorText, explained
+from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
+from twin.run import durable
+from twin.run.cli import AsJson, InputErrorText, Quiet, Standing, explained, heartbeat, print_whole, result_table
+
+if TYPE_CHECKING:
+    from scenes.specs.operation import OperationSetup
+    from twin.operate.estimate.following import Following
+    from twin.operate.estimate.operation import Operation
+    from twin.operate.record.entries import Alarm
+    from twin.operate.record.history import History
 
 Place = Annotated[
     str,
@@ -19,17 +32,11 @@ Place = Annotated[
         metavar="DIR_OR_URL", help="Folder of the record, or address of a database: postgresql://host/name."
     ),
 ]
-
-
-def require_record(place: str) -> None:
-    """Tell that a folder holds no record, before what reads a record is imported.
-
-    Raises:
-        typer.Exit: it holds none, which has been told.
-    """
-    if (file := file_of(place)) is not None:
-        with told():
-            require_file(file)
+PlanFile = Annotated[
+    Path | None,
+    typer.Argument(metavar="[PLAN.yaml]", readable=False, help="Plan of operation. Default: that of the record."),
+]
+NewFolder = Annotated[Path, typer.Option(readable=False, help="Folder for them; it must not be there yet.")]
 
 
 @contextmanager
@@ -46,8 +53,34 @@ def told() -> Iterator[Console]:
             raise typer.Exit(FAILURE) from None
 
 
+@contextmanager
+def problems_of(what: str = "") -> Iterator[None]:
+    """Raise InputErrorText for a Problem of what a command was asked for: an option with its dashes, or its place."""
+    try:
+        yield
+    except Problem as problem:
+        text = str(problem.at("")).removeprefix("input: ")
+        raise InputErrorText(f"{what}: {text}" if what else text) from None
+
+
+def moment_said(option: str, text: str) -> int:
+    """Microseconds of TAI since 2000 of a UTC that a command was given.
+
+    Args:
+        option: with its dashes.
+        text: after it.
+
+    Raises:
+        InputErrorText: not a date and time.
+    """
+    from twin.operate.record.entries import micros
+
+    with problems_of(option):
+        return micros(text)
+
+
 def tell(errors: Console, as_json: bool, quiet: bool, data: Any, show: Callable[[Console], None]) -> None:
-    """A result, as JSON or as a reader wants it.
+    """Print a result, as JSON or as a reader wants it.
 
     Args:
         errors: where it is told that standard output is gone.
@@ -64,5 +97,133 @@ def tell(errors: Console, as_json: bool, quiet: bool, data: Any, show: Callable[
 
 
 def line(console: Console, text: str) -> None:
-    """A line as it is."""
+    """Print a line as it is."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def show_table(console: Console, heads: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int]) -> None:
+    """Print a table, the columns of these numbers flush right."""
+    table = result_table()
+    for k, head in enumerate(heads):
+        table.add_column(head, justify="right" if k in right else "left")
+    for row in rows:
+        table.add_row(*row)
+    print_whole(console, table)
+
+
+@dataclass(frozen=True)
+class Call:
+    """A command at work on a record.
+
+    Attributes:
+        place: folder or address of the record.
+        history: the record.
+        errors: where errors and the progress are told.
+        as_json, quiet: as the options ask for.
+    """
+
+    place: str
+    history: History
+    errors: Console
+    as_json: bool
+    quiet: bool
+
+    def tell(self, data: Any, show: Callable[[Console], None]) -> None:
+        """Print a result; arguments as of `tell`."""
+        tell(self.errors, self.as_json, self.quiet, data, show)
+
+    def planned(self, plan: Path | None) -> OperationSetup:
+        """Return the plan in a file, or that of the record. Raises InputError; InputErrorText: the record has none."""
+        from twin.operate.estimate.operation_model import kept_plan, read_plan
+
+        setup = kept_plan(self.history) if plan is None else read_plan(plan, self.history)
+        if setup is None:
+            raise InputErrorText(
+                f"the record keeps no plan of operation; name one, or keep one: python -m twin.operate init RECORD "
+                f"{self.history.name} --plan FILE"
+            )
+        return setup
+
+    def followed(self, setup: OperationSetup, history: History | None = None) -> Operation:
+        """Return the estimate of the record under a plan, with all readings; how far it is is told now and then.
+
+        Args:
+            setup: the plan.
+            history: the record as it was at an earlier time, in place of the command's.
+
+        Raises:
+            InputErrorText: there is no reading of the monitor.
+        """
+        from twin.operate.estimate.operation import Operation
+
+        standing, history = Standing("follow the record"), history or self.history
+        with problems_of(history.url), heartbeat(self.errors, standing.__str__, self.quiet or self.as_json):
+            made = Operation(history, setup, lambda done, of: standing.advance("readings", done, of))
+            made.follow()
+        return made
+
+    @property
+    def has_estimate(self) -> bool:
+        """Whether the record has a plan and a reading of the monitor."""
+        return self.history.plan() is not None and self.history.first("monitor") is not None
+
+    def estimate(self, plan: Path | None = None) -> tuple[Operation, Following, list[Alarm]]:
+        """Return the estimate under a plan, what it says, and the alarms that are new, which are then in the record."""
+        from twin.operate.estimate.following import raise_alarms
+
+        operation = self.followed(self.planned(plan))
+        following = operation.follow()
+        return operation, following, raise_alarms(self.history, operation.plan.operation, following)
+
+    def write_new(self, out: Path, files: Mapping[str, bytes], what: str) -> None:
+        """Write files into a new folder.
+
+        Args:
+            out: the folder, see `require_new`.
+            files: path in it -> content.
+            what: they are.
+
+        Raises:
+            typer.Exit: they cannot be written, which has been told.
+        """
+        try:
+            for folder in sorted({out, *((out / name).parent for name in files)}):
+                durable.make_folders(folder)
+            durable.write_all_safely((out / name, content) for name, content in files.items())
+        except OSError as error:
+            print_error(self.errors, f"{out}: {error.strerror or error}; what is there is not all of the {what}")
+            raise typer.Exit(FAILURE) from None
+
+
+def require_new(out: Path) -> None:
+    """Refuse a folder that is there. Raises InputErrorText."""
+    if out.exists():
+        raise InputErrorText(f"--out: {out} is there already; name a folder that is not")
+
+
+def on_record(work: Callable[..., None]) -> Callable[..., None]:
+    """Return the command that opens a record and does some work on it.
+
+    Args:
+        work: called with a `Call` and with the options of its signature; the record comes before them, ``--json`` and
+            ``--quiet`` after them.
+    """
+
+    @wraps(work)
+    def command(record: str, as_json: bool, quiet: bool, **options: Any) -> None:
+        with told() as errors:
+            if (file := file_of(record)) is not None:
+                require_file(file)  # before what reads a database is imported
+            from twin.operate.record.history import History
+
+            with History(record) as history:
+                work(Call(record, history, errors, as_json, quiet), **options)
+
+    # Typer makes arguments and options from the signature
+    own = list(signature(work, eval_str=True).parameters.values())[1:]
+    kind = Parameter.POSITIONAL_OR_KEYWORD
+    common = [Parameter(name, kind, default=False, annotation=a) for name, a in (("as_json", AsJson), ("quiet", Quiet))]
+    every = [Parameter("record", kind, annotation=Place), *own, *common]
+    command.__signature__ = Signature(every)  # type: ignore[attr-defined]
+    command.__annotations__ = {one.name: one.annotation for one in every}
+    return command

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Protocol
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from scenes.yaml.errors import InputError, Issue
 from twin.run import owned_files
 from twin.run.durable import PARTIAL_NAME, ending_later, make_folders, put_in_place, sync_folder, sync_tree
 from twin.run.owned_files import MANIFEST
@@ -282,6 +283,11 @@ class Manifest(BaseModel):
     sha256: dict[Annotated[str, AfterValidator(_inside)], Checksum]
     digest: Checksum | None = None
 
+    @property
+    def kind(self) -> str:
+        """Program, and the kind of a test."""
+        return f"{self.program} {self.test}".strip()
+
 
 def _ours(named: dict[str, str]) -> dict[str, str]:
     if "space-camera-twin" not in named:
@@ -352,6 +358,15 @@ def read_manifest(folder: Path) -> Manifest | None:
         return Manifest.model_validate_json((folder / MANIFEST).read_bytes())
     except (OSError, ValueError):  # of pydantic too; a name with a NUL is none of a folder
         return None
+
+
+def finished_manifest(folder: Path) -> Manifest:
+    """The manifest of a finished run. Raises InputError: the folder has none."""
+    manifest = read_manifest(folder)
+    if manifest is None:
+        problem = "no such folder" if not folder.is_dir() else f"not a run folder: it has no {MANIFEST} of a run"
+        raise InputError(Issue(problem, str(folder), allowed="a folder that a command of the twin has written"))
+    return manifest
 
 
 def is_run_folder(folder: Path) -> bool:

@@ -90,7 +90,7 @@ class Operation:
             vars(self).update({name: known[name] for name in ("experiment", "model") if name in known})
             if "_taking" in known and before_it.events == self.events:
                 vars(self)["_taking"] = known["_taking"]
-                self._stood, self._saved = (known.get("_standing"), before_it._newest), before_it._saved
+                self._stood, self._saved = (known.get("standing"), before_it._newest), before_it._saved
 
     def again(self) -> Operation:
         """The estimate of the same record under the same plan with what has come since; quicker than a new one."""
@@ -135,9 +135,9 @@ class Operation:
         reference = np.array([(self._before[spot]["row"], self._before[spot]["column"]) for spot in self.model.spots])
         return Taking(self.model, how, self.epoch, reference, self.history.temperature)
 
-    def _moments(self, after_us: int | None, until_us: int | None = None) -> Iterator[list[dict[str, Any]]]:
+    def _moments(self, after_us: int | None) -> Iterator[list[dict[str, Any]]]:
         """Entries that are used, those of one time together, in the order of time."""
-        own = (one for one in self.history.entries(after_us=after_us, until_us=until_us) if one["kind"] in USED)
+        own = (one for one in self.history.entries(after_us=after_us) if one["kind"] in USED)
         for _, together in groupby(own, key=lambda one: int(one["time_us"])):
             yield [{**one, "content": content_of(one), "decided": self._decisions.get(one["id"])} for one in together]
 
@@ -147,13 +147,9 @@ class Operation:
         found = (content_of(one) for one in self.history.entries(DECISION))
         return {int(one["entry"]): (bool(one["included"]), str(one["why"])) for one in found}
 
-    def standing(self) -> Standing:
-        """Take all readings that are new; where the estimate stands then."""
-        return self._standing
-
     @cached_property
-    def _standing(self) -> Standing:
-        """After all readings."""
+    def standing(self) -> Standing:
+        """Where the estimate stands after all readings, of which those that are new are taken."""
         with one_blas_thread():
             return self._followed()
 
@@ -224,14 +220,13 @@ class Operation:
 
     def follow(self) -> Following:
         """Take all readings that are new, and tell what is known."""
-        standing = self._standing
+        standing = self.standing
         now = self.forecast([standing.time])
         jumps = tuple(self._found(one.time, one.jump) for one in standing.jumps)
         sensors = []
         for one in standing.sensors.values():
             state, since, reason = one.state(standing.time, one.body not in standing.together)
             sensors.append(SensorState(one.body, state, since, one.last_us, reason))
-        names = [f"{one.group} {one.key}" for one in self.quantities]
         return Following(
             standing.time,
             standing.scores.readings,
@@ -242,7 +237,7 @@ class Operation:
             self.events,
             tuple(sorted(sensors, key=lambda one: one.body)),
             standing.left_out,
-            dict(zip(names, standing.explained.tolist(), strict=True)),
+            {one.name: share for one, share in zip(self.quantities, standing.explained.tolist(), strict=True)},
             self._widened,
             self.too_many_jumps,
             self._breaks(),
@@ -255,16 +250,16 @@ class Operation:
         """Return the smallest jump of each body that is found, at the mean interval of the readings so far; empty where
         there is one reading.
         """
-        count, noise = self._standing.scores.readings, self.model.how.reference_noise
+        count, noise = self.standing.scores.readings, self.model.how.reference_noise
         if count < 2 or noise is None:
             return ()
-        interval = (self._standing.time - self.epoch) / MICRO / (count - 1)
+        interval = (self.standing.time - self.epoch) / MICRO / (count - 1)
         with one_blas_thread():
             return detection_power(self.model.how, interval, noise)
 
     def _too_small(self) -> tuple[str, ...]:
         """Causes of the temperatures of bodies whose sensors disagree with what is stated at the same time."""
-        stated, heat, accused = self.model.how.stated, self.model.how.heat, self._standing.accused
+        stated, heat, accused = self.model.how.stated, self.model.how.heat, self.standing.accused
         if heat is None:
             return ()
         lasting = (k for k in heat.motions.tolist() if stated.bodies[k] in accused and not stated.laws[k].white)
@@ -277,19 +272,19 @@ class Operation:
         width = self.model.how.space.width
         read, changed = rows @ (self.model.reading @ change[:width]), rows @ change[width:]
         sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, spread[width:, width:], rows))
-        names = [f"{one.group} {one.key}" for one in self.quantities]
-        carried = dict(zip(names, zip(read.tolist(), changed.tolist(), sigma.tolist(), strict=True), strict=True))
+        each = zip(self.quantities, read.tolist(), changed.tolist(), sigma.tolist(), strict=True)
+        carried = {one.name: (was, now, spread) for one, was, now, spread in each}
         return FoundJump(jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals, carried)
 
     def _breaks(self) -> tuple[Break, ...]:
-        operation, start = self.plan.operation, self._standing.time
+        operation, start = self.plan.operation, self.standing.time
         if not operation.requirements:
             return ()
         days = max(1, round(operation.horizon * MICRO / DAY))
         ahead = self.forecast([start + round(k * operation.horizon * MICRO / days) for k in range(days + 1)])
         out = []
         for one in operation.requirements:
-            k = ahead.column(one.group, one.key)
+            k = [each.name for each in ahead.quantities].index(one.name)
             chance = beyond(ahead.values[:, k], ahead.sigmas[:, k], one.largest)
             broken = np.flatnonzero(chance > 1.0 - one.probability)
             breaks = int(ahead.times[broken[0]]) if len(broken) else None
@@ -308,8 +303,8 @@ class Operation:
             Problem: a time before it.
         """
         times = np.asarray(times_us, np.int64)
-        if len(times) and times.min() < self._standing.time:
-            allowed = f"times from {utc_text(self._standing.time)} on, that of the newest reading"
+        if len(times) and times.min() < self.standing.time:
+            allowed = f"times from {utc_text(self.standing.time)} on, that of the newest reading"
             raise Problem("a forecast of what is past", utc_text(int(times.min())), allowed)
         how = self._taking.how
         with one_blas_thread():
@@ -319,21 +314,21 @@ class Operation:
     @cached_property
     def _now(self) -> Belief:
         """What is known after all readings, jumps that are not told counted by their chances."""
-        return self._taking.how.blended(self._standing.belief)
+        return self._taking.how.blended(self.standing.belief)
 
     @cached_property
     def _widened(self) -> float:
         """Of sigmas now, where the last readings contradict what is stated."""
-        squares = self._unexplained(self._standing.innovations)
-        told = [time for time, _, _ in self._standing.innovations]
+        squares = self._unexplained(self.standing.innovations)
+        told = [time for time, _, _ in self.standing.innovations]
         return float(widening(squares, [len(squares)], False, self._lasting(told))[0])
 
     def _lasting(self, told: Sequence[int]) -> list[tuple[int, Array]]:
         """Return contradictions that widen sigma for good: of the first readings, and of what bodies of jumps do not
         explain; and the number of readings before each.
         """
-        out = [(0, self._unexplained(self._standing.first))]
-        jumps = [] if self.too_many_jumps else self._standing.jumps
+        out = [(0, self._unexplained(self.standing.first))]
+        jumps = [] if self.too_many_jumps else self.standing.jumps
         return out + [(int(np.searchsorted(told, one.time)) + 1, np.array([one.jump.rest])) for one in jumps]
 
     @cached_property
@@ -341,17 +336,17 @@ class Operation:
         """Whether more jumps were told than is stated, one in a thousand times by chance; a body of which nothing is
         stated of how often it jumps does so once.
         """
-        stated, lasted = self.model.how.stated, (self._standing.time - self.epoch) / MICRO
+        stated, lasted = self.model.how.stated, (self.standing.time - self.epoch) / MICRO
         every = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
         mean = sum(1.0 if rate is None else lasted / rate for rate in every.values())
-        count = len(self._standing.jumps)
+        count = len(self.standing.jumps)
         return bool(count > 1 and pdtrc(count - 1, mean) < FALSE_ALARM)
 
     def _unexplained(self, innovations: Sequence[tuple[int, float, int]]) -> Array:
         """(N, 2) chi-square and degrees of freedom of readings; none of those that jumps explain which were told, but
         where there are more of these than is stated: then it is not jumps that the readings ask for.
         """
-        jumps = [] if self.too_many_jumps else [self._found(one.time, one.jump) for one in self._standing.jumps]
+        jumps = [] if self.too_many_jumps else [self._found(one.time, one.jump) for one in self.standing.jumps]
         out = np.array([(square, degrees) for _, square, degrees in innovations], np.float64).reshape(-1, 2)
         times = np.array([time for time, _, _ in innovations], np.int64)
         for one in jumps:
@@ -386,7 +381,7 @@ class Operation:
         squares = self._unexplained(told)
         number = np.searchsorted([time for time, _, _ in told], times, side="right")
         out = widening(squares, number, True, self._lasting([time for time, _, _ in told]))
-        out[times >= self._standing.time] = self._widened
+        out[times >= self.standing.time] = self._widened
         return out
 
     def motions(self, time_us: int, acting: bool = False) -> Motions:
@@ -401,7 +396,7 @@ class Operation:
             Problem: a time before it.
         """
         stated = self.model.how.stated
-        how = replace(self._taking.how, steps=(*self._taking.how.steps, *self._steps(self._standing)))
+        how = replace(self._taking.how, steps=(*self._taking.how.steps, *self._steps()))
         since = self._taking.seconds(self.epoch)
         found = self._past(
             np.array([time_us], np.int64),
@@ -411,16 +406,15 @@ class Operation:
         spread = spread * self._widened_at(np.array([time_us], np.int64))[0] ** 2
         return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
 
-    @staticmethod
-    def _steps(standing: Standing, told_after: int | None = None) -> tuple[Step, ...]:
-        own = (one for one in standing.jumps if told_after is None or one.time > told_after)
+    def _steps(self, told_after: int | None = None) -> tuple[Step, ...]:
+        own = (one for one in self.standing.jumps if told_after is None or one.time > told_after)
         return tuple(Step.of(one.jump) for one in own)
 
     def _past(
         self, times: NDArray[np.int64], each: Callable[[Array, Array, float], tuple[Array, Array]]
     ) -> list[tuple[Array, Array]]:
         """What is made of the states at times, by all readings; from the newest on it is what a forecast has."""
-        taking, last = self._taking, self._standing
+        taking, last = self._taking, self.standing
         if len(times) and times.max() >= last.time:
             with one_blas_thread():
                 ahead = []
@@ -454,7 +448,7 @@ class Operation:
         times, taking = np.asarray(times_us, np.int64), self._taking
         seconds = [taking.seconds(int(time)) for time in times]
         with one_blas_thread():
-            if not len(times) or times[0] >= self._standing.time:
+            if not len(times) or times[0] >= self.standing.time:
                 values, covariance = jointly(taking.how, self._now, (), seconds, ())
             else:
                 self._require_known(int(times[0]))
@@ -475,16 +469,14 @@ class Operation:
         """
         taking, start = self._taking, self._before_all(time)
         told = None if start is None else start.time
-        steps = (*taking.how.steps, *self._steps(self._standing, told))
+        steps = (*taking.how.steps, *self._steps(told))
         used, left = self._used(told)
         wanted = set(used.tolist())
         every = (one for together in self._moments(told) for one in together)
         said = {one["id"]: taking.observed(one) for one in every if one["id"] in wanted}
         observed = [said[number] for number in used.tolist()]
         belief = (taking.start(self._begin()) if start is None else start).belief
-        belief = replace(
-            belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
-        )
+        belief = _alone(belief)
         knowing = replace(taking.how, steps=steps, window=0)
         belief, with_hints = hinted(taking.how, knowing, belief, observed, list(left))
         return knowing, belief, observed, with_hints
@@ -494,7 +486,7 @@ class Operation:
         spans = self._spans(after_us)
         width = len(self._taking.how.walking)
         left = np.concatenate([one.left.reshape(len(one.used), width) for one in spans])
-        used, pending = np.concatenate([one.used for one in spans]), self._standing.pending
+        used, pending = np.concatenate([one.used for one in spans]), self.standing.pending
         good = used != (0 if pending is None else pending[0])
         return used[good], left[good]
 
@@ -504,21 +496,29 @@ class Operation:
 
     @cached_property
     def _every_span(self) -> list[Standing]:
-        last = self._standing  # what is new is taken and kept first
-        kept = [one for one in self.history.checkpoints(self.key) if one.number > _HEAD]
-        return [*(Standing.from_bytes(one.content) for one in kept), last]
+        last = self.standing  # what is new is taken and kept first
+        kept = (Standing.from_bytes(one.content) for one in self.history.checkpoints(self.key) if one.number > _HEAD)
+        return [*(replace(one, belief=_alone(one.belief)) for one in kept), last]
 
     def _begin(self) -> int:
         return min(int(one["time_us"]) for kind in USED if (one := self.history.first(kind)) is not None)
 
     def _before_all(self, time: int) -> Standing | None:
         """The newest that was kept for good before a time and before all jumps that were told since; None for none."""
-        last = self._standing
+        last = self.standing
         while True:
             kept = self.history.checkpoint(self.key, before_us=time, valid=True)
             if kept is None:
                 return None
-            earlier = [self.epoch + int(one.jump.chances[0][0] * MICRO) for one in last.jumps if one.time > kept.time]
-            if not earlier or min(earlier) >= kept.time:
+            earlier = [
+                self.epoch + int(one.jump.chances[0][0] * MICRO) for one in last.jumps if one.time > kept.time_us
+            ]
+            if not earlier or min(earlier) >= kept.time_us:
                 return Standing.from_bytes(kept.content)
             time = min(earlier)
+
+
+def _alone(belief: Belief) -> Belief:
+    """What is known without the steps that are looked for, which take most of its memory."""
+    state, none = belief.state.alone(), belief.after[:0]
+    return replace(belief, state=state, search=None, after=none, until=none, aside=None)

@@ -19,7 +19,6 @@ from analysis.monitor.limits import Quantity, quantities
 from analysis.monitor.parameters import ANGLE, ANGLE_GROUP, CAMERA_PARAMETERS, GROUND, GROUND_GROUP
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import HeatInputs
-from optics.numerics.backend import load_backend
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import HEAT, StatedMotions
 from scenes.models.thermal_model import ThermalModel
@@ -61,7 +60,7 @@ class OperationModel:
 
 
 def traced_model(
-    setup: OperationSetup, reference_sigma: Array, sensors: Sequence[str], experiment: MonitorExperiment | None = None
+    setup: OperationSetup, reference_sigma: Array, sensors: Sequence[str], experiment: MonitorExperiment
 ) -> OperationModel:
     """Trace what is stated to move.
 
@@ -69,13 +68,12 @@ def traced_model(
         setup: the plan with its instrument.
         reference_sigma: (C, 2) px of the spots that all shifts are counted from, row and column.
         sensors: bodies of which there are temperatures.
-        experiment: on the instrument, if it is there already.
+        experiment: on the instrument.
 
     Raises:
         InputError: a body that the instrument does not have, or that cannot move or be warmed so.
     """
     plan = setup.operation
-    experiment = experiment or MonitorExperiment(setup.model, load_backend())
     stated, motions = experiment.disturbances, experiment.stated
     assert stated is not None  # a plan states what moves
     assert motions is not None

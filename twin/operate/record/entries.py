@@ -103,23 +103,6 @@ class Alarm:
 
 
 @dataclass(frozen=True)
-class Checkpoint:
-    """Where an estimate stood at some time.
-
-    Attributes:
-        number: counts the checkpoints of a plan.
-        time: up to which readings are in it, microseconds of TAI since 2000.
-        entry: the largest id of the entries that are in it.
-        content: the estimate.
-    """
-
-    number: int
-    time: int
-    entry: int
-    content: bytes
-
-
-@dataclass(frozen=True)
 class Given:
     """What one file holds.
 

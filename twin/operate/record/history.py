@@ -7,9 +7,9 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from sqlalchemy import Connection, delete, func, insert, or_, select
+from sqlalchemy import Connection, Row, delete, func, insert, select
 from sqlalchemy.exc import IntegrityError
 
 from optics.numerics.backend import load_backend
@@ -17,11 +17,10 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.json_file import parse_json
-from twin.operate.record import schema
+from twin.operate.record import NotARecord, RecordFailed, schema
 from twin.operate.record.entries import (
     DECISION,
     Alarm,
-    Checkpoint,
     Entry,
     Given,
     canonical,
@@ -30,7 +29,6 @@ from twin.operate.record.entries import (
     now,
     utc_text,
 )
-from twin.operate.record.place import NotARecord, RecordFailed
 from twin.operate.record.schema import (
     ACKNOWLEDGEMENT,
     ALARM,
@@ -58,6 +56,11 @@ USED = ("monitor", "temperature")
 class History:
     """The record of one instrument in a database.
 
+    Args:
+        place: folder or address of the record.
+        until: of the record as it was: by the times of the readings nothing later is in it, and nothing is added to it
+            but what was traced of the instrument; None for the whole record.
+
     Attributes:
         url: of the database, without its password.
         name: of the instrument.
@@ -67,8 +70,8 @@ class History:
         bodies: ``warm``, paths of those that have a temperature; ``cameras``, their names.
     """
 
-    def __init__(self, place: str) -> None:
-        url = url_of(place)
+    def __init__(self, place: str, until: int | None = None) -> None:
+        url, self._until = url_of(place), until
         self._engine = opened(url)
         self.url = url.render_as_string(hide_password=True)
         with self.reading() as connection:
@@ -106,7 +109,10 @@ class History:
 
         Raises:
             RecordFailed: nothing was added.
+            TypeError: into the record as it was.
         """
+        if self._until is not None:
+            raise TypeError("nothing is taken into a record as it was")
         for attempt in (True, False):
             try:
                 with writing(self._engine) as connection:
@@ -155,25 +161,14 @@ class History:
         keys = {key: row[key] for key in ("kind", "subject", "time_utc")}
         return {"entry": number, **keys, "included": included, "why": why}
 
-    def entries(
-        self,
-        kind: str = "",
-        subject: str = "",
-        after_us: int | None = None,
-        after_id: int | None = None,
-        until_us: int | None = None,
-    ) -> Iterator[dict[str, Any]]:
+    def entries(self, kind: str = "", after_us: int | None = None) -> Iterator[dict[str, Any]]:
         """Readings and events in the order of time, those of one moment in the order in which they were taken.
 
         SQLite has no writer while they are read: take what is wanted, and write then.
 
         Args:
             kind: of reading; all if empty.
-            subject: likewise.
             after_us: those after this time, microseconds of TAI since 2000.
-            after_id: those that were taken after the one of this id; beside ``after_us`` of those at that time only,
-                so that the two together name a place in the order.
-            until_us: those up to this time, it included.
 
         Yields:
             ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``, ``sha256``, ``line``, ``file`` and ``content``,
@@ -181,19 +176,14 @@ class History:
         """
         c = ENTRY.c
         query = select(*c, SOURCE.c.file).join(SOURCE, c.source_id == SOURCE.c.id)
+        query = query.where(*_not_after(c.time_us, self._until))
         query = query.where(c.kind == kind) if kind else query
-        query = query.where(c.subject == subject) if subject else query
-        if after_us is not None and after_id is not None:
-            query = query.where(c.time_us >= after_us, or_(c.time_us > after_us, c.id > after_id))
-        elif after_us is not None:
-            query = query.where(c.time_us > after_us)
-        elif after_id is not None:
-            query = query.where(c.id > after_id)
-        query = query if until_us is None else query.where(c.time_us <= until_us)
-        limited = not (after_us is None and until_us is None)
+        query = query if after_us is None else query.where(c.time_us > after_us)
         with self.reading() as connection:
-            if kind and not subject and limited:  # a look into the index for each subject, and no walk through all
-                query = query.where(c.subject.in_([own for of, own in _streams(connection) if of == kind]))
+            if kind and not (
+                after_us is None and self._until is None
+            ):  # a look into the index for each subject, and no walk through all
+                query = query.where(c.subject.in_(_subjects(connection, kind)))
             yield from map(dict, connection.execute(query.order_by(c.time_us, c.id)).mappings())
 
     def refusals(self) -> list[dict[str, Any]]:
@@ -218,15 +208,9 @@ class History:
             sources = int(connection.execute(select(func.count()).select_from(SOURCE)).scalar_one())
             guarded = schema.guarded(connection)
             checked, altered = schema.altered(connection, None if every else schema.LAST_CHECKED)
+        keys = ("file", "line", "reason", "refused_utc")
         refused = [
-            {
-                "file": row["file"],
-                "line": row["line"],
-                "reason": row["reason"],
-                "refused_utc": row["refused_utc"],
-                "taken_since": bool(row["taken_since"]),
-            }
-            for row in self.refusals()
+            {**{key: row[key] for key in keys}, "taken_since": bool(row["taken_since"])} for row in self.refusals()
         ]
         return {
             "record": self.url,
@@ -281,19 +265,18 @@ class History:
             # of each subject by the index, which has it before the time
             rows = [
                 connection.execute(
-                    select(*c).where(c.kind == kind, c.subject == subject).order_by(c.time_us, c.id).limit(1)
+                    select(*c).where(c.kind == kind, c.subject == one).order_by(c.time_us, c.id).limit(1)
                 )
                 .mappings()
                 .one()
-                for own, subject in _streams(connection)
-                if own == kind
+                for one in _subjects(connection, kind)
             ]
         return dict(min(rows, key=lambda row: (row["time_us"], row["id"]))) if rows else None
 
     def subjects(self, kind: str) -> list[str]:
         """Of what there are readings of a kind, in alphabetical order."""
         with self.reading() as connection:
-            return [subject for own, subject in _streams(connection) if own == kind]
+            return _subjects(connection, kind)
 
     def newest_id(self) -> int:
         """The largest id of an entry; 0 where there is none."""
@@ -307,14 +290,13 @@ class History:
             after_id: the id of that.
             until_us: the time, microseconds of TAI since 2000.
         """
-        query = select(ENTRY.c.id).where(*_late(after_id, until_us)).limit(1)
         with self.reading() as connection:
-            return connection.execute(query).first() is not None
+            return _is_newer(connection, after_id, until_us)
 
     def checkpoint(
         self, plan: str, number: int | None = None, before_us: int | None = None, valid: bool = False
-    ) -> Checkpoint | None:
-        """The newest of what was kept of an estimate; None for none.
+    ) -> Row[Any] | None:
+        """The newest of what was kept of an estimate, as a row of the table; None for none.
 
         Args:
             plan: as of `save_checkpoint`.
@@ -324,24 +306,25 @@ class History:
             valid: only one up to whose time no reading has come since it was kept.
         """
         c, e = CHECKPOINT.c, ENTRY.c
+        if self._until is not None:
+            before_us = self._until + 1 if before_us is None else min(before_us, self._until + 1)
         query = select(CHECKPOINT).where(c.plan == plan, _numbered(number, before_us))
         query = query if before_us is None else query.where(c.time_us < before_us)
         if valid:
             query = query.where(~select(e.id).where(*_late(c.entry_id, c.time_us)).exists())
         with self.reading() as connection:
-            row = connection.execute(query.order_by(c.time_us.desc(), c.number.desc()).limit(1)).first()
-        return None if row is None else Checkpoint(row.number, row.time_us, row.entry_id, row.content)
+            return connection.execute(query.order_by(c.time_us.desc(), c.number.desc()).limit(1)).first()
 
-    def checkpoints(self, plan: str) -> list[Checkpoint]:
-        """Where the estimate under a plan stood, in the order of time.
+    def checkpoints(self, plan: str) -> list[Row[Any]]:
+        """Where the estimate under a plan stood, in the order of time, as rows of the table.
 
         Args:
             plan: digest of all that the estimate rests on besides the readings.
         """
         c = CHECKPOINT.c
+        query = select(CHECKPOINT).where(c.plan == plan, *_not_after(c.time_us, self._until))
         with self.reading() as connection:
-            rows = connection.execute(select(CHECKPOINT).where(c.plan == plan).order_by(c.time_us, c.number)).all()
-        return [Checkpoint(row.number, row.time_us, row.entry_id, row.content) for row in rows]
+            return list(connection.execute(query.order_by(c.time_us, c.number)))
 
     def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
         """Keep where an estimate stands, in place of what was kept under the number.
@@ -356,10 +339,11 @@ class History:
         Returns:
             Whether it is kept; it is not if a reading up to that time has come since.
         """
+        if self._until is not None and number >= 0:  # the newest estimate stays where it is
+            return False
         row = {"plan": plan, "number": number, "time_us": time_us, "entry_id": entry_id, "content": content}
-        newer = select(ENTRY.c.id).where(*_late(entry_id, time_us)).limit(1)
         with writing(self._engine) as connection:
-            if connection.execute(newer).first() is not None:
+            if _is_newer(connection, entry_id, time_us):
                 return False
             connection.execute(delete(CHECKPOINT).where(CHECKPOINT.c.plan == plan, CHECKPOINT.c.number == number))
             connection.execute(insert(CHECKPOINT).values(**row))
@@ -367,6 +351,8 @@ class History:
 
     def drop_checkpoints(self, plan: str, from_time_us: int) -> int:
         """Remove checkpoints of a plan from a time on; how many there were."""
+        if self._until is not None:
+            return 0
         c = CHECKPOINT.c
         with writing(self._engine) as connection:
             gone = connection.execute(delete(CHECKPOINT).where(c.plan == plan, c.time_us >= from_time_us))
@@ -378,6 +364,8 @@ class History:
         Returns:
             Whether it is new.
         """
+        if self._until is not None:  # what was to be told then was told then
+            return False
         digest = alarm.digest
         row = {"sha256": digest, "kind": alarm.kind, "subject": alarm.subject, "time_us": alarm.time}
         row |= {"text": alarm.text, "content": canonical(alarm.content), "raised_utc": utc_text(now())}
@@ -392,20 +380,15 @@ class History:
         ``raised_utc``, ``text``, ``content``, and ``acknowledged``: ``by``, ``note`` and ``acknowledged_utc``, or None.
         """
         a = ACKNOWLEDGEMENT.c
-        query = select(*ALARM.c, a.by, a.note, a.acknowledged_utc).join(
-            ACKNOWLEDGEMENT, a.alarm_id == ALARM.c.id, isouter=True
-        )
+        query = select(*ALARM.c, a.by, a.note, a.acknowledged_utc).where(*_not_after(ALARM.c.time_us, self._until))
+        query = query.join(ACKNOWLEDGEMENT, a.alarm_id == ALARM.c.id, isouter=True).order_by(ALARM.c.id)
         with self.reading() as connection:
-            rows = connection.execute(query.order_by(ALARM.c.id)).mappings().all()
-        keys = ("id", "kind", "subject", "time_us", "raised_utc", "text")
-        seen = ("by", "note", "acknowledged_utc")
+            rows = connection.execute(query).mappings().all()
+        keys, seen = ("id", "kind", "subject", "time_us", "raised_utc", "text"), ("by", "note", "acknowledged_utc")
         return [
-            {
-                **{key: row[key] for key in keys},
-                "time_utc": utc_text(row["time_us"]),
-                "content": content_of(dict(row)),
-                "acknowledged": None if row["by"] is None else {key: row[key] for key in seen},
-            }
+            {key: row[key] for key in keys}
+            | {"time_utc": utc_text(row["time_us"]), "content": content_of(dict(row))}
+            | {"acknowledged": None if row["by"] is None else {key: row[key] for key in seen}}
             for row in rows
         ]
 
@@ -434,67 +417,18 @@ class History:
             connection.execute(insert(ACKNOWLEDGEMENT).values(**row))
 
 
-class PastHistory(History):
-    """A record without what came later, by the times of the readings. What was traced of the instrument is kept in it
-    as in any.
-
-    Args:
-        place: folder or address of the record.
-        until: microseconds of TAI since 2000; what is of this time is in it.
-    """
-
-    def __init__(self, place: str, until: int) -> None:
-        super().__init__(place)
-        self.until = until
-
-    def entries(
-        self,
-        kind: str = "",
-        subject: str = "",
-        after_us: int | None = None,
-        after_id: int | None = None,
-        until_us: int | None = None,
-    ) -> Iterator[dict[str, Any]]:
-        """Readings and events as `History.entries` yields them, without what came later."""
-        until = self.until if until_us is None else min(until_us, self.until)
-        yield from super().entries(kind, subject, after_us, after_id, until)
-
-    def checkpoint(
-        self, plan: str, number: int | None = None, before_us: int | None = None, valid: bool = False
-    ) -> Checkpoint | None:
-        """The newest of what was kept of an estimate then; None for none."""
-        before = self.until + 1 if before_us is None else min(before_us, self.until + 1)
-        return super().checkpoint(plan, number, before, valid)
-
-    def checkpoints(self, plan: str) -> list[Checkpoint]:
-        """Where the estimate stood then and before."""
-        return [one for one in super().checkpoints(plan) if one.time <= self.until]
-
-    def alarms(self) -> list[dict[str, Any]]:
-        """Alarms that belong to that time or before; who has acknowledged them since is told."""
-        return [one for one in super().alarms() if one["time_us"] <= self.until]
-
-    def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
-        """Keep nothing but what has no time: the newest estimate stays where it is."""
-        return number < 0 and super().save_checkpoint(plan, number, time_us, entry_id, content)
-
-    def drop_checkpoints(self, plan: str, from_time_us: int) -> int:
-        """Remove nothing."""
-        return 0
-
-    def raise_alarm(self, alarm: Alarm) -> bool:
-        """Raise nothing: what was to be told then was told then."""
-        return False
-
-    def take(self, *given: Any, **how: Any) -> NoReturn:
-        """Refuse to take readings into the past. Raises TypeError."""
-        raise TypeError("nothing is taken into a record as it was")
-
-
 def _late(after_id: Any, until_us: Any) -> tuple[Any, Any]:
     """Entries up to a time that were taken after another one."""
     # few are newer and all are older: the sum keeps databases from a walk through the index of the times
     return ENTRY.c.id > after_id, ENTRY.c.time_us + 0 <= until_us
+
+
+def _is_newer(connection: Connection, after_id: int, until_us: int) -> bool:
+    return connection.execute(select(ENTRY.c.id).where(*_late(after_id, until_us)).limit(1)).first() is not None
+
+
+def _not_after(time: Any, until: int | None) -> list[Any]:
+    return [] if until is None else [time <= until]
 
 
 def _numbered(number: int | None, before_us: int | None) -> Any:
@@ -513,6 +447,10 @@ def _streams(connection: Connection) -> Iterator[tuple[str, str]]:
         yield found.kind, found.subject
         same, next_kind = in_order.where(c.kind == found.kind, c.subject > found.subject), c.kind > found.kind
         found = connection.execute(same).first() or connection.execute(in_order.where(next_kind)).first()
+
+
+def _subjects(connection: Connection, kind: str) -> list[str]:
+    return [subject for own, subject in _streams(connection) if own == kind]
 
 
 def _extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, int]:

@@ -33,6 +33,11 @@ _FROM = (
 )
 
 
+def _readings(meaning: str, *own: Quantity[Row]) -> Record[Row]:
+    """Columns of readings: when each was, what it says, and where it comes from."""
+    return Record(meaning, *_WHEN, *own, *_FROM)
+
+
 def _value(k: int) -> Any:
     return lambda row: row["content"]["values"][k] if k < len(row["content"]["values"]) else None
 
@@ -42,57 +47,44 @@ def _sigma(row: Row) -> float:
 
 
 TABLES: Mapping[str, Record[Row]] = {
-    "temperature": Record(
+    "temperature": _readings(
         "Temperatures of bodies.",
-        *_WHEN,
         _key("subject", "body"),
         Quantity("temperature_K", _value(0), "of the body, absolute"),
         Quantity("temperature_K_sigma", _sigma, "standard deviation of the sensor's error"),
-        *_FROM,
     ),
-    "focus": Record(
+    "focus": _readings(
         "Foci found in orbit.",
-        *_WHEN,
         _key("subject", "camera"),
         Quantity("defocus_um", _value(0), "of the detector, positive downstream"),
         Quantity("defocus_um_sigma", lambda row: 1e6 * _sigma(row), "standard deviation", converted=False),
-        *_FROM,
     ),
-    "attitude": Record(
+    "attitude": _readings(
         "Attitudes of star trackers.",
-        *_WHEN,
         _key("subject", "star tracker"),
         Quantity("form", lambda row: row["content"]["unit"], "quaternion, or rad of three angles"),
         *(Quantity(f"component_{k + 1}", _value(k), "of the quaternion, the scalar last; or angle") for k in range(4)),
         Quantity("angle_arcsec_sigma", lambda row: in_unit(_sigma(row), "arcsec"), "about each axis", converted=False),
-        *_FROM,
     ),
-    "event": Record(
+    "event": _readings(
         "What happened to the instrument.",
-        *_WHEN,
         _key("subject", "event"),
         Quantity("detail", lambda row: row["content"].get("detail"), "what the table says of it"),
-        *_FROM,
     ),
-    "decision": Record(
+    "decision": _readings(
         "Entries that a person excluded from the estimate or included.",
-        *_WHEN,
         Quantity("decided_entry", lambda row: row["content"]["entry"], "number of the entry"),
         Quantity("included", lambda row: row["content"]["included"], "whether it counts from then on"),
         Quantity("why", lambda row: row["content"]["why"], "the reason"),
-        *_FROM,
     ),
-    "run": Record(
+    "run": _readings(
         "Calibrations and angles found in orbit.",
-        *_WHEN,
         _key("kind", "calibration or angle"),
         Quantity("results_sha256", lambda row: row["content"]["sha256"], "of the file of results"),
         Quantity("verdict", lambda row: row["content"]["numbers"].get("verdict"), "of the run"),
-        *_FROM,
     ),
-    "monitor": Record(
+    "monitor": _readings(
         "Changes of cameras that the monitor's frames gave, by camera and estimator; each states its sigma.",
-        *_WHEN,
         _key("camera", "of the instrument"),
         _key("estimator", "that found it"),
         *(
@@ -100,17 +92,14 @@ TABLES: Mapping[str, Record[Row]] = {
             for name in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
             for end, said in (("", "change"), ("_sigma", "its total sigma"), ("_sigma_noise", "its sigma of noise"))
         ),
-        *_FROM,
     ),
-    "intersection_angle": Record(
+    "intersection_angle": _readings(
         "Changes of the angle between cameras that the monitor's frames gave.",
-        *_WHEN,
         _key("estimator", "that found it"),
         *(
             _number(key, "change of the angle, or its sigma")
             for key in ("change_arcsec", "change_arcsec_sigma", "change_arcsec_sigma_noise")
         ),
-        *_FROM,
     ),
     "refused": Record(
         "What was refused.",

@@ -37,8 +37,8 @@ from sqlalchemy import (
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, IntegrityError, NoSuchModuleError
 
+from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
 from twin.operate.record.entries import digest_of_data, utc_text
-from twin.operate.record.place import NotARecord, RecordFailed, file_of, require_file
 
 VERSION = 4
 LAST_CHECKED = 500
@@ -181,30 +181,13 @@ def _guard(connection: Connection, table: Table) -> None:
         for sql in _triggers(table).values():
             connection.execute(text(sql))
     elif connection.dialect.name == "postgresql":
-        for what in ("UPDATE", "DELETE"):
+        for what in ("UPDATE", "DELETE", "TRUNCATE"):
             connection.execute(
                 text(
                     f"CREATE TRIGGER {table.name}_no_{what.lower()} BEFORE {what} ON {table.name} "
                     "FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
                 )
             )
-    if connection.dialect.name == "postgresql":
-        connection.execute(
-            text(
-                f"CREATE TRIGGER {table.name}_no_truncate BEFORE TRUNCATE ON {table.name} "
-                "FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
-            )
-        )
-
-
-def _guard_function(connection: Connection) -> None:
-    if connection.dialect.name == "postgresql":
-        connection.execute(
-            text(
-                "CREATE OR REPLACE FUNCTION record_refuses() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "
-                "RAISE EXCEPTION 'a record is never altered: % of %', TG_OP, TG_TABLE_NAME; END $$"
-            )
-        )
 
 
 def guarded(connection: Connection) -> bool:
@@ -250,7 +233,13 @@ def _digest_of(row: RowMapping) -> str:
 def create(connection: Connection) -> None:
     """Make all tables of this version, with what guards them."""
     _METADATA.create_all(connection)
-    _guard_function(connection)
+    if connection.dialect.name == "postgresql":
+        connection.execute(
+            text(
+                "CREATE OR REPLACE FUNCTION record_refuses() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "
+                "RAISE EXCEPTION 'a record is never altered: % of %', TG_OP, TG_TABLE_NAME; END $$"
+            )
+        )
     for table in _METADATA.sorted_tables:
         if table.name not in _DERIVED:
             _guard(connection, table)

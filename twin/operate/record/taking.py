@@ -48,6 +48,12 @@ class Taken:
     before: bool = False
     refused_before: int = 0
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many readings and events were taken, were known, and are refused now and were before."""
+        refused = len(self.refused) - self.refused_before
+        return {"new": self.new, "known": self.known, "refused": refused, "refused_before": self.refused_before}
+
 
 class Taking:
     """One file on its way into the record.

@@ -1,11 +1,14 @@
-"""Readings and events of an instrument's tables, row by row; a row that cannot be true is refused with its reason."""
+"""Readings and events on their way into a record: from tables, row by row, and from run folders. What cannot be true is
+refused with its reason.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ from scenes.specs.load import INSTRUMENTS, find_named
 from scenes.specs.measured.telemetry import (
     EVENT,
     QUATERNION,
+    RUNS,
     VALUES,
     ReadingColumnSpec,
     ReadingTableSpec,
@@ -22,22 +26,150 @@ from scenes.specs.operation import EVENTS
 from scenes.specs.resolved import resolve_with
 from scenes.yaml.csv_table import rows_apart
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown, unknown
-from scenes.yaml.input_file import digest_of
+from scenes.yaml.input_file import digest_of, is_file
+from scenes.yaml.json_file import parse_json, read_json
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
 from twin.operate.record.entries import (
+    MICRO,
     Entry,
     Given,
     Refused,
+    canonical,
     digest_of_data,
     digest_of_job,
+    instrument_digest,
     micros,
     micros_after,
     one_line,
 )
 from twin.operate.record.history import History
-from twin.operate.record.run_readings import run_entries
+from twin.run.cli import InputErrorText
+from twin.run.owned_files import MANIFEST
+from twin.run.run_folder import Manifest, is_run_folder, read_manifest
+
+RESULTS = {"monitor": "recovered.json", "calibration": "calibration.json", "angle": "angle.json"}
+"""Sort of reading -> file of the run folder that holds it."""
+_OF_A_STATE = (
+    "cameras",
+    "intersection_angle",
+    "spots",
+    "disturbances",
+    "retraced",
+    "sigma_holds",
+    "centroid",
+    "frames",
+)
+"""Keys of a monitor's result that tell of one state."""
+_IMAGES = (".tiff", ".tif", ".fits", ".fit", ".fts", ".png")
+CONFIG = "config.yaml"
+LARGEST_READING = 4_000_000
+"""Characters of what is kept of one reading."""
+
+
+def kind_of_run(folder: Path) -> str:
+    """Sort of reading that a run folder holds; empty for none."""
+    return next((kind for kind in RUNS if is_file(folder / RESULTS[kind])), "")
+
+
+def run_entries(place: Path, kind: str, moment: int, history: History, stated: bool) -> Given:
+    """The readings of a run folder; what is wrong with it stands in their place.
+
+    Args:
+        place: the folder, or the file of results in it.
+        kind: of reading; empty for the one that it holds.
+        moment: of it, or of the beginning of a series, microseconds of TAI since 2000.
+        history: the record.
+        stated: whether somebody says that the run is of the record's instrument, of a run that does not say it itself.
+    """
+    folder = place.parent if place.name in RESULTS.values() else place
+    kind = kind or kind_of_run(folder)
+    file = folder / RESULTS.get(kind, RESULTS["monitor"])
+    manifest = read_manifest(folder)
+    digest, frames = "", {}
+    items: list[Entry | Refused]
+    try:
+        if not kind or manifest is None or not is_file(file):
+            allowed = f"a finished run folder with {names_text(RESULTS.values())}"
+            raise Problem(f"no reading in {folder}", None, allowed)
+        digest, frames = digest_of(file), _frames(manifest)
+        _is_as_written(folder, file, digest, manifest)
+        _is_of(folder, history, stated and kind != "monitor")
+        items = list(_found(kind, read_json(file), moment, digest, frames))
+    except (Problem, InputError) as error:
+        items = [Refused(one_line(error))]
+    return Given(str(file), digest or digest_of_data(str(file)), digest_of_data([kind, moment, stated]), items, frames)
+
+
+def _frames(manifest: Manifest) -> dict[str, str]:
+    """Images from which a run found what it found, with their SHA-256: those that it read, else those that it wrote."""
+    read = {name: digest for name, digest in manifest.inputs.items() if name.lower().endswith(_IMAGES)}
+    own = {name: digest for name, digest in manifest.sha256.items() if name.startswith("images/")}
+    return read or {name: digest for name, digest in own.items() if name.endswith((".tiff", ".fits"))}
+
+
+def _is_as_written(folder: Path, file: Path, digest: str, manifest: Manifest) -> None:
+    """Refuse results that are not those that the run wrote. Raises Problem."""
+    known = {file.name: digest}
+    known |= {CONFIG: digest_of(folder / CONFIG)} if is_file(folder / CONFIG) else {}
+    changed = [name for name, own in known.items() if manifest.sha256.get(name) != own]
+    if changed:
+        problem = f"{folder}: changed since its run: {names_text(changed)}"
+        raise Problem(problem, None, "the folder as the run left it; python -m twin.verify tells more")
+
+
+def _is_of(folder: Path, history: History, stated: bool) -> None:
+    """Refuse a run of another instrument, or one that does not say of which. Raises Problem, InputError."""
+    data = read_yaml(folder / CONFIG).data if is_file(folder / CONFIG) else None
+    model = data.get("model", data) if isinstance(data, Mapping) else None
+    instrument = model.get("instrument") if isinstance(model, Mapping) else None
+    cameras = model.get("cameras") if isinstance(model, Mapping) else None
+    if not isinstance(instrument, Mapping) or not isinstance(cameras, Mapping):
+        if stated:
+            return
+        problem = f"{folder} does not say of which instrument it is"
+        raise Problem(
+            problem, None, "a run whose config.yaml holds the instrument, or --instrument NAME, which says it"
+        )
+    found = instrument_digest(instrument, {k: v for k, v in cameras.items() if isinstance(v, Mapping)})
+    if found != history.sha256:
+        name = instrument.get("name", "without a name")
+        problem = f"{folder} is of another instrument, {name} ({found[:12]})"
+        raise Problem(problem, None, f"runs of {history.name} ({history.sha256[:12]})")
+
+
+def _found(kind: str, data: Any, moment: int, digest: str, frames: Mapping[str, str]) -> list[Entry]:
+    """One reading, or those of a series at its times. Raises Problem."""
+    if not isinstance(data, Mapping):
+        raise Problem("no results", None, RESULTS[kind])
+    origin = digest_of_data(sorted(frames.values())) if frames else digest
+    if kind != "monitor":
+        content = {key: value for key, value in data.items() if key != "reference_frames"}
+        return [_entry(kind, moment, {"sha256": digest, "numbers": content}, origin)]
+    states, times = data.get("series") or [data], data.get("times_s") or [0.0]
+    if not isinstance(states, list) or not isinstance(times, list) or len(states) != len(times):
+        raise Problem("times and states that do not belong together", None, RESULTS[kind])
+    out = []
+    for k, (state, seconds) in enumerate(zip(states, times, strict=True)):
+        if not isinstance(state, Mapping) or "cameras" not in state or not isinstance(seconds, int | float):
+            raise Problem("a state without cameras or without a time", None, RESULTS[kind])
+        numbers = {key: state[key] for key in _OF_A_STATE if key in state}
+        content = {"sha256": digest, "state": k, "numbers": numbers}
+        out.append(_entry(kind, moment + round(seconds * MICRO), content, digest_of_data([origin, k])))
+    return out
+
+
+def _entry(kind: str, moment: int, content: Mapping[str, Any], origin: str) -> Entry:
+    """A reading of a size and with numbers that a record can hold. Raises Problem."""
+    try:
+        text = canonical(content)
+    except ValueError:
+        raise Problem("a number that is not finite", None, "finite numbers") from None
+    if len(text) > LARGEST_READING:
+        raise Problem("too large", f"{len(text)} characters", f"at most {LARGEST_READING}")
+    return Entry(kind, kind, moment, parse_json(text, "results"), None, origin)
+
 
 LARGEST = 1 << 28
 """Bytes of a table."""
@@ -128,9 +260,11 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
             items.append(Refused(f"{table.time}: {one_line(problem)}", number))
             continue
         if table.kind in VALUES:
-            items += _values(table, row, moment, number, history)
+            read = ((one, column, [row[head] for head in column.column]) for one, column in table.columns.items())
+            # cells that are empty say nothing
+            items += [_tried(_reading, table, history, *one, moment, number) for one in read if any(one[2])]
         elif table.kind == EVENT:
-            items.append(_told(partial(_event, table, row, moment, number), number))
+            items.append(_tried(_event, table, row, moment, number))
         else:
             found = run_entries(path.parent / row[str(table.name)], table.kind, moment, history, stated=True)
             frames |= found.frames
@@ -161,15 +295,16 @@ def _keyword_items(
         except Problem as problem:
             items.append(Refused(one_line(problem), number))
             continue
-        items.append(_told(partial(_reading, table, subject, column, [words[1]], moment, number, history), number))
+        items.append(_tried(_reading, table, history, subject, column, [words[1]], moment, number))
     return items
 
 
-def _told(make: Callable[[], Entry], line: int) -> Entry | Refused:
+def _tried(make: Callable[..., Entry], *of: Any) -> Entry | Refused:
+    """Return an entry, or why there is none; the last argument is its line."""
     try:
-        return make()
+        return make(*of)
     except Problem as problem:
-        return Refused(one_line(problem), line)
+        return Refused(one_line(problem), of[-1])
 
 
 def _moment(table: ReadingTableSpec, text: str) -> int:
@@ -179,31 +314,20 @@ def _moment(table: ReadingTableSpec, text: str) -> int:
     return micros_after(table.epoch, table.time_scale, parse_quantity(f"{text} {table.time_unit}", MOMENT))
 
 
-def _values(
-    table: ReadingTableSpec, row: dict[str, str], moment: int, line: int, history: History
-) -> list[Entry | Refused]:
-    """What a row says of each body; cells that are empty say nothing."""
-    items: list[Entry | Refused] = []
-    for subject, column in table.columns.items():
-        cells = [row[head] for head in column.column]
-        if any(cells):
-            items.append(_told(partial(_reading, table, subject, column, cells, moment, line, history), line))
-    return items
-
-
 def _reading(
     table: ReadingTableSpec,
+    history: History,
     subject: str,
     column: ReadingColumnSpec,
     cells: Sequence[str],
     moment: int,
     line: int,
-    history: History,
 ) -> Entry:
     """One reading in SI units. Raises Problem: no number, or one that such a body cannot have."""
     kind, of_sigma = VALUES[table.kind]
     sigma = parse_quantity(column.sigma, of_sigma)
-    if column.unit == QUATERNION:
+    unit = QUATERNION if column.unit == QUATERNION else kind.si
+    if unit == QUATERNION:
         values = [_number(cell) for cell in cells]
         length = math.hypot(*values)
         if not abs(length - 1.0) <= UNIT:
@@ -214,11 +338,7 @@ def _reading(
         values = [parse_quantity(f"{cell} {column.unit}", kind) for cell in cells]
     if table.kind == "temperature":
         _is_warm_enough(subject, values[0], column.unit, history)
-    return Entry(table.kind, subject, moment, {"values": values, "sigma": sigma, "unit": _si(column, kind.si)}, line)
-
-
-def _si(column: ReadingColumnSpec, si: str) -> str:
-    return QUATERNION if column.unit == QUATERNION else si
+    return Entry(table.kind, subject, moment, {"values": values, "sigma": sigma, "unit": unit}, line)
 
 
 def _number(cell: str) -> float:
@@ -257,3 +377,117 @@ def _event(table: ReadingTableSpec, row: dict[str, str], moment: int, line: int)
         )
     detail: dict[str, Any] = {} if table.detail is None else {"detail": row[table.detail]}
     return Entry(EVENT, name, moment, detail, line)
+
+
+SETTLED = 2.0
+"""Seconds for which a file has not changed before a watching command reads it: it may still be written."""
+
+_TIME = re.compile(r"(\d{4})-?(\d{2})-?(\d{2})T(\d{2})[:-]?(\d{2})[:-]?(\d{2}(?:\.\d+)?)Z")
+_YAML = (".yaml", ".yml")
+State = tuple[int, ...]
+
+
+def time_of_name(name: str) -> int | None:
+    """Microseconds of TAI since 2000 of the UTC in the name of a run folder, ``recover-2026-03-05T03-05-00Z`` or
+    ``20260305T030500Z``; None where there is none.
+    """
+    found = _TIME.search(name)
+    if found is None:
+        return None
+    year, month, day, hour, minute, second = found.groups()
+    try:
+        return micros(f"{year}-{month}-{day}T{hour}:{minute}:{second}Z")
+    except Problem:
+        return None
+
+
+@dataclass
+class Sources:
+    """What was named to be taken into a record.
+
+    Attributes:
+        places: YAML files, run folders, folders with some of these.
+        moment: of a run folder that is named itself, microseconds; None where its name says it.
+        stated: whether run folders that do not say it are of the record's instrument.
+        watching: whether it is looked at more than once, and then only what has changed since is read.
+        seen: path -> how it was when it was read.
+    """
+
+    places: Sequence[Path]
+    moment: int | None
+    stated: bool
+    watching: bool = False
+    seen: dict[str, State] = field(default_factory=dict)
+
+    def look(self, history: History) -> Iterator[Given]:
+        """What they hold now; of what is watched only what has changed since the last look.
+
+        Raises:
+            InputErrorText: nothing is there, or a run folder that was named has no time.
+            InputError: a YAML file is not valid.
+        """
+        for place in self.places:
+            if place.suffix not in _YAML and is_run_folder(place if place.is_dir() else place.parent):
+                yield from self._run(place, self.moment, history)
+                continue
+            described = sorted(place.glob("*.yaml")) if place.is_dir() else [place]
+            runs = sorted(one for one in place.iterdir() if is_run_folder(one)) if place.is_dir() else []
+            if not described and not runs and not (self.watching and place.is_dir()):
+                raise InputErrorText(
+                    f"{place}: neither a run folder nor one with a YAML file that says what tables hold"
+                )
+            named: set[Path] = set()
+            for file in described:
+                yield from self._tables(file, history, named)
+            for run in runs:
+                if (run / MANIFEST).resolve() not in named:  # the time of others stands in a table
+                    yield from self._run(run, None, history)
+
+    def _tables(self, file: Path, history: History, named: set[Path]) -> Iterator[Given]:
+        """What the tables hold that a YAML file describes; the run folders that they name are added to ``named``."""
+        spec = read_telemetry(file, history)
+        for table in spec.readings:
+            for path in tables_of(spec, table):
+                own = _runs_named(table, path) if table.kind in RUNS else []
+                named |= {one.resolve() for one in own}
+                if not self._is_seen(path, own):
+                    yield read_table_file(table, path, history)
+
+    def _run(self, place: Path, moment: int | None, history: History) -> Iterator[Given]:
+        folder = place if place.is_dir() else place.parent
+        moment = time_of_name(folder.name) if moment is None else moment
+        if moment is None and place in self.places:
+            raise InputErrorText(f"{place}: a run folder does not say when it was read; --time UTC does, or its name")
+        if self._is_seen(folder / MANIFEST):
+            return
+        if moment is None:
+            reason = (
+                "a run folder does not say when it was read; put the UTC into its name, recover-2026-03-05T03-05-00Z"
+            )
+            yield Given(str(folder), digest_of_data(str(folder)), "", [Refused(f"{folder.name}: {reason}")], {})
+        else:
+            yield run_entries(place, "", moment, history, self.stated)
+
+    def _is_seen(self, path: Path, named: Sequence[Path] = ()) -> bool:
+        """Whether a watched file, and the run folders that it names, are as they were when it was read, or may still be
+        written.
+        """
+        if not self.watching:
+            return False
+        states = [one.stat() for one in (path, *named)]
+        now = tuple(number for state in states for number in (state.st_mtime_ns, state.st_size))
+        if self.seen.get(str(path)) == now or any(time.time() - state.st_mtime < SETTLED for state in states):
+            return True
+        self.seen[str(path)] = now
+        return False
+
+
+def _runs_named(table: ReadingTableSpec, path: Path) -> list[Path]:
+    """Manifests of the run folders that a table names and that are finished."""
+    try:
+        heads, *rows = [cells for _, cells in rows_apart(path, LARGEST) if not isinstance(cells, str)]
+        column = [head.strip() for head in heads].index(str(table.name))
+    except (InputError, OSError, ValueError):
+        return []
+    named = (path.parent / cells[column].strip() / MANIFEST for cells in rows if len(cells) > column)
+    return [one for one in named if is_file(one)]

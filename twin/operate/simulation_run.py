@@ -5,31 +5,29 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from optics.numerics.backend import Backend
 from scenes.specs.operation import EVENTS, OperationSetup, read_operation
-from scenes.yaml.errors import KeyPath, Problem, unknown
+from scenes.yaml.errors import KeyPath, unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, SCALE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.operation_model import keep_plan, read_plan
-from twin.operate.lives.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
-from twin.operate.record.entries import one_line, utc_text
+from twin.operate.record.entries import utc_text
 from twin.operate.record.history import History, initialised
-from twin.operate.record.run_readings import CONFIG
-from twin.operate.record.sources import moment_said
 from twin.operate.record.taking import Taken
-from twin.operate.record.telemetry import read_table_file, read_telemetry, tables_of
+from twin.operate.record.telemetry import CONFIG, read_table_file, read_telemetry, tables_of
+from twin.operate.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
+from twin.operate.terminal import moment_said, problems_of
 from twin.run.cli import InputErrorText
 from twin.run.durable import write_safely
 from twin.run.memory import Lowered, require_memory
 from twin.run.procedure import WRITE, Advance
 from twin.run.reference_frames import described
-from twin.run.run_folder import Numbered, RunFolder, chosen, json_text, write_manifest
+from twin.run.run_folder import RunFolder, chosen, json_text, write_manifest
 
 PROGRAM = "twin.operate"
 CALIBRATE, TAKE = "calibrate", "take into the record"
@@ -40,48 +38,6 @@ MOST = 100_000
 _READING = 2e5
 """Bytes of a reading: of numbers that are kept beside its frames."""
 DAY = 86_400.0
-
-
-@dataclass(frozen=True)
-class Places:
-    """Where a life is read from and goes to.
-
-    Attributes:
-        plan: file of the plan of the operation, which the record keeps; or config.yaml of a life.
-        record: folder, or address of a database; None for the files alone.
-        out: folder for what the instrument would send down; None for one in the record's, or the next free run folder.
-        truth: file for what only the simulation knows; None for one in that folder, ``none`` for no file.
-        force: replace the folder, if it is that of such files.
-    """
-
-    plan: Path
-    record: str | None
-    out: Path | None = None
-    truth: Path | None = None
-    force: bool = False
-
-    @property
-    def folder(self) -> Path | Numbered:
-        """For the files.
-
-        Raises:
-            InputErrorText: there is no place for them.
-        """
-        if self.out is None and self.record is not None:
-            if "://" in self.record:
-                raise InputErrorText("--out: a database holds no files; name a folder for those that are simulated")
-            return Path(self.record) / FOLDER
-        return chosen(self.out, LIFE)
-
-    @property
-    def complete(self) -> bool:
-        """Whether the plan's file holds all that a plan refers to, as config.yaml of a life does. Raises InputError."""
-        data = read_yaml(self.plan).data
-        return isinstance(data, dict) and "model" in data
-
-    def read(self) -> OperationSetup:
-        """The plan with all it refers to. Raises InputError."""
-        return validate(OperationSetup, read_yaml(self.plan)) if self.complete else read_operation(self.plan)
 
 
 def simulation(options: Mapping[str, str], several: Mapping[str, Sequence[str]], seed: int) -> Simulation:
@@ -134,10 +90,8 @@ def _words(several: Mapping[str, Sequence[str]]) -> Iterator[str]:
 
 
 def _quantity(option: str, text: str, kind: Kind) -> float:
-    try:
+    with problems_of(option):
         return parse_quantity(text, kind)
-    except Problem as problem:
-        raise InputErrorText(f"{option}: {one_line(problem)}") from None
 
 
 def _at(option: str, text: str, known: Collection[str] | None = None) -> tuple[str, int]:
@@ -152,8 +106,9 @@ def _at(option: str, text: str, known: Collection[str] | None = None) -> tuple[s
 
 def _known(option: str, name: str, names: Collection[str]) -> None:
     """Raises InputErrorText: none of these names."""
-    if name not in names:
-        raise InputErrorText(f"{option}: {one_line(unknown('no such name', name, sorted(names)))}")
+    with problems_of(option):
+        if name not in names:
+            raise unknown("no such name", name, sorted(names))
 
 
 class _Options:
@@ -163,11 +118,25 @@ class _Options:
         return InputErrorText(f"{key[0]}: {problem}; {found} readings, allowed: {allowed}")
 
 
-def simulate_into(places: Places, what: Simulation, backend: Backend, advance: Advance) -> dict[str, Any]:
+def simulate_into(
+    file: Path,
+    record: str | None,
+    out: Path | None,
+    truth: Path | None,
+    force: bool,
+    what: Simulation,
+    backend: Backend,
+    advance: Advance,
+) -> dict[str, Any]:
     """Simulate a life, write its files and take them into a record, which is made where there is none.
 
     Args:
-        places: where it is read from and goes to.
+        file: plan of the operation, which the record keeps; or config.yaml of a life, which holds all that a plan
+            refers to.
+        record: folder, or address of a database; None for the files alone.
+        out: folder for what the instrument would send down; None for one in the record's, or the next free run folder.
+        truth: file for what only the simulation knows; None for one in that folder, ``none`` for no file.
+        force: replace the folder, if it is that of such files.
         what: is simulated.
         backend: where to trace.
         advance: told of the progress.
@@ -176,14 +145,21 @@ def simulate_into(places: Places, what: Simulation, backend: Backend, advance: A
         What was done, as plain data.
 
     Raises:
-        InputErrorText: a record that holds readings already, or is not of simulated ones; an unknown body; more memory
-            than there is.
+        InputErrorText: a record that holds readings already, or is not of simulated ones; no place for the files; an
+            unknown body; more memory than there is.
         InputError, RunFolderError, NotARecord, RecordFailed: of the plan, the instrument, the folder, the record.
     """
     started, clock = time.time(), time.monotonic()
-    plan, target = places.read(), places.folder
+    text = read_yaml(file)
+    complete = isinstance(text.data, dict) and "model" in text.data
+    plan = validate(OperationSetup, text) if complete else read_operation(file)
+    if out is None and record is not None and "://" in record:
+        raise InputErrorText("--out: a database holds no files; name a folder for those that are simulated")
+    target = Path(record) / FOLDER if out is None and record is not None else chosen(out, LIFE)
     readings = len(what.times)
     require_memory(Lowered(_Options(), ("--every",), readings, "readings", lambda count: count * _READING))
+    if out is not None:  # what is there is told before there is a record, which is never altered
+        RunFolder(out, force)
     advance(CALIBRATE, 0, 1)
     experiment = MonitorExperiment(plan.model, backend)
     experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
@@ -191,13 +167,13 @@ def simulate_into(places: Places, what: Simulation, backend: Backend, advance: A
     _are_stated(experiment, what)
     with ExitStack() as open_record:
         history = None
-        if places.record is not None:
-            initialised(places.record, plan.model, simulated=True)
-            history = open_record.enter_context(History(places.record))
+        if record is not None:
+            initialised(record, plan.model, simulated=True)
+            history = open_record.enter_context(History(record))
             _is_empty(history)
             # requirements are checked against the instrument; those of a life were when it was simulated
-            keep_plan(plan if places.complete else read_plan(places.plan, history), places.plan, history)
-        folder = RunFolder(target, places.force)
+            keep_plan(plan if complete else read_plan(file, history), file, history)
+        folder = RunFolder(target, force)
         advance(CALIBRATE, 1, 1)
         found = recorded(plan, experiment, what, advance)
         if not found.readings:
@@ -207,13 +183,13 @@ def simulate_into(places: Places, what: Simulation, backend: Backend, advance: A
         told = [f"no reading at {utc_text(moment)}: {why}" for moment, why in found.lost]
         with folder:
             write_simulated(folder, plan, experiment, what, found)
-            if places.truth is None:
+            if truth is None:
                 folder.write_json(f"{LIFE}.json", life)
             facts = {"backend": backend.name, "seed": what.seed, "frames": what.frames, "warnings": told}
-            facts["again"] = list(_again(places, what, backend))
+            facts["again"] = list(_again(truth, what, backend))
             write_manifest(folder, PROGRAM, started, time.monotonic() - clock, test="simulate", **facts)
-        if places.truth is not None and str(places.truth) != NO_TRUTH:
-            _write(places.truth, json_text(life))
+        if truth is not None and str(truth) != NO_TRUTH:
+            _write(truth, json_text(life))
         advance(TAKE, 0, 1)
         taken = [] if history is None else take_files(history, folder.target / TELEMETRY)
         advance(TAKE, 1, 1)
@@ -224,7 +200,7 @@ def simulate_into(places: Places, what: Simulation, backend: Backend, advance: A
         "record": None if history is None else history.url,
         "instrument": plan.model.instrument.name,
         "files": str(folder.target),
-        "truth": str(places.truth or folder.target / f"{LIFE}.json"),
+        "truth": str(truth or folder.target / f"{LIFE}.json"),
         "readings": len(found.readings),
         "entries": sum(one.new for one in taken),
         "steps": len(found.life.steps),
@@ -233,10 +209,10 @@ def simulate_into(places: Places, what: Simulation, backend: Backend, advance: A
     }
 
 
-def _again(places: Places, what: Simulation, backend: Backend) -> Iterator[str]:
+def _again(truth: Path | None, what: Simulation, backend: Backend) -> Iterator[str]:
     """Words of the command that makes the files again in their folder."""
     yield from (PROGRAM, "simulate", CONFIG, *what.words, "--seed", str(what.seed), "--backend", backend.name)
-    if places.truth is not None:  # nothing outside of the folder is written by who makes a run again
+    if truth is not None:  # nothing outside of the folder is written by who makes a run again
         yield from ("--truth", NO_TRUTH)
 
 

@@ -33,7 +33,7 @@ from twin.monitor.monitor_memory import largest_piece
 from twin.monitor.observation import Observation, Observing, observe, one_detector
 from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.operate.record.entries import MICRO, utc_text
-from twin.operate.record.run_readings import CONFIG, RESULTS
+from twin.operate.record.telemetry import CONFIG, RESULTS
 from twin.run.procedure import Advance
 from twin.run.random_streams import stream
 from twin.run.reference_frames import described

@@ -1,1 +1,0 @@
-"""Simulated lives of an instrument in operation: drawn, rendered into a record, followed, held against their truth."""
