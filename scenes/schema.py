@@ -24,7 +24,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
 from rich.console import Console
 
-from scenes.kinds.file_kinds import FILE_KINDS
+from scenes.specs.file_kinds import FILE_KINDS
 from scenes.yaml.standard_output import to_stdout
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from scenes.specs.operation import OperationSetup
-from scenes.yaml.json_file import read_json
+from scenes.yaml.input_file import read_json
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.operate.lives.simulate import FOLDER, LIFE, TELEMETRY

@@ -12,7 +12,7 @@ from typing import Any
 
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import cores
-from scenes.kinds.file_kinds import read_for
+from scenes.specs.file_kinds import read_for
 from scenes.yaml.errors import InputError
 from twin.run import cli, cluster, durable, memory, provenance, run_folder
 from twin.study.runs import sampling

@@ -9,7 +9,7 @@ from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.specs.perturbation import PlainPerturbationSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
-from scenes.yaml.spec import Flag, Name, Named, Number, Paths, Reference, Seed, Spec, TitledSpec, Whole, short_for
+from scenes.yaml.spec import Flag, Name, Named, Number, Paths, Ref, Seed, Spec, TitledSpec, Whole, short_for
 from scenes.yaml.units import DISTANCE, LENGTH, MOMENT
 
 LINES = ("forward", "nadir", "backward")
@@ -165,7 +165,7 @@ class OrbitAngleSpec(TitledSpec):
         seed: of every random number.
     """
 
-    camera: Reference
+    camera: Ref
     angles: Angles = None
     perturb: Paths[Change] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec.model_construct()

@@ -5,7 +5,7 @@ What only a simulation knows stands in a file of its own, which nothing of the o
 
 A life that could have been: amounts of every stated motion over time, drawn by the laws of their disturbances.
 
-Laws without steps are drawn by `scenes.models.drawn_motions`; steps come by chance at a stated mean rate, or at the
+Laws without steps are drawn by `scenes.models.disturbances`; steps come by chance at a stated mean rate, or at the
 dates of events. Nothing here uses the filter or the smoother that such lives test.
 """
 
@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.arrays import Array
-from scenes.models.disturbances import Component, StatedMotions, correlation_root, states_of
-from scenes.models.drawn_motions import causes_of, drawn_motions
+from scenes.models.disturbances import Component, StatedMotions, causes_of, correlation_root, drawn_motions, states_of
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.main_job.monitor_reading import MonitorReading, stated

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from scenes.specs.measured.telemetry import RUNS
+from scenes.specs.operation import RUNS
 from scenes.yaml.errors import InputError, Problem, names_text
-from scenes.yaml.input_file import digest_of, is_file
-from scenes.yaml.json_file import parse_json, read_json
+from scenes.yaml.input_file import digest_of, is_file, parse_json, read_json
 from scenes.yaml.yaml_file import read_yaml
 from twin.operate.record.entries import (
     MICRO,

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from scenes.specs.measured.telemetry import RUNS, ReadingTableSpec
+from scenes.specs.operation import RUNS, ReadingTableSpec
 from scenes.yaml.csv_table import rows_apart
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.input_file import is_file

@@ -9,17 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scenes.specs.load import INSTRUMENTS, find_named
-from scenes.specs.measured.telemetry import (
-    EVENT,
-    QUATERNION,
-    VALUES,
-    ReadingColumnSpec,
-    ReadingTableSpec,
-    TelemetrySpec,
-)
-from scenes.specs.operation import EVENTS
-from scenes.specs.resolved import resolve_with
+from scenes.specs.operation import EVENT, EVENTS, QUATERNION, VALUES, ReadingColumnSpec, ReadingTableSpec, TelemetrySpec
+from scenes.specs.resolved import resolve_on
 from scenes.yaml.csv_table import rows_apart
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import digest_of
@@ -54,12 +45,10 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
         InputError: it cannot be read, is not valid, or is of another instrument than the record.
     """
     spec = validate(TelemetrySpec, read_yaml(path))
-    find_named(INSTRUMENTS, spec.instrument, spec, ("instrument",), ("cameras",))
-    folder, named = path.parent, spec.instrument
-    digest = digest_of_job(resolve_with(str(folder / named) if named.endswith((".yaml", ".yml")) else named))
+    digest = digest_of_job(resolve_on(spec, spec.instrument))
     if digest != history.sha256:
         problem = f"tables of another instrument than the record's ({digest[:12]}, not {history.sha256[:12]})"
-        raise spec.error(problem, ("instrument",), found=named, allowed=history.name)
+        raise spec.error(problem, ("instrument",), found=spec.instrument, allowed=history.name)
     for k, table in enumerate(spec.readings):
         known = {"temperature": history.bodies["warm"], "focus": history.bodies["cameras"]}.get(table.kind)
         for subject in table.columns if known is not None else ():

@@ -18,7 +18,7 @@ from analysis.measurement_error import MeasurementError
 from analysis.orbit.ground_errors import Accuracy, level_axes, predicted, realised
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup
+from scenes.specs.orbit.setup import AnyAdjust, MeasuredAdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import measured_block
 from twin.orbit.block.pass_knowledge import MonitorSource

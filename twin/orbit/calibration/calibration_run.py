@@ -18,8 +18,8 @@ from analysis.orbit.null_space import RankError
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.specs.orbit.calibration import LEAST_TIES
+from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from twin.orbit.calibration.camera_drift import Monitoring, monitored
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, drift_looked_for, gauge_of, simultaneous
@@ -53,8 +53,7 @@ from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.measured.orbit_data_setup import AnyCalibration
-    from scenes.specs.orbit.setup import CalibrationSetup
+    from scenes.specs.orbit.setup import AnyCalibration, CalibrationSetup
 
 _EVEN = 1e-3
 """Largest deviation of an interval between readings from their median interval, relative, for even times."""

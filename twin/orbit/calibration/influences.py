@@ -22,7 +22,7 @@ from analysis.calibration.hidden_terms import FALSE_ALARM, Rates, Steps
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
-from scenes.specs.measured.orbit_data import MeasuredCalibrationSpec
+from scenes.specs.orbit.measurements import MeasuredCalibrationSpec
 from twin.orbit.calibration.campaign import Campaign, FoundDrift
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
 from twin.orbit.calibration.observations import EFFECTS

@@ -12,9 +12,8 @@ from analysis.orbit.jitter_lines import Course, Found, search, splined
 from analysis.orbit.jitter_spectrum import JitterError
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.measured.orbit_data_setup import AnyJitter, MeasuredJitterSetup
 from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
-from scenes.specs.orbit.setup import JitterSetup
+from scenes.specs.orbit.setup import AnyJitter, JitterSetup, MeasuredJitterSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.jitter import Jitter

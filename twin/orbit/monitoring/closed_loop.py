@@ -31,8 +31,8 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import State, compose
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import cores, one_blas_thread
+from scenes.models.disturbances import drawn_motions
 from scenes.models.disturbances import states_of as amounts_as_states
-from scenes.models.drawn_motions import drawn_motions
 from scenes.specs.course import moment
 from scenes.specs.motion_text import AXES, node_named
 from scenes.specs.orbit.monitor import PARAMETERS, CorrectionSpec, OrbitMonitorSpec

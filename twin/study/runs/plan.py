@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.specs.samplers import GRID
+from scenes.specs.study import GRID
 from scenes.yaml.errors import InputError, KeyPath, Problem
 from scenes.yaml.spec import validate
 from scenes.yaml.units import with_unit

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.specs.samplers import GRID, unit_cube
-from scenes.specs.study import FactorSpec, StudySpec
+from scenes.specs.study import GRID, FactorSpec, StudySpec, unit_cube
 from scenes.yaml.errors import KeyPath, Problem, shown
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.study.runs.base_job import Tree, leaf
