@@ -1,4 +1,5 @@
-"""Specifications from files: from the library that comes with the twin, by name, or from a user's own files, by path.
+"""What references lead to: files of the library that comes with the twin, by name, a user's own files, by path, or the
+mapping that stands in the place of a file.
 
 The library's folders are cameras, instruments, detectors, payloads, disturbances and budgets in scenes/library,
 scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's name without .yaml is its name there.

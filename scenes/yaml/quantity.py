@@ -16,9 +16,9 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
@@ -382,3 +382,18 @@ def allowed_at(metadata: Iterable[Any], key: KeyPath, allowed: str | None) -> st
         if isinstance(quantity, Quantity) and allowed == quantity.kind.allowed:
             return quantity.kind.asked(example_of(quantity, key))
     return allowed
+
+
+TimeScale = Literal["UTC", "GPS", "TAI", "TT", "GAL", "QZS", "BDT"]
+"""What a clock shows."""
+
+
+def _reading(value: Any) -> str:
+    """What a clock read at 0 s; its form is checked where it is used."""
+    if not isinstance(value, str) or not 10 < len(value) < 40:
+        allowed = "a date and time such as '2011-03-05T03:05:00', in the file's time scale"
+        raise Problem("not a date and time", repr(value), allowed)
+    return value
+
+
+ClockReading = Annotated[str, BeforeValidator(_reading)]

@@ -21,6 +21,7 @@ from scenes.specs.orbit.flight import (
     Interval,
     Latitude,
     Longitude,
+    PayloadTestSpec,
     UtcTime,
 )
 from scenes.specs.orbit.measurements import MeasuredTestSpec
@@ -28,7 +29,7 @@ from scenes.specs.orbit.scene import LineTime
 from scenes.specs.procedures import SENSORS
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
-from scenes.yaml.spec import Flag, Name, Named, Number, Ref, Reference, Seed, Spec, TitledSpec, Whole, not_empty
+from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, Whole, not_empty
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 
 Sensor = Literal["ties", "control", "monitor", "laser", "terrain", "tracker_angles"]
@@ -267,7 +268,7 @@ def one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None:
         raise Problem("`monitor` and `monitor_record` are both given", None, "one of them", within=("monitor_record",))
 
 
-class OrbitAdjustSpec(TitledSpec):
+class OrbitAdjustSpec(PayloadTestSpec):
     """A block of scenes, adjusted at once.
 
     Attributes:
@@ -299,7 +300,6 @@ class OrbitAdjustSpec(TitledSpec):
         seed: of every random number.
     """
 
-    camera: Ref
     lines: tuple[Name, ...] = ("forward", "nadir", "backward")
     earth: EarthSpec = EarthSpec.model_construct()
     altitude: Altitude = 500e3

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.angle import Angles, EffectsSpec, LightEffectsSpec, Moment
@@ -20,7 +20,7 @@ from scenes.specs.orbit.flight import EarthSpec, Interval, LengthSigmas, Payload
 from scenes.specs.orbit.jitter_search import JitterSearchSpec, SomeLines
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.yaml.errors import KeyPath, Problem, names_text
-from scenes.yaml.quantity import AngleSigmas, Quantity
+from scenes.yaml.quantity import AngleSigmas, ClockReading, Quantity, TimeScale
 from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Spec, SpecType, Text, Whole, not_empty
 from scenes.yaml.units import ANGLE, LENGTH, TIME
 
@@ -51,7 +51,6 @@ def _right_handed(axes: tuple[Toward, Toward, Toward]) -> tuple[Toward, Toward, 
 
 BodyAxes = Annotated[tuple[Toward, Toward, Toward], AfterValidator(_right_handed)]
 
-TimeScale = Literal["UTC", "GPS", "TAI", "TT", "GAL", "QZS", "BDT"]
 OrbitFrame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
 TurnFrame = Literal["ITRS", "GCRS", "EME2000", "TEME", "orbital"]
 Sequence = Literal["xyz", "xzy", "yxz", "yzx", "zxy", "zyx"]
@@ -59,17 +58,6 @@ Satellite = Annotated[str, Field(strict=True, min_length=1, max_length=100)]
 ClockOffset = Annotated[float, Quantity(TIME, largest="1000 s")]
 PointSigma = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="10 km")]
 AngleSigma = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="10 deg")]
-
-
-def _reading(value: Any) -> str:
-    """What a clock read at 0 s; its form is checked where it is used."""
-    if not isinstance(value, str) or not 10 < len(value) < 40:
-        allowed = "a date and time such as '2011-03-05T03:05:00', in the file's time scale"
-        raise Problem("not a date and time", repr(value), allowed)
-    return value
-
-
-ClockReading = Annotated[str, BeforeValidator(_reading)]
 
 
 class OrbitFileSpec(Spec):

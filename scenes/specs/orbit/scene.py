@@ -13,11 +13,11 @@ from optics.geometry.polygon import area, hull, intersect, sides
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import Diffusion, TdiSpec
 from scenes.specs.orbit.angle import GroundSigma, LightEffectsSpec, Moment, TerrainHeight
-from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
+from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, PayloadTestSpec
 from scenes.specs.spectrum import WavelengthRange
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, Named, Number, Ref, Seed, Spec, TitledSpec, Whole
+from scenes.yaml.spec import Name, Named, Number, Ref, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, TIME, format_quantity
 
 _EVEN_TERMS = ("Z4", "Z5", "Z6", "Z11", "Z12", "Z13", "Z14", "Z15", "Z22")
@@ -312,7 +312,7 @@ class PatchSpec(Spec):
     pixels: Side = 1000
 
 
-class OrbitSimulateSpec(TitledSpec):
+class OrbitSimulateSpec(PayloadTestSpec):
     """A pass over a patch of ground.
 
     Attributes:
@@ -335,7 +335,6 @@ class OrbitSimulateSpec(TitledSpec):
         seed: of every random number.
     """
 
-    camera: Ref
     lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "backward")
     perturb: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec.model_construct()

@@ -29,9 +29,9 @@ from scenes.specs.monitor_frames import MeasurementSetup, read_frame_table
 from scenes.specs.operation import read_operation
 from scenes.specs.orbit import setup as orbit_setup
 from scenes.specs.orbit.flight import ErrorsSpec, OrbitSpec
-from scenes.specs.orbit.setup import AdjustSetup, MatchSetup, MeasuredAdjustSetup
 from scenes.specs.perturbation import NodeInfo
-from scenes.specs.resolved import DistortionSetup, FocusSetup, resolve
+from scenes.specs.procedures import PROCEDURES
+from scenes.specs.resolved import FocusSetup, resolve
 from scenes.specs.spectrum import SpectrumSpec
 from scenes.specs.study import StudySpec
 from scenes.yaml.csv_table import Column, read_table
@@ -85,16 +85,14 @@ autocollimators = _plain(load.load_autocollimator_test)
 operation = _plain(read_operation)
 orbit, errors, study, spectrum = map(_spec, (OrbitSpec, ErrorsSpec, StudySpec, SpectrumHolder))
 camera_text = _spec(CameraSpec)
-angle, monitor, simulate = map(
-    _plain, (orbit_setup.AngleSetup.read, orbit_setup.MonitorSetup.read, orbit_setup.SimulateSetup.read)
-)
-calibration, jitter, adjust = map(
-    _plain, (orbit_setup.CalibrationSetup.read, orbit_setup.JitterSetup.read, AdjustSetup.read)
-)
-match, measured_adjust = _plain(MatchSetup.read), _plain(MeasuredAdjustSetup.read)
-resolved, focus_setup, distortion = _plain(resolve), _plain(FocusSetup.read), _plain(DistortionSetup.read)
+measured_adjust, resolved = _plain(orbit_setup.MeasuredAdjustSetup.read), _plain(resolve)
 zemax, codev = _plain(read_zemax), _plain(read_codev)
 batoid = _plain(lambda path: read_batoid(path, 650e-9))
+
+
+def test(*command: str) -> Callable[[Path, Fixture], Read]:
+    """The test of a command with all that it refers to."""
+    return _plain(PROCEDURES[" ".join(command)].resolve)
 
 
 def job_nodes(folder: Path, fixture: Fixture) -> Read:
