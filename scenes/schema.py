@@ -71,7 +71,7 @@ class _Generator(GenerateJsonSchema):
 
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> JsonSchemaValue:
         result = super().default_schema(schema)
-        if isinstance(schema.get("default"), float | tuple):
+        if isinstance(schema.get("default"), float | tuple) and schema["default"] != ():
             result["default"] = SchemaSerializer(schema["schema"]).to_python(schema["default"], mode="json")
         return result
 

@@ -560,7 +560,8 @@ def _as_file(value: Any) -> Any:
 
 
 JobDisturbances = Annotated[
-    JobDisturbancesSpec, BeforeValidator(_as_file, json_schema_input_type=Ref | JobDisturbancesSpec | DisturbancesSpec)
+    JobDisturbancesSpec,
+    BeforeValidator(_as_file, json_schema_input_type=Reference | JobDisturbancesSpec | DisturbancesSpec),
 ]
 """With its keys, the file's name alone, as `disturbances: orbit`, or what such a file says."""
 

@@ -176,7 +176,7 @@ def _referred(value: Any, handler: ValidatorFunctionWrapHandler, within: KeyPath
 Ref = Annotated[
     str,
     Field(strict=True, min_length=1, max_length=1000),
-    WrapValidator(_referred, json_schema_input_type=str | dict[str, Any]),
+    WrapValidator(_referred, json_schema_input_type=Reference | dict[str, Any]),
 ]
 """Reference to another specification: its name in the library (`gf7`), the path of its file, relative to the file that
 names it, or the mapping itself. ``{camera: ...}`` of an instrument is the camera by itself. `scenes.specs.load` reads
