@@ -171,9 +171,30 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
 
     def checked(self) -> Self:
         """Check that the camera has the three lines, and that points and changes lie on them."""
-        _require_calibration(self.test, self.camera)
-        if self.test.images is not None:
-            _require_detectors(self, tuple(self.camera.lines), self.camera, self.detectors)
+        test, camera = self.test, self.camera
+        if missing := [name for name in LINES if name not in camera.lines]:
+            found = f"{names_text(tuple(camera.lines))} in {camera.name}"
+            problem = f"the camera has no {' and no '.join(missing)} line"
+            raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
+        _require_known("line", test, ("perturb",), test.perturb, LINES)
+        _require_known("line", test, ("drift",), test.drift, LINES)
+        _require_places(test, (*test.perturb, *test.drift), camera)
+        if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
+            raise test.error(
+                "the nadir line's principal point is the gauge",
+                ("perturb", "nadir", "principal_point"),
+                allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
+            )
+        fewest = min(camera.pixels_of(name) for name in LINES)
+        if test.points is not None:
+            _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
+        if test.images is None:
+            return self
+        _require_images_of(test, LINES, camera)
+        _require_detectors(self, tuple(camera.lines), camera, self.detectors)
+        for k, place in enumerate(test.images.patches):
+            key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
+            _require_pixel(test, key, place.pixel, pixels, f"the nadir line of {camera.name}")
         return self
 
 
@@ -249,8 +270,20 @@ class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
 
     def checked(self) -> Self:
         """Check that the lines that are named exist and can be rendered, and that the patch lies on one of them."""
-        _require_images(self.test, self.camera)
-        _require_detectors(self, self.test.lines, self.camera, self.detectors)
+        test, camera = self.test, self.camera
+        names = tuple(camera.lines)
+        named = [(("patch", "line"), test.patch.line), *((("perturb", name), name) for name in test.perturb)]
+        for key, name in [*((("lines",), name) for name in test.lines), *named]:
+            if name not in names:
+                allowed = f"{names_text(names)}, the lines of {camera.name}"
+                raise test.error(unknown("no such line", name, names, allowed=allowed), key)
+        _require_places(test, test.perturb, camera)
+        _require_images_of(test, test.lines, camera)
+        line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
+        _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
+        if wrong := test.orbit.misses(test.patch.time):
+            raise test.error(wrong, ("patch", "time"))
+        _require_detectors(self, test.lines, camera, self.detectors)
         return self
 
 
@@ -442,7 +475,7 @@ def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
     """InputError unless every change turns one of a payload's lines. What an instrument's nodes allow is told when it
     is built.
     """
-    _require_lines(test, test.perturb, lines)
+    _require_known("line", test, ("perturb",), test.perturb, lines)
     for name, change in test.perturb.items():
         for action in change.needs():
             if action != "rotate":
@@ -513,48 +546,6 @@ def _require_several(test: Spec, named: tuple[str, ...] | None, camera: ThreeLin
         raise test.error("jitter is seen by two lines or more", ("camera",), found=found, allowed="a camera of several")
 
 
-def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> None:
-    """InputError unless all lines that are named exist and can be rendered, and the patch lies on one of them."""
-    names = tuple(camera.lines)
-    named = [(("patch", "line"), test.patch.line), *((("perturb", name), name) for name in test.perturb)]
-    for key, name in [*((("lines",), name) for name in test.lines), *named]:
-        if name not in names:
-            allowed = f"{names_text(names)}, the lines of {camera.name}"
-            raise test.error(unknown("no such line", name, names, allowed=allowed), key)
-    _require_places(test, test.perturb, camera)
-    _require_images_of(test, test.lines, camera)
-    line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
-    _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
-    if wrong := test.orbit.misses(test.patch.time):
-        raise test.error(wrong, ("patch", "time"))
-
-
-def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec) -> None:
-    """InputError unless the camera has the three lines, and points and changes lie on them."""
-    if missing := [name for name in LINES if name not in camera.lines]:
-        found = f"{names_text(tuple(camera.lines))} in {camera.name}"
-        problem = f"the camera has no {' and no '.join(missing)} line"
-        raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
-    _require_lines(test, test.perturb, LINES)
-    _require_lines(test, test.drift, LINES, "drift")
-    _require_places(test, (*test.perturb, *test.drift), camera)
-    if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
-        raise test.error(
-            "the nadir line's principal point is the gauge",
-            ("perturb", "nadir", "principal_point"),
-            allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
-        )
-    fewest = min(camera.pixels_of(name) for name in LINES)
-    if test.points is not None:
-        _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
-    if test.images is None:
-        return
-    _require_images_of(test, LINES, camera)
-    for k, place in enumerate(test.images.patches):
-        key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
-        _require_pixel(test, key, place.pixel, pixels, f"the nadir line of {camera.name}")
-
-
 _THREE_LINES = "a camera with lines forward, nadir and backward"
 
 
@@ -564,11 +555,6 @@ def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraS
         if name in camera.lines and camera.lines[name].by_look_angles:
             problem = f"{name} of {camera.name} is known by look angles, which say nothing of a changed lens"
             raise test.error(problem, ("perturb", name), allowed="a line with `shift` and `rotate` of its CCDs")
-
-
-def _require_lines(test: Spec, changes: Iterable[str], lines: tuple[str, ...], key: str = "perturb") -> None:
-    """InputError unless every change is one of a line."""
-    _require_known("line", test, (key,), changes, lines)
 
 
 def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec) -> None:
