@@ -32,7 +32,7 @@ def telemetry(path: Path) -> Any:
 
 def frames(path: Path) -> Any:
     """Measured frames that are made beside the file."""
-    path.write_text(re.sub("frames: .*", "frames: frames.csv", path.read_text("utf-8")), "utf-8")
+    path.write_text(re.sub("(?m)^frames: .*", "frames: frames.csv", path.read_text("utf-8")), "utf-8")
     return measurement(path.parent, lambda name: None)(path)
 
 
