@@ -8,7 +8,7 @@ scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's na
 from pathlib import Path
 from typing import Any, TypeVar
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.camera import CameraSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec

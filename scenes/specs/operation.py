@@ -14,7 +14,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.load import DISTURBANCES, INSTRUMENTS, placed
 from scenes.specs.resolved import ResolvedJob, resolve_on

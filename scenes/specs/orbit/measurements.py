@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import Angles, EffectsSpec, LightEffectsSpec, Moment
 from scenes.specs.orbit.calibration import LaunchSpec, MapLimitsSpec
 from scenes.specs.orbit.flight import EarthSpec, Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime

@@ -8,7 +8,7 @@ from typing import Any, Generic, Self
 
 from pydantic import Field
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs import load
 from scenes.specs.camera import CameraSpec
 from scenes.specs.course import DEFAULT_PIVOT
