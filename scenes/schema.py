@@ -24,7 +24,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
 from rich.console import Console
 
-from scenes.kinds.file_kinds import FILE_KINDS
+from scenes.specs.file_kinds import FILE_KINDS
 from scenes.yaml.standard_output import to_stdout
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class _Generator(GenerateJsonSchema):
 
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> JsonSchemaValue:
         result = super().default_schema(schema)
-        if isinstance(schema.get("default"), float | tuple):
+        if isinstance(schema.get("default"), float | tuple) and schema["default"] != ():
             result["default"] = SchemaSerializer(schema["schema"]).to_python(schema["default"], mode="json")
         return result
 

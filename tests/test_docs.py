@@ -26,7 +26,7 @@ from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.load import load_camera
-from scenes.specs.measured.monitor_frames import read_frame_table
+from scenes.specs.monitor_frames import read_frame_table
 from scenes.specs.resolved import resolve
 from scenes.yaml.csv_table import read_table
 from scenes.yaml.errors import InputError

@@ -19,8 +19,8 @@ import tifffile
 import xarray as xr
 from scipy import stats
 
-import scenes.kinds.file_kinds
 import scenes.schema
+import scenes.specs.file_kinds
 import twin
 import twin.export.__main__
 import twin.lab
@@ -52,9 +52,9 @@ from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.procedures import Procedure
 from scenes.specs.resolved import resolve
-from scenes.specs.samplers import Sampler
+from scenes.specs.study import Sampler
 from scenes.yaml.errors import InputError
-from scenes.yaml.file_kind import FileKind
+from scenes.yaml.named import FileKind
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
@@ -578,7 +578,7 @@ def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 # --- studies ----------------------------------------------------------------------------------------------------------
 
-SAMPLERS = "scenes.specs.samplers.SAMPLERS"
+SAMPLERS = "scenes.specs.study.SAMPLERS"
 FORMATS = "twin.study.study_files.FORMATS"
 MIDDLE = Sampler("all in the middle", lambda runs, factors, generator: np.full((runs, factors), 0.5))
 
@@ -663,7 +663,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
     """Makes anew what reads the list of tests once, when a program starts; and again when the test ends."""
 
     def start() -> None:
-        for module in (scenes.kinds.file_kinds, scenes.schema, twin.lab):
+        for module in (scenes.specs.file_kinds, scenes.schema, twin.lab):
             importlib.reload(module)
 
     yield start
@@ -677,7 +677,6 @@ def test_a_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: Callab
     toy = Procedure(
         "level",
         setup=f"{TOY_TEST}:LevelSetup",
-        resolve=f"{TOY_TEST}:resolve",
         run=f"{TOY_TEST}:measure",
         numbers=f"{TOY_TEST}:numbers",
         report=f"{TOY_TEST}:report",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from scenes.kinds.file_kinds import read_for
+from scenes.specs.file_kinds import read_for
 from scenes.yaml.named import Named
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.run import cli

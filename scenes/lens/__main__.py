@@ -100,7 +100,7 @@ def read_prescription(path: Path, glasses: Sequence[Path] = (), wavelength: floa
     Raises:
         InputError: the file cannot be read as what it is.
     """
-    from scenes.lens.glass_catalogue import read_catalogues
+    from scenes.lens.statements import read_catalogues
 
     kind = READS.get(path.suffix.lower())
     if kind is None:
@@ -166,8 +166,7 @@ def read(
         from dataclasses import replace
 
         from optics.numerics.backend import load_backend
-        from scenes.lens.camera_reader import Width, camera_of, camera_text
-        from scenes.lens.unfolding import with_flat_image
+        from scenes.lens.camera_reader import Width, camera_of, camera_text, with_flat_image
 
         if half is not None:
             lens = replace(lens, fields=((0.0, 0.0), (0.0, half)), heights=(), field_kind="angles", round_field=True)
@@ -218,11 +217,11 @@ def write(
         lens = _perturbed(camera, perturbed, mounted, backend) if perturbed else _designed(camera, backend)
         notes = list(lens.notes)
         if out.suffix.lower() == ".zmx":
-            from scenes.lens.zemax_writer import zemax_text
+            from scenes.lens.camera_writer import zemax_text
 
             content = zemax_text(lens).replace("\n", "\r\n").encode("utf-16")
         else:
-            from scenes.lens.batoid_writer import batoid_text
+            from scenes.lens.camera_writer import batoid_text
 
             text, more = batoid_text(lens)
             notes += more

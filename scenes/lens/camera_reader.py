@@ -1,4 +1,7 @@
-"""From a foreign prescription to a camera's file, and whether both trace the same."""
+"""From a foreign prescription to a camera's file, and whether both trace the same.
+
+Prescriptions without what a camera's file has no place for: flat folds before a turned image, and a curved image.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optics.geometry.aperture import Circle
-from optics.geometry.pose import rotation_vector
+from optics.geometry.aperture import Circle, turned_over
+from optics.geometry.pose import Pose, rotation_vector
 from optics.geometry.sag_terms import LAST_NOLL, SAG_TERMS, ZernikeSag
-from optics.geometry.surface import Surface, ZernikeFigure
+from optics.geometry.surface import Surface, ZernikeFigure, plane
 from optics.materials.glass import GLASSES, CatalogueGlass
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
@@ -29,12 +32,67 @@ from scenes.lens.prescription import (
     without_rim,
     written,
 )
-from scenes.lens.unfolding import unfolded
 from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
 from scenes.specs.glass import glass_entry
 from scenes.yaml.errors import InputError, Problem, printable
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity, power_of_length
+
+_FLIP = np.diag([1.0, -1.0, 1.0])
+"""A mirror image has no right-handed axes; with its y the other way round it has."""
+
+
+def unfolded(lens: Prescription) -> Prescription:
+    """Return the prescription with its flat mirrors taken out, and what follows each as the mirror shows it.
+
+    Rays go the same ways in length and in angles; an odd number of mirrors turns the image's y round. A flat that is
+    the stop or has edges stays as a plane that light passes.
+
+    Args:
+        lens: the prescription.
+
+    Raises:
+        InputError: a surface behind a fold is not of revolution.
+    """
+    turn, shift, stop, notes = np.eye(3), np.zeros(3), lens.surfaces[lens.stop].name, []
+    kept: list[LensSurface] = []
+    for surface in lens.surfaces:
+        rotation, place, shape = turn @ surface.pose.rotation, turn @ surface.pose.translation + shift, surface.surface
+        if np.linalg.det(turn) < 0.0:
+            if shape.terms or shape.figure is not None:
+                problem = "a fold before a surface that is not of revolution, which cannot be unfolded"
+                raise lens.error(problem, surface.line, surface.name, "an image square to the axis of the light")
+            rotation = rotation @ _FLIP
+            edge = surface.aperture and replace(
+                surface.aperture, centre=(surface.aperture.centre[0], -surface.aperture.centre[1])
+            )
+            surface = replace(surface, aperture=edge, edges=tuple(map(turned_over, surface.edges)))
+        surface = replace(surface, pose=Pose(rotation, place))
+        if surface.interaction is Interaction.REFLECT and shape.is_plane and shape.figure is None:
+            mirror = np.eye(3) - 2.0 * np.outer(rotation[:, 2], rotation[:, 2])
+            turn, shift = mirror @ turn, place + mirror @ (shift - place)
+            text = (
+                "a flat mirror, unfolded: its errors are not carried, nor its shadow, which an edge that blocks states"
+            )
+            notes.append(Note(surface.line, surface.name, text))
+            surface = replace(surface, interaction=Interaction.PASS)
+            if surface.name != stop and not surface.every_edge:
+                continue
+        kept.append(surface)
+    at = [surface.name for surface in kept].index(stop)
+    return replace(lens, surfaces=tuple(kept), stop=at).with_notes(*notes)
+
+
+def with_flat_image(lens: Prescription) -> Prescription:
+    """Return the prescription with the plane that touches its image in the image's middle."""
+    image, radius = lens.image, 1.0 / (lens.image.surface.curvature or np.inf)
+    text = (
+        f"curved, radius {radius:.6g} m: the plane that touches it is taken, which is {500.0 / radius:.3g} mm x "
+        "(h / 1 m)^2 away from it at a height h; python -m twin.camera --refocus finds the best plane"
+    )
+    flat = replace(image, surface=plane())
+    return replace(lens, surfaces=(*lens.surfaces[:-1], flat)).with_notes(Note(image.line, image.name, text))
+
 
 PITCH = 7e-6
 """Pitch of a line CCD's pixels where none is asked for, metres."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from ruamel.yaml import YAML
@@ -16,12 +16,10 @@ from optics.numerics import quadrature
 from scenes.models.camera_model import IMAGE, surface_of
 from scenes.models.camera_sharpness import FocalPlane
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, ImageSpec
-from scenes.specs.load import find_camera, load_camera
-from scenes.specs.resolved import ExperimentSetup, read_setup
+from scenes.specs.load import load_camera
+from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import unknown
-from scenes.yaml.spec import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from scenes.yaml.yaml_file import read_yaml
 
 _RINGS = 5
 _ACROSS, _ALONG = (0.0, 0.5, 1.0), (-1.0, 0.0, 1.0)
@@ -33,23 +31,19 @@ class CameraDesignSetup(ExperimentSetup[CameraDesignSpec]):
 
     camera: CameraSpec
 
+    @classmethod
+    def parts(cls, test: CameraDesignSpec) -> dict[str, Any]:
+        """Return the camera."""
+        return {"camera": load_camera(test.camera, test, ("camera",))}
 
-def resolve_design(path: str | Path) -> CameraDesignSetup:
-    """Read a design's file and its camera; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: a file cannot be read or is not valid, or ``vary`` names what the camera does not have.
-    """
-    setup = read_setup(CameraDesignSetup, path)
-    if setup is None:
-        test = validate(CameraDesignSpec, read_yaml(path))
-        setup = CameraDesignSetup(test=test, camera=load_camera(find_camera(test)))
-    setup.camera.require_mirrors("a camera that is optimised", on_axis=True)
-    known = (*setup.camera.mirrors, IMAGE)
-    for name in setup.test.vary:
-        if name not in known:
-            raise setup.test.error(unknown("no such mirror", name, known), ("vary", name))
-    return setup
+    def checked(self) -> Self:
+        """Check that the camera can be optimised, and has what ``vary`` names."""
+        self.camera.require_mirrors("a camera that is optimised", on_axis=True)
+        known = (*self.camera.mirrors, IMAGE)
+        for name in self.test.vary:
+            if name not in known:
+                raise self.test.error(unknown("no such mirror", name, known), ("vary", name))
+        return self
 
 
 def prescription_of(camera: CameraSpec) -> Prescription:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -22,13 +21,13 @@ from scenes.models.clearance import convex_hull
 from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import imaging_segments, rays_taken
 from scenes.specs import instrument as instruments
+from scenes.specs import load
 from scenes.specs.camera import CameraSpec, MonitorDesignSpec, PrismChoiceSpec
 from scenes.specs.detector import DetectorSpec
-from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.load import read_design
-from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.yaml.spec import Paths, validate
-from scenes.yaml.yaml_file import read_yaml
+from scenes.specs.disturbances import NONE, DisturbancesSpec
+from scenes.specs.resolved import ExperimentSetup
+from scenes.yaml.errors import KeyPath
+from scenes.yaml.spec import Paths, Spec
 
 RAYS = 2000
 """Rays of an imaging beam by which shares of the pupil are told: to about a thousandth."""
@@ -53,24 +52,46 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
     disturbances: Paths[DisturbancesSpec]
     detectors: Paths[DetectorSpec] = FrozenMap()
 
+    @classmethod
+    def parts(cls, test: MonitorDesignSpec) -> dict[str, Any]:
+        """Return the instrument with all that belongs to it, and what the design may choose from."""
+        start = load.load_instrument(test.instrument, test, ("instrument",))
+        if start.as_built:
+            problem = f"{start.name} is an instrument as built, and a layout is drawn"
+            allowed = "the drawing that its file names as its design"
+            raise test.error(problem, ("instrument",), found=test.instrument, allowed=allowed)
+        owner: Spec = test
+        references = test.disturbances
+        if references is None:
+            owner, references = start, () if start.disturbances in (None, NONE) else (start.disturbances,)
+        if not references:
+            problem = f"there is no prior on disturbances in {start.name}"
+            raise test.error(problem, ("disturbances",), allowed="disturbances files, by name or path")
+        stated = {}
+        for k, reference in enumerate(references):
+            key: KeyPath = ("disturbances", k) if owner is test else ("disturbances",)
+            stated[str(reference)] = load.load_disturbances(reference, owner, key)
+        sheets = {
+            name: load.load_detector(one.detector, test, ("area_ccds", name, "detector"))
+            for name, one in (test.area_ccds or {}).items()
+        }
+        return {
+            "instrument": start,
+            "cameras": load.load_cameras(start),
+            "detector": load.load_detector(start.autocollimator.area_ccd.detector, start, load.AREA_CCD),
+            "disturbances": FrozenMap(stated),
+            "detectors": FrozenMap(sheets),
+        }
 
-def resolve_monitor_design(path: str | Path) -> MonitorDesignSetup:
-    """Read a design and all it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: a file cannot be read or is not valid, or the instrument is none that can be designed so.
-    """
-    setup = read_setup(MonitorDesignSetup, path)
-    if setup is None:
-        test = validate(MonitorDesignSpec, read_yaml(path))
-        setup = MonitorDesignSetup.model_construct(test=test, **read_design(test))
-    test, start = setup.test, setup.instrument
-    if len(start.cameras) != 2:
-        raise test.error("a layout is designed for a pair", ("instrument",), found=f"{len(start.cameras)} cameras")
-    if test.goal.height is not None and start.altitude is None:
-        raise test.error(f"{start.name} does not state its altitude", ("goal", "height"), allowed="angle or d_f")
-    start_beams(setup)
-    return setup
+    def checked(self) -> Self:
+        """Check that the instrument is one that can be designed so."""
+        test, start = self.test, self.instrument
+        if len(start.cameras) != 2:
+            raise test.error("a layout is designed for a pair", ("instrument",), found=f"{len(start.cameras)} cameras")
+        if test.goal.height is not None and start.altitude is None:
+            raise test.error(f"{start.name} does not state its altitude", ("goal", "height"), allowed="angle or d_f")
+        start_beams(self)
+        return self
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -13,8 +12,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs import load
 from scenes.specs.course import noll
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.job import JobSpec
-from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
+from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_on
 from scenes.specs.tolerance import Amount, CompensatorSpec, FieldShare, MeritSpec
 from scenes.yaml.errors import Problem, names_text, unknown
 from scenes.yaml.quantity import Quantity, Vector
@@ -24,16 +22,15 @@ from scenes.yaml.spec import (
     Named,
     NothingIsEmpty,
     Number,
+    Ref,
     Reference,
     Seed,
     Spec,
     Text,
     Whole,
     one_given,
-    validate,
 )
 from scenes.yaml.units import ANGLE, LENGTH, TEMPERATURE_DIFFERENCE
-from scenes.yaml.yaml_file import read_yaml
 
 Fields = Annotated[tuple[tuple[FieldShare, FieldShare], ...], Field(min_length=1, max_length=200)]
 Sigma = Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 m")]
@@ -428,7 +425,7 @@ class SimulatedInstrumentSpec(Spec):
     """
 
     law: Literal["normal", "uniform"] = "normal"
-    prior: Reference | None = None
+    prior: Ref | None = None
     seed: Seed = 0
 
 
@@ -449,9 +446,9 @@ class AsBuiltSpec(Spec):
         simulate: a drawn instrument in place of data.
     """
 
-    instrument: Reference
+    instrument: Ref
     camera: Name | None = None
-    prior: Reference = "assembled"
+    prior: Ref = "assembled"
     measurements: MeasurementsSpec
     merits: Annotated[Named[MeritSpec], Field(min_length=1, max_length=50)]
     actuators: Annotated[Named[ActuatorSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
@@ -500,19 +497,10 @@ class AsBuiltSetup(ExperimentSetup[AsBuiltSpec]):
     base: ResolvedJob
     drawn: DisturbancesSpec | None = None
 
-
-def resolve_asbuilt(path: str | Path) -> AsBuiltSetup:
-    """Read the measurements of an instrument with all they name. The config.yaml of an earlier run can be given.
-
-    Raises:
-        InputError: any of the files cannot be read or is not valid.
-    """
-    setup = read_setup(AsBuiltSetup, path)
-    if setup is not None:
-        return setup
-    test = validate(AsBuiltSpec, read_yaml(path))
-    job = JobSpec.model_validate({"instrument": test.instrument, "disturbances": test.prior}).with_source(test.source)
-    drawn = None
-    if test.simulate is not None and test.simulate.prior is not None:
-        drawn = load.load_disturbances(test.simulate.prior)
-    return AsBuiltSetup(test=test, base=resolve_job(job), drawn=drawn)
+    @classmethod
+    def parts(cls, test: AsBuiltSpec) -> dict[str, Any]:
+        """Return the nominal job, and what a simulated instrument is drawn from."""
+        base, simulated = resolve_on(test, test.instrument, test.prior), test.simulate
+        if simulated is None or simulated.prior is None:
+            return {"base": base}
+        return {"base": base, "drawn": load.load_disturbances(simulated.prior, test, ("simulate", "prior"))}

@@ -28,7 +28,7 @@ from scenes.yaml.quantity import (
     Vector2,
     Wavelength,
 )
-from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, TitledSpec, Whole
+from scenes.yaml.spec import Name, Named, Number, Ref, Seed, Spec, Text, TitledSpec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE
 
 Diffusion = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="1 mm")]
@@ -70,7 +70,7 @@ class BandSpec(Spec):
     pixels: Annotated[Whole, Field(ge=2, le=1_000_000)]
     pitch: PixelPitch
     spectrum: Spectrum
-    detector: Reference
+    detector: Ref
     diffusion: Diffusion = 0.0
     tdi: TdiSpec = TdiSpec.model_construct()
 
@@ -265,10 +265,10 @@ class MonitorDesignSpec(Spec):
         seed: of everything drawn.
     """
 
-    instrument: Reference
+    instrument: Ref
     name: Name
     description: Text = ""
-    disturbances: Annotated[tuple[Reference, ...], Field(min_length=1)] | None = None
+    disturbances: Annotated[tuple[Ref, ...], Field(min_length=1)] | None = None
     beams: Annotated[Whole, Field(ge=1, le=6)]
     vary: BeamRangesSpec
     prisms: Annotated[Named[PrismChoiceSpec], Field(min_length=1)] | None = None
@@ -574,7 +574,7 @@ class CameraDesignSpec(Spec):
         seed: of the starts that are drawn.
     """
 
-    camera: Reference
+    camera: Ref
     name: Name
     description: Text = ""
     vary: Annotated[Named[tuple[Vary, ...]], Field(min_length=1)]

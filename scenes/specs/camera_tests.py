@@ -14,7 +14,7 @@ from scenes.specs.perturbation import FigureTerm, PlainPerturbationSpec
 from scenes.specs.turntable import TableAngle, TurntableFiles
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Angle, AngleSigma, AngleSigmas, LengthSigma, PositiveLength, Quantity, Vector, Vector3
-from scenes.yaml.spec import Name, Number, Paths, Reference, Seed, Spec, Text, TitledSpec, Whole, one_given
+from scenes.yaml.spec import Name, Number, Paths, Ref, Reference, Seed, Spec, Text, TitledSpec, Whole, one_given
 from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
 
 
@@ -47,7 +47,7 @@ class CameraUnderTestSpec(Spec):
             job; figures of mirrors for the most part.
     """
 
-    camera: Reference
+    camera: Ref
     as_built: Paths[PlainPerturbationSpec] = Field(default_factory=FrozenMap)
 
     @model_validator(mode="after")
@@ -201,7 +201,7 @@ class DistortionTestSpec(CameraUnderTestSpec):
     name: Name
     description: Text = ""
     collimator: CollimatorSpec
-    turntable: Reference
+    turntable: Ref
     pinhole: PositiveLength
     band: Name
     points: Annotated[Whole, Field(ge=3, le=1001)]

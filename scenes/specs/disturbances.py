@@ -21,7 +21,19 @@ from scenes.yaml import units
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, Reference, Spec, Text, TitledSpec, Whole, short_for
+from scenes.yaml.spec import (
+    Name,
+    Named,
+    NothingIsEmpty,
+    Number,
+    Ref,
+    Reference,
+    Spec,
+    Text,
+    TitledSpec,
+    Whole,
+    short_for,
+)
 
 NONE = "none"
 """`disturbances: none`: nothing is stated, and sigmas are those of the noise alone."""
@@ -527,7 +539,7 @@ class JobDisturbancesSpec(Spec):
         without: causes of the file that are left out.
     """
 
-    file: Reference | None = None
+    file: Ref | None = None
     causes: Named[CauseChangeSpec] = Field(default_factory=FrozenMap)
     without: tuple[Name, ...] = ()
 
@@ -542,8 +554,16 @@ class JobDisturbancesSpec(Spec):
         return self
 
 
-JobDisturbances = Annotated[JobDisturbancesSpec, short_for("file", str, schema=Reference | JobDisturbancesSpec)]
-"""With its keys, or the file's name alone: `disturbances: orbit`."""
+def _as_file(value: Any) -> Any:
+    """A file's name, or what it says, stands for the file."""
+    return {"file": value} if isinstance(value, str) or (isinstance(value, Mapping) and "name" in value) else value
+
+
+JobDisturbances = Annotated[
+    JobDisturbancesSpec,
+    BeforeValidator(_as_file, json_schema_input_type=Reference | JobDisturbancesSpec | DisturbancesSpec),
+]
+"""With its keys, the file's name alone, as `disturbances: orbit`, or what such a file says."""
 
 
 AngleErrors = Annotated[
@@ -567,13 +587,13 @@ class ErrorBudgetSpec(Spec):
     """
 
     description: Text = ""
-    instrument: Reference
+    instrument: Ref
     photons_per_frame: Annotated[Number, Field(gt=0.0, le=1e12)]
     frames: Frames = 9
     trials: Annotated[Whole, Field(ge=20, le=100_000)] = 100
     all_together: Annotated[Whole, Field(ge=20, le=100_000)] = 300
     angle_errors: AngleErrors
-    disturbances: Reference
+    disturbances: Ref
 
     def applied_to(self, instrument: InstrumentSpec) -> InstrumentSpec:
         """The instrument with this budget's angle errors and light."""

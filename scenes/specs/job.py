@@ -11,7 +11,6 @@ from optics.numerics.number_tree import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
 from scenes.specs import job_tables
-from scenes.specs.as_built import InstrumentReference
 from scenes.specs.course import CourseSpec, read_course
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
@@ -26,7 +25,7 @@ from scenes.specs.perturbation import (
 )
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Flag, NothingIsEmpty, OneOf, Paths, Seed, Spec, Whole
+from scenes.yaml.spec import Flag, NothingIsEmpty, OneOf, Paths, Ref, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, SCALE
 
 
@@ -212,7 +211,7 @@ class JobSpec(Spec):
         analysis: how it is analysed.
     """
 
-    instrument: InstrumentReference
+    instrument: Ref
     perturb: Annotated[Paths[PerturbationSpec], IN_WORDS] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None
     disturbances: JobDisturbances | None = None

@@ -1,4 +1,5 @@
-"""Specifications from files: from the library that comes with the twin, by name, or from a user's own files, by path.
+"""What references lead to: files of the library that comes with the twin, by name, a user's own files, by path, or the
+mapping that stands in the place of a file.
 
 The library's folders are cameras, instruments, detectors, payloads, disturbances and budgets in scenes/library,
 scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's name without .yaml is its name there.
@@ -8,17 +9,16 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from optics.numerics.number_tree import FrozenMap
-from scenes.specs.as_built import DESIGN, AsBuiltInstrumentSpec
 from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
-from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
+from scenes.specs.camera import CameraSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec, ErrorBudgetSpec
-from scenes.specs.instrument import BASE, InstrumentSpec
+from scenes.specs.instrument import BASE, DESIGN, AsBuiltInstrumentSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
+from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import is_file, unusable
-from scenes.yaml.spec import Source, Spec, validate
+from scenes.yaml.spec import Inline, Source, Spec, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)
@@ -49,23 +49,15 @@ def load_job(path: str | Path) -> JobSpec:
             fault.
     """
     job = with_tables(validate(JobSpec, read_yaml(path)))
-    instrument_path(job)
+    _instrument_file(job.instrument, job, ("instrument",))
     return job
 
 
-def instrument_path(job: JobSpec) -> Path:
-    """The file of the job's instrument.
-
-    Raises:
-        InputError: there is none, said with the line of the job's file.
-    """
-    return find_named(_folder_of_instrument(job.instrument), job.instrument, job, ("instrument",), (CAMERAS,))
-
-
-def _folder_of_instrument(reference: str | Path) -> str:
-    """Where the library has what a reference calls an instrument: a camera alone is one, too."""
-    alone = place_of(INSTRUMENTS, reference, Path()) is None and str(reference) in library_names(CAMERAS)
-    return CAMERAS if alone else INSTRUMENTS
+def _instrument_file(reference: str | Path, owner: Spec | None, key: KeyPath) -> YamlFile:
+    """What a reference to an instrument leads to: a camera alone is one, too."""
+    alone = str(reference) not in library_names(INSTRUMENTS) and str(reference) in library_names(CAMERAS)
+    folder = CAMERAS if alone and not isinstance(reference, Inline) else INSTRUMENTS
+    return referred(folder, reference, owner, key, (CAMERAS,))
 
 
 def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
@@ -73,44 +65,48 @@ def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
     return load_named(ErrorBudgetSpec, BUDGETS, name_or_path)
 
 
-def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
+def load_instrument(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> InstrumentSpec:
     """Read an instrument. The cameras and the detector it names are looked for, not read. Of one as built the design
     is read as well, to which its errors and its paths belong.
 
     Args:
-        name_or_path: a name in the library, or a path from the current folder (anything with a slash or ending in
-            .yaml or .yml). Of a camera it is the instrument that consists of this camera alone.
+        reference: a name in the library, a path from the folder of the owner's file (anything with a slash or ending in
+            .yaml or .yml), or the mapping itself. Of a camera it is the instrument that consists of this camera alone.
+        owner: the specification that refers to it; None for a path from the current folder.
+        key: where the owner refers to it.
 
     Raises:
         InputError: as `load_job`.
     """
-    path, text = _read_named(_folder_of_instrument(name_or_path), name_or_path, (CAMERAS,))
-    if isinstance(text.data, dict) and "mirrors" in text.data:
-        camera = validate(CameraSpec, text)
+    text = _instrument_file(reference, owner, key)
+    data = text.data if isinstance(text.data, dict) else {}
+    if "mirrors" in data:
+        camera, path = validate(CameraSpec, text), Path(text.file)
         own = path.stem if path.parent == _folder(CAMERAS) else path.name
-        return InstrumentSpec.of_camera(camera.name, own).with_source(Source(str(path)))
-    if isinstance(text.data, dict) and DESIGN in text.data:
+        if isinstance(reference, Inline):
+            own = Inline(camera.name, text)
+        return InstrumentSpec.of_camera(camera.name, own).with_source(Source(text.file))
+    if DESIGN in data:
         return _as_built(validate(AsBuiltInstrumentSpec, text))
     instrument = validate(InstrumentSpec, text)
-    paths_of_cameras(instrument)
+    for name, mounted in instrument.cameras.items():
+        referred(CAMERAS, mounted.camera, instrument, ("cameras", name, "camera"))
     if instrument.monitor is not None:
-        path_of_detector(instrument)
+        referred(DETECTORS, instrument.monitor.area_ccd.detector, instrument, AREA_CCD)
     return instrument
 
 
 def _as_built(spec: AsBuiltInstrumentSpec) -> InstrumentSpec:
     """The instrument that was built to the design of a file."""
-    path = find_named(_folder_of_instrument(spec.design), spec.design, spec, (DESIGN,), (CAMERAS,))
-    data = read_yaml(path).data
+    data = _instrument_file(spec.design, spec, (DESIGN,)).data
     if isinstance(data, dict) and DESIGN in data:
         problem, its = "this design is itself an instrument as built", shown(data[DESIGN])
         allowed = f"the drawing that it names, {its}, and all that departs from it below as_built"
         raise spec.error(problem, (DESIGN,), found=spec.design, allowed=allowed)
     stated = spec.disturbances
     if stated is not None and stated != NONE:
-        found = find_named(DISTURBANCES, stated, spec, ("disturbances",))
-        stated = str(found.absolute()) if is_path(stated) else stated
-    return spec.made_of(load_instrument(path), stated)
+        stated = placed(DISTURBANCES, stated, spec, ("disturbances",))
+    return spec.made_of(load_instrument(spec.design, spec, (DESIGN,)), stated)
 
 
 def is_instrument(data: Any) -> bool:
@@ -122,9 +118,9 @@ _OTHERS = {"job", "study", "test", "detector", "camera"}
 """Keys of a run's config.yaml, and no instrument's."""
 
 
-def load_disturbances(name_or_path: str | Path) -> DisturbancesSpec:
+def load_disturbances(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> DisturbancesSpec:
     """Read a disturbances file; arguments and errors as `load_instrument`."""
-    return load_named(DisturbancesSpec, DISTURBANCES, name_or_path).with_tables()
+    return load_named(DisturbancesSpec, DISTURBANCES, reference, owner, key).with_tables()
 
 
 def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
@@ -144,91 +140,49 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
             text = "there is no disturbances file that could be changed"
             raise job.error(text, ("disturbances",), allowed="the name of one as file")
         return None
-    stated = load_disturbances(find_named(DISTURBANCES, reference, owner, key))
+    stated = load_disturbances(reference, owner, key)
     return stated if asked is None else stated.changed(asked)
 
 
-def read_design(design: MonitorDesignSpec) -> dict[str, Any]:
-    """What a search for a layout refers to: the instrument to start from, its cameras by the name that it gives them,
-    detector (its area CCD), disturbances by their names in the design, and detectors, data sheets of the area CCDs that
-    it may choose.
-
-    Raises:
-        InputError: a file is not there or not valid, or nothing is stated to move.
-    """
-    start = load_instrument(find_named(INSTRUMENTS, design.instrument, design, ("instrument",)))
-    if start.as_built:
-        problem = f"{start.name} is an instrument as built, and a layout is drawn"
-        raise design.error(problem, ("instrument",), allowed="the drawing that its file names as its design")
-    owner: Spec = design
-    references = design.disturbances
-    if references is None:
-        owner, references = start, () if start.disturbances in (None, NONE) else (str(start.disturbances),)
-    if not references:
-        problem = f"there is no prior on disturbances in {start.name}"
-        raise design.error(problem, ("disturbances",), allowed="disturbances files, by name or path")
-    stated = {}
-    for k, reference in enumerate(references):
-        key: KeyPath = ("disturbances", k) if owner is design else ("disturbances",)
-        stated[reference] = load_disturbances(find_named(DISTURBANCES, reference, owner, key))
-    sheets = {
-        name: load_detector(find_named(DETECTORS, one.detector, design, ("area_ccds", name, "detector")))
-        for name, one in (design.area_ccds or {}).items()
-    }
-    return {
-        "instrument": start,
-        "cameras": load_cameras(start),
-        "detector": load_detector(path_of_detector(start)),
-        "disturbances": FrozenMap(stated),
-        "detectors": FrozenMap(sheets),
-    }
-
-
-def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:
-    """Name in the instrument -> file of its camera. Raises InputError if there is none."""
-    return {
-        name: find_named(CAMERAS, mounted.camera, instrument, ("cameras", name, "camera"))
-        for name, mounted in instrument.cameras.items()
-    }
+AREA_CCD: KeyPath = ("monitor", "area_ccd", "detector")
+"""Key at which an instrument refers to the data sheet of its area CCDs."""
 
 
 def load_cameras(instrument: InstrumentSpec) -> FrozenMap[str, CameraSpec]:
-    """The prescriptions of an instrument's cameras, by the names that its file gives them. Raises InputError."""
-    files = paths_of_cameras(instrument)
-    return FrozenMap({mounted.camera: load_camera(files[name]) for name, mounted in instrument.cameras.items()})
+    """The prescriptions of an instrument's cameras, by the names that its file gives them.
+
+    Raises:
+        InputError: a camera is not there or not valid, or two that are described in the file have one name.
+    """
+    cameras: dict[str, CameraSpec] = {}
+    for name, mounted in instrument.cameras.items():
+        key: KeyPath = ("cameras", name, "camera")
+        camera = load_camera(mounted.camera, instrument, key)
+        if cameras.setdefault(str(mounted.camera), camera) != camera:
+            raise instrument.error("another camera of this instrument has this name", (*key, "name"))
+    return FrozenMap(cameras)
 
 
-def path_of_detector(instrument: InstrumentSpec) -> Path:
-    """The file of the area CCD's data sheet. Raises InputError: there is none, or no monitor that has one."""
-    key = ("monitor", "area_ccd", "detector")
-    return find_named(DETECTORS, instrument.autocollimator.area_ccd.detector, instrument, key)
-
-
-def load_camera(name_or_path: str | Path) -> CameraSpec:
+def load_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> CameraSpec:
     """Read a camera; arguments and errors as `load_instrument`."""
-    path, text = _read_named(CAMERAS, name_or_path)
+    text = referred(CAMERAS, reference, owner, key)
     if isinstance(text.data, dict) and DESIGN in text.data:
         problem = "an instrument as built is no prescription of a camera"
-        raise InputError(Issue(problem, str(path), text.lines.get((DESIGN,)), (DESIGN,), None, "its design's camera"))
+        line, place = text.lines.get((*text.prefix, DESIGN)), (*text.prefix, DESIGN)
+        raise InputError(Issue(problem, text.file, line, place, None, "its design's camera"))
     return validate(CameraSpec, text).with_curves()
 
 
-def load_detector(name_or_path: str | Path) -> DetectorSpec:
+def load_detector(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> DetectorSpec:
     """Read a detector's data sheet; arguments and errors as `load_instrument`."""
-    return load_named(DetectorSpec, DETECTORS, name_or_path)
+    return load_named(DetectorSpec, DETECTORS, reference, owner, key)
 
 
 def load_autocollimator_test(name_or_path: str | Path = "principle_experiment") -> AutocollimatorSetup:
     """Read a test with two autocollimators and the data sheet of their CCDs; arguments, errors as `load_instrument`."""
     spec = load_named(AutocollimatorTestSpec, LAB, name_or_path)
-    reference = spec.autocollimator.area_ccd.detector
-    detector = find_named(DETECTORS, reference, spec, ("autocollimator", "area_ccd", "detector"))
-    return AutocollimatorSetup(spec, load_detector(detector))
-
-
-def find_camera(test: CameraUnderTestSpec | CameraDesignSpec) -> Path:
-    """The file of the camera under test, or that a design starts from. Raises InputError if there is none."""
-    return find_named(CAMERAS, test.camera, test, ("camera",))
+    key = ("autocollimator", "area_ccd", "detector")
+    return AutocollimatorSetup(spec, load_detector(spec.autocollimator.area_ccd.detector, spec, key))
 
 
 def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
@@ -240,14 +194,14 @@ def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
     Raises:
         InputError: as `load_instrument`; the instrument has several cameras, or both files say how a body was built.
     """
-    path = find_camera(test)
-    data = read_yaml(path).data
-    if not (isinstance(data, dict) and DESIGN in data):
-        return test, load_camera(path)
-    instrument = load_instrument(path)
+    key = ("camera",)
+    text = referred(CAMERAS, test.camera, test, key)
+    if not (isinstance(text.data, dict) and DESIGN in text.data):
+        return test, load_camera(test.camera, test, key)
+    instrument = load_instrument(test.camera, test, key)
     if len(instrument.cameras) > 1:
         problem = f"one camera is tested, and {instrument.name} has {names_text(instrument.cameras)}"
-        raise test.error(problem, ("camera",), found=test.camera, allowed="an instrument as built to a camera's design")
+        raise test.error(problem, key, found=test.camera, allowed="an instrument as built to a camera's design")
     (name, mounted), *_ = instrument.cameras.items()
     built = dict(test.as_built)
     for node, what in (instrument.as_built or {}).items():
@@ -256,39 +210,33 @@ def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
             continue
         own = node.removeprefix(f"{BASE}/").removeprefix(f"{name}/")
         if own in built:
-            raise test.error(f"{path} says how this body was built", ("as_built", own), allowed="one of the two")
+            raise test.error(f"{text.file} says how this body was built", ("as_built", own), allowed="one of the two")
         built[own] = what
     return test.model_copy(update={"as_built": FrozenMap(built)}), load_cameras(instrument)[mounted.camera]
 
 
-def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:
+def load_band_detectors(camera: CameraSpec) -> FrozenMap[str, DetectorSpec]:
     """Data sheets of a camera's line CCDs, by the name that the bands give. Raises InputError as `load_instrument`."""
-    return {
-        band.detector: load_detector(find_named(DETECTORS, band.detector, camera, ("bands", name, "detector")))
-        for name, band in camera.bands.items()
-    }
+    bands = camera.bands.items()
+    return FrozenMap({b.detector: load_detector(b.detector, camera, ("bands", name, "detector")) for name, b in bands})
 
 
-def load_named(model: type[SpecType], folder: str, name_or_path: str | Path) -> SpecType:
-    """Read a file of one folder of the library, or a user's own of that kind.
+def load_named(
+    model: type[SpecType], folder: str, reference: str | Path, owner: Spec | None = None, key: KeyPath = ()
+) -> SpecType:
+    """Read a file of one folder of the library, a user's own of that kind, or the mapping in its place.
 
     Args:
         model: what its kind of files may say.
         folder: of the library, for a name.
-        name_or_path: as of `load_instrument`.
+        reference: as of `load_instrument`, likewise owner and key.
+        owner: that refers to it.
+        key: where.
 
     Raises:
         InputError: as `load_instrument`.
     """
-    return validate(model, _read_named(folder, name_or_path)[1])
-
-
-def _read_named(folder: str, name_or_path: str | Path, others: tuple[str, ...] = ()) -> tuple[Path, YamlFile]:
-    """The file that a reference leads to, and what it says; arguments as of `find_named`, errors as `load_named`."""
-    path = place_of(folder, name_or_path, Path())
-    if path is None:
-        raise InputError(_no_such_name(str(name_or_path), folder, *others).at(""))
-    return path, read_yaml(path)
+    return validate(model, referred(folder, reference, owner, key))
 
 
 def _names(folders: tuple[str, ...]) -> list[str]:
@@ -302,33 +250,48 @@ def _names_and_paths(folders: tuple[str, ...]) -> str:
     return f"{first}{others}, or the path of a .yaml file"
 
 
-def _no_such_name(name: str, *folders: str) -> Problem:
-    problem = f"no such name in {' or '.join(folders)}"
-    return unknown(problem, name, _names(folders), allowed=_names_and_paths(folders))
-
-
-def find_named(folder: str, reference: str, owner: Spec, key: KeyPath, others: tuple[str, ...] = ()) -> Path:
-    """The file that a specification refers to.
+def referred(
+    folder: str, reference: str | Path, owner: Spec | None = None, key: KeyPath = (), others: tuple[str, ...] = ()
+) -> YamlFile:
+    """Return what a reference leads to: the one way in which names, paths and mappings are resolved.
 
     Args:
         folder: of the library, for a name.
-        reference: a name there, or a path from the folder of the specification's file.
-        owner: the specification.
-        key: where it refers to it.
+        reference: a name there, a path from the folder of the owner's file, or the mapping itself.
+        owner: the specification that refers to it; None for a path from the current folder.
+        key: where the owner refers to it.
         others: folders whose names may be meant by a name that is unknown, since they may stand here as well.
 
     Raises:
-        InputError: there is no such file; with the line of the reference and the nearest name.
+        InputError: there is no such file or it cannot be read; with the line of the reference and the nearest name.
     """
-    file = owner.source.file
-    path = place_of(folder, reference, Path(file).parent if file else Path())
+    if isinstance(reference, Inline):
+        return reference.placed(Source() if owner is None else owner.source, key).yaml
+    return read_yaml(find_named(folder, reference, owner, key, others))
+
+
+def find_named(
+    folder: str, reference: str | Path, owner: Spec | None, key: KeyPath, others: tuple[str, ...] = ()
+) -> Path:
+    """The file that a name or a path leads to; arguments and errors as of `referred`."""
+    path = place_of(folder, reference, owner)
     folders = (folder, *others)
     if path is None:
-        raise owner.error(_no_such_name(reference, *folders), key)
-    if not is_file(path):
+        text = f"no such name in {' or '.join(folders)}"
+        problem = unknown(text, str(reference), _names(folders), allowed=_names_and_paths(folders))
+        raise InputError(problem.at("")) if owner is None else owner.error(problem, key)
+    if owner is not None and not is_file(path):
         meant = nearest(path.stem, _names(folders))
         raise owner.error(unusable(path), key, allowed=_names_and_paths(folders), suggestion=meant)
     return path
+
+
+def placed(folder: str, reference: str, owner: Spec, key: KeyPath, others: tuple[str, ...] = ()) -> str:
+    """Return a reference that leads to the same wherever it stands; arguments and errors as of `referred`."""
+    if isinstance(reference, Inline):
+        return reference.placed(owner.source, key)
+    found = find_named(folder, reference, owner, key, others)
+    return str(found.absolute()) if is_path(reference) else reference
 
 
 def is_path(name_or_path: str | Path) -> bool:
@@ -337,10 +300,9 @@ def is_path(name_or_path: str | Path) -> bool:
     return isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml"))
 
 
-def place_of(folder: str, name_or_path: str | Path, base: Path) -> Path | None:
+def place_of(folder: str, reference: str | Path, owner: Spec | None) -> Path | None:
     """Where a reference leads: a library file that exists, a path that may not, or None for an unknown name."""
-    text = str(name_or_path)
-    if is_path(name_or_path):
-        return base / text
-    path = _folder(folder) / f"{text}.yaml"
-    return path if text in library_names(folder) else None
+    text = str(reference)
+    if is_path(reference):
+        return (Path(owner.source.file).parent if owner is not None and owner.source.file else Path()) / text
+    return _folder(folder) / f"{text}.yaml" if text in library_names(folder) else None

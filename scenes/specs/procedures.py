@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from optics.numerics.number_tree import FrozenMap
-from scenes.yaml.file_kind import FileKind
-from scenes.yaml.named import Named
+from scenes.yaml.named import FileKind, Named
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class Procedure:
 
     Attributes:
         kind: for example ``focus``; KIND.json has the numbers.
-        setup: class of the simulated test with all it refers to; has ``test``, ``with_seed`` and ``to_yaml``.
-        resolve: file, or the name of one in the library -> set-up. Raises InputError.
+        setup: class of the simulated test with all it refers to, an `ExperimentSetup`.
         run: set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
         report: run -> `twin.run.report.Report`.
+        measured: class of the test on measurements, chosen by the keys of the file; None where there is none.
         export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
-        files: kinds of file that it reads; their command is known from the list.
+        files: kinds of file that it reads beside those in file_kinds.csv; their command is known from the list.
         varied: whether a study can vary it.
         judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
         seeded: whether anything is drawn at random; config.yaml then states the seed.
@@ -41,10 +41,10 @@ class Procedure:
 
     kind: str
     setup: Any
-    resolve: Any
     run: Any
     numbers: Any
     report: Any
+    measured: Any = None
     export: Any = None
     files: tuple[FileKind, ...] = ()
     varied: bool = False
@@ -55,7 +55,7 @@ class Procedure:
 
     def __post_init__(self) -> None:
         """Functions that are given by name are imported when they are called."""
-        for name in ("resolve", "run", "numbers", "report", "export"):
+        for name in ("run", "numbers", "report", "export"):
             if isinstance(path := getattr(self, name), str):
                 object.__setattr__(self, name, Named(path))
 
@@ -63,6 +63,21 @@ class Procedure:
     def model(self) -> Any:
         """Class of the simulated test's set-up."""
         return Named(self.setup).get() if isinstance(self.setup, str) else self.setup
+
+    def resolve(self, path: Path | str) -> Any:
+        """Read a test with all it refers to.
+
+        Args:
+            path: of its file or of a run's config.yaml, or the name of a test in the library.
+
+        Raises:
+            InputError: a file cannot be read or is not valid, or they do not fit together.
+        """
+        if self.measured is not None:
+            measured = Named(self.measured).get()
+            if measured.measured_by(Named("scenes.specs.resolved:test_keys")(path)):
+                return measured.read(path)
+        return self.model.read(path)
 
 
 BASES: dict[str, Named] = {
@@ -78,24 +93,18 @@ def studied() -> tuple[str, ...]:
     return (*BASES, *(name for name, procedure in PROCEDURES.items() if procedure.varied))
 
 
+SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
+"""What the adjustment of a block can be asked to do without; the command's help names them."""
+
 PROCEDURES: dict[str, Procedure] = {
     "lab focus": Procedure(
         "focus",
         setup="scenes.specs.resolved:FocusSetup",
-        resolve="scenes.specs.resolved:resolve_focus_test",
+        measured="scenes.specs.resolved:MeasuredFocusSetup",
         run="twin.laboratory.focus_run:run_focus",
         numbers="twin.laboratory.focus_numbers:focus_numbers",
         report="twin.laboratory.focus_report:focus_report",
         export="twin.laboratory.export:export_focus",
-        files=(
-            FileKind("focus_test", "scenes.specs.camera_tests:FocusTestSpec", "a focus test", needs=("misset", "scan")),
-            FileKind(
-                "measured_focus",
-                "scenes.specs.camera_tests:MeasuredFocusSpec",
-                "a focus test on measurements",
-                needs=("measured", "mount"),
-            ),
-        ),
         varied=True,
         about="""
     Align a mis-set focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane,
@@ -110,25 +119,11 @@ PROCEDURES: dict[str, Procedure] = {
     "lab distortion": Procedure(
         "distortion",
         setup="scenes.specs.resolved:DistortionSetup",
-        resolve="scenes.specs.resolved:resolve_distortion_test",
+        measured="scenes.specs.resolved:MeasuredDistortionSetup",
         run="twin.laboratory.distortion_run:run_distortion",
         numbers="twin.laboratory.distortion_numbers:DISTORTION",
         report="twin.laboratory.distortion_report:distortion_report",
         export="twin.laboratory.export:export_distortion",
-        files=(
-            FileKind(
-                "distortion_test",
-                "scenes.specs.camera_tests:DistortionTestSpec",
-                "a distortion test",
-                needs=("pinhole", "sets"),
-            ),
-            FileKind(
-                "measured_distortion",
-                "scenes.specs.camera_tests:MeasuredDistortionSpec",
-                "a distortion test on measurements",
-                needs=("measured", "principal_distance"),
-            ),
-        ),
         varied=True,
         about="""
     Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
@@ -144,25 +139,11 @@ PROCEDURES: dict[str, Procedure] = {
     "lab turntable": Procedure(
         "turntable",
         setup="scenes.specs.resolved:TurntableSetup",
-        resolve="scenes.specs.resolved:resolve_turntable_test",
+        measured="scenes.specs.resolved:MeasuredTurntableSetup",
         run="twin.laboratory.turntable_run:run_turntable_test",
         numbers="twin.laboratory.turntable_numbers:TURNTABLE",
         report="twin.laboratory.turntable_report:turntable_report",
         export="twin.laboratory.export:export_turntable",
-        files=(
-            FileKind(
-                "turntable_test",
-                "scenes.specs.turntable:TurntableTestSpec",
-                "a turntable test",
-                needs=("dividing_error", "calibration"),
-            ),
-            FileKind(
-                "measured_turntable",
-                "scenes.specs.turntable:MeasuredTurntableSpec",
-                "a turntable test on measurements",
-                needs=("measured",),
-            ),
-        ),
         varied=True,
         about="""
     Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.
@@ -172,25 +153,11 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "orbit adjust": Procedure(
         "block",
-        setup="scenes.specs.measured.adjust_setup:AdjustSetup",
-        resolve="scenes.specs.measured.adjust_setup:resolve_any_adjust",
+        setup="scenes.specs.orbit.setup:AdjustSetup",
+        measured="scenes.specs.orbit.setup:MeasuredAdjustSetup",
         run="twin.operate.operated_block:run_operated_block",
         numbers="twin.orbit.block.block_numbers:BLOCK",
         report="twin.orbit.block.block_report:block_report",
-        files=(
-            FileKind(
-                "orbit_adjust",
-                "scenes.specs.orbit.adjust:OrbitAdjustSpec",
-                "an adjustment of a block",
-                needs=("area", "passes"),
-            ),
-            FileKind(
-                "measured_adjust",
-                "scenes.specs.measured.adjust_setup:MeasuredAdjustSpec",
-                "an adjustment of measured passes",
-                needs=("names", "changes"),
-            ),
-        ),
         varied=True,
         about="""
     One adjustment of all scenes of a block: image points, control, the cameras' monitor, star trackers and their
@@ -208,25 +175,11 @@ PROCEDURES: dict[str, Procedure] = {
     "orbit angle": Procedure(
         "angle",
         setup="scenes.specs.orbit.setup:AngleSetup",
-        resolve="scenes.specs.measured.orbit_data_setup:resolve_any_angle",
+        measured="scenes.specs.orbit.setup:MeasuredAngleSetup",
         run="twin.orbit.angle.measured_angle:run_angle_test",
         numbers="twin.orbit.angle.angle_numbers:angle_numbers",
         report="twin.orbit.angle.angle_report:angle_report",
         export="twin.orbit.angle.measured_angle:angle_exported",
-        files=(
-            FileKind(
-                "orbit_angle",
-                "scenes.specs.orbit.angle:OrbitAngleSpec",
-                "a test of intersection angles",
-                needs=("orbit", "strips"),
-            ),
-            FileKind(
-                "measured_angle",
-                "scenes.specs.measured.orbit_data:MeasuredAngleSpec",
-                "intersection angles on measurements",
-                needs=("camera", "errors"),
-            ),
-        ),
         varied=True,
         about="""
     Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
@@ -245,25 +198,11 @@ PROCEDURES: dict[str, Procedure] = {
     "orbit calibrate": Procedure(
         "calibration",
         setup="scenes.specs.orbit.setup:CalibrationSetup",
-        resolve="scenes.specs.measured.orbit_data_setup:resolve_any_calibration",
+        measured="scenes.specs.orbit.setup:MeasuredCalibrationSetup",
         run="twin.orbit.calibration.calibration_run:run_calibration",
         numbers="twin.orbit.calibration.calibration_numbers:CALIBRATION",
         report="twin.orbit.calibration.calibration_report:calibration_report",
         export="twin.orbit.calibration.calibration_export:exported",
-        files=(
-            FileKind(
-                "orbit_calibration",
-                "scenes.specs.orbit.calibration:OrbitCalibrationSpec",
-                "an in-orbit calibration",
-                needs=("fields", "schemes"),
-            ),
-            FileKind(
-                "measured_calibration",
-                "scenes.specs.measured.orbit_data:MeasuredCalibrationSpec",
-                "a calibration on measurements",
-                needs=("errors", "schemes"),
-            ),
-        ),
         varied=True,
         about="""
     Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
@@ -280,20 +219,11 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "orbit check": Procedure(
         "check",
-        setup="scenes.specs.measured.orbit_data_setup:CheckSetup",
-        resolve="scenes.specs.measured.orbit_data_setup:resolve_check",
+        setup="scenes.specs.orbit.setup:CheckSetup",
         run="twin.orbit.conventions.check_run:run_check",
         numbers="twin.orbit.conventions.check_numbers:CHECK",
         report="twin.orbit.conventions.check_report:check_report",
         export="twin.orbit.conventions.check_run:exported",
-        files=(
-            FileKind(
-                "orbit_check",
-                "scenes.specs.measured.orbit_data:OrbitCheckSpec",
-                "a check of the conventions of a pass",
-                needs=("ground", "platform"),
-            ),
-        ),
         judged=False,
         seeded=False,
         about="""
@@ -312,25 +242,11 @@ PROCEDURES: dict[str, Procedure] = {
     "orbit jitter": Procedure(
         "jitter",
         setup="scenes.specs.orbit.setup:JitterSetup",
-        resolve="scenes.specs.measured.orbit_data_setup:resolve_any_jitter",
+        measured="scenes.specs.orbit.setup:MeasuredJitterSetup",
         run="twin.orbit.jitter.jitter_run:run_jitter",
         numbers="twin.orbit.jitter.jitter_numbers:JITTER",
         report="twin.orbit.jitter.jitter_report:jitter_report",
         export="twin.orbit.jitter.jitter_run:exported",
-        files=(
-            FileKind(
-                "orbit_jitter",
-                "scenes.specs.orbit.jitter_search:OrbitJitterSpec",
-                "a search for jitter",
-                needs=("points", "search"),
-            ),
-            FileKind(
-                "measured_jitter",
-                "scenes.specs.measured.orbit_data:MeasuredJitterSpec",
-                "a search for jitter on measurements",
-                needs=("camera", "search"),
-            ),
-        ),
         varied=True,
         judged=False,
         about="""
@@ -348,20 +264,11 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "orbit match": Procedure(
         "match",
-        setup="scenes.specs.measured.orbit_data_setup:MatchSetup",
-        resolve="scenes.specs.measured.orbit_data_setup:resolve_match",
+        setup="scenes.specs.orbit.setup:MatchSetup",
         run="twin.orbit.matching.match_run:run_match",
         numbers="twin.orbit.matching.match_run:MATCH",
         report="twin.orbit.matching.match_report:match_report",
         export="twin.orbit.matching.match_run:exported",
-        files=(
-            FileKind(
-                "orbit_match",
-                "scenes.specs.measured.orbit_data:OrbitMatchSpec",
-                "points to be measured in line images",
-                needs=("orthophoto", "dem"),
-            ),
-        ),
         judged=False,
         seeded=False,
         about="""
@@ -377,19 +284,9 @@ PROCEDURES: dict[str, Procedure] = {
     "orbit monitor": Procedure(
         "monitor",
         setup="scenes.specs.orbit.setup:MonitorSetup",
-        resolve="scenes.specs.orbit.setup:resolve_monitor",
         run="twin.orbit.monitoring.monitoring_run:run_monitor",
         numbers="twin.orbit.monitoring.monitoring_numbers:monitor_numbers",
         report="twin.orbit.monitoring.monitoring_report:monitor_report",
-        files=(
-            FileKind(
-                "orbit_monitor",
-                "scenes.specs.orbit.monitor:OrbitMonitorSpec",
-                "a test of monitoring in orbit",
-                one_of=("interval", "mechanisms"),
-                needs=("orbit", "ground"),
-            ),
-        ),
         varied=True,
         about="""
     Height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper 001's
@@ -406,19 +303,10 @@ PROCEDURES: dict[str, Procedure] = {
     "orbit simulate": Procedure(
         "simulate",
         setup="scenes.specs.orbit.setup:SimulateSetup",
-        resolve="scenes.specs.orbit.setup:resolve_simulate",
         run="twin.orbit.images.simulate_run:run_simulation",
         numbers="twin.orbit.images.simulate_numbers:SIMULATE",
         report="twin.orbit.images.simulate_report:simulation_report",
         export="twin.orbit.calibration.calibration_export:simulation_exported",
-        files=(
-            FileKind(
-                "orbit_simulate",
-                "scenes.specs.orbit.simulate:OrbitSimulateSpec",
-                "a simulation of images of the ground",
-                needs=("orbit", "patch"),
-            ),
-        ),
         about="""
     Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
@@ -433,18 +321,9 @@ PROCEDURES: dict[str, Procedure] = {
     "design camera": Procedure(
         "design",
         setup="scenes.models.camera_design:CameraDesignSetup",
-        resolve="scenes.models.camera_design:resolve_design",
         run="twin.design.design_run:run_design",
         numbers="twin.design.design_run:DESIGN",
         report="twin.design.design_report:design_report",
-        files=(
-            FileKind(
-                "camera_design",
-                "scenes.specs.camera:CameraDesignSpec",
-                "an optimisation of a camera",
-                needs=("camera", "vary"),
-            ),
-        ),
         judged=False,
         about="""
     Optimise a camera's prescription: curvatures, conics, aspheric terms and places vary; the wavefront error over
@@ -462,35 +341,17 @@ PROCEDURES: dict[str, Procedure] = {
     "design monitor": Procedure(
         "layouts",
         setup="scenes.models.monitor_layout:MonitorDesignSetup",
-        resolve="scenes.models.monitor_layout:resolve_monitor_design",
         run="twin.design.monitor_design:run_monitor_design",
         numbers="twin.design.monitor_design:LAYOUTS",
         report="twin.design.monitor_report:monitor_design_report",
-        files=(
-            FileKind(
-                "monitor_design",
-                "scenes.specs.camera:MonitorDesignSpec",
-                "a search for a monitor's layout",
-                needs=("beams", "goal"),
-            ),
-        ),
         judged=False,
     ),
     "asbuilt estimate": Procedure(
         "asbuilt",
         setup="scenes.specs.asbuilt:AsBuiltSetup",
-        resolve="scenes.specs.asbuilt:resolve_asbuilt",
         run="twin.asbuilt.asbuilt_run:run_asbuilt",
         numbers="twin.asbuilt.asbuilt_run:ASBUILT",
         report="twin.asbuilt.asbuilt_report:asbuilt_report",
-        files=(
-            FileKind(
-                "asbuilt",
-                "scenes.specs.asbuilt:AsBuiltSpec",
-                "the measurements of one instrument",
-                needs=("measurements", "merits"),
-            ),
-        ),
         about="""
     Estimate the state of one instrument: all motions of its prior from everything that was measured, with the
     combinations that are known, what is possible for the camera beside what the design promises, and the next move.
@@ -506,7 +367,6 @@ PROCEDURES: dict[str, Procedure] = {
     "asbuilt check": Procedure(
         "orientation",
         setup="scenes.specs.asbuilt:AsBuiltSetup",
-        resolve="scenes.specs.asbuilt:resolve_asbuilt",
         run="twin.asbuilt.orientation_check:run_check",
         numbers="twin.asbuilt.orientation_check:ORIENTATION",
         report="twin.asbuilt.orientation_check:check_report",

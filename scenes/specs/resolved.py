@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Generic, Self, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar, cast
 
 from pydantic import Field
 
@@ -17,13 +17,12 @@ from scenes.specs.disturbances import DisturbancesSpec, ErrorBudgetSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, PerturbationSpec, TargetsSpec, with_tables
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
-from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, unknown
+from scenes.yaml.errors import InputError, Issue, unknown
 from scenes.yaml.input_file import is_file
-from scenes.yaml.spec import Name, Paths, Source, Spec, validate
+from scenes.yaml.spec import Name, Paths, Spec, validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
 
 TestType = TypeVar("TestType", bound=Spec)
-SetupType = TypeVar("SetupType", bound="ExperimentSetup")
 
 
 class ResolvedJob(Spec):
@@ -78,6 +77,17 @@ class ResolvedJob(Spec):
         render = self.job.render.model_copy(update={"frames": frames, "seed": seed})
         return self.model_copy(update={"job": self.job.model_copy(update={"render": render})})
 
+    def instrument_file(self) -> dict[str, Any]:
+        """Return what a file of the instrument says that refers to no other; nothing is expected to move there."""
+        plain = self.plain()
+        instrument: dict[str, Any] = plain["instrument"]
+        instrument.pop("disturbances", None)
+        for mounted in instrument["cameras"].values():
+            mounted["camera"] = plain["cameras"][mounted["camera"]]
+        if "detector" in plain:
+            instrument["monitor"]["area_ccd"]["detector"] = plain["detector"]
+        return instrument
+
     def to_yaml(self) -> str:
         """The text of a config.yaml; `resolve` reads it back to exactly the same values."""
         return dump_yaml(self.plain())
@@ -97,10 +107,13 @@ def resolve(path: str | Path) -> ResolvedJob:
 
 def resolve_job(job: JobSpec) -> ResolvedJob:
     """A job with all it refers to. Raises InputError as `resolve`."""
-    return _with_instrument(job, load.load_instrument(load.instrument_path(job)))
+    return _with_instrument(job, load.load_instrument(job.instrument, job, ("instrument",)))
 
 
 def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
+    detector = None
+    if instrument.monitor is not None:
+        detector = load.load_detector(instrument.monitor.area_ccd.detector, instrument, load.AREA_CCD)
     cameras = load.load_cameras(instrument)
     line_detectors = None
     if job.render.target_images:
@@ -110,7 +123,7 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
         job=job,
         instrument=instrument,
         cameras=cameras,
-        detector=None if instrument.monitor is None else load.load_detector(load.path_of_detector(instrument)),
+        detector=detector,
         line_detectors=line_detectors,
         disturbances=load.find_disturbances(job, instrument),
     )
@@ -122,13 +135,26 @@ def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
     Raises:
         InputError: as `resolve`; or the budget names no disturbances.
     """
-    named = {"file": budget.disturbances}
-    job = JobSpec.model_validate({"instrument": budget.instrument, "disturbances": named}).with_source(budget.source)
-    resolved = resolve_job(job)
+    resolved = resolve_on(budget, budget.instrument, budget.disturbances)
     if resolved.disturbances is None:
         text = "an error budget is one of disturbances"
         raise budget.error(text, ("disturbances",), found=budget.disturbances, allowed="the name of a file of them")
     return resolved
+
+
+def resolve_on(owner: Spec, instrument: str, disturbances: Any = None) -> ResolvedJob:
+    """The nominal job on the instrument of another file.
+
+    Args:
+        owner: the file, whose keys `instrument` and `disturbances` these are.
+        instrument: that it refers to.
+        disturbances: that it refers to, as in a job; None for the instrument's own.
+
+    Raises:
+        InputError: as `resolve`.
+    """
+    plain = {"instrument": instrument, "disturbances": disturbances}
+    return resolve_job(JobSpec.model_validate(plain).with_source(owner.source))
 
 
 def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJob:
@@ -196,44 +222,68 @@ def _complete(resolved: ResolvedJob) -> ResolvedJob:
 class ExperimentSetup(Spec, Generic[TestType]):
     """A test together with all it refers to, so that one file says all that went into a run.
 
+    A kind of test is a subclass: its fields are what is read, ``parts`` reads them, ``checked`` holds them against each
+    other.
+
     Attributes:
         test: what the test's file says.
     """
 
+    FOLDER: ClassVar[str] = load.LAB
+    """Folder of the library in which tests of this kind have names."""
+
     test: TestType
 
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Return a test and all it refers to.
+
+        Args:
+            path: of the test's file, or of a run's config.yaml; or the name of a test in the library.
+
+        Raises:
+            InputError: a file cannot be read or is not valid, or they do not fit together.
+        """
+        yaml = load.referred(cls.FOLDER, path)
+        if isinstance(yaml.data, dict) and "test" in yaml.data:
+            return validate(cls, yaml).checked()
+        model = cast(type[Spec], cls.model_fields["test"].annotation)
+        test = validate(model, yaml)
+        return cast(Self, cls.model_construct(**{"test": test, **cls.parts(test)})).checked()
+
+    @classmethod
+    def parts(cls, test: Any) -> dict[str, Any]:
+        """Return what a test refers to, by field. Raises InputError."""
+        return {}
+
+    def checked(self) -> Self:
+        """Return the set-up, complete. Raises InputError where test and parts do not fit."""
+        return self
+
+    @classmethod
+    def measured_by(cls, keys: Mapping[str, Any]) -> bool:
+        """Return whether a file with these keys is a test of this kind on measurements; asked of set-ups that are."""
+        return MEASURED in keys
+
     def with_seed(self, seed: int) -> Self:
-        """Return the set-up with another seed, for one that a command overrides."""
+        """Return the set-up with another seed, for one that a command overrides; where nothing is drawn, itself."""
+        if "seed" not in type(self.test).model_fields:
+            return self
         return self.model_copy(update={"test": self.test.model_copy(update={"seed": seed})})
 
     def to_yaml(self) -> str:
-        """Text of a config.yaml, which ``read_setup`` reads back to the same values."""
+        """Text of a config.yaml, which ``read`` reads back to the same values."""
         return dump_yaml(self.plain())
-
-
-def read_setup(model: type[SetupType], path: str | Path) -> SetupType | None:
-    """The setup that a run's config.yaml holds; None for the file, or the name in the library, of a test alone.
-
-    Raises:
-        InputError: the file cannot be read, or is a config.yaml that is not valid.
-    """
-    if not load.is_path(path):
-        return None
-    yaml = read_yaml(path)
-    if not (isinstance(yaml.data, dict) and "test" in yaml.data):
-        return None
-    return validate(model, yaml)
 
 
 MEASURED = "measured"
 """Key of a test whose data come from files and not from a simulated bench."""
 DATA_FILES = ("comparisons", "held_out", "spots", "mtf", "images")
 """Keys of `measured` that name files."""
-MeasuredSetup = TypeVar("MeasuredSetup", bound="ExperimentSetup[Any]")
 
 
-class FocusSetup(ExperimentSetup[FocusTestSpec]):
-    """A focal-plane alignment with its camera and detectors.
+class CameraTestSetup(ExperimentSetup[TestType], Generic[TestType]):
+    """A test of a camera in the laboratory.
 
     Attributes:
         camera: prescription and bands.
@@ -243,110 +293,83 @@ class FocusSetup(ExperimentSetup[FocusTestSpec]):
     camera: CameraSpec
     detectors: Paths[DetectorSpec]
 
+    @classmethod
+    def parts(cls, test: Any) -> dict[str, Any]:
+        """Return the camera with its detectors, and the test with what was built in its `as_built`."""
+        test, camera = load.load_camera_under_test(test)
+        return {"test": test, "camera": camera, "detectors": load.load_band_detectors(camera)}
 
-class DistortionSetup(ExperimentSetup[DistortionTestSpec]):
+    def checked(self) -> Self:
+        """Check that the camera has line CCDs, and that their data sheets are there."""
+        if not self.camera.bands:
+            text = f"the camera {self.camera.name} has no line CCDs"
+            raise self.test.error(text, ("camera",), allowed="a camera with `bands:` in its file")
+        for name, band in self.camera.bands.items():
+            require_detector(self, ("camera", "bands", name, "detector"), band.detector, self.detectors)
+        return self
+
+
+class FocusSetup(CameraTestSetup[FocusTestSpec]):
+    """A focal-plane alignment with its camera and detectors."""
+
+    def checked(self) -> Self:
+        """Check also that the tilt about the line can be told: not by bands at one X' alone."""
+        super().checked()
+        if len({band.offset for band in self.camera.bands.values()}) < 2:
+            text = (
+                f"all bands of the camera {self.camera.name} stand at one X', so the tilt about the line cannot be told"
+            )
+            raise self.test.error(text, ("camera",), allowed="a camera with bands at different offsets")
+        return self
+
+
+class DistortionSetup(CameraTestSetup[DistortionTestSpec]):
     """A distortion test with its camera, detectors and turntable.
 
     Attributes:
         turntable: its dividing error and calibration.
-        camera: prescription and bands.
-        detectors: as the bands name them -> data sheet.
     """
 
     turntable: TurntableTestSpec
-    camera: CameraSpec
-    detectors: Paths[DetectorSpec]
+
+    @classmethod
+    def parts(cls, test: DistortionTestSpec) -> dict[str, Any]:
+        """Return also the turntable."""
+        turntable = load.load_named(TurntableTestSpec, load.LAB, test.turntable, test, ("turntable",))
+        return {**super().parts(test), "turntable": turntable}
+
+    def checked(self) -> Self:
+        """Check also that the camera has the band."""
+        super().checked()
+        if self.test.band not in self.camera.bands:
+            raise self.test.error(unknown("no such band", self.test.band, self.camera.bands), ("band",))
+        return self
 
 
 class TurntableSetup(ExperimentSetup[TurntableTestSpec]):
     """A turntable test, which refers to nothing else."""
 
 
-class MeasuredFocusSetup(ExperimentSetup[MeasuredFocusSpec]):
+class MeasuredSetup(ExperimentSetup[TestType], Generic[TestType]):
+    """A test of the laboratory on measurements."""
+
+    def checked(self) -> Self:
+        """Make the paths of the data absolute, so that a run's config.yaml finds them from anywhere."""
+        folder = Path(self.test.source.file).parent.absolute()
+        measured = _absolute(getattr(self.test, MEASURED), folder)
+        return self.model_copy(update={"test": self.test.model_copy(update={MEASURED: measured})})
+
+
+class MeasuredFocusSetup(MeasuredSetup[MeasuredFocusSpec]):
     """A focal-plane alignment on measurements."""
 
 
-class MeasuredDistortionSetup(ExperimentSetup[MeasuredDistortionSpec]):
+class MeasuredDistortionSetup(MeasuredSetup[MeasuredDistortionSpec]):
     """A distortion test on measurements."""
 
 
-class MeasuredTurntableSetup(ExperimentSetup[MeasuredTurntableSpec]):
+class MeasuredTurntableSetup(MeasuredSetup[MeasuredTurntableSpec]):
     """A turntable test on measurements."""
-
-
-def resolve_focus(path: str | Path) -> FocusSetup:
-    """Read a focal-plane alignment and all it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: any of the files cannot be read or is not valid.
-    """
-    if (again := read_setup(FocusSetup, path)) is not None:
-        _require_plane(again.test, again.camera)
-        _require_detectors(again, again.camera, again.detectors)
-        return again
-    test = load.load_named(FocusTestSpec, load.LAB, path)
-    test, camera = load.load_camera_under_test(test)
-    _require_plane(test, camera)
-    return FocusSetup.model_construct(test=test, camera=camera, detectors=FrozenMap(load.load_band_detectors(camera)))
-
-
-def resolve_distortion(path: str | Path) -> DistortionSetup:
-    """Read a distortion test and all it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: any of the files cannot be read or is not valid.
-    """
-    if (again := read_setup(DistortionSetup, path)) is not None:
-        _require_bands(again.test, again.camera, again.test.band)
-        _require_detectors(again, again.camera, again.detectors)
-        return again
-    test = load.load_named(DistortionTestSpec, load.LAB, path)
-    test, camera = load.load_camera_under_test(test)
-    _require_bands(test, camera, test.band)
-    turntable = load.load_named(
-        TurntableTestSpec, load.LAB, load.find_named(load.LAB, test.turntable, test, ("turntable",))
-    )
-    return DistortionSetup.model_construct(
-        test=test, turntable=turntable, camera=camera, detectors=FrozenMap(load.load_band_detectors(camera))
-    )
-
-
-def resolve_turntable(path: str | Path) -> TurntableSetup:
-    """Read a turntable test; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: the file cannot be read or is not valid.
-    """
-    if (again := read_setup(TurntableSetup, path)) is not None:
-        return again
-    return TurntableSetup.model_construct(test=load.load_named(TurntableTestSpec, load.LAB, path))
-
-
-def resolve_focus_test(path: str | Path) -> FocusSetup | MeasuredFocusSetup:
-    """Read a focal-plane alignment as `resolve_focus`, for a simulated bench or, with `measured:` in the file, for
-    measurements.
-    """
-    return _measured(MeasuredFocusSetup, MeasuredFocusSpec, path) if is_measured(path) else resolve_focus(path)
-
-
-def resolve_distortion_test(path: str | Path) -> DistortionSetup | MeasuredDistortionSetup:
-    """Read a distortion test as `resolve_distortion`, for a simulated bench or, with `measured:` in the file, for
-    measurements.
-    """
-    return (
-        _measured(MeasuredDistortionSetup, MeasuredDistortionSpec, path)
-        if is_measured(path)
-        else resolve_distortion(path)
-    )
-
-
-def resolve_turntable_test(path: str | Path) -> TurntableSetup | MeasuredTurntableSetup:
-    """Read a turntable test as `resolve_turntable`, for a simulated bench or, with `measured:` in the file, for
-    measurements.
-    """
-    return (
-        _measured(MeasuredTurntableSetup, MeasuredTurntableSpec, path) if is_measured(path) else resolve_turntable(path)
-    )
 
 
 def test_keys(path: str | Path) -> Mapping[str, Any]:
@@ -360,23 +383,6 @@ def test_keys(path: str | Path) -> Mapping[str, Any]:
     return inner if isinstance(inner, dict) else {}
 
 
-def is_measured(path: str | Path) -> bool:
-    """Whether a test's file, or a run's config.yaml, takes its data from measurements.
-
-    Raises:
-        InputError: it cannot be read.
-    """
-    return MEASURED in test_keys(path)
-
-
-def _measured(setup: type[MeasuredSetup], model: type[Spec], path: str | Path) -> MeasuredSetup:
-    """The test with the paths of its data made absolute, so that a run's config.yaml finds them from anywhere."""
-    again = read_setup(setup, path)
-    test: Spec = load.load_named(model, load.LAB, path) if again is None else again.test
-    measured = _absolute(getattr(test, MEASURED), Path(test.source.file).parent.absolute())
-    return cast(MeasuredSetup, setup.model_construct(test=test.model_copy(update={MEASURED: measured})))
-
-
 def _absolute(files: Spec, folder: Path) -> Spec:
     """Make every path of a section absolute."""
     changed: dict[str, Any] = {}
@@ -387,32 +393,6 @@ def _absolute(files: Spec, folder: Path) -> Spec:
         elif name in DATA_FILES and value is not None:
             changed[name] = str(files.file_at((name,), value, folder, "a CSV file"))
     return files.model_copy(update=changed)
-
-
-def _require_plane(test: Spec, camera: CameraSpec) -> None:
-    """Bands at one X' alone do not tell the tilt about the line."""
-    _require_bands(test, camera)
-    if len({band.offset for band in camera.bands.values()}) < 2:
-        raise test.error(
-            f"all bands of the camera {camera.name} stand at one X', so the tilt about the line cannot be told",
-            ("camera",),
-            allowed="a camera with bands at different offsets",
-        )
-
-
-def _require_detectors(setup: Spec, camera: CameraSpec, detectors: Mapping[str, DetectorSpec]) -> None:
-    """InputError unless the data sheets of all bands are there."""
-    for name, band in camera.bands.items():
-        require_detector(setup, ("camera", "bands", name, "detector"), band.detector, detectors)
-
-
-def _require_bands(test: Spec, camera: CameraSpec, band: str | None = None) -> None:
-    if not camera.bands:
-        raise test.error(
-            f"the camera {camera.name} has no line CCDs", ("camera",), allowed="a camera with `bands:` in its file"
-        )
-    if band is not None and band not in camera.bands:
-        raise test.error(unknown("no such band", band, camera.bands), ("band",))
 
 
 ALLOWED = "the file of a camera or of an instrument, or the config.yaml of a run with one"
@@ -490,18 +470,18 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
         InputError: the file cannot be read or is not valid, holds no camera, or several and ``name`` none of them.
     """
     text = str(file)
-    if not load.is_path(text) and not is_file(Path(text)):
-        return _of_library(text, name)
-    yaml = read_yaml(file)
+    place: Path | str = text if not load.is_path(text) and not is_file(Path(text)) else Path(text)
+    folder = load.CAMERAS if text in load.library_names(load.CAMERAS) else load.INSTRUMENTS
+    yaml = load.referred(folder, place, others=(load.CAMERAS,))
     data = yaml.data if isinstance(yaml.data, dict) else {}
     if "mirrors" in data:
-        return _alone(load.load_camera(Path(text)), text, name)
+        return _alone(load.load_camera(place), text, name)
     if "camera" in data and {"mounted", "perturb"} & set(data) and "test" not in data:
         return validate(CameraSetup, yaml)
     if "job" in data or ("instrument" in data and "mounted" not in data and "study" not in data):
         return _of_job(resolve(file), text, name)
     if load.is_instrument(data):
-        return _mounted(load.load_instrument(Path(text)), text, name)
+        return _mounted(load.load_instrument(place), text, name)
     return _of_run(yaml, name)
 
 
@@ -518,16 +498,6 @@ def _of_job(resolved: ResolvedJob, file: str, name: str | None) -> CameraSetup:
     ).with_source(job.source)
 
 
-def _of_library(text: str, name: str | None) -> CameraSetup:
-    cameras, instruments = load.library_names(load.CAMERAS), load.library_names(load.INSTRUMENTS)
-    if text in cameras:
-        return _alone(load.load_camera(text), text, name)
-    if text in instruments:
-        return _mounted(load.load_instrument(text), text, name)
-    allowed = f"{names_text(cameras)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
-    raise InputError(unknown("no such camera or instrument", text, (*cameras, *instruments), allowed=allowed).at(""))
-
-
 def _alone(camera: CameraSpec, file: str, name: str | None) -> CameraSetup:
     if name is not None and name != camera.name:
         raise InputError(Issue(f"--camera {name}: the file holds one camera, {camera.name}", file))
@@ -542,26 +512,17 @@ def _mounted(instrument: InstrumentSpec, file: str, name: str | None) -> CameraS
 
 def _of_run(yaml: YamlFile, name: str | None) -> CameraSetup:
     """From a run's config.yaml; a study's has its own below ``base``."""
-    data: Any = yaml.data
-    way: KeyPath = ("base",) if isinstance(data, dict) and "study" in data else ()
-    below = data.get("base") if way else data
-    one = below.get("camera") if isinstance(below, dict) else None
-    many = below.get("cameras") if isinstance(below, dict) else None
+    below = yaml.data if isinstance(yaml.data, dict) else {}
+    if "study" in below and isinstance(below.get("base"), dict):
+        yaml, below = yaml.part("base"), below["base"]
+    one, many = below.get("camera"), below.get("cameras")
     if isinstance(one, dict) and "mirrors" in one:
-        return _alone(_read(yaml, one, (*way, "camera")), yaml.file, name)
+        return _alone(validate(CameraSpec, yaml.part("camera")), yaml.file, name)
     held = {key: c for key, c in many.items() if isinstance(c, dict)} if isinstance(many, dict) else {}
     if held and all("mirrors" in camera for camera in held.values()):
-        chosen = _chosen(tuple(held), yaml.file, name)
-        camera = _read(yaml, held[chosen], (*way, "cameras", chosen))
+        camera = validate(CameraSpec, yaml.part("cameras", _chosen(tuple(held), yaml.file, name)))
         return CameraSetup.model_construct(camera=camera, mounted=None, instrument=None, cameras=FrozenMap())
     raise InputError(Issue("there is no camera's prescription in this file", yaml.file, 1, allowed=ALLOWED))
-
-
-def _read(yaml: YamlFile, data: Mapping[str, Any], way: KeyPath) -> CameraSpec:
-    """A camera that stands at ``way`` in a file."""
-    lines = {key[len(way) :]: line for key, line in yaml.lines.items() if key[: len(way)] == way}
-    camera = validate(CameraSpec, YamlFile(yaml.file, data, lines))
-    return camera.with_source(Source(yaml.file, yaml.lines, way))
 
 
 def _chosen(names: tuple[str, ...], file: str, name: str | None) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -13,12 +12,11 @@ from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import noll
 from scenes.specs.disturbances import JobDisturbances
-from scenes.specs.job import JobSpec
 from scenes.specs.motion_text import PURE, motion_of
-from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
+from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_on
 from scenes.specs.study import MOST_RUNS, LimitsSpec
 from scenes.yaml.errors import Problem, shown
-from scenes.yaml.spec import Flag, Name, Named, NothingIsEmpty, Number, Reference, Seed, Spec, Text, Whole, validate
+from scenes.yaml.spec import Flag, Name, Named, NothingIsEmpty, Number, Ref, Seed, Spec, Text, Whole
 from scenes.yaml.units import (
     ANGLE,
     LENGTH,
@@ -29,7 +27,6 @@ from scenes.yaml.units import (
     format_quantity,
     parse_quantity,
 )
-from scenes.yaml.yaml_file import read_yaml
 
 Amount = Annotated[str, Field(strict=True, max_length=100)] | Number
 """A quantity with its unit, or a pure number where the motion has no unit."""
@@ -422,7 +419,7 @@ class ToleranceBudgetSpec(Spec):
         limits: what the Monte Carlo run may use.
     """
 
-    instrument: Reference
+    instrument: Ref
     camera: Name | None = None
     disturbances: JobDisturbances | None = None
     tolerances: Annotated[Named[ToleranceSpec], Field(min_length=1, max_length=300)]
@@ -454,17 +451,7 @@ class ToleranceSetup(ExperimentSetup[ToleranceBudgetSpec]):
     base: ResolvedJob
     draws: Annotated[dict[str, Number], NothingIsEmpty] = Field(default_factory=FrozenMap)
 
-
-def resolve_tolerance(path: str | Path) -> ToleranceSetup:
-    """Read a tolerance budget and its instrument. The config.yaml of an earlier run can be given in its place.
-
-    Raises:
-        InputError: any of the files cannot be read or is not valid.
-    """
-    setup = read_setup(ToleranceSetup, path)
-    if setup is not None:
-        return setup
-    test = validate(ToleranceBudgetSpec, read_yaml(path))
-    given = {key: value for key, value in test.plain().items() if key in ("instrument", "disturbances")}
-    job = JobSpec.model_validate(given).with_source(test.source)
-    return ToleranceSetup(test=test, base=resolve_job(job))
+    @classmethod
+    def parts(cls, test: ToleranceBudgetSpec) -> dict[str, Any]:
+        """Return the nominal job."""
+        return {"base": resolve_on(test, test.instrument, test.disturbances)}

@@ -25,15 +25,16 @@ from pydantic import (
     PrivateAttr,
     StringConstraints,
     ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
 )
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, ErrorDetails, PydanticUndefined, core_schema
 
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
-from scenes.yaml.examples import allowed_at, written
 from scenes.yaml.input_file import file_beside, is_file, unusable
-from scenes.yaml.quantity import Terms
+from scenes.yaml.quantity import Terms, allowed_at, written
 from scenes.yaml.units import decimal_comma
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
 
@@ -118,7 +119,69 @@ def _freeze(value: Mapping[str, Value]) -> FrozenMap[str, Value]:
 Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)]
 """Seed of every random number."""
 Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
-"""Name of a file in the library (`gf7`), or path of a file of one's own, relative to the file that names it."""
+"""Path of a file of one's own, relative to the file that names it."""
+
+
+class Inline(str):
+    """A reference in whose place stands the mapping itself; as text it is the mapping's name.
+
+    Attributes:
+        yaml: the mapping; with its file, lines and place where these are known, else with its place below the key of
+            the reference.
+    """
+
+    yaml: YamlFile
+
+    def __new__(cls, name: str, yaml: YamlFile) -> Self:
+        """Make one of the mapping's name and the mapping."""
+        reference = super().__new__(cls, name)
+        reference.yaml = yaml
+        return reference
+
+    def __getnewargs__(self) -> tuple[str, YamlFile]:  # type: ignore[override]
+        """What a copy in another process is made of."""
+        return str(self), self.yaml
+
+    def placed(self, source: Source, key: KeyPath) -> Inline:
+        """Return the reference with the place of its mapping.
+
+        Args:
+            source: of the specification that has the reference.
+            key: of the reference there.
+        """
+        if self.yaml.file or self.yaml.lines:
+            return self
+        full = (*source.prefix, *key)
+        while full and source.lines and full not in source.lines:  # the key of which the reference is the short form
+            full = full[:-1]
+        place = (*full, *self.yaml.prefix)
+        return Inline(str(self), YamlFile(source.file, self.yaml.data, source.lines, place))
+
+
+def _referred(value: Any, handler: ValidatorFunctionWrapHandler, within: KeyPath = ()) -> Any:
+    """Take a name, a path or a mapping, each also as ``{camera: ...}``."""
+    if isinstance(value, Inline):
+        return value
+    if isinstance(value, Mapping):
+        if set(value) == {"camera"}:
+            return _referred(value["camera"], handler, ("camera",))
+        name = value.get("name")
+        if not isinstance(name, str):
+            allowed = "the name of a file of the library, the path of one, or what such a file says, with its `name`"
+            raise Problem("neither a file nor what one says", shown(value), allowed)
+        return Inline(name, YamlFile("", value, {}, within))
+    return handler(value)
+
+
+Ref = Annotated[
+    str,
+    Field(strict=True, min_length=1, max_length=1000),
+    WrapValidator(_referred, json_schema_input_type=Reference | dict[str, Any]),
+]
+"""Reference to another specification: its name in the library (`gf7`), the path of its file, relative to the file that
+names it, or the mapping itself. ``{camera: ...}`` of an instrument is the camera by itself. `scenes.specs.load` reads
+what it refers to.
+"""
 
 Named = Annotated[dict[Name, Value], AfterValidator(_freeze)]
 """A mapping from names to values of one sort."""
@@ -241,10 +304,16 @@ class TitledSpec(Spec):
     name: Name
     description: Text = ""
 
-    def file_text(self, remark: str) -> str:
-        """Text of a file that says this, with remarks at its top; keys without a value are left out."""
+    def file_text(self, remark: str, **others: Any) -> str:
+        """Text of a file that says this, with remarks at its top; keys without a value are left out.
+
+        Args:
+            remark: lines of comment.
+            others: plain data of keys that are to be written in place of their own.
+        """
         head = "".join(f"# {line}\n" for line in remark.splitlines())
-        return head + dump_yaml({key: value for key, value in self.plain().items() if value not in ("", {})})
+        plain = {**self.plain(), **others}
+        return head + dump_yaml({key: value for key, value in plain.items() if value not in ("", {})})
 
 
 def one_given(spec: Spec, names: Sequence[str], problem: str, allowed: str | None = None, within: KeyPath = ()) -> None:
@@ -304,7 +373,7 @@ def validate(model: type[SpecType], yaml: YamlFile) -> SpecType:
     Raises:
         InputError: one issue for each fault, in the order of the file.
     """
-    source = Source(yaml.file, yaml.lines)
+    source = Source(yaml.file, yaml.lines, yaml.prefix)
     try:
         spec = model.model_validate(yaml.data)
     except ValidationError as error:

@@ -8,7 +8,7 @@ parser's events, so a refusal comes before anything is unfolded.
 
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -18,13 +18,12 @@ from typing import Any
 import yaml
 
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
-from scenes.yaml.input_file import read_text
+from scenes.yaml.input_file import DEEPEST, read_text
 from scenes.yaml.units import OTHER_MINUS, foreign_minus
 
 LARGEST_BYTES = 1_000_000
 MOST_VALUES = 100_000
 """Keys and values, which take some seconds to read."""
-DEEPEST = 32
 KEPT, LONGEST_KEPT = 64, 50_000
 """How many texts read last are kept, of how many characters each at most: a command reads a camera for each place in
 which it stands, and a script or a study the same files of the library again and again.
@@ -58,11 +57,20 @@ class YamlFile:
         file: path as the user gave it.
         data: dict, list and scalars. Keys are always text.
         lines: key path -> line, counted from 1; for a mapping's entry the line of its key.
+        prefix: key path of the data, where they are a part of the file.
     """
 
     file: str
     data: Any
-    lines: dict[KeyPath, int] = field(repr=False)
+    lines: Mapping[KeyPath, int] = field(repr=False)
+    prefix: KeyPath = ()
+
+    def part(self, *key: str | int) -> "YamlFile":
+        """Return what stands at a key, which is there; faults in it are told at their lines of the whole file."""
+        data = self.data
+        for name in key:
+            data = data[name]
+        return YamlFile(self.file, data, self.lines, (*self.prefix, *key))
 
 
 def read_yaml(path: str | Path) -> YamlFile:

@@ -16,7 +16,7 @@ import numpy as np
 from optics.numerics.backend import Backend
 from scenes.models.camera_model import derive_camera
 from scenes.specs.load import load_camera
-from scenes.specs.tolerance import resolve_tolerance
+from scenes.specs.tolerance import ToleranceSetup
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.hunt.hunt import BAD_REFUSAL, RIGHT, WRONG_READING, Outcome
@@ -152,7 +152,7 @@ def _wrong(made: LegalTelescope, folder: Path, backend: Backend) -> str:
         "merits": {"wavefront": {"kind": "wavefront", "at_most": 0.3, "fields": [[0.0, 0.0]]}},
     }
     (folder / "budget.yaml").write_text(dump_yaml(budget), "utf-8")
-    bench = ToleranceBench(resolve_tolerance(folder / "budget.yaml"), backend)
+    bench = ToleranceBench(ToleranceSetup.read(folder / "budget.yaml"), backend)
     told = bench.merits[0].values(bench.try_out(AMOUNT * np.eye(2)).parts)
     off = np.abs(told / np.array(list(made.waves.values())) - 1.0)
     return "" if np.all(off < PARAXIAL) else f"astigmatism gives {told} waves, is {made.waves}"

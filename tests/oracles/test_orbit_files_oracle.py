@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scenes.specs.measured.pass_files import PlatformFilesSpec
+from scenes.specs.orbit.measurements import PlatformFilesSpec
 from scenes.specs.orbit.setup import load_three_line_camera
 from tests.tiers import quick
 from tests.twin import orbit_file_bench as bench

@@ -15,11 +15,10 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.camera_reader import Width, camera_of
-from scenes.lens.camera_writer import prescription_of
+from scenes.lens.camera_writer import prescription_of, zemax_text
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.prescription import SEQUENCE
 from scenes.lens.zemax_reader import read_zemax
-from scenes.lens.zemax_writer import zemax_text
 from scenes.yaml.errors import InputError
 from tests.oracles import prescription_peers as peers
 from tests.tiers import quick

@@ -12,9 +12,8 @@ import pytest
 
 from optics.numerics.backend import Backend
 from scenes.lens.batoid_reader import read_batoid
-from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of
-from scenes.lens.camera_writer import prescription_of
+from scenes.lens.camera_writer import batoid_text, prescription_of
 from scenes.models.camera_model import derive_camera, field_direction
 from scenes.specs.load import load_camera
 from tests.oracles.pupil_raster import PupilRaster, raster

@@ -7,7 +7,7 @@ from optics.geometry.pose import triple
 from optics.geometry.tree import Motion
 from optics.numerics.backend import Backend
 from scenes.specs.load import load_camera
-from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from scenes.specs.tolerance import ToleranceSetup
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import VariedBeams
 from twin.tolerance.merit_models import Sensitivities, sensitivities
@@ -65,7 +65,7 @@ def setup(tmp_path_factory) -> ToleranceSetup:
         "merits: {wavefront: {kind: wavefront, at_most: 0.0714}}\n",
         "utf-8",
     )
-    return resolve_tolerance(path)
+    return ToleranceSetup.read(path)
 
 
 @pytest.fixture(scope="module")

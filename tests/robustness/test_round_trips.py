@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scenes.specs.orbit.setup import load_three_line_camera, resolve_angle, resolve_calibration, resolve_monitor
-from scenes.specs.resolved import resolve, resolve_focus
+from scenes.specs.orbit.setup import AngleSetup, CalibrationSetup, MonitorSetup, load_three_line_camera
+from scenes.specs.resolved import FocusSetup, resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.units import ANGLE, LENGTH, PER_LENGTH3, SCALE, format_quantity, parse_quantity
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
@@ -47,10 +47,10 @@ RESOLVERS = {
     "render-perturb": resolve,
     "render-targets": resolve,
     "render-own-gf7": resolve,
-    "lab-focus": resolve_focus,
-    "orbit-angle": resolve_angle,
-    "orbit-calibrate": resolve_calibration,
-    "orbit-monitor": resolve_monitor,
+    "lab-focus": FocusSetup.read,
+    "orbit-angle": AngleSetup.read,
+    "orbit-calibrate": CalibrationSetup.read,
+    "orbit-monitor": MonitorSetup.read,
 }
 
 

@@ -10,9 +10,9 @@ from scenes.models.camera_model import build_camera_under_test
 from scenes.models.disturbances import stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.job_state import LIKELY, beyond_statement
-from scenes.specs.as_built import as_built_file
+from scenes.specs.instrument import as_built_file
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
-from scenes.specs.resolved import resolve, resolve_camera, resolve_focus
+from scenes.specs.resolved import FocusSetup, resolve, resolve_camera
 from scenes.yaml.errors import InputError
 
 HEAD = "name: own\ndesign: gf7_pair\nas_built:\n"
@@ -82,18 +82,18 @@ def test_a_camera_as_built_in_the_laboratory(backend, tmp_path) -> None:
     lab = (LIBRARY.parent / "lab" / "focus.yaml").read_text().replace("camera: gf7\n", "camera: ./own.yaml\n")
     (tmp_path / "focus.yaml").write_text(lab)
     read(tmp_path, "name: own\ndesign: gf7\nas_built: [focal_plane shift z 30 um, gf7 rotate x 1 arcmin]\n")
-    setup = resolve_focus(tmp_path / "focus.yaml")
+    setup = FocusSetup.read(tmp_path / "focus.yaml")
     assert list(setup.test.as_built) == ["M1", "M2", "M3", "focal_plane"]
     state = build_camera_under_test(setup.test, setup.camera, backend).as_built
     assert state["camera/focal_plane"].shift == (0.0, 0.0, 30e-6)
     read(tmp_path, "name: own\ndesign: gf7\nas_built: [base/gf7/M2 shift z 30 um]\n")
     with pytest.raises(InputError, match=r"focus.yaml:\d+: as_built.M2: .*own.yaml says how this body was built"):
-        resolve_focus(tmp_path / "focus.yaml")
+        FocusSetup.read(tmp_path / "focus.yaml")
     read(tmp_path, HEAD + "  forward/M2: {shift: 0 0 3 um}\n")
     with pytest.raises(
         InputError, match=r"focus.yaml:\d+: camera: one camera is tested, and own has forward, backward"
     ):
-        resolve_focus(tmp_path / "focus.yaml")
+        FocusSetup.read(tmp_path / "focus.yaml")
 
 
 def random_state(rng: np.random.Generator) -> dict[str, Motion]:

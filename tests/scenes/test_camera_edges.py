@@ -13,11 +13,9 @@ from optics.geometry.surface import Surface
 from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.assembly import Interaction
 from scenes.lens.__main__ import read_prescription
-from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
-from scenes.lens.camera_writer import prescription_of
+from scenes.lens.camera_writer import batoid_text, prescription_of, zemax_text
 from scenes.lens.prescription import LensSurface
-from scenes.lens.zemax_writer import zemax_text
 from scenes.models.camera_model import derive_camera
 from scenes.models.camera_sharpness import FieldBeams, FocalPlane
 from scenes.specs.camera import CameraSpec

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.kinds.file_kinds import FILE_KINDS, kind_of, kinds_of, read_for
+from scenes.specs.file_kinds import FILE_KINDS, kind_of, kinds_of, read_for
 from scenes.specs.load import SCENES
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError, Issue

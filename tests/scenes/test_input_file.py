@@ -12,15 +12,14 @@ import pytest
 
 from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.codev_reader import read_codev
-from scenes.lens.glass_catalogue import read_catalogue
+from scenes.lens.statements import read_catalogue
 from scenes.lens.zemax_reader import read_zemax
 from scenes.specs.resolved import resolve
 from scenes.yaml import csv_table, yaml_file
 from scenes.yaml.csv_table import Column, Table, read_table, table_text
 from scenes.yaml.errors import InputError, Issue, nearest, shown
 from scenes.yaml.finish_files import read_bsdf
-from scenes.yaml.input_file import read_bytes, read_text
-from scenes.yaml.json_file import parse_json
+from scenes.yaml.input_file import parse_json, read_bytes, read_text
 from scenes.yaml.units import ANGLE, LENGTH
 from scenes.yaml.yaml_file import YamlFile, dump_yaml, parse_yaml, read_yaml
 

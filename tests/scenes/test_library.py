@@ -12,8 +12,8 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.specs import load
 from scenes.specs.camera import CameraSpec
-from scenes.specs.orbit.setup import resolve_angle, resolve_monitor, resolve_simulate
-from scenes.specs.resolved import resolve, resolve_focus
+from scenes.specs.orbit.setup import AngleSetup, MonitorSetup, SimulateSetup
+from scenes.specs.resolved import FocusSetup, resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
@@ -55,9 +55,9 @@ disturbances:
 @pytest.mark.parametrize(
     ("read", "file"),
     [
-        *((resolve_angle, f"{load.ORBIT}/{name}.yaml") for name in ("angle", "angle_gf7", "angle_off_axis")),
-        *((resolve_monitor, f"{load.ORBIT}/{name}.yaml") for name in ("loop", "monitor")),
-        *((resolve_simulate, f"{load.ORBIT}/simulate.yaml"), (resolve_focus, f"{load.LAB}/focus.yaml")),
+        *((AngleSetup.read, f"{load.ORBIT}/{name}.yaml") for name in ("angle", "angle_gf7", "angle_off_axis")),
+        *((MonitorSetup.read, f"{load.ORBIT}/{name}.yaml") for name in ("loop", "monitor")),
+        *((SimulateSetup.read, f"{load.ORBIT}/simulate.yaml"), (FocusSetup.read, f"{load.LAB}/focus.yaml")),
         *((resolve, "examples/perturb.yaml"), (resolve, CAUSES)),
     ],
 )

@@ -13,7 +13,7 @@ from optics.numerics.backend import load_backend
 from scenes.models.disturbances import stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.meshes import sheet_mesh
-from scenes.specs import samplers
+from scenes.specs import study
 from scenes.specs.load import EXAMPLES, LIBRARY, ORBIT, SCENES, load_camera, load_instrument
 from scenes.specs.operation import ENDINGS, OperationSpec, read_operation, resolve_operation
 from scenes.specs.orbit import setup as orbit_setup
@@ -43,12 +43,12 @@ def read(model: type[Spec], text: str) -> Spec:
         (lambda spec: spec.index_behind("M1"), "M1 is no face of a lens"),
         (lambda spec: spec.warm_glass("M1"), "says nothing of heat; name its glass"),
         (lambda spec: sheet_mesh(Surface(2.0), Circle(1.0)), "ends before its clear aperture does"),
-        (lambda spec: samplers.unit_cube("few", 4, 2, 0), r"must give points \(4, 2\)"),
+        (lambda spec: study.unit_cube("few", 4, 2, 0), r"must give points \(4, 2\)"),
     ],
 )
 def test_calls_for_what_is_not_there_are_refused(call, problem: str, monkeypatch) -> None:
-    few = samplers.Sampler("few", lambda runs, factors, generator: np.zeros((1, factors)))
-    monkeypatch.setitem(samplers.SAMPLERS, "few", few)
+    few = study.Sampler("few", lambda runs, factors, generator: np.zeros((1, factors)))
+    monkeypatch.setitem(study.SAMPLERS, "few", few)
     with pytest.raises(ValueError, match=problem):
         call(load_camera("gf7"))
 
@@ -101,19 +101,19 @@ def test_lines_of_a_camera_of_ones_own(tmp_path: Path) -> None:
     small = good("angle").replace("th1", "own.yaml")
     (tmp_path / "own.yaml").write_text(TH1.replace("name: th1", "name: own").replace("  backward:", "  rear:"), "utf-8")
     named = small + "angles: {all: [forward, rear]}\n"
-    setup = orbit_setup.resolve_angle(write(tmp_path, named))
+    setup = orbit_setup.AngleSetup.read(write(tmp_path, named))
     assert (setup.camera.name, dict(setup.angles)) == ("own", {"all": ("forward", "rear")})
     with pytest.raises(InputError, match=r"perturb.backward.*no such line"):
-        orbit_setup.resolve_angle(write(tmp_path, named + "perturb: {backward: [0 deg, 0 deg, 0 deg]}"))
+        orbit_setup.AngleSetup.read(write(tmp_path, named + "perturb: {backward: [0 deg, 0 deg, 0 deg]}"))
     plain = orbit_setup.load_three_line_camera("th1").plain()
     two = {**plain, "lines": {name: plain["lines"][name] for name in ("backward", "nadir")}}
     (tmp_path / "own.yaml").write_text(dump_yaml(two), "utf-8")
-    assert dict(orbit_setup.resolve_angle(write(tmp_path, small)).angles) == {"alpha": ("backward", "nadir")}
+    assert dict(orbit_setup.AngleSetup.read(write(tmp_path, small)).angles) == {"alpha": ("backward", "nadir")}
 
 
 def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     """By name or path; a configuration without its camera is refused."""
-    setup = orbit_setup.resolve_angle(SCENES / ORBIT / "angle_gf7.yaml")
+    setup = orbit_setup.AngleSetup.read(SCENES / ORBIT / "angle_gf7.yaml")
     assert setup.camera is None
     assert setup.instrument == load_instrument("gf7_pair")
     assert dict(setup.cameras) == {"gf7": load_camera("gf7")}
@@ -121,7 +121,7 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     assert setup.test.perturb["base"].temperature.gradient[2] == pytest.approx(0.4)
     text = (LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8").replace("name: gf7_pair", "name: own")
     (tmp_path / "own.yaml").write_text(text, "utf-8")
-    own = orbit_setup.resolve_angle(write(tmp_path, good("angle").replace("th1", "own.yaml")))
+    own = orbit_setup.AngleSetup.read(write(tmp_path, good("angle").replace("th1", "own.yaml")))
     assert (own.camera_name, dict(own.angles)) == ("own", {"alpha": ("forward", "backward")})
     data = parse_yaml(setup.to_yaml()).data
     whole = data.pop("instrument")
@@ -131,11 +131,11 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
         ({"instrument": whole, "cameras": {"gf8": data["cameras"]["gf7"]}}, "camera 'gf7' of the instrument's forward"),
     ):
         with pytest.raises(InputError, match=words):
-            orbit_setup.resolve_angle(write(tmp_path, dump_yaml({**data, **change})))
+            orbit_setup.AngleSetup.read(write(tmp_path, dump_yaml({**data, **change})))
 
 
 def test_a_loop(tmp_path: Path) -> None:
-    setup = orbit_setup.resolve_monitor(write(tmp_path, good("loop")))
+    setup = orbit_setup.MonitorSetup.read(write(tmp_path, good("loop")))
     test = setup.test
     assert setup.disturbances.name == "orbit"
     assert test.times == (0.0, 600.0, 1200.0)
@@ -149,9 +149,9 @@ def test_a_loop(tmp_path: Path) -> None:
 
 
 def test_a_monitored_orbit(tmp_path: Path) -> None:
-    setup = orbit_setup.resolve_monitor(SCENES / ORBIT / "monitor.yaml")
+    setup = orbit_setup.MonitorSetup.read(SCENES / ORBIT / "monitor.yaml")
     assert (setup.pair, setup.test.step, setup.test.referred) == (("forward", "backward"), 300.0, 0)
-    test = orbit_setup.resolve_monitor(write(tmp_path, good("monitor"))).test
+    test = orbit_setup.MonitorSetup.read(write(tmp_path, good("monitor"))).test
     assert test.apply == ("d_alpha", "d_beta", "d_gamma", "d_f")
     assert test.compared == (300.0, 600.0, 1200.0)
     assert test.errors.gps.noise == (0.0, 0.0, 0.0)
@@ -162,7 +162,7 @@ def test_a_monitored_orbit(tmp_path: Path) -> None:
     kept = [row for row in text.splitlines() if not row.lstrip().startswith("backward")]
     (tmp_path / "own.yaml").write_text("\n".join(kept), "utf-8")
     with pytest.raises(InputError, match=r"no stereo pair.*forward in gf7_pair.*two cameras"):
-        orbit_setup.resolve_monitor(write(tmp_path, good("monitor").replace("gf7_pair", "own.yaml")))
+        orbit_setup.MonitorSetup.read(write(tmp_path, good("monitor").replace("gf7_pair", "own.yaml")))
 
 
 def test_a_motion_is_a_step_a_ramp_or_a_swing() -> None:
@@ -182,11 +182,11 @@ def test_a_payload_of_ones_own_comes_through_config_yaml(tmp_path: Path) -> None
     text = TH1.replace("detector: th1_line", "detector: mine.yaml")
     text = text.replace("f_number: 6\n", "f_number: 6\n  obstruction: [[[-0.6, 0.6], [-0.2, 0.6], [-0.2, 1.1]]]\n")
     (tmp_path / "own.yaml").write_text(text, "utf-8")
-    setup = orbit_setup.resolve_simulate(write(tmp_path, good("simulate").replace("th1", "own.yaml")))
+    setup = orbit_setup.SimulateSetup.read(write(tmp_path, good("simulate").replace("th1", "own.yaml")))
     assert setup.detectors["mine.yaml"].name == "mine"
     image = setup.camera.image_of("nadir")
     assert image.obstruction[0][0] == (-0.6, 0.6)
-    again = orbit_setup.resolve_simulate(write(tmp_path, setup.to_yaml())).camera.image_of("nadir")
+    again = orbit_setup.SimulateSetup.read(write(tmp_path, setup.to_yaml())).camera.image_of("nadir")
     assert again.obstruction == image.obstruction
 
 

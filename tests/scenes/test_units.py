@@ -12,8 +12,7 @@ import pytest
 import scenes.specs
 from scenes.yaml import units
 from scenes.yaml.errors import Problem
-from scenes.yaml.examples import EXAMPLES, example_of
-from scenes.yaml.quantity import Quantity, Vector
+from scenes.yaml.quantity import EXAMPLES, Quantity, Vector, example_of
 from scenes.yaml.spec import Spec
 
 EXACT = {

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from analysis.spots.screened_fit import one_shape
-from scenes.specs.measured.monitor_frames import MeasurementSpec
+from scenes.specs.monitor_frames import MeasurementSpec
 from twin.recover.channel_measurement import ChannelMeasurement
 from twin.recover.measured_frames import ChannelFrames, StateFrames
 from twin.sensors.area_detector import EmvaDetector

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup, resolve_any_calibration
-from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
+from scenes.specs.orbit.setup import CalibrationSetup, MeasuredCalibrationSetup
+from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.orbit.calibration.calibration_export import files_of
 from twin.orbit.calibration.calibration_run import source_of
@@ -17,7 +17,7 @@ from twin.orbit.calibration.campaign import Campaign
 
 REFUSALS: dict[str, Any] = read_yaml(Path(__file__).with_name("orbit_refusals.yaml")).data
 """Files and jobs that are refused, and results that warn: a thousand lines, which every test of them reads here."""
-WHOLE = resolve_calibration(SCENES / ORBIT / "calibrate.yaml")
+WHOLE = CalibrationSetup.read(SCENES / ORBIT / "calibrate.yaml")
 FIELDS = ("Beijing", "Anhui")
 Table = tuple[list[str], list[list[str]]]
 
@@ -51,7 +51,7 @@ def export(folder: Path, setup: CalibrationSetup, campaign: Campaign) -> Path:
 
 def read_back(file: Path) -> tuple[MeasuredCalibrationSetup, Campaign]:
     """The campaign of the files that a test names."""
-    setup = resolve_any_calibration(file)
+    setup = PROCEDURES["orbit calibrate"].resolve(file)
     assert isinstance(setup, MeasuredCalibrationSetup)
     return setup, source_of(setup, np.random.SeedSequence(0))
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from scenes.specs.load import INSTRUMENTS, LIBRARY
-from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from scenes.specs.tolerance import ToleranceSetup
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.commands import replaced
 
@@ -31,7 +31,7 @@ def budget(folder: Path, name: str = "gf7", **changes: Any) -> ToleranceSetup:
     """Read a tolerance budget of study_texts.yaml with other keys at its top from a file."""
     file = folder / "budget.yaml"
     file.write_text(dump_yaml({**TEXTS[name], **changes}), "utf-8")
-    return resolve_tolerance(file)
+    return ToleranceSetup.read(file)
 
 
 def write_study(folder: Path, *changes: tuple[str, str], text: str = STUDY) -> Path:

@@ -6,7 +6,7 @@ import pytest
 from optics.geometry.tree import Motion, compose
 from scenes.models.clearance import convex_bodies
 from scenes.models.instrument_builder import build_instrument, squared_facets
-from scenes.specs.as_built import as_built_file
+from scenes.specs.instrument import as_built_file
 from scenes.specs.load import load_cameras, load_instrument
 from scenes.specs.resolved import resolve, resolve_camera
 from scenes.yaml.errors import InputError

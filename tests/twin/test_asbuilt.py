@@ -22,7 +22,7 @@ from optics.geometry import zernike
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
 from optics.raytrace.trace import BeamMissedError
-from scenes.specs.asbuilt import resolve_asbuilt
+from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.load import EXAMPLES
 from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError
@@ -55,7 +55,7 @@ def written(folder: Path, measurements: dict, prior: str = "parts", **more) -> P
 
 
 def bench_of(backend: Backend, folder: Path, measurements: dict, prior: str = "parts", **more) -> AsBuiltBench:
-    return AsBuiltBench(resolve_asbuilt(written(folder, measurements, prior, **more)), backend)
+    return AsBuiltBench(AsBuiltSetup.read(written(folder, measurements, prior, **more)), backend)
 
 
 @pytest.fixture(scope="module")
@@ -266,7 +266,7 @@ def test_an_orientation_is_found_after_a_move(backend, tmp_path) -> None:
         ({"before": before, "later": before | {"after": "poke"}}, TEXTS["poked"]),
         ({"one": before}, {}),
     ):
-        found = run_check(resolve_asbuilt(written(tmp_path, {"wavefronts": measured}, **more)), backend)
+        found = run_check(AsBuiltSetup.read(written(tmp_path, {"wavefronts": measured}, **more)), backend)
         assert (found.code, one in found.evidence.together) == (0, True)
         assert (found.evidence.found == one) == (len(found.evidence.together) == 1) == bool(more)
 
@@ -311,7 +311,7 @@ def test_one_state_without_light_leaves_the_others(backend, tmp_path, monkeypatc
 
 def test_a_run_from_file_to_numbers(backend, tmp_path) -> None:
     """Numbers of a whole run: those of the estimate in the units of the file, and the truth where it is said to be."""
-    setup = resolve_asbuilt(written(tmp_path, **TEXTS["whole_run"]))
+    setup = AsBuiltSetup.read(written(tmp_path, **TEXTS["whole_run"]))
     streams = []
     with pytest.MonkeyPatch.context() as patch:
         own = asbuilt_run.stream
@@ -438,7 +438,7 @@ def test_the_posterior_is_that_of_the_joint_normal_distribution(whole) -> None:
 def test_bad_input_has_one_message(backend, tmp_path, changes, words) -> None:
     """File, line, key and what is allowed."""
     with pytest.raises(InputError) as caught:
-        AsBuiltBench(resolve_asbuilt(written(tmp_path, **{"measurements": ONE, **changes})), backend)
+        AsBuiltBench(AsBuiltSetup.read(written(tmp_path, **{"measurements": ONE, **changes})), backend)
     assert words in str(caught.value)
     assert "asbuilt.yaml" in str(caught.value)
 
@@ -460,7 +460,7 @@ def test_files_that_hold_no_measurement_are_refused(backend, tmp_path, kind, key
 
 @pytest.mark.parametrize(("run", "changes", "words"), refusals("states"))
 def test_what_no_state_can_be_estimated_of_is_refused(backend, tmp_path, run, changes, words) -> None:
-    setup = resolve_asbuilt(written(tmp_path, **{"measurements": ONE, **changes}))
+    setup = AsBuiltSetup.read(written(tmp_path, **{"measurements": ONE, **changes}))
     with pytest.raises(InputError, match=words):
         (run_asbuilt if run == "estimate" else run_check)(setup, backend)
 

@@ -13,7 +13,7 @@ from analysis.instrument_state.state_estimate import combinations
 from analysis.monitor.recovery import recover
 from optics.geometry.tree import Motion, compose
 from optics.numerics.backend import Backend
-from scenes.specs.asbuilt import resolve_asbuilt
+from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.yaml_file import dump_yaml
@@ -34,7 +34,7 @@ def coverage_bench(backend: Backend, folder: Path) -> AsBuiltBench:
     data = TEXTS["assembled"] | {"merits": {"wavefront": wavefront, **TEXTS["assembled"]["merits"]}}
     path = folder / "asbuilt.yaml"
     path.write_text(dump_yaml(data))
-    return AsBuiltBench(resolve_asbuilt(path), backend)
+    return AsBuiltBench(AsBuiltSetup.read(path), backend)
 
 
 def judged(bench: AsBuiltBench, rng: np.random.Generator, count: int, unknown_figure: float = 0.0) -> tuple:
@@ -117,7 +117,7 @@ def test_the_bias_of_the_drawings_model_goes_away(backend, tmp_path, record_prop
     (tmp_path / "mounts.yaml").write_text(dump_yaml(TEXTS["mounts"]))
     file = tmp_path / "asbuilt.yaml"
     file.write_text(dump_yaml(TEXTS["delivered"]))
-    run = run_asbuilt(resolve_asbuilt(file), backend)
+    run = run_asbuilt(AsBuiltSetup.read(file), backend)
     (tmp_path / "instrument.yaml").write_text(instrument_text(run))
     posterior, table = posterior_files(run)
     (tmp_path / "posterior.yaml").write_text(posterior)

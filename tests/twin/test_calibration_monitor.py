@@ -10,7 +10,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.flight import ThermalDriftSpec
-from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
+from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.camera_drift import (
     adjust_field_with_readings,
     adjust_with_readings,
@@ -25,7 +25,7 @@ from twin.orbit.calibration.schemes import tested as at_checks
 from twin.orbit.flight.line_camera import drifted_payload
 
 EXAMPLE = SCENES / ORBIT / "calibrate_monitor.yaml"
-WHOLE = resolve_calibration(EXAMPLE)
+WHOLE = CalibrationSetup.read(EXAMPLE)
 KEPT = ("Beijing", "Anhui", "Xinjiang")
 SEED = np.random.SeedSequence(3)
 

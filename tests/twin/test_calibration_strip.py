@@ -9,7 +9,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
-from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
+from scenes.specs.orbit.setup import CalibrationSetup
 from tests.twin.strip_prediction import predicted
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.schemes import tested as at_checks
@@ -17,7 +17,7 @@ from twin.orbit.calibration.strip import adjusted_strip
 from twin.orbit.calibration.strip import tested_in_strip as in_strip
 
 EXAMPLE = SCENES / ORBIT / "calibrate_strip.yaml"
-WHOLE = resolve_calibration(EXAMPLE)
+WHOLE = CalibrationSetup.read(EXAMPLE)
 ARCSEC = np.pi / 648000
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from optics.design.merit_function import Operands
 from optics.design.optimiser import DesignError, Held, _require_held, judged
-from scenes.models.camera_design import beams_of, prescription_of, resolve_design
+from scenes.models.camera_design import CameraDesignSetup, beams_of, prescription_of
 from scenes.models.monitor_layout import Beam
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import EXAMPLES, LIBRARY, load_camera
@@ -64,7 +64,7 @@ def test_a_camera_without_light_is_no_start(tmp_path, backend) -> None:
     file, text = tmp_path / "away.yaml", TEXTS["short"].format(envelope="101 percent", vary="M2: [conic]")
     file.write_text(text.replace("camera: gf7", "camera: axis.yaml"), "utf-8")
     with pytest.raises(InputError, match=r"axis\.yaml:\d+: mirrors: no beams to design with come through"):
-        run_design(resolve_design(file), backend)
+        run_design(CameraDesignSetup.read(file), backend)
 
 
 @pytest.mark.second
@@ -94,7 +94,7 @@ def test_a_run_folder(tmp_path) -> None:
     assert camera.name == "small"
     assert 0.0 < abs(camera.image.z - gf7.image.z) < 1e-3
     assert camera.bands == gf7.bands
-    assert resolve_design(out / "config.yaml").camera == gf7
+    assert CameraDesignSetup.read(out / "config.yaml").camera == gf7
     told = json.loads((out / "design.json").read_text("utf-8"))
     assert told["improved"]  # by 0.1 %
     assert told["local_optimum"]
@@ -186,4 +186,4 @@ def test_what_a_constraint_is_worth(tmp_path) -> None:
 @pytest.mark.parametrize(("old", "new", "message"), refusals("design"))
 def test_what_is_wrong_with_a_file(tmp_path, old: str, new: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        resolve_design(edited_copy(EXAMPLE, tmp_path, (old, new)))
+        CameraDesignSetup.read(edited_copy(EXAMPLE, tmp_path, (old, new)))

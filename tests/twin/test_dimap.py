@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.specs.measured.orbit_data import LineTimesFileSpec
-from scenes.specs.measured.pass_files import PlatformFilesSpec
+from scenes.specs.orbit.measurements import LineTimesFileSpec, PlatformFilesSpec
 from scenes.yaml.errors import InputError
 from tests.twin.dimap_bench import Oracle, Scene, clock, write
 from twin.orbit.conventions.pass_readings import read_line_clocks

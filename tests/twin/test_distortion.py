@@ -21,7 +21,7 @@ from optics.targets.target_shapes import pinhole
 from optics.waves.diffraction import Grid
 from optics.waves.transfer import TransferTable
 from scenes.specs.load import EXAMPLES, LAB, load_named
-from scenes.specs.resolved import resolve_distortion
+from scenes.specs.resolved import DistortionSetup
 from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
@@ -43,14 +43,14 @@ def backend():
 
 def altered(table=None, **changes):
     """The library's test with other values; table: of its turntable."""
-    setup = resolve_distortion("distortion")
+    setup = DistortionSetup.read("distortion")
     turntable = setup.turntable.model_copy(update=table or {})
     return setup.model_copy(update={"test": setup.test.model_copy(update=changes), "turntable": turntable})
 
 
 @cache
 def bench():
-    return DistortionBench.build(resolve_distortion("distortion"), backend())
+    return DistortionBench.build(DistortionSetup.read("distortion"), backend())
 
 
 @cache
@@ -208,7 +208,7 @@ def turntable_score(setup, seed: int) -> list[float]:
 @pytest.mark.second
 def test_sigmas_over_40_turntables():
     """Of f, p and radial3; over 400 tests they scattered by 0.91, 0.85 and 0.86 of their sigmas."""
-    setup, count = resolve_distortion("distortion"), 40
+    setup, count = DistortionSetup.read("distortion"), 40
     score = np.array([turntable_score(setup, seed) for seed in range(2000, 2000 + count)])
     for values in score.T:
         assert stats.chi2.ppf(FALSE_ALARM, count) < np.sum(values**2) < stats.chi2.isf(FALSE_ALARM, count)

@@ -11,7 +11,7 @@ import pytest
 
 import twin.orbit.__main__ as command
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit.setup import resolve_simulate
+from scenes.specs.orbit.setup import SimulateSetup
 from tests.twin.commands import invoke
 from tests.twin.line_scanner_model import LineScannerModel
 from tests.twin.study_bench import REFUSED
@@ -31,7 +31,7 @@ HEIGHTS = (0.0, 1000.0, 2000.0)
 
 @pytest.fixture(scope="module")
 def flight():
-    return fly_simulation(resolve_simulate(SCENES / ORBIT / "simulate.yaml"), 1)
+    return fly_simulation(SimulateSetup.read(SCENES / ORBIT / "simulate.yaml"), 1)
 
 
 def _sensor(flight, name: str, effects: LightEffects, measured: bool = False, lines: int = 4000) -> Sensor:

@@ -14,7 +14,7 @@ from optics.geometry.surface import plane
 from optics.raytrace.assembly import Element, Interaction
 from scenes.models.camera_model import derive_camera
 from scenes.specs.load import load_camera
-from scenes.specs.tolerance import resolve_tolerance
+from scenes.specs.tolerance import ToleranceSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.tolerance.tolerance_bench import ToleranceBench
 from twin.tolerance.variations import spectrum_over, states_of
@@ -66,7 +66,7 @@ def bench_of(folder: Path, instrument: str, backend, **motions: str) -> Toleranc
     }
     path = folder / "budget.yaml"
     path.write_text(dump_yaml(budget), "utf-8")
-    return ToleranceBench(resolve_tolerance(path), backend)
+    return ToleranceBench(ToleranceSetup.read(path), backend)
 
 
 def test_a_mirror_about_its_axis_is_round(backend, tmp_path) -> None:

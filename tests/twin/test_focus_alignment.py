@@ -20,7 +20,8 @@ from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.targets.collimator import TooNarrowError
 from scenes.specs.load import LAB, SCENES
-from scenes.specs.resolved import FocusSetup, resolve_focus, resolve_focus_test
+from scenes.specs.procedures import PROCEDURES
+from scenes.specs.resolved import FocusSetup
 from twin.laboratory import focus_run
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_numbers import focus_numbers
@@ -38,7 +39,7 @@ SEEDS = (1, 2)
 
 def reduced() -> FocusSetup:
     """The example with fewer fields, bands and positions of the target, which takes seconds."""
-    setup = resolve_focus(FILE)
+    setup = FocusSetup.read(FILE)
     camera = setup.camera.model_copy(
         update={"bands": FrozenMap({name: setup.camera.bands[name] for name in ("P", "B4")})}
     )
@@ -182,7 +183,7 @@ def aligned(folder: Path, rows) -> FocusRun:
     shutil.copytree(EXAMPLES, folder)
     with (folder / "mtf.csv").open("w", newline="") as stream:
         csv.writer(stream).writerows([["band", "x [mm]", "y [mm]", "edge", "shift [um]", "mtf", "sigma"], *rows])
-    return align_files(resolve_focus_test(folder / "focus.yaml").test)
+    return align_files(PROCEDURES["lab focus"].resolve(folder / "focus.yaml").test)
 
 
 def piston_pull(run: FocusRun) -> float:

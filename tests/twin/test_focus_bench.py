@@ -14,7 +14,7 @@ from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import ROOT
 from scenes.specs.load import LAB, SCENES
-from scenes.specs.resolved import resolve_focus
+from scenes.specs.resolved import FocusSetup
 from tests.tiers import quick
 from twin.laboratory.focus_bench import BudgetLine, FocusBench, Site
 from twin.sensors.line_ccd import band_wavelengths
@@ -29,7 +29,7 @@ MISSET = Motion(rotate=(3.0 * ARCMIN, -8.0 * ARCMIN, 4.0 * ARCMIN), shift=(0.2e-
 
 
 def make(backend, fields: tuple[float, ...], bands: tuple[str, ...]) -> FocusBench:
-    setup = resolve_focus(SCENES / LAB / "focus.yaml")
+    setup = FocusSetup.read(SCENES / LAB / "focus.yaml")
     some = FrozenMap({name: setup.camera.bands[name] for name in bands})
     test = setup.test.model_copy(update={"fields": fields})
     return FocusBench(

@@ -7,7 +7,7 @@ import pytest
 
 from optics.geometry.pose import rotation_matrix
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit.setup import resolve_simulate
+from scenes.specs.orbit.setup import SimulateSetup
 from twin.orbit.export import ground_accuracy
 from twin.orbit.export.ground_accuracy import (
     TOGETHER,
@@ -31,7 +31,7 @@ INTERIOR = np.array([0.4, 0.3, 1e-4])
 
 @pytest.fixture(scope="module")
 def sensors() -> dict[str, Sensor]:
-    return dict(fly_simulation(resolve_simulate(SCENES / ORBIT / "simulate.yaml"), 1).sensors)
+    return dict(fly_simulation(SimulateSetup.read(SCENES / ORBIT / "simulate.yaml"), 1).sensors)
 
 
 @pytest.fixture(autouse=True)

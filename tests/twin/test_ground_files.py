@@ -9,7 +9,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from scenes.specs.measured.pass_files import GroundFileSpec, RasterFileSpec
+from scenes.specs.orbit.measurements import GroundFileSpec, RasterFileSpec
 from scenes.yaml.errors import Problem
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.flight.earth import Earth, east_north_up

@@ -3,7 +3,7 @@
 import re
 import shlex
 
-from scenes.kinds.file_kinds import kind_of
+from scenes.specs.file_kinds import kind_of
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.study_bench import ROOT
 from twin.run.console import parser

@@ -12,7 +12,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec
-from scenes.specs.orbit.setup import resolve_calibration, resolve_simulate
+from scenes.specs.orbit.setup import CalibrationSetup, SimulateSetup
 from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.campaign_adjustment import simultaneous
@@ -29,7 +29,7 @@ SIMULATE, CALIBRATE = (SCENES / ORBIT / f"{name}.yaml" for name in ("simulate", 
 
 @pytest.fixture(scope="module")
 def flown() -> Simulation:
-    setup = resolve_simulate(SIMULATE)
+    setup = SimulateSetup.read(SIMULATE)
     patch = setup.test.patch.model_copy(update={"lines": 320, "pixels": 320})
     update = {"patch": patch, "points": None, "oversampling": 2}
     return run_simulation(setup.model_copy(update={"test": setup.test.model_copy(update=update)}), None, 3)
@@ -41,7 +41,7 @@ def control(flown: Simulation) -> MatchedPoints:
 
 
 def asked() -> ImagePointsSpec:
-    points = resolve_simulate(SIMULATE).test.points
+    points = SimulateSetup.read(SIMULATE).test.points
     assert points is not None
     return points
 
@@ -136,7 +136,7 @@ def test_matches_that_agree_on_nothing_are_refused(flown: Simulation, monkeypatc
 
 
 def two_patches() -> OrbitCalibrationSpec:
-    test = resolve_calibration(CALIBRATE).test
+    test = CalibrationSetup.read(CALIBRATE).test
     assert test.images is not None
     places = tuple(test.images.patches[k] for k in (0, 4))
     points = test.images.points.model_copy(update={"control": 40, "check": 12, "tie": 12})
@@ -159,7 +159,7 @@ def parameters_fit(campaign: Campaign) -> None:
 @pytest.mark.second
 def test_calibration_from_images() -> None:
     """Two patches of one field."""
-    setup = resolve_calibration(CALIBRATE)
+    setup = CalibrationSetup.read(CALIBRATE)
     campaign = fly_fields(setup.model_copy(update={"test": two_patches()}), np.random.SeedSequence(5))
     assert campaign.images is not None
     done = screened(campaign)

@@ -20,7 +20,6 @@ from scenes.models.monitor_layout import (
     changed_beam,
     drawn_beam,
     layout_spec,
-    resolve_monitor_design,
     start_beams,
 )
 from tests.twin.test_monitor_layouts import FIRST, SECOND
@@ -37,7 +36,7 @@ STATED_NAME = "mirrors.yaml"
 
 @pytest.fixture(scope="module")
 def setup() -> MonitorDesignSetup:
-    return resolve_monitor_design(FILES / "design.yaml")
+    return MonitorDesignSetup.read(FILES / "design.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +128,7 @@ def test_another_area_ccd_counts_the_same_spots_in_other_pixels(bench: LayoutBen
     ccds = "area_ccds: {coarse: {detector: monitor_ccd, pitch: 12 um, rows: 96, columns: 96}, "
     ccds += "fine: {detector: monitor_ccd, pitch: 9 um, rows: 128, columns: 128}}\n"
     (tmp_path / "design.yaml").write_text((FILES / "design.yaml").read_text("utf-8") + ccds, "utf-8")
-    setup = resolve_monitor_design(tmp_path / "design.yaml")
+    setup = MonitorDesignSetup.read(tmp_path / "design.yaml")
     assert [beam.area_ccd for beam in start_beams(setup)] == ["coarse"]
     rng = np.random.default_rng(1)
     assert {drawn_beam(setup, rng).area_ccd for _ in range(20)} == {"coarse", "fine"}

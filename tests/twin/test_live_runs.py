@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 
 import twin
 import twin.live.__main__ as command
-from scenes.models.monitor_layout import resolve_monitor_design
+from scenes.models.monitor_layout import MonitorDesignSetup
 from scenes.specs.load import EXAMPLES, SCENES
-from scenes.specs.measured.monitor_frames import resolve_measurement
-from scenes.specs.orbit.setup import resolve_angle, resolve_monitor
-from scenes.specs.resolved import resolve, resolve_camera, resolve_turntable
+from scenes.specs.monitor_frames import MeasurementSetup
+from scenes.specs.orbit.setup import AngleSetup, MonitorSetup
+from scenes.specs.resolved import TurntableSetup, resolve, resolve_camera
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import REFUSED
 from twin.live.camera_pictures import _with_targets
@@ -202,7 +202,7 @@ def test_targets_are_imaged_by_cameras_with_line_ccds():
 def test_a_measurement_opens_its_instrument_as_designed(tmp_path):
     """With its exposure and what it states to move, also when the frames are no longer where they were."""
     file = frames_beside(tmp_path)
-    setup = resolve_measurement(file)
+    setup = MeasurementSetup.read(file)
     folder = run_folder(tmp_path / "run", "twin.recover", setup.to_yaml(), "recovered")
     for frame in (tmp_path / "frames").iterdir():
         frame.unlink()
@@ -226,7 +226,7 @@ def test_a_measurement_without_an_instrument(tmp_path):
         "instrument: gf7_pair\n", f"geometry: {{forward: {geometry}, backward: {geometry}}}\ntemplate: measured\n"
     )
     text = text.replace("disturbances: launch\n", "detector: monitor_ccd\n")
-    config = resolve_measurement(written(tmp_path, text, "measurement.yaml")).to_yaml()
+    config = MeasurementSetup.read(written(tmp_path, text, "measurement.yaml")).to_yaml()
     code, said = told(run_folder(tmp_path / "run", "twin.recover", config, "recovered"))
     assert code == 2
     assert "geometry of the cameras alone" in said
@@ -246,7 +246,7 @@ def test_an_orbit_of_drawn_motions_is_no_course():
 
 def test_a_monitored_orbit_is_a_course_with_the_motions_of_its_mounts(pair, tmp_path):
     """States of the test itself: temperatures, swings and ramps; poses to rounding."""
-    setup = resolve_monitor(SCENES / "orbit" / "monitor.yaml")
+    setup = MonitorSetup.read(SCENES / "orbit" / "monitor.yaml")
     folder = run_folder(tmp_path / "run", "twin.orbit", setup.to_yaml(), "monitor")
     bench = bench_of(read_source(str(folder)), pair)
     numbers = [0, 9, 14]
@@ -331,8 +331,8 @@ def test_a_run_that_a_study_does_not_have(studied, tmp_path):
 
 
 DATA = {
-    "twin.lab": lambda: resolve_turntable(SCENES / "lab/turntable.yaml").to_yaml(),
-    "twin.orbit": lambda: resolve_angle(SCENES / "orbit/angle_gf7.yaml").to_yaml(),
+    "twin.lab": lambda: TurntableSetup.read(SCENES / "lab/turntable.yaml").to_yaml(),
+    "twin.orbit": lambda: AngleSetup.read(SCENES / "orbit/angle_gf7.yaml").to_yaml(),
     "twin.camera": lambda: resolve_camera("gf7_pair", "forward").to_yaml(),
     "twin.compare": lambda: "runs: [a, b]\n",
     "twin.export": lambda: "run: a\n",
@@ -352,7 +352,7 @@ def test_run_folders_without_a_monitors_state(tmp_path, program, test, words):
 def test_an_instrument_that_a_design_made_is_named(tmp_path):
     """And opened: it is what the folder has to show."""
     made = (SCENES / "library" / "instruments" / "gf7_pair_two.yaml").read_text("utf-8")
-    config = resolve_monitor_design(EXAMPLES / "design_monitor_two.yaml").to_yaml()
+    config = MonitorDesignSetup.read(EXAMPLES / "design_monitor_two.yaml").to_yaml()
     folder = run_folder(tmp_path / "run", "twin.design", config, "layouts", l1=made, notes="a: 1\n")
     code, said = told(folder)
     assert code == 2

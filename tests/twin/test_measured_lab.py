@@ -19,7 +19,7 @@ from analysis.focal_plane.through_focus import QUARTIC
 from scenes.specs.load import LAB, SCENES, load_named
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import LineCameraSpec
-from scenes.specs.resolved import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
+from scenes.specs.procedures import PROCEDURES
 from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.lab import app
@@ -57,16 +57,16 @@ def write(path: Path, rows: Sequence[Sequence[object]]) -> None:
 
 
 def distortion_of(folder: Path) -> DistortionRun:
-    return measure_files(resolve_distortion_test(folder / "distortion.yaml").test, 1)  # type: ignore[arg-type]
+    return measure_files(PROCEDURES["lab distortion"].resolve(folder / "distortion.yaml").test, 1)  # type: ignore[arg-type]
 
 
 def focus_of(folder: Path) -> FocusRun:
-    return align_files(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
+    return align_files(PROCEDURES["lab focus"].resolve(folder / "focus.yaml").test)  # type: ignore[arg-type]
 
 
 def turntable_of(folder: Path, names: Sequence[str] = ("cubic_spline", "fourier")) -> TurntableRun:
     """Without the network, which takes nearly all of the time."""
-    spec = resolve_turntable_test(folder / "turntable.yaml").test
+    spec = PROCEDURES["lab turntable"].resolve(folder / "turntable.yaml").test
     measured = spec.measured.model_copy(update={"held_out": None, "folds": 10})  # type: ignore[union-attr]
     return run_turntable(spec.model_copy(update={"measured": measured}), 1, names=names)
 
@@ -147,7 +147,7 @@ def test_exported_comparisons_are_those_of_the_bench(tmp_path: Path) -> None:
     done = run_turntable(spec, 7, names=("cubic_spline",))
     for name, content in export_turntable(done).items():
         (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    again = resolve_turntable_test(tmp_path / "turntable.yaml").test
+    again = PROCEDURES["lab turntable"].resolve(tmp_path / "turntable.yaml").test
     series, held_out = read_turntable(again.measured)  # type: ignore[union-attr]
     assert held_out is not None
     for there, here in ((done.series, series.series), (done.held_out, held_out.series)):

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from analysis.turntable.dividing_error import CalibrationSeries, expected_rejections, normal_reduction, rejection_rate
 from scenes.specs.load import SCENES
-from scenes.specs.resolved import resolve_focus_test
+from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.study_bench import REFUSED
@@ -205,7 +205,7 @@ def stack(folder: Path, images: Path) -> Path:
 
 @pytest.mark.second
 def test_a_stack_that_the_twin_did_not_make(stack: Path) -> None:
-    run = align_files(resolve_focus_test(stack / "focus.yaml").test)  # type: ignore[arg-type]
+    run = align_files(PROCEDURES["lab focus"].resolve(stack / "focus.yaml").test)  # type: ignore[arg-type]
     true = np.array([-20e-6, -40e-6, -20e-6, -40e-6])
     by_place = {tuple(np.rint(1e3 * place)): k for k, place in enumerate(run.places)}
     order = [by_place[place] for place in ((0, -100), (0, 100), (20, -100), (20, 100))]
@@ -225,7 +225,7 @@ def test_an_image_in_uneven_light_is_named(stack: Path) -> None:
     for name, light in (("2_along_4", 1.0 - 0.1 * column**2), ("1_track_3", 1.0 + 0.1 * row + 0.1 * column)):
         image = tifffile.imread(stack / f"{name}.tiff")
         tifffile.imwrite(stack / f"{name}.tiff", np.uint16(light * image))
-    run = align_files(resolve_focus_test(stack / "focus.yaml").test)
+    run = align_files(PROCEDURES["lab focus"].resolve(stack / "focus.yaml").test)
     with (stack / "images.csv").open() as stream:
         line = next(k for k, text in enumerate(stream, 1) if "2_along_4" in text)
     assert [fault.line for fault in run.readings.uneven] == [line]
@@ -287,7 +287,7 @@ def test_bad_images(stack: Path, tmp_path: Path, spoil: Callable[[Path], object]
 
 @pytest.mark.second
 def test_images_without_an_edge_are_told_and_have_no_weight(stack: Path) -> None:
-    test = resolve_focus_test(stack / "focus.yaml").test
+    test = PROCEDURES["lab focus"].resolve(stack / "focus.yaml").test
     before = align_files(test)  # type: ignore[arg-type]
     flat = np.random.default_rng(1).normal(1000.0, 4.0, (64, 64)).astype(np.uint16)
     tifffile.imwrite(stack / "0_along_8.tiff", flat)

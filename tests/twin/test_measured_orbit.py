@@ -13,10 +13,9 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.orbit_data_setup import resolve_measured_angle, resolve_measured_calibration
-from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.specs.orbit.angle import EffectsSpec
-from scenes.specs.orbit.setup import resolve_angle, resolve_simulate
+from scenes.specs.orbit.measurements import body_axes_matrix
+from scenes.specs.orbit.setup import AngleSetup, MeasuredAngleSetup, MeasuredCalibrationSetup, SimulateSetup
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
@@ -338,7 +337,7 @@ def test_velocities_and_one_table_of_the_platform_may_be_left_to_the_positions(c
 def test_points_of_simulated_images_are_exported_where_they_were_found(tmp_path) -> None:
     """A patch of 400 pixels: control points lie where the true camera sees their given coordinates, but for the errors
     of matching (0.1 px), of the orthophoto and of the elevation model (0.5 m and 2 m of 5 m pixels)."""
-    setup = resolve_simulate(SCENES / ORBIT / "simulate.yaml")
+    setup = SimulateSetup.read(SCENES / ORBIT / "simulate.yaml")
     test = setup.test
     small_patch = {"patch": test.patch.model_copy(update={"lines": 400, "pixels": 400})}
     setup = setup.model_copy(update={"test": test.model_copy(update=small_patch)})
@@ -346,7 +345,7 @@ def test_points_of_simulated_images_are_exported_where_they_were_found(tmp_path)
     for name, text in simulation_exported(done).items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    said = resolve_measured_calibration(tmp_path / "calibrate.yaml")
+    said = MeasuredCalibrationSetup.read(tmp_path / "calibrate.yaml")
     (one,) = read_measurements(said.data, said.camera)
     assert set(one.images) == {"forward", "nadir", "backward"}
     assert set(one.ground.role.tolist()) == {"control", "check", "tie"}
@@ -376,11 +375,11 @@ def test_angles_of_a_simulation_and_of_its_exported_files(tmp_path, changes) -> 
     for key, value in changes.items():
         plain[key] = plain[key] | value if isinstance(value, dict) else value
     (tmp_path / "angle.yaml").write_text(dump_yaml(plain))
-    run_ = run_angle(resolve_angle(tmp_path / "angle.yaml"), None, 3)
+    run_ = run_angle(AngleSetup.read(tmp_path / "angle.yaml"), None, 3)
     for name, text in angle_exported(run_).items():
         (tmp_path / "out" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "out" / name).write_text(text)
-    again = run_measured_angle(resolve_measured_angle(tmp_path / "out/angle.yaml"))
+    again = run_measured_angle(MeasuredAngleSetup.read(tmp_path / "out/angle.yaml"))
     assert len(again.passes) == 1
     one, two = run_.estimate, again.passes[0].estimate
     for method in one.angles:

@@ -25,7 +25,6 @@ from scenes.models.monitor_layout import (
     prism_mass,
     pupil_share,
     ranges,
-    resolve_monitor_design,
 )
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
@@ -58,7 +57,7 @@ def written(folder: Path, design: str = DESIGN) -> Path:
 
 @pytest.fixture(scope="module")
 def setup() -> MonitorDesignSetup:
-    return resolve_monitor_design(FILES / "design.yaml")
+    return MonitorDesignSetup.read(FILES / "design.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -295,7 +294,7 @@ def test_a_start_that_throws_a_ghost_is_refused_with_both_bodies_and_the_line(
 def test_bad_input_is_told_with_its_line(tmp_path: Path, change: str, to: str, told: str) -> None:
     file = written(tmp_path, DESIGN.replace(change, to, 1))
     with pytest.raises(InputError) as error:
-        resolve_monitor_design(file)
+        MonitorDesignSetup.read(file)
     assert told in str(error.value)
     issue = error.value.issues[0]
     assert issue.line is not None

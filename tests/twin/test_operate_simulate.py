@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import TimeLaw
-from scenes.models.disturbances import Component, StatedMotions
-from scenes.models.drawn_motions import drawn_course
+from scenes.models.disturbances import Component, StatedMotions, drawn_course
 from scenes.specs.disturbances import TimeLawSpec
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with

@@ -11,8 +11,8 @@ import pytest
 from analysis.block.block import CamerasKnowledge
 from analysis.block.block_adjustment import adjust_block
 from optics.numerics.backend import one_blas_thread
-from scenes.specs.measured.adjust_setup import resolve_adjust
 from scenes.specs.operation import read_operation
+from scenes.specs.orbit.setup import AdjustSetup
 from scenes.yaml.errors import InputError
 from tests.twin.operation_records import (
     DAY,
@@ -104,7 +104,7 @@ def by_hand(stated, shifts):
 @one_blas_thread()
 def test_check_points_by_a_record_are_those_of_the_same_laws_and_readings_by_hand(operated):
     folder, stated, shifts = operated
-    run = run_operated_block(resolve_adjust(folder / "block.yaml"), None, 5)
+    run = run_operated_block(AdjustSetup.read(folder / "block.yaml"), None, 5)
     found = run.adjustment
     said = found.assembly.block.monitored
     hand = by_hand(stated, shifts)
@@ -127,7 +127,7 @@ def test_check_points_by_a_record_are_those_of_the_same_laws_and_readings_by_han
 def test_true_cameras_are_drawn_from_what_the_record_says(operated):
     folder, stated, shifts = operated
     hand = by_hand(stated, shifts)
-    setup = resolve_adjust(folder / "block.yaml")
+    setup = AdjustSetup.read(folder / "block.yaml")
     value, every = hand.mean.ravel(), []
     for seed in range(8):
         drawn = draw_block(setup, np.random.SeedSequence(seed), lambda epochs, lines: hand)
@@ -164,4 +164,4 @@ def test_a_record_that_does_not_fit_is_refused(operated, old, new, told):
     text = text.replace("own_lines.yaml", "renamed.yaml") if new == "rear" else text
     (folder / "wrong.yaml").write_text(text.replace(old, new))
     with pytest.raises(InputError, match=told):
-        run_operated_block(resolve_adjust(folder / "wrong.yaml"), None, 5)
+        run_operated_block(AdjustSetup.read(folder / "wrong.yaml"), None, 5)

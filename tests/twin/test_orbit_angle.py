@@ -10,14 +10,14 @@ from scipy.stats import chi2
 from analysis.arrays import ARCSEC
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES
-from scenes.specs.orbit.setup import AngleSetup, resolve_angle
+from scenes.specs.orbit.setup import AngleSetup
 from twin.orbit.angle.angle_flight import AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, frame_rows, run_angle, tls_angles
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import look_angle
 
 EXAMPLE = SCENES / ORBIT / "angle.yaml"
-SETUP = resolve_angle(EXAMPLE)
+SETUP = AngleSetup.read(EXAMPLE)
 LOOK = np.radians(25.0)
 
 

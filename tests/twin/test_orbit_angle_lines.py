@@ -7,13 +7,13 @@ import pytest
 
 from analysis.arrays import ARCSEC
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit.setup import AngleSetup, resolve_angle
+from scenes.specs.orbit.setup import AngleSetup
 from tests.tiers import quick
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, run_angle, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 
-PAIR, LINES = (resolve_angle(SCENES / ORBIT / f"{name}.yaml") for name in ("angle_gf7", "angle_off_axis"))
+PAIR, LINES = (AngleSetup.read(SCENES / ORBIT / f"{name}.yaml") for name in ("angle_gf7", "angle_off_axis"))
 
 
 def without_errors(setup: AngleSetup) -> AngleSetup:

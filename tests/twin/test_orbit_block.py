@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from scenes.specs.load import SCENES
-from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_any_adjust, without_sensors
-from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
+from scenes.specs.orbit.setup import AdjustSetup, MeasuredCalibrationSetup, without_sensors
+from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from twin.orbit.block.block_report import block_report
 from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
@@ -26,10 +26,10 @@ def setup(tmp_path=None, *changes):
         assert old in text
         text = text.replace(old, new)
     if tmp_path is None:
-        return resolve_adjust(FILE)
+        return AdjustSetup.read(FILE)
     file = tmp_path / "adjust.yaml"
     file.write_text(text, "utf-8")
-    return resolve_adjust(file)
+    return AdjustSetup.read(file)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_a_wrong_datum_is_told(tmp_path):
 
 def test_sensors_that_are_not_there_are_refused():
     with pytest.raises(InputError, match="no such sensor; did you mean 'control'"):
-        without_sensors(resolve_adjust(FILE), ["controls"])
+        without_sensors(AdjustSetup.read(FILE), ["controls"])
 
 
 def test_scenes_that_share_no_ground_are_an_error_with_a_key(tmp_path):
@@ -139,7 +139,7 @@ MEASURED = SCENES / "orbit" / "measured" / "adjust.yaml"
 @pytest.mark.second
 def test_measured_passes_as_their_calibration_has_them():
     """The tables of the shipped campaign: two image points of control points were moved by some pixels."""
-    found = run_adjustment(resolve_any_adjust(MEASURED), None, 0)
+    found = run_adjustment(PROCEDURES["orbit adjust"].resolve(MEASURED), None, 0)
     assert found.drawn is None
     assert {("Beijing c4", "Beijing/forward"), ("Beijing k33", "Beijing/nadir")} <= set(found.rejected)
     assert len(found.rejected) <= 6
@@ -148,7 +148,7 @@ def test_measured_passes_as_their_calibration_has_them():
     assert len(found.network.parts) == 2
     assert found.worth["without control"].predicted.le90 > 20 * found.worth[ALL].predicted.le90
     # the same passes calibrated by the campaign's adjustment: the principal distances agree
-    calibrated = simultaneous(source_of(resolve_measured_calibration(MEASURED.with_name("calibrate.yaml")), None))
+    calibrated = simultaneous(source_of(MeasuredCalibrationSetup.read(MEASURED.with_name("calibrate.yaml")), None))
     for line in ("forward", "nadir", "backward"):
         change = found.cameras[f"Beijing/{line}"]
         laboratory = found.adjustment.assembly.block.cameras[line].interior[0]
@@ -165,8 +165,8 @@ def test_monitor_readings_of_measured_passes_hold_the_cameras(tmp_path):
     )
     file = tmp_path / "adjust.yaml"
     file.write_text(text + monitor, "utf-8")
-    block, given = measured_block(resolve_any_adjust(file))
-    setup_ = resolve_any_adjust(file)
+    block, given = measured_block(PROCEDURES["orbit adjust"].resolve(file))
+    setup_ = PROCEDURES["orbit adjust"].resolve(file)
     known = {name: change for name, change in setup_.test.changes.items() if name != "nadir"}
     setup_ = setup_.model_copy(update={"test": setup_.test.model_copy(update={"changes": known})})
     with pytest.raises(BenchError, match="it is not said how nadir may have changed"):

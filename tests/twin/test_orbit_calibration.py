@@ -13,7 +13,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES, EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
-from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
+from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
 from twin.orbit.calibration.campaign import interior_names
@@ -26,7 +26,7 @@ from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints
 
 EXAMPLE = SCENES / ORBIT / "calibrate.yaml"
-WHOLE = resolve_calibration(EXAMPLE)
+WHOLE = CalibrationSetup.read(EXAMPLE)
 SETUP = WHOLE.model_copy(update={"test": WHOLE.test.model_copy(update={"repeats": 2})})
 NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
 INNER = interior_names(LINES)

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
-from scenes.specs.measured.orbit_data import OrbitCheckSpec
-from scenes.specs.measured.orbit_data_setup import CheckSetup
-from scenes.specs.measured.pass_files import with_absolute_files
-from scenes.specs.orbit.setup import load_three_line_camera
+from scenes.specs.orbit.measurements import OrbitCheckSpec, with_absolute_files
+from scenes.specs.orbit.setup import CheckSetup, load_three_line_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench
@@ -148,17 +146,17 @@ def test_what_is_exported_is_the_pass_that_was_read() -> None:
     reader, to rounding of times (1e-11 s, 1e-7 m).
     """
     from scenes.specs.load import SCENES
-    from scenes.specs.measured.orbit_data_setup import resolve_check, resolve_measured_calibration
+    from scenes.specs.orbit.setup import CheckSetup, MeasuredCalibrationSetup
     from twin.orbit.conventions.check_run import exported, measurements
     from twin.orbit.flight.platform_table import TabulatedTrajectory
     from twin.orbit.measured.clock import Readings
     from twin.orbit.measured.measurement_tables import read_measurements
 
     folder = SCENES / "orbit/measured"
-    found = run_check(resolve_check(folder / "check.yaml"), None, 0)
+    found = run_check(CheckSetup.read(folder / "check.yaml"), None, 0)
     assert "camera.yaml" in exported(found)
     mine = measurements(found)
-    setup = resolve_measured_calibration(folder / "calibrate.yaml")
+    setup = MeasuredCalibrationSetup.read(folder / "calibrate.yaml")
     theirs = next(one for one in read_measurements(setup.data, setup.camera) if one.name == "Beijing")
     later = Readings.of_texts([theirs.platform.epoch]).instants("UTC").since(mine.platform.epoch)[0]
     a, b = TabulatedTrajectory(mine.platform), TabulatedTrajectory(theirs.platform)

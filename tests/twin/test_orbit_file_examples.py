@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.specs.measured.pass_files import GroundFileSpec, PlatformFilesSpec
+from scenes.specs.orbit.measurements import GroundFileSpec, PlatformFilesSpec
 from twin.orbit.flight.earth import Earth
 from twin.orbit.measured.earth_orientation import read_earth_orientation
 from twin.orbit.measured.ground_files import read_ground_points

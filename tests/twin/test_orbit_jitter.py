@@ -7,9 +7,9 @@ import pytest
 
 from analysis.orbit.jitter import Found, search
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.orbit_data_setup import resolve_any_jitter
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec
 from scenes.specs.orbit.setup import JitterSetup, load_three_line_camera
+from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.yaml_file import read_yaml
 from tests.tiers import quick
 from twin.orbit.flight.light_effects import LightEffects
@@ -33,7 +33,7 @@ def setup(**change) -> JitterSetup:
     data["points"] = {"count": 160, "duration": "10 s", "noise": 0.1, "height": "300 m", "relief": "100 m"}
     data |= change
     test = OrbitJitterSpec.model_validate(data)
-    camera = resolve_any_jitter(SCENES / ORBIT / "jitter.yaml").camera
+    camera = PROCEDURES["orbit jitter"].resolve(SCENES / ORBIT / "jitter.yaml").camera
     return JitterSetup.model_construct(test=test, camera=camera)
 
 

@@ -11,7 +11,7 @@ from analysis.monitor.model_fit import unseen_modes
 from scenes.models.disturbances import state_of
 from scenes.specs.course import CourseSpec
 from scenes.specs.orbit.monitor import CorrectionSpec, LoopImagesSpec, MotionSpec
-from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
+from scenes.specs.orbit.setup import MonitorSetup
 from scenes.specs.resolved import line_detector
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -87,7 +87,7 @@ def test_gain_nothing_dead_bands_and_the_open_loop_leave_mechanisms_alone() -> N
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory) -> MonitorSetup:
-    return resolve_monitor(Path(__file__).with_name("orbit_loop.yaml"))
+    return MonitorSetup.read(Path(__file__).with_name("orbit_loop.yaml"))
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,8 @@ import pytest
 import tifffile
 
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.orbit_data import OrbitMatchSpec
-from scenes.specs.measured.orbit_data_setup import MatchSetup
-from scenes.specs.measured.pass_files import with_absolute_files
-from scenes.specs.orbit.setup import load_three_line_camera, resolve_simulate
+from scenes.specs.orbit.measurements import OrbitMatchSpec, with_absolute_files
+from scenes.specs.orbit.setup import MatchSetup, SimulateSetup, load_three_line_camera
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.images.simulate_run import Simulation, run_simulation
 from twin.orbit.matching.match_run import Match, run_match
@@ -19,7 +17,7 @@ from twin.orbit.matching.match_run import Match, run_match
 
 @pytest.fixture(scope="module")
 def flown() -> Simulation:
-    setup = resolve_simulate(SCENES / ORBIT / "simulate.yaml")
+    setup = SimulateSetup.read(SCENES / ORBIT / "simulate.yaml")
     patch = setup.test.patch.model_copy(update={"lines": 320, "pixels": 320})
     update = {"patch": patch, "points": None, "oversampling": 2}
     return run_simulation(setup.model_copy(update={"test": setup.test.model_copy(update=update)}), None, 3)

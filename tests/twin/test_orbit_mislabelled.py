@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.calibration.adjustment import FarPointsError
-from scenes.specs.measured.orbit_data_setup import resolve_any_calibration
+from scenes.specs.procedures import PROCEDURES
 from tests.tiers import quick
 from tests.twin.orbit_files import FIELDS, edit, export, flown, read_back, set_keys, small
 from twin.orbit.calibration.calibration_run import run_calibration
@@ -71,7 +71,7 @@ def test_exchanged_names_are_found_and_no_others(file: Path, table: str, share: 
         read_back(file)
     named = str(refused.value)
     assert any(f"{point} in" in named for _, point in wrong)
-    setup = resolve_any_calibration(file)
+    setup = PROCEDURES["orbit calibrate"].resolve(file)
     campaign = campaign_of(setup.test, setup.camera, read_measurements(setup.data, setup.camera), True)
     found = set()
     for one in campaign.passes:
@@ -98,7 +98,7 @@ def test_check_points_with_exchanged_coordinates_are_found(file: Path) -> None:
 def test_a_refusal_of_a_measured_test_points_to_its_data(file: Path) -> None:
     swapped(file.parent, 0.2, "image_points")
     with pytest.raises(BenchError, match="lie elsewhere than those around") as refused:
-        run_calibration(resolve_any_calibration(file), None, 0)
+        run_calibration(PROCEDURES["orbit calibrate"].resolve(file), None, 0)
     assert refused.value.key == ("data",)
     assert "screening: robust" in refused.value.remedy
 

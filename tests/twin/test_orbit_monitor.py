@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, intersect_pair
 from optics.geometry.tree import Motion
-from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
+from scenes.specs.orbit.setup import MonitorSetup
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
 from twin.orbit.monitoring.monitoring_run import run_monitor
@@ -47,7 +47,7 @@ def changed(setup: MonitorSetup, **errors) -> MonitorSetup:
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory) -> MonitorSetup:
-    return resolve_monitor(write(tmp_path_factory.mktemp("monitor"), JOB))
+    return MonitorSetup.read(write(tmp_path_factory.mktemp("monitor"), JOB))
 
 
 @pytest.fixture(scope="module")
@@ -60,13 +60,13 @@ def quiet(setup, backend):
 def noisy(tmp_path_factory, backend):
     """Noise everywhere, a prism that warms unevenly at the end, and nothing stated: the monitor is read by `model`."""
     text = WARM + "disturbances: none\n"
-    return run_monitor(resolve_monitor(write(tmp_path_factory.mktemp("noisy"), text)), backend, 3, silent)
+    return run_monitor(MonitorSetup.read(write(tmp_path_factory.mktemp("noisy"), text)), backend, 3, silent)
 
 
 @pytest.fixture(scope="module")
 def stated(tmp_path_factory, backend):
     """The same with the instrument's disturbances."""
-    return run_monitor(resolve_monitor(write(tmp_path_factory.mktemp("stated"), WARM)), backend, 3, silent)
+    return run_monitor(MonitorSetup.read(write(tmp_path_factory.mktemp("stated"), WARM)), backend, 3, silent)
 
 
 # The correction

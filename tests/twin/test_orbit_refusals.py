@@ -22,12 +22,25 @@ from analysis.orbit.three_line_model import LineModel
 from analysis.spots.spot_positions import SpotError
 from optics.numerics.array_math import UnphysicalError
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.adjust_setup import resolve_measured_adjust
-from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec
-from scenes.specs.measured.orbit_data_setup import CheckSetup, MatchSetup, resolve_measured_angle
-from scenes.specs.measured.pass_files import GroundFileSpec, PlatformFilesSpec, RasterFileSpec, with_absolute_files
 from scenes.specs.orbit.angle import EffectsSpec
-from scenes.specs.orbit.setup import JitterSetup, load_three_line_camera, resolve_angle, resolve_simulate
+from scenes.specs.orbit.measurements import (
+    GroundFileSpec,
+    OrbitCheckSpec,
+    OrbitMatchSpec,
+    PlatformFilesSpec,
+    RasterFileSpec,
+    with_absolute_files,
+)
+from scenes.specs.orbit.setup import (
+    AngleSetup,
+    CheckSetup,
+    JitterSetup,
+    MatchSetup,
+    MeasuredAdjustSetup,
+    MeasuredAngleSetup,
+    SimulateSetup,
+    load_three_line_camera,
+)
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.tiers import quick
@@ -152,7 +165,7 @@ def rpc_files(folder: Path) -> None:
 
 
 def match_files(folder: Path) -> dict[str, Any]:
-    setup = resolve_simulate(SCENES / ORBIT / "simulate.yaml")
+    setup = SimulateSetup.read(SCENES / ORBIT / "simulate.yaml")
     patch = setup.test.patch.model_copy(update={"lines": 320, "pixels": 320})
     test = setup.test.model_copy(update={"patch": patch, "points": None, "oversampling": 2})
     for name, value in (("nan", np.full((40, 40), np.nan, "f4")), ("complex", np.zeros((40, 40), "c8"))):
@@ -170,7 +183,7 @@ def map_used(folder: Path, spec: dict[str, Any]) -> None:
 
 def angle_used(folder: Path, spec: dict[str, Any]) -> None:
     (folder / "angle.yaml").write_text(dump_yaml(spec))
-    run_measured_angle(resolve_measured_angle(folder / "angle.yaml"))
+    run_measured_angle(MeasuredAngleSetup.read(folder / "angle.yaml"))
 
 
 def used(kind: type, setup: type, run: Callable[..., object], folder: Path, spec: dict[str, Any]) -> None:
@@ -185,7 +198,7 @@ def block_files(folder: Path) -> None:
 READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, dict[str, Any]], object]]] = {
     "campaign": (campaign_files, lambda folder, _: orbit_files.read_back(folder / "calibrate.yaml")),
     "angle": (campaign_files, angle_used),
-    "block": (block_files, lambda folder, _: run_adjustment(resolve_measured_adjust(folder / "adjust.yaml"), None, 0)),
+    "block": (block_files, lambda folder, _: run_adjustment(MeasuredAdjustSetup.read(folder / "adjust.yaml"), None, 0)),
     "platform": (
         platform_files,
         lambda folder, spec: platform_table(
@@ -304,8 +317,8 @@ def calibrated() -> CalibratedLine:
 GONE: Any = Ns(submit=lambda *_: Ns(status="lost"), next_finished=lambda look: look())
 FILE = Path("scene.ntf")
 TRACED = SimulatedAngleRun.__new__(SimulatedAngleRun)
-object.__setattr__(TRACED, "setup", resolve_angle(SCENES / ORBIT / "angle_gf7.yaml"))
-MEASURED: Any = Ns(setup=resolve_measured_angle(SCENES / ORBIT / "measured/angle.yaml"))
+object.__setattr__(TRACED, "setup", AngleSetup.read(SCENES / ORBIT / "angle_gf7.yaml"))
+MEASURED: Any = Ns(setup=MeasuredAngleSetup.read(SCENES / ORBIT / "measured/angle.yaml"))
 PLACES = np.column_stack([np.zeros((2, 3)), [-179.9, 179.9], np.zeros(2)])
 SPOT = Ns(reading=np.ones((1, 1)), lines=np.full((1, 1), 3), file=Ns(file="spots.csv"), head="reading [deg]")
 UNMADE: Any = Ns(setup=None, test=None, camera=None, instrument=None, images={"nadir": 1}, kind="other", name="th1")

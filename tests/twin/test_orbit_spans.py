@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from optics.numerics.array_math import ROUNDING, in_span, number_of
 from scenes.specs.course import CourseSpec
-from scenes.specs.measured.pass_files import PlatformFilesSpec
+from scenes.specs.orbit.measurements import PlatformFilesSpec
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.yaml.errors import InputError
 from tests.twin import orbit_file_bench as bench

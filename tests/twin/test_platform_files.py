@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenes.specs.measured.pass_files import PlatformFilesSpec
+from scenes.specs.orbit.measurements import PlatformFilesSpec
 from scenes.yaml.errors import InputError, Problem
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.flight.platform_table import PlatformTable

@@ -22,9 +22,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
 from scenes.specs.procedures import Procedure
-from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.yaml.spec import Name, Number, Seed, Spec, Whole, validate
-from scenes.yaml.yaml_file import read_yaml
+from scenes.specs.resolved import ExperimentSetup
+from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
 from tests.twin.commands import files, invoke
 from tests.twin.test_blurred_cameras import gf7_with
 from twin.run import cli, reference_frames
@@ -65,11 +64,6 @@ class LevelNumbers:
     mean_arcsec: float
     mean_arcsec_sigma: float
     readings_arcsec: np.ndarray
-
-
-def resolve(path: Path | str) -> LevelSetup:
-    again = read_setup(LevelSetup, path)
-    return again or LevelSetup.model_construct(test=validate(LevelSpec, read_yaml(path)))
 
 
 def measure(setup: LevelSetup, backend: Backend, seed: int, advance: Advance) -> LevelRun:
@@ -141,7 +135,7 @@ def test_statements_become_a_verdict_and_what_follows_it() -> None:
     )
 
 
-LEVEL = Procedure("level", LevelSetup, resolve, measure, numbers, report, about="Read a level.", varied=True)
+LEVEL = Procedure("level", LevelSetup, measure, numbers, report, about="Read a level.", varied=True)
 
 
 def program(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> typer.Typer:
@@ -236,18 +230,18 @@ def test_what_fails_on_the_bench_is_told_at_the_line_of_the_file(run: Callable, 
     assert files(tmp_path) == {"level.yaml"}
 
 
-class FocusedSetup(ExperimentSetup[LevelSpec]):
-    camera: CameraSpec
-
-
 def test_a_blurred_camera_is_told_wherever_a_test_has_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """In the terminal, the manifest and the report; beside the error where the test fails; in a study not at all."""
     camera = load_camera(gf7_with(tmp_path, "-2.02 m"))
 
-    def with_camera(path: Path | str) -> FocusedSetup:
-        return FocusedSetup.model_construct(test=validate(LevelSpec, read_yaml(path)), camera=camera)
+    class FocusedSetup(ExperimentSetup[LevelSpec]):
+        camera: CameraSpec
 
-    app = program(monkeypatch, setup=FocusedSetup, resolve=with_camera)
+        @classmethod
+        def parts(cls, test: LevelSpec) -> dict[str, Any]:
+            return {"camera": camera}
+
+    app = program(monkeypatch, setup=FocusedSetup)
     path, out = tmp_path / "level.yaml", tmp_path / "run"
     path.write_text(FILE, "utf-8")
     done = invoke(app, "level", path, "--out", out)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from scenes.specs.measured.telemetry import ReadingTableSpec
+from scenes.specs.operation import ReadingTableSpec
 from twin.operate.record.entries import Refused
 from twin.operate.record.record_tables import TABLES
 from twin.operate.record.telemetry import read_table_file

@@ -25,7 +25,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State
 from scenes.specs.job import JobSpec
-from scenes.specs.measured.monitor_frames import resolve_measurement
+from scenes.specs.monitor_frames import MeasurementSetup
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue
 from tests.tiers import quick
@@ -67,7 +67,7 @@ def measured(folder, text, backend, run, name="measurement.yaml"):
     """Of the instrument that the run has built."""
     file = folder / name
     file.write_text(text)
-    return run_recover(resolve_measurement(file), backend, experiment=run.experiment)
+    return run_recover(MeasurementSetup.read(file), backend, experiment=run.experiment)
 
 
 def test_rendered_frames_give_the_main_jobs_numbers_to_the_last_digit(run, images, backend):
@@ -380,13 +380,13 @@ def test_a_missing_file_is_missing_though_there_is_a_picture_of_it(images, tmp_p
     cv2.imwrite(str(folder / "forward_left_after.png"), np.full((32, 32), 7, np.uint8))
     (tmp_path / "measurement.yaml").write_text(HEAD + "frames: images\n")
     with pytest.raises(InputError) as caught:
-        resolve_measurement(tmp_path / "measurement.yaml")
+        MeasurementSetup.read(tmp_path / "measurement.yaml")
     told = str(caught.value)
     assert "no frames of forward/left after" in told
     assert "forward_left_after.png is a picture with 8 bits" in told
     assert "forward_left_after.tiff" in told
     cv2.imwrite(str(folder / "forward_left_after.png"), np.full((32, 32), 7, np.uint16))
-    setup = resolve_measurement(tmp_path / "measurement.yaml")
+    setup = MeasurementSetup.read(tmp_path / "measurement.yaml")
     assert setup.test.frames["forward/left"].after[0][0].endswith("forward_left_after.png")
 
 
@@ -480,7 +480,7 @@ class Course:
     def measured(self, backend, text: str, name: str = "series.yaml") -> RecoverRun:
         file = self.folder / name
         file.write_text(text)
-        return run_recover(resolve_measurement(file), backend, experiment=self.experiment)
+        return run_recover(MeasurementSetup.read(file), backend, experiment=self.experiment)
 
     def text(self, times=TIMES, which=None, **other: str) -> str:
         """A measurement's file; other: channel -> file in place of that of the second time."""
@@ -558,6 +558,6 @@ def test_a_single_time_and_one_without_statements_are_not_smoothed(course, backe
     assert "smoothed" not in recover_numbers(alone)
     text = course.text().replace("disturbances: orbit", "disturbances: none")
     (course.folder / "none.yaml").write_text(text)
-    plain = run_recover(resolve_measurement(course.folder / "none.yaml"), backend)
+    plain = run_recover(MeasurementSetup.read(course.folder / "none.yaml"), backend)
     assert plain.smoothed is None
     assert recover_report(plain).sections[0].text == ()

@@ -13,7 +13,7 @@ import xarray as xr
 from astropy.io import fits
 
 from analysis.images.image_file import ImageFile
-from scenes.specs.measured.monitor_frames import resolve_measurement
+from scenes.specs.monitor_frames import MeasurementSetup
 from scenes.specs.resolved import resolve
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import ROOT
@@ -75,7 +75,7 @@ def exported(run, tmp_path_factory) -> dict[str, Path]:
 def test_exported_frames_give_the_same_readings_to_the_bit(job, exported, backend, tmp_path) -> None:
     file = tmp_path / "measurement.yaml"
     file.write_text(f"instrument: gf7_pair\ndisturbances: orbit\nframes: {exported['fits'] / 'images'}\n")
-    found = run_recover(resolve_measurement(file), backend, experiment=job.experiment)
+    found = run_recover(MeasurementSetup.read(file), backend, experiment=job.experiment)
     expected = stated(job.recovered_dict())
     numbers = recover_numbers(found)
     assert {key: numbers[key] for key in expected} == expected

@@ -79,7 +79,7 @@ def test_only_named_errors_are_failures(fault) -> None:
     class NamedMeasurement(MeasurementError, ValueError):
         pass
 
-    base = ProcedureBase(Procedure("toy", Toy, None, None, None, None))
+    base = ProcedureBase(Procedure("toy", Toy, None, None, None))
     assert base.block == 1  # a slow run is kept as soon as it is there
     for what in ("lost", "unmeasured"):
         assert base.evaluate({"what": what}, [Run(0, (), None)], None) == [Failure("no light")]

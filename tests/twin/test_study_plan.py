@@ -8,8 +8,7 @@ import pytest
 from scipy.stats import kstest, norm
 
 from scenes.specs.load import EXAMPLES
-from scenes.specs.samplers import unit_cube
-from scenes.specs.study import ResponseSpec
+from scenes.specs.study import ResponseSpec, unit_cube
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.tiers import quick

@@ -17,7 +17,7 @@ import pytest
 from analysis.focal_plane.plane_fit import FocalPlaneFit
 from analysis.turntable import dividing_error
 from optics.numerics.backend import load_backend
-from scenes.specs.resolved import resolve_distortion, resolve_focus
+from scenes.specs.resolved import DistortionSetup, FocusSetup
 from tests.validation.mutated import break_it, times, with_fields
 from twin.laboratory import distortion_run as laboratory
 from twin.laboratory.distortion_bench import DistortionBench
@@ -40,14 +40,14 @@ TESTS = 4
 @cache
 def spot_tests():
     """Bench, and per seed what was recorded, the spots, and the measured test."""
-    bench = DistortionBench.build(resolve_distortion("distortion"), load_backend("llvm"))
+    bench = DistortionBench.build(DistortionSetup.read("distortion"), load_backend("llvm"))
     return bench, {int(s): laboratory.measure(bench, int(s)) for s in np.random.SeedSequence(1).generate_state(TESTS)}
 
 
 @cache
 def alignment():
     """One alignment with two fields instead of five, a frame instead of four."""
-    setup = resolve_focus("focus")
+    setup = FocusSetup.read("focus")
     test = setup.test.model_copy(update={"fields": (-0.9, 0.9), "frames": 1})
     setup = setup.model_copy(update={"test": test})
     return align(FocusBench(setup, load_backend("llvm")), 1)

@@ -89,7 +89,7 @@ def test_parameters_that_adjustments_tie_together(ties, largest):
 )
 def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, keys, monkeypatch):
     """The stated limits come from a formula; tables with such inputs, simulated, just agree and just do not."""
-    right = turntable_checks.resolve_turntable
+    right = turntable_checks.TurntableSetup.read
     limits = results(REPEATS)[identifier].inputs[which]
 
     def judged(value):
@@ -114,7 +114,7 @@ def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, 
 
 def test_the_network_is_judged_as_the_other_fits_are(monkeypatch):
     """Straight lines in its place miss the held-out readings by what straight lines miss; one that fails, by any."""
-    spec = turntable_checks.resolve_turntable(turntable_checks.TEST).test
+    spec = turntable_checks.TurntableSetup.read(turntable_checks.TEST).test
     monkeypatch.setattr(turntable_checks, "fit", lambda name, *series: fit("piecewise_linear", *series))
     found = turntable_checks.fit_table(spec, 3).held_out
     assert set(found) == set(FITS)

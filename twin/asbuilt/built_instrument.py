@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from optics.geometry.tree import Motion
 from scenes.models.disturbances import HEAT, Component
 from scenes.models.joint_disturbances import joint_disturbances, joint_files
-from scenes.specs.as_built import as_built_file
-from scenes.specs.load import is_path
+from scenes.specs.instrument import as_built_file
+from scenes.specs.load import CAMERAS, INSTRUMENTS, is_path, library_names
 from twin.asbuilt.asbuilt_run import AsBuiltRun
 
 POSTERIOR = "posterior"
@@ -32,12 +33,14 @@ def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
 def instrument_text(run: AsBuiltRun) -> str:
     """The instrument's file, which names the drawing and how each body stands against it."""
     test, base = run.setup.test, run.setup.base.instrument.name
-    name = test.instrument
-    if is_path(name):
-        name = str((Path(test.source.file).parent / name).resolve())
+    design: str | dict[str, Any] = test.instrument
+    if is_path(test.instrument):
+        design = str((Path(test.source.file).parent / test.instrument).resolve())
+    elif test.instrument not in (*library_names(INSTRUMENTS), *library_names(CAMERAS)):
+        design = run.setup.base.instrument_file()
     return as_built_file(
         f"{base}_as_built",
-        name,
+        design,
         built_motions(run),
         f"./{POSTERIOR}.yaml",
         f"{base} as estimated from {', '.join(kind.name for kind in run.bench.kinds)}",

@@ -23,10 +23,9 @@ import cv2
 import numpy as np
 import tifffile
 
-from scenes.kinds.file_kinds import kind_of
+from scenes.specs.file_kinds import kind_of
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.input_file import why_unreadable
-from scenes.yaml.json_file import parse_json
+from scenes.yaml.input_file import parse_json, why_unreadable
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from twin.run.data_files import read_netcdf

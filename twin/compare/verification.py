@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from scenes.yaml.errors import InputError
-from scenes.yaml.json_file import read_json
+from scenes.yaml.input_file import read_json
 from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import ArrayDifference, FileDifference, Leaf, NumberDifference
 from twin.compare.folder_state import Elsewhere, FolderState, elsewhere

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from optics.numerics.backend import cores
-from scenes.kinds.file_kinds import kind_of
+from scenes.specs.file_kinds import kind_of
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import read_yaml

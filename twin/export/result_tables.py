@@ -18,7 +18,7 @@ import h5py
 from analysis.monitor import parameters
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.study import unit_of
-from scenes.yaml.json_file import read_json
+from scenes.yaml.input_file import read_json
 from twin.run.data_files import DataColumn, DataTable
 from twin.run.owned_files import MANIFEST
 

@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from scenes.kinds.file_kinds import kind_of, read_for
+from scenes.specs.file_kinds import kind_of, read_for
 from scenes.specs.job import JobSpec
 from scenes.specs.load import CAMERAS, INSTRUMENTS, library_names
-from scenes.specs.measured.monitor_frames import resolve_measurement
-from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
+from scenes.specs.monitor_frames import MeasurementSetup
+from scenes.specs.orbit.setup import MonitorSetup
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
-from scenes.yaml.file_kind import FileKind
+from scenes.yaml.named import FileKind
 from scenes.yaml.spec import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml
@@ -198,7 +198,7 @@ def _is_instrument(file: Path) -> bool:
 
 def _of_measurement(file: Path) -> Source:
     """The instrument of measured frames, to which nothing happens: what happened is what was asked."""
-    model = resolve_measurement(file).model
+    model = MeasurementSetup.read(file).model
     if model is None:
         text = (
             "this measurement was read by the geometry of the cameras alone, without an instrument that could be shown"
@@ -213,7 +213,7 @@ def _of_measurement(file: Path) -> Source:
 
 def _of_orbit(file: Path) -> Source:
     """A monitored orbit as a course, its motions in steps among it."""
-    setup = resolve_monitor(file)
+    setup = MonitorSetup.read(file)
     if setup.test.course is None:
         problem = "the motions of this orbit are drawn, and there is no course that could be shown"
         raise setup.test.error(problem, ("mechanisms", "readings"), allowed="a course")

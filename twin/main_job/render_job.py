@@ -19,8 +19,7 @@ from scenes.models.instrument_builder import squared_facets
 from scenes.models.instrument_model import Instrument, MisplacedError
 from scenes.models.obstruction import find_obstructions, moved_into_beams
 from scenes.models.scenery import measured_finishes
-from scenes.specs.as_built import as_built_of
-from scenes.specs.instrument import PRISM_180, prism_of
+from scenes.specs.instrument import PRISM_180, as_built_of, prism_of
 from scenes.specs.job import checked_nodes
 from scenes.specs.perturbation import in_words
 from scenes.specs.resolved import ResolvedJob

@@ -24,7 +24,7 @@ from analysis.arrays import Array
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from scenes.specs.operation import OperationSetup
-from scenes.yaml.json_file import read_json
+from scenes.yaml.input_file import read_json
 from twin.operate.estimate.following import Course, Following
 from twin.operate.estimate.operation import Operation
 from twin.operate.record.entries import MICRO, Entry, Given, utc_text

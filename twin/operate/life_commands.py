@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scenes.yaml.json_file import read_json
+from scenes.yaml.input_file import read_json
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.operate.terminal import line, tell, told
 from twin.run import durable

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from analysis.arrays import ARCSEC, Array
 from analysis.block.block import CamerasKnowledge
 from analysis.monitor.limits import Quantity
-from scenes.specs.measured.adjust_setup import AnyAdjust
 from scenes.specs.orbit.adjust import MonitorRecordSpec
+from scenes.specs.orbit.setup import AnyAdjust
 from scenes.yaml.errors import InputError, Problem, unknown
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.operation_model import kept_plan, read_plan

@@ -21,7 +21,6 @@ from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import share_interval
 from optics.numerics.number_tree import FrozenMap
-from twin.operate.estimate.alarms import name_of, percent
 from twin.operate.estimate.following import name_of, percent, with_sigma
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from analysis.arrays import Array
 from optics.numerics.array_math import covariance_root
-from scenes.models.disturbances import Component, StatedMotions, states_of
-from scenes.models.drawn_motions import causes_of, drawn_motions
+from scenes.models.disturbances import Component, StatedMotions, causes_of, drawn_motions, states_of
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.main_job.monitor_reading import MonitorReading, stated

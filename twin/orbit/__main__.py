@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from scenes.specs.orbit.sensors import SENSORS
-from scenes.specs.procedures import PROCEDURES
+from scenes.specs.procedures import PROCEDURES, SENSORS
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import ANGLE, DISTANCE, parse_quantity
 from twin.run.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed, Strict
@@ -26,7 +25,7 @@ from twin.run.procedure import Advance, Session
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.measured.adjust_setup import AnyAdjust
+    from scenes.specs.orbit.setup import AnyAdjust
     from twin.orbit.block.block_run import BlockRun
     from twin.orbit.export.export_run import ExportSource, SceneSource, Wishes
     from twin.orbit.export.polynomial_export import PolynomialSource
@@ -91,14 +90,14 @@ def adjust(
     """Adjust a block of scenes; its help is that of the test."""
     procedure = PROCEDURES["orbit adjust"]
 
-    def resolve(path: Path) -> AnyAdjust:
-        from scenes.specs.measured.adjust_setup import resolve_any_adjust, without_sensors
+    def reduced(setup: AnyAdjust) -> AnyAdjust:
+        from scenes.specs.orbit.setup import without_sensors
 
-        return without_sensors(resolve_any_adjust(path), without or ())
+        return without_sensors(setup, without or ())
 
     options = Options(out, seed, backend, force, as_json, quiet, strict=strict)
     if workers is None and scheduler is None:
-        run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve), file, options)
+        run_test(PROGRAM, "adjust", procedure, file, options, changed=reduced)
         return
 
     def run(setup: AnyAdjust, backend: Backend, seed: int, advance: Advance) -> BlockRun:
@@ -109,7 +108,7 @@ def adjust(
             return run_adjustment(setup, backend, seed, advance, pool)
 
     errors = Console(stderr=True)
-    run_test(PROGRAM, "adjust", replace(procedure, resolve=resolve, run=run), file, options)
+    run_test(PROGRAM, "adjust", replace(procedure, run=run), file, options, changed=reduced)
 
 
 @app.command("export")

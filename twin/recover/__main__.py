@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scenes.kinds.file_kinds import read_for
+from scenes.specs.file_kinds import read_for
 from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Strict
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
 
 if TYPE_CHECKING:
-    from scenes.specs.measured.monitor_frames import MeasurementSetup
+    from scenes.specs.monitor_frames import MeasurementSetup
 
 PROGRAM = "twin.recover"
 
@@ -78,7 +78,7 @@ def main(
     run_command(
         measurement.stem,
         Options(out, None, backend, force, as_json, quiet, strict=strict),
-        lambda: read_for(PROGRAM, measurement, Named("scenes.specs.measured.monitor_frames:resolve_measurement")),
+        lambda: read_for(PROGRAM, measurement, Named("scenes.specs.monitor_frames:MeasurementSetup.read")),
         work,
     )
 

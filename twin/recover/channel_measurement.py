@@ -32,7 +32,7 @@ from analysis.spots.screened_fit import CORE_SHARE, ScreenedFit, one_shape
 from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import Examined, examine, lone_pixels, refit, repaired_centroid
-from scenes.specs.measured.monitor_frames import MeasurementSpec
+from scenes.specs.monitor_frames import MeasurementSpec
 from scenes.yaml.errors import Issue
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 from twin.run.frame_store import let_go, mean_of

@@ -19,7 +19,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PhotonTransfer, PixelCorrection, photon_transfer, pixel_correction
 from scenes.specs.course import moment
 from scenes.specs.detector import DetectorSpec
-from scenes.specs.measured.monitor_frames import AFTER, BEFORE, MeasurementSetup, MeasurementSpec, per_channel
+from scenes.specs.monitor_frames import AFTER, BEFORE, MeasurementSetup, MeasurementSpec, per_channel
 from scenes.yaml.errors import InputError, Issue, KeyPath
 from scenes.yaml.spec import Spec
 from twin.run.frame_store import IN_MEMORY, PART, frame_room, let_go

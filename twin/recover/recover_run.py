@@ -22,7 +22,7 @@ from optics.numerics.backend import Backend, one_blas_thread
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.course import moment
 from scenes.specs.instrument import SIDES
-from scenes.specs.measured.monitor_frames import MeasurementSetup
+from scenes.specs.monitor_frames import MeasurementSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.main_job.monitor_reading import MonitorReading
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from scenes.kinds.file_kinds import read_for
+from scenes.specs.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run import cli, durable
@@ -206,7 +206,13 @@ def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure)
 
 
 def run_test(
-    program: str, command: str, procedure: Procedure, file: Path, options: cli.Options, kept: KeptWork | None = None
+    program: str,
+    command: str,
+    procedure: Procedure,
+    file: Path,
+    options: cli.Options,
+    kept: KeptWork | None = None,
+    changed: Callable[[Any], Any] | None = None,
 ) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
@@ -217,10 +223,15 @@ def run_test(
         file: of the test.
         options: what the user chose.
         kept: see `run_command`.
+        changed: set-up -> the one that is run, by options that this test alone has. Raises InputError.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
     """
+
+    def resolve(path: Path) -> Any:
+        setup = procedure.resolve(path)
+        return setup if changed is None else changed(setup)
 
     def work(setup: Any, session: Session) -> Result:
         from twin.run.report import numbers_only, with_warnings
@@ -250,7 +261,7 @@ def run_test(
         return replace(done, problem=problem)
 
     name = f"{program} {command}"
-    run_command(file.stem, options, lambda: read_for(name, file, procedure.resolve), work, kept)
+    run_command(file.stem, options, lambda: read_for(name, file, resolve), work, kept)
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from scenes.kinds.file_kinds import read_for
+from scenes.specs.file_kinds import read_for
 from twin.run import cli
 from twin.run.command import Result, run_command
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scenes.kinds.file_kinds import read_for
+from scenes.specs.file_kinds import read_for
 from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
 from twin.run.command import Result, finished, run_command
@@ -73,7 +73,7 @@ def main(
     from twin.run.run_folder import KeptWork
 
     def resolve() -> ToleranceSetup:
-        setup: ToleranceSetup = read_for(PROGRAM, file, Named("scenes.specs.tolerance:resolve_tolerance"))
+        setup: ToleranceSetup = read_for(PROGRAM, file, Named("scenes.specs.tolerance:ToleranceSetup.read"))
         changed = {name: value for name, value in (("samples", samples), ("seed", seed)) if value is not None}
         return setup.model_copy(update={"test": setup.test.model_copy(update=changed)}) if changed else setup
 

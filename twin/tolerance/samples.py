@@ -12,7 +12,7 @@ import numpy as np
 
 from optics.numerics.backend import Backend
 from scenes.specs.study import StudySpec
-from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec, resolve_tolerance
+from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.camera.varied_beams import AT_ONCE
@@ -40,7 +40,7 @@ class ToleranceBase:
 
     def resolve(self, file: Path | str) -> Spec:
         """Read a budget. Raises InputError."""
-        return resolve_tolerance(file)
+        return ToleranceSetup.read(file)
 
     def check(self, tree: Tree, backend: Backend) -> None:
         """Whether all that the budget names is there. Raises InputError."""

@@ -5,11 +5,11 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
-from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec
+from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec, PayloadTestSpec
 from scenes.specs.perturbation import PlainPerturbationSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
-from scenes.yaml.spec import Flag, Name, Named, Number, Paths, Reference, Seed, Spec, TitledSpec, Whole, short_for
+from scenes.yaml.spec import Flag, Name, Named, Number, Paths, Seed, Spec, Whole, short_for
 from scenes.yaml.units import DISTANCE, LENGTH, MOMENT
 
 LINES = ("forward", "nadir", "backward")
@@ -141,7 +141,7 @@ class AngleErrorsSpec(Spec):
     datum: DatumShift = (0.0, 0.0, 0.0)
 
 
-class OrbitAngleSpec(TitledSpec):
+class OrbitAngleSpec(PayloadTestSpec):
     """The intersection angles of a camera of two or more lines from one moment's ground points.
 
     Attributes:
@@ -165,7 +165,6 @@ class OrbitAngleSpec(TitledSpec):
         seed: of every random number.
     """
 
-    camera: Reference
     angles: Angles = None
     perturb: Paths[Change] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec.model_construct()

@@ -7,11 +7,11 @@ from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.orbit.angle import LINES, DatumShift, EffectsSpec, GroundSigma, Relief, TerrainHeight, check_ends
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
-from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
+from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec, InteriorChangeSpec, LineTime, Side
 from scenes.yaml.errors import Problem, names_text, unknown
 from scenes.yaml.quantity import AngleSigmas, LengthSigma, Quantity, Vector
-from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, TitledSpec, Whole, not_empty, one_given
-from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT, TIME
+from scenes.yaml.spec import Flag, Name, Named, Number, Ref, Seed, Spec, TitledSpec, Whole, not_empty, one_given
+from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 
 LEAST_TIES = 20
 """Tie points of a strip. Fewer leave most readings of the attitude without a point near them."""
@@ -77,22 +77,8 @@ LEAST_PATCHES = 2
 """Patches of a field. One has no width, and the principal distance is open."""
 
 FieldLength = Annotated[float, Quantity(DISTANCE, smallest="1 km", largest="500 km")]
-Side = Annotated[Whole, Field(ge=16, le=20_000)]
-LineTime = Annotated[float, Quantity(TIME, above_zero=True, largest="1 s")]
 Count = Annotated[Whole, Field(le=5000)]
 Repeats = Annotated[Whole, Field(ge=0, le=1000)]
-
-
-class InteriorChangeSpec(Spec):
-    """How the interior orientation of a line has changed since the laboratory.
-
-    Attributes:
-        principal_distance: change of the principal distance, metres.
-        principal_point: change of x (flight) and y (along the line), metres.
-    """
-
-    principal_distance: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
-    principal_point: Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="5 mm"), 2)] = (0.0, 0.0)
 
 
 class FieldSpec(Spec):
@@ -275,7 +261,7 @@ class OrbitCalibrationSpec(TitledSpec):
         seed: of every random number.
     """
 
-    camera: Reference
+    camera: Ref
     perturb: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec.model_construct()
     altitude: Altitude = 500e3

@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
-from scenes.yaml.spec import Number, Reference, Spec, TitledSpec, one_given
+from scenes.yaml.spec import Number, Ref, Spec, TitledSpec, one_given
 from scenes.yaml.units import ANGLE, ANGLE_SPECTRUM, DISTANCE, FREQUENCY, LENGTH, MOMENT, SPEED, TIME, format_quantity
 
 Frequency = Annotated[float, Quantity(FREQUENCY, above_zero=True, largest="10 kHz")]
@@ -342,4 +342,4 @@ class PayloadTestSpec(TitledSpec):
         camera: name in scenes/library/payloads or path of a file.
     """
 
-    camera: Reference
+    camera: Ref

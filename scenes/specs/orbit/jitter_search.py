@@ -8,8 +8,8 @@ from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LightEffectsSpec, Moment, TerrainHeight
-from scenes.specs.orbit.calibration import LineTime
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, Frequency, OrbitSpec, PayloadTestSpec
+from scenes.specs.orbit.scene import LineTime
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import AngleSigma, Quantity
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole

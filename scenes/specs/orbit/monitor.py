@@ -16,27 +16,14 @@ from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment, no_
 from scenes.specs.disturbances import JobDisturbances, component_named
 from scenes.specs.job import AnalysisSpec, JobSpec, PerturbationSpec, RenderSpec, checked_nodes
 from scenes.specs.orbit.angle import Relief, TerrainHeight, check_ends
-from scenes.specs.orbit.calibration import Count, FieldLength, LineTime, Side
+from scenes.specs.orbit.calibration import Count, FieldLength
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
 from scenes.specs.orbit.scene import GroundSpec as SceneGroundSpec
-from scenes.specs.orbit.scene import ImagePointsSpec
+from scenes.specs.orbit.scene import ImagePointsSpec, LineTime, Side
 from scenes.specs.perturbation import NodeInfo, PlainPerturbationSpec, perturbation_issues
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import (
-    Flag,
-    Name,
-    Named,
-    NothingIsEmpty,
-    Number,
-    Paths,
-    Reference,
-    Seed,
-    Spec,
-    Text,
-    TitledSpec,
-    Whole,
-)
+from scenes.yaml.spec import Flag, Name, Named, NothingIsEmpty, Number, Paths, Ref, Seed, Spec, Text, TitledSpec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, MOMENT, Kind, parse_quantity
 
 _EVEN = 1e-6
@@ -326,7 +313,7 @@ class OrbitMonitorSpec(TitledSpec):
         seed: of every random number.
     """
 
-    instrument: Reference
+    instrument: Ref
     cameras: tuple[Name, ...] | None = None
     perturb: Paths[PlainPerturbationSpec] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None

@@ -1,4 +1,7 @@
-"""What a line camera in orbit sees, what is known of it, and which points are measured in its images."""
+"""What a line camera in orbit sees, what is known of it, and which points are measured in its images.
+
+Images of a patch of ground by every line of a camera in orbit, as a file in scenes/orbit gives them.
+"""
 
 import math
 from typing import Annotated, Literal
@@ -9,12 +12,13 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from optics.geometry.polygon import area, hull, intersect, sides
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import Diffusion, TdiSpec
-from scenes.specs.orbit.angle import GroundSigma, TerrainHeight
+from scenes.specs.orbit.angle import GroundSigma, LightEffectsSpec, Moment, TerrainHeight
+from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, PayloadTestSpec
 from scenes.specs.spectrum import WavelengthRange
-from scenes.yaml.errors import Problem
+from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Number, Reference, Spec, Whole
-from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from scenes.yaml.spec import Name, Named, Number, Ref, Seed, Spec, Whole
+from scenes.yaml.units import ANGLE, LENGTH, TIME, format_quantity
 
 _EVEN_TERMS = ("Z4", "Z5", "Z6", "Z11", "Z12", "Z13", "Z14", "Z15", "Z22")
 
@@ -88,7 +92,7 @@ class LineImageSpec(Spec):
     wavefront: Annotated[dict[EvenTerm, TermSize], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
     obstruction: Annotated[tuple[Outline, ...], AfterValidator(_apart)] = ()
     spectrum: WavelengthRange
-    detector: Reference
+    detector: Ref
     diffusion: Diffusion = 0.0
     tdi: TdiSpec = TdiSpec.model_construct()
 
@@ -267,3 +271,81 @@ class ImagePointsSpec(Spec):
         if not self.control + self.check + self.tie:
             raise Problem("no points", "control, check and tie 0", "some points, or no section `points`")
         return self
+
+
+def _each_once(lines: tuple[str, ...]) -> tuple[str, ...]:
+    if not lines or len(set(lines)) != len(lines):
+        raise Problem("no lines, or one twice", names_text(lines) or "none", "each line once")
+    return lines
+
+
+Side = Annotated[Whole, Field(ge=16, le=20_000)]
+LineTime = Annotated[float, Quantity(TIME, above_zero=True, largest="1 s")]
+
+
+class InteriorChangeSpec(Spec):
+    """How the interior orientation of a line has changed since the laboratory.
+
+    Attributes:
+        principal_distance: change of the principal distance, metres.
+        principal_point: change of x (flight) and y (along the line), metres.
+    """
+
+    principal_distance: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
+    principal_point: Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="5 mm"), 2)] = (0.0, 0.0)
+
+
+class PatchSpec(Spec):
+    """The patch of ground that is imaged; its middle lies on what one line sees at a moment.
+
+    Attributes:
+        line: of the camera, by name.
+        pixel: of that line that sees the middle.
+        time: at which it does, seconds from the orbit's epoch.
+        lines, pixels: size of every image.
+    """
+
+    line: Name = "nadir"
+    pixel: Number
+    time: Moment = 0.0
+    lines: Side = 1000
+    pixels: Side = 1000
+
+
+class OrbitSimulateSpec(PayloadTestSpec):
+    """A pass over a patch of ground.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file; it needs a section `image`.
+        lines: those that are rendered, by name.
+        perturb: line -> how its interior has changed since the laboratory.
+        earth: its rotation.
+        orbit: true orbit.
+        attitude: true attitude.
+        effects: what happens to the light between ground and camera.
+        line_time: from one image line to the next, seconds.
+        patch: where and how large.
+        ground: what is there.
+        control: what is known of the ground.
+        points: that are measured in the images; none without this section.
+        errors: of what the satellite measures of itself.
+        oversampling: samples of the ground along each side of a pixel.
+        seed: of every random number.
+    """
+
+    lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "backward")
+    perturb: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
+    earth: EarthSpec = EarthSpec.model_construct()
+    orbit: OrbitSpec
+    attitude: AttitudeSpec = AttitudeSpec.model_construct(steering="yaw")
+    effects: LightEffectsSpec = LightEffectsSpec.model_construct()
+    line_time: LineTime = 0.7e-3
+    patch: PatchSpec
+    ground: GroundSpec = GroundSpec.model_construct()
+    control: ControlSpec = ControlSpec.model_construct()
+    points: ImagePointsSpec | None = None
+    errors: ErrorsSpec = ErrorsSpec.model_construct()
+    oversampling: Annotated[Whole, Field(ge=2, le=8)] = 3
+    seed: Seed = 0

@@ -1,9 +1,10 @@
-"""A test in orbit together with everything it refers to, by name or by path."""
+"""A test in orbit together with everything it refers to: simulated, or on measurements and nothing drawn."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, Generic, Self
 
 from pydantic import Field
 
@@ -14,56 +15,40 @@ from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.orbit import measurements
+from scenes.specs.orbit.adjust import MeasuredAdjustSpec, OrbitAdjustSpec
 from scenes.specs.orbit.angle import LINES, OrbitAngleSpec, usual_angles
-from scenes.specs.orbit.calibration import OrbitCalibrationSpec
-from scenes.specs.orbit.flight import PayloadTestSpec
+from scenes.specs.orbit.calibration import OrbitCalibrationSpec, checked_schemes
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec
 from scenes.specs.orbit.monitor import MechanismsSpec, OrbitMonitorSpec
-from scenes.specs.orbit.scene import LineImageSpec
-from scenes.specs.orbit.simulate import OrbitSimulateSpec
+from scenes.specs.orbit.scene import LineImageSpec, OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
-from scenes.specs.resolved import ExperimentSetup, ResolvedJob, line_detector, read_setup, resolve_job
-from scenes.yaml.errors import KeyPath, names_text, unknown
-from scenes.yaml.spec import Paths, Spec
+from scenes.specs.resolved import ExperimentSetup, ResolvedJob, TestType, line_detector, resolve_job
+from scenes.yaml.errors import KeyPath, Problem, names_text, unknown
+from scenes.yaml.input_file import MISSING, no_file
+from scenes.yaml.spec import Inline, Paths, Spec, validate
 from scenes.yaml.units import ANGLE, format_quantity
 from scenes.yaml.yaml_file import read_yaml
 
 
-def load_three_line_camera(name_or_path: str | Path) -> ThreeLineCameraSpec:
+def load_three_line_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> ThreeLineCameraSpec:
     """Read a three-line payload; arguments and errors as `load_instrument`."""
-    return load.load_named(ThreeLineCameraSpec, load.PAYLOADS, name_or_path)
+    return load.load_named(ThreeLineCameraSpec, load.PAYLOADS, reference, owner, key)
 
 
-def load_payload(
-    test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | PayloadTestSpec,
-) -> ThreeLineCameraSpec:
-    """The payload of a test in orbit. Raises InputError if there is none, or it is not valid."""
-    return load_three_line_camera(load.find_named(load.PAYLOADS, test.camera, test, ("camera",)))
-
-
-def _find_orbit_camera(test: OrbitAngleSpec) -> Path:
-    """The file of the payload or instrument of a test in orbit. Raises InputError if there is none."""
-    reference, file = test.camera, test.source.file
-    for folder in (load.PAYLOADS, load.INSTRUMENTS):
-        if load.place_of(folder, reference, Path(file).parent if file else Path()) is not None:
-            return load.find_named(folder, reference, test, ("camera",))
-    payloads, instruments = load.library_names(load.PAYLOADS), load.library_names(load.INSTRUMENTS)
-    allowed = f"{names_text(payloads)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
-    problem = "no such name in payloads or instruments"
-    raise test.error(unknown(problem, reference, (*payloads, *instruments), allowed=allowed), ("camera",))
-
-
-def _line_detectors(camera: ThreeLineCameraSpec) -> dict[str, DetectorSpec]:
+def _line_detectors(camera: ThreeLineCameraSpec) -> FrozenMap[str, DetectorSpec]:
     """Data sheets of a payload's line CCDs, by the name that the image sections give. Raises InputError as
     `load_instrument`.
     """
     sections: list[tuple[KeyPath, LineImageSpec | None]] = [(("image",), camera.image)]
     sections += [(("lines", name, "image"), line.image) for name, line in camera.lines.items()]
-    return {
-        image.detector: load.load_detector(load.find_named(load.DETECTORS, image.detector, camera, (*key, "detector")))
-        for key, image in sections
-        if image is not None
-    }
+    return FrozenMap(
+        {
+            image.detector: load.load_detector(image.detector, camera, (*key, "detector"))
+            for key, image in sections
+            if image is not None
+        }
+    )
 
 
 class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
@@ -75,9 +60,27 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
         cameras: what `instrument.cameras.<name>.camera` says -> prescription; empty for a payload.
     """
 
+    FOLDER = load.ORBIT
+
     camera: ThreeLineCameraSpec | None = None
     instrument: InstrumentSpec | None = None
     cameras: Paths[CameraSpec] = Field(default_factory=FrozenMap)
+
+    @classmethod
+    def parts(cls, test: OrbitAngleSpec) -> dict[str, Any]:
+        """Return the payload, or the instrument with its cameras."""
+        reference, key = test.camera, ("camera",)
+        folders = (load.PAYLOADS, load.INSTRUMENTS)
+        known = next((folder for folder in folders if load.place_of(folder, reference, test) is not None), None)
+        if known is None and not isinstance(reference, Inline):
+            payloads, instruments = (load.library_names(folder) for folder in folders)
+            allowed = f"{names_text(payloads)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
+            problem = "no such name in payloads or instruments"
+            raise test.error(unknown(problem, reference, (*payloads, *instruments), allowed=allowed), key)
+        if not load.is_instrument(load.referred(known or load.PAYLOADS, reference, test, key).data):
+            return {"camera": load_three_line_camera(reference, test, key)}
+        instrument = load.load_instrument(reference, test, key)
+        return {"instrument": instrument, "cameras": load.load_cameras(instrument)}
 
     @property
     def pixels(self) -> Mapping[str, int]:
@@ -99,108 +102,100 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def angles(self) -> Mapping[str, tuple[str, str]]:
-        """Angle -> its two lines; `resolve_angle` has filled in the usual ones."""
+        """Angle -> its two lines; reading has filled in the usual ones."""
         return self.test.angles or {}
 
-
-def resolve_angle(path: str | Path) -> AngleSetup:
-    """Read a test and the payload or instrument it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: a file cannot be read or is not valid, or test and camera do not fit.
-    """
-    setup = read_setup(AngleSetup, path)
-    if setup is None:
-        test = load.load_named(OrbitAngleSpec, load.ORBIT, path)
-        setup = _with_camera(test, _find_orbit_camera(test))
-    if (setup.camera is None) == (setup.instrument is None):
-        found = "neither" if setup.camera is None else "both"
-        raise setup.error("one camera is tested", ("camera",), found=found, allowed="`camera:` or `instrument:`")
-    for name, mounted in setup.instrument.cameras.items() if setup.instrument is not None else ():
-        if mounted.camera not in setup.cameras:
-            problem = f"camera {mounted.camera!r} of the instrument's {name} is missing"
-            raise setup.error(problem, ("cameras",), allowed=f"cameras.{mounted.camera}: its prescription")
-    return _checked_angles(setup)
-
-
-def _with_camera(test: OrbitAngleSpec, file: Path) -> AngleSetup:
-    """The test with what its camera's file holds: an instrument has cameras, a payload has lines."""
-    if not load.is_instrument(read_yaml(file).data):
-        return AngleSetup.model_construct(
-            test=test, camera=load_three_line_camera(file), instrument=None, cameras=FrozenMap()
-        )
-    instrument = load.load_instrument(file)
-    cameras = load.load_cameras(instrument)
-    return AngleSetup.model_construct(test=test, camera=None, instrument=instrument, cameras=cameras)
-
-
-def _checked_angles(setup: AngleSetup) -> AngleSetup:
-    """The set-up with its angles filled in. InputError unless angles, changes and strips fit the camera's lines."""
-    test, lines = setup.test, tuple(setup.pixels)
-    has = f"{names_text(lines)} in {setup.camera_name}"
-    if len(lines) < 2:
-        raise test.error("an angle needs two lines", ("camera",), found=has, allowed="a camera with two lines or more")
-    angles = test.angles or usual_angles(lines)
-    if angles is None:
-        problem = "which lines the angles lie between is not said"
-        allowed = "`angles:` with a name and two lines for each, as alpha: [forward, nadir]"
-        raise test.error(problem, ("camera",), found=has, allowed=allowed)
-    for name, pair in angles.items():
-        for k, line in enumerate(pair):
-            if line not in lines:
-                raise test.error(unknown("no such line", line, lines), ("angles", name, k))
-    if setup.camera is not None:
-        _require_turns(test, lines)
-    ends = (test.strips.first, test.strips.last)
-    _require_ends(test, "strips", ends, setup.usual_pixels, f"the lines of {setup.camera_name}")
-    return setup.model_copy(update={"test": test.model_copy(update={"angles": FrozenMap(angles)})})
+    def checked(self) -> Self:
+        """Fill in the angles, and check that angles, changes and strips fit the camera's lines."""
+        if (self.camera is None) == (self.instrument is None):
+            found = "neither" if self.camera is None else "both"
+            raise self.error("one camera is tested", ("camera",), found=found, allowed="`camera:` or `instrument:`")
+        for name, mounted in self.instrument.cameras.items() if self.instrument is not None else ():
+            if mounted.camera not in self.cameras:
+                problem = f"camera {mounted.camera!r} of the instrument's {name} is missing"
+                raise self.error(problem, ("cameras",), allowed=f"cameras.{mounted.camera}: its prescription")
+        test, lines = self.test, tuple(self.pixels)
+        has = f"{names_text(lines)} in {self.camera_name}"
+        if len(lines) < 2:
+            raise test.error(
+                "an angle needs two lines", ("camera",), found=has, allowed="a camera with two lines or more"
+            )
+        angles = test.angles or usual_angles(lines)
+        if angles is None:
+            problem = "which lines the angles lie between is not said"
+            allowed = "`angles:` with a name and two lines for each, as alpha: [forward, nadir]"
+            raise test.error(problem, ("camera",), found=has, allowed=allowed)
+        for name, pair in angles.items():
+            for k, line in enumerate(pair):
+                if line not in lines:
+                    raise test.error(unknown("no such line", line, lines), ("angles", name, k))
+        if self.camera is not None:
+            _require_turns(test, lines)
+        ends = (test.strips.first, test.strips.last)
+        _require_ends(test, "strips", ends, self.usual_pixels, f"the lines of {self.camera_name}")
+        return self.model_copy(update={"test": test.model_copy(update={"angles": FrozenMap(angles)})})
 
 
-def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
-    """InputError unless every change turns one of a payload's lines. What an instrument's nodes allow is told when it
-    is built.
-    """
-    _require_lines(test, test.perturb, lines)
-    for name, change in test.perturb.items():
-        for action in change.needs():
-            if action != "rotate":
-                allowed = "a rotation, or an instrument of traced cameras instead of a payload"
-                raise test.error(
-                    f"a payload's line does not allow {action}", ("perturb", name, action), allowed=allowed
-                )
-        if change.pivot != DEFAULT_PIVOT:
-            problem = "a payload's line has no pivots"
-            raise test.error(problem, ("perturb", name, "pivot"), found=change.pivot, allowed="no pivot")
-
-
-class CalibrationSetup(ExperimentSetup[OrbitCalibrationSpec]):
-    """An in-orbit calibration with its camera.
+class PayloadSetup(ExperimentSetup[TestType], Generic[TestType]):
+    """A test of a payload.
 
     Attributes:
         camera: the payload.
+    """
+
+    FOLDER = load.ORBIT
+
+    camera: ThreeLineCameraSpec
+
+    @classmethod
+    def parts(cls, test: Any) -> dict[str, Any]:
+        """Return the payload, and the test with paths of files that hold from anywhere."""
+        camera = load_three_line_camera(test.camera, test, ("camera",))
+        return {"test": _placed(test), "camera": camera}
+
+
+class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
+    """An in-orbit calibration with its camera.
+
+    Attributes:
         detectors: data sheets of its line CCDs where images are rendered.
     """
 
-    camera: ThreeLineCameraSpec
     detectors: Paths[DetectorSpec] = Field(default_factory=FrozenMap)
 
+    @classmethod
+    def parts(cls, test: OrbitCalibrationSpec) -> dict[str, Any]:
+        """Return also the detectors."""
+        parts = super().parts(test)
+        return parts if test.images is None else {**parts, "detectors": _line_detectors(parts["camera"])}
 
-def resolve_calibration(path: str | Path) -> CalibrationSetup:
-    """Read a calibration and the camera it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: a file cannot be read or is not valid, or test and camera do not fit.
-    """
-    setup = read_setup(CalibrationSetup, path)
-    if setup is None:
-        test = load.load_named(OrbitCalibrationSpec, load.ORBIT, path)
-        camera = load_payload(test)
-        detectors = FrozenMap({} if test.images is None else _line_detectors(camera))
-        setup = CalibrationSetup.model_construct(test=test, camera=camera, detectors=detectors)
-    _require_calibration(setup.test, setup.camera)
-    if setup.test.images is not None:
-        _require_detectors(setup, tuple(setup.camera.lines), setup.camera, setup.detectors)
-    return setup
+    def checked(self) -> Self:
+        """Check that the camera has the three lines, and that points and changes lie on them."""
+        test, camera = self.test, self.camera
+        if missing := [name for name in LINES if name not in camera.lines]:
+            found = f"{names_text(tuple(camera.lines))} in {camera.name}"
+            problem = f"the camera has no {' and no '.join(missing)} line"
+            raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
+        _require_known("line", test, ("perturb",), test.perturb, LINES)
+        _require_known("line", test, ("drift",), test.drift, LINES)
+        _require_places(test, (*test.perturb, *test.drift), camera)
+        if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
+            raise test.error(
+                "the nadir line's principal point is the gauge",
+                ("perturb", "nadir", "principal_point"),
+                allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
+            )
+        fewest = min(camera.pixels_of(name) for name in LINES)
+        if test.points is not None:
+            _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
+        if test.images is None:
+            return self
+        _require_images_of(test, LINES, camera)
+        _require_detectors(self, tuple(camera.lines), camera, self.detectors)
+        for k, place in enumerate(test.images.patches):
+            key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
+            _require_pixel(test, key, place.pixel, pixels, f"the nadir line of {camera.name}")
+        return self
 
 
 class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
@@ -214,11 +209,30 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
         line_detectors: as cameras -> data sheet of the line CCD that images; None where no line images are rendered.
     """
 
+    FOLDER = load.ORBIT
+
     instrument: InstrumentSpec
     cameras: Paths[CameraSpec]
     detector: DetectorSpec
     disturbances: DisturbancesSpec | None = None
     line_detectors: Paths[DetectorSpec] | None = None
+
+    @classmethod
+    def parts(cls, test: OrbitMonitorSpec) -> dict[str, Any]:
+        """Return the instrument with all that belongs to it."""
+        job = resolve_job(test.job)
+        parts = {key: getattr(job, key) for key in ("instrument", "cameras", "detector", "disturbances")}
+        if test.mechanisms is not None and test.mechanisms.images is not None:
+            sheets = {name: line_detector(camera) for name, camera in job.cameras.items()}
+            parts["line_detectors"] = FrozenMap(sheets)
+        return parts
+
+    def checked(self) -> Self:
+        """Check that test and instrument fit, and that something is stated to move that mechanisms could act on."""
+        _require_pair(self.test, self.instrument, self.cameras)
+        if self.test.mechanisms is not None:
+            _require_mechanisms(self, self.test.mechanisms)
+        return self
 
     @property
     def resolved(self) -> ResolvedJob:
@@ -239,26 +253,239 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
         return first, second
 
 
-def resolve_monitor(path: str | Path) -> MonitorSetup:
-    """Read a monitored orbit and the instrument it refers to; a run's config.yaml can be given in its place.
+class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
+    """A pass over a patch of ground with its camera.
+
+    Attributes:
+        detectors: data sheets of its line CCDs, by the name that the image sections give.
+    """
+
+    detectors: Paths[DetectorSpec]
+
+    @classmethod
+    def parts(cls, test: OrbitSimulateSpec) -> dict[str, Any]:
+        """Return also the detectors."""
+        parts = super().parts(test)
+        return {**parts, "detectors": _line_detectors(parts["camera"])}
+
+    def checked(self) -> Self:
+        """Check that the lines that are named exist and can be rendered, and that the patch lies on one of them."""
+        test, camera = self.test, self.camera
+        names = tuple(camera.lines)
+        named = [(("patch", "line"), test.patch.line), *((("perturb", name), name) for name in test.perturb)]
+        for key, name in [*((("lines",), name) for name in test.lines), *named]:
+            if name not in names:
+                allowed = f"{names_text(names)}, the lines of {camera.name}"
+                raise test.error(unknown("no such line", name, names, allowed=allowed), key)
+        _require_places(test, test.perturb, camera)
+        _require_images_of(test, test.lines, camera)
+        line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
+        _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
+        if wrong := test.orbit.misses(test.patch.time):
+            raise test.error(wrong, ("patch", "time"))
+        _require_detectors(self, test.lines, camera, self.detectors)
+        return self
+
+
+class JitterSetup(PayloadSetup[OrbitJitterSpec]):
+    """A pass whose jitter is sought, with its camera."""
+
+    def checked(self) -> Self:
+        """Check that the camera has the lines."""
+        _require_several(self.test, self.test.lines, self.camera)
+        _require_known("line", self.test, ("points", "line_noise"), self.test.points.line_noise, self.camera.lines)
+        return self
+
+
+class AdjustSetup(PayloadSetup[OrbitAdjustSpec]):
+    """A block with its camera."""
+
+    def checked(self) -> Self:
+        """Check that the camera has the lines, and the block the sensors that are to be left out."""
+        for k, name in enumerate(self.test.lines):
+            if name not in self.camera.lines:
+                raise self.test.error(unknown("no such line", name, self.camera.lines), ("lines", k))
+        _require_sensors(self.test)
+        return self
+
+
+class CheckSetup(PayloadSetup[measurements.OrbitCheckSpec]):
+    """A check of a pass in files with its camera."""
+
+
+class MatchSetup(PayloadSetup[measurements.OrbitMatchSpec]):
+    """Points in a user's images with the camera."""
+
+    def checked(self) -> Self:
+        """Check that the camera has the lines."""
+        _require_known("line", self.test, ("images",), self.test.images, self.camera.lines)
+        return self
+
+
+class MeasuredPassesSetup(PayloadSetup[TestType], Generic[TestType]):
+    """A test on measurements with its camera.
+
+    Attributes:
+        data: the passes, with paths that hold from anywhere.
+    """
+
+    data: measurements.OrbitDataSpec
+
+    @classmethod
+    def measured_by(cls, keys: Mapping[str, Any]) -> bool:
+        """Return whether these are the keys of such a test; `passes` of a simulation are a number."""
+        return "data" in keys or "conventions" in keys or isinstance(keys.get("passes"), dict)
+
+    @classmethod
+    def parts(cls, test: Any) -> dict[str, Any]:
+        """Return also the passes."""
+        return {**super().parts(test), "data": data_of(test)}
+
+
+class MeasuredCalibrationSetup(MeasuredPassesSetup[measurements.MeasuredCalibrationSpec]):
+    """A calibration on measurements, with its camera."""
+
+    def checked(self) -> Self:
+        """Check that the schemes name passes."""
+        try:
+            checked_schemes(self.test.schemes, self.data.passes)
+        except Problem as problem:
+            raise self.test.error(problem) from None
+        return self
+
+
+class MeasuredAngleSetup(MeasuredPassesSetup[measurements.MeasuredAngleSpec]):
+    """Intersection angles on measurements, with the camera."""
+
+
+class MeasuredJitterSetup(MeasuredPassesSetup[measurements.MeasuredJitterSpec]):
+    """A search for jitter on measurements, with the camera."""
+
+    def checked(self) -> Self:
+        """Check that the camera has the lines."""
+        _require_several(self.test, self.test.lines, self.camera)
+        return self
+
+
+class MeasuredAdjustSetup(MeasuredPassesSetup[MeasuredAdjustSpec]):
+    """A block of measured passes with its camera."""
+
+    @classmethod
+    def measured_by(cls, keys: Mapping[str, Any]) -> bool:
+        """Return whether these are the keys of such a block; a simulated one has a mapping of passes, too."""
+        return "data" in keys or "conventions" in keys
+
+    def checked(self) -> Self:
+        """Check that there is every pass, line and sensor that is named."""
+        test, passes = self.test, self.data.passes
+        _require_known("pass", test, ("trackers",), test.trackers, passes)
+        _require_known("line", test, ("changes",), test.changes, self.camera.lines)
+        readings = {} if test.monitor is None else test.monitor.readings
+        _require_known("pass", test, ("monitor", "readings"), readings, passes)
+        for name, lines in readings.items():
+            _require_known("line", test, ("monitor", "readings", name), lines, test.changes)
+        _require_sensors(test)
+        return self
+
+
+AnyAdjust = AdjustSetup | MeasuredAdjustSetup
+AnyAngle = AngleSetup | MeasuredAngleSetup
+AnyCalibration = CalibrationSetup | MeasuredCalibrationSetup
+AnyJitter = JitterSetup | MeasuredJitterSetup
+"""Simulated, or on measurements."""
+
+
+def _placed(test: Any) -> Any:
+    """The test with paths of its files and of its record that hold from anywhere; the URL of a database stays."""
+    if isinstance(test, measurements.OrbitCheckSpec | measurements.OrbitMatchSpec):
+        return measurements.with_absolute_files(test)
+    one = getattr(test, "monitor_record", None)
+    if one is None:
+        return test
+    folder = Path(test.source.file).parent if test.source.file else Path()
+    record = one.record if "://" in one.record else str((folder / one.record).resolve())
+    plan = None if one.plan is None else str((folder / one.plan).resolve())
+    return test.model_copy(update={"monitor_record": one.model_copy(update={"record": record, "plan": plan})})
+
+
+DATA_FILE = "data.yaml"
+"""Name of the file that says what a folder of measurements holds."""
+
+
+def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
+    """The passes of a test, with paths that hold from anywhere.
 
     Raises:
-        InputError: a file cannot be read or is not valid, test and instrument do not fit, or nothing is stated to move
-            that mechanisms could act on.
+        InputError: there is no such folder, its file is not valid, a file is not there, or nothing says how a table of
+            an attitude is to be read.
     """
-    setup = read_setup(MonitorSetup, path)
-    if setup is None:
-        test = load.load_named(OrbitMonitorSpec, load.ORBIT, path)
-        parts = dict(resolve_job(test.job))
-        sheets = None
-        if test.mechanisms is not None and test.mechanisms.images is not None:
-            sheets = FrozenMap({name: line_detector(camera) for name, camera in parts["cameras"].items()})
-        parts = {key: parts[key] for key in ("instrument", "cameras", "detector", "disturbances")}
-        setup = MonitorSetup.model_construct(test=test, line_detectors=sheets, **parts)
-    _require_pair(setup.test, setup.instrument, setup.cameras)
-    if setup.test.mechanisms is not None:
-        _require_mechanisms(setup, setup.test.mechanisms)
-    return setup
+    file = Path(test.source.file)
+    if test.data is None:
+        said = {"conventions": test.conventions, "passes": test.passes}
+        data = measurements.OrbitDataSpec.model_construct(**said).with_source(test.source)
+    else:
+        place = file.parent / test.data
+        file = place / DATA_FILE if place.is_dir() else place
+        if (wrong := no_file(file)) is not None:
+            allowed = f"a folder with a {DATA_FILE}, or the path of such a file"
+            problem = "no such measurements" if wrong == MISSING else f"no measurements: {wrong}"
+            raise test.error(problem, ("data",), found=str(place), allowed=allowed)
+        data = validate(measurements.OrbitDataSpec, read_yaml(file))
+    tables = any(not isinstance(one.platform, measurements.PlatformFilesSpec) for one in data.passes.values())
+    for key in ("quaternion", "body_axes"):
+        if tables and getattr(data.conventions, key) is None:
+            problem = f"{key} is missing: a table of an attitude does not say how it is to be read"
+            raise data.error(problem, ("conventions",), allowed=f"`{key}:`")
+    return measurements.with_absolute_files(data, file.parent, data)
+
+
+def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:
+    """The block adjusted without further sensors.
+
+    Args:
+        setup: the block.
+        names: of sensors.
+
+    Raises:
+        InputError: the block has no such sensor.
+    """
+    if not names:
+        return setup
+    every = tuple(dict.fromkeys((*setup.test.without, *names)))
+    test = setup.test.model_copy(update={"without": every})
+    _require_sensors(test)
+    return setup.model_copy(update={"test": test})
+
+
+def _require_known(what: str, test: Spec, key: KeyPath, names: Iterable[str], known: Iterable[str]) -> None:
+    """InputError at the first of the names below a key that is not known."""
+    for name in names:
+        if name not in known:
+            raise test.error(unknown(f"no such {what}", name, known), (*key, name))
+
+
+def _require_sensors(test: OrbitAdjustSpec | MeasuredAdjustSpec) -> None:
+    """InputError for a sensor that is to be left out and is not there."""
+    for name in test.without:
+        if name not in test.sensors:
+            raise test.error(unknown("the block has no such sensor", name, test.sensors), ("without",))
+
+
+def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
+    """InputError unless every change turns one of a payload's lines. What an instrument's nodes allow is told when it
+    is built.
+    """
+    _require_known("line", test, ("perturb",), test.perturb, lines)
+    for name, change in test.perturb.items():
+        for action in change.needs():
+            if action != "rotate":
+                allowed = "a rotation, or an instrument of traced cameras instead of a payload"
+                raise test.error(
+                    f"a payload's line does not allow {action}", ("perturb", name, action), allowed=allowed
+                )
+        if change.pivot != DEFAULT_PIVOT:
+            problem = "a payload's line has no pivots"
+            raise test.error(problem, ("perturb", name, "pivot"), found=change.pivot, allowed="no pivot")
 
 
 def _require_mechanisms(setup: MonitorSetup, loop: MechanismsSpec) -> None:
@@ -307,63 +534,7 @@ _LEAST_ANGLE = 0.0174
 """Radians between the cameras of a stereo pair."""
 
 
-class SimulateSetup(ExperimentSetup[OrbitSimulateSpec]):
-    """A pass over a patch of ground with its camera.
-
-    Attributes:
-        camera: the payload.
-        detectors: data sheets of its line CCDs, by the name that the image sections give.
-    """
-
-    camera: ThreeLineCameraSpec
-    detectors: Paths[DetectorSpec]
-
-
-def resolve_simulate(path: str | Path) -> SimulateSetup:
-    """Read a pass and the camera and detectors it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: a file cannot be read or is not valid, or test and camera do not fit.
-    """
-    setup = read_setup(SimulateSetup, path)
-    if setup is None:
-        test = load.load_named(OrbitSimulateSpec, load.ORBIT, path)
-        camera = load_payload(test)
-        detectors = FrozenMap(_line_detectors(camera))
-        setup = SimulateSetup.model_construct(test=test, camera=camera, detectors=detectors)
-    _require_images(setup.test, setup.camera)
-    _require_detectors(setup, setup.test.lines, setup.camera, setup.detectors)
-    return setup
-
-
-class JitterSetup(ExperimentSetup[OrbitJitterSpec]):
-    """A pass whose jitter is sought, with its camera.
-
-    Attributes:
-        camera: the payload.
-    """
-
-    camera: ThreeLineCameraSpec
-
-
-def resolve_jitter(path: str | Path) -> JitterSetup:
-    """Read a simulated search for jitter and the camera it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: a file cannot be read or is not valid, or the camera has no such line.
-    """
-    setup = read_setup(JitterSetup, path)
-    if setup is None:
-        test = load.load_named(OrbitJitterSpec, load.ORBIT, path)
-        setup = JitterSetup.model_construct(test=test, camera=load_payload(test))
-    require_lines(setup.test, setup.test.lines, setup.camera)
-    for name in setup.test.points.line_noise:
-        if name not in setup.camera.lines:
-            raise setup.test.error(unknown("no such line", name, setup.camera.lines), ("points", "line_noise", name))
-    return setup
-
-
-def require_lines(test: Spec, named: tuple[str, ...] | None, camera: ThreeLineCameraSpec) -> None:
+def _require_several(test: Spec, named: tuple[str, ...] | None, camera: ThreeLineCameraSpec) -> None:
     """InputError unless all lines that are named exist, and there are two or more."""
     names = tuple(camera.lines)
     for k, name in enumerate(named or ()):
@@ -375,48 +546,6 @@ def require_lines(test: Spec, named: tuple[str, ...] | None, camera: ThreeLineCa
         raise test.error("jitter is seen by two lines or more", ("camera",), found=found, allowed="a camera of several")
 
 
-def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> None:
-    """InputError unless all lines that are named exist and can be rendered, and the patch lies on one of them."""
-    names = tuple(camera.lines)
-    named = [(("patch", "line"), test.patch.line), *((("perturb", name), name) for name in test.perturb)]
-    for key, name in [*((("lines",), name) for name in test.lines), *named]:
-        if name not in names:
-            allowed = f"{names_text(names)}, the lines of {camera.name}"
-            raise test.error(unknown("no such line", name, names, allowed=allowed), key)
-    _require_places(test, test.perturb, camera)
-    _require_images_of(test, test.lines, camera)
-    line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
-    _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
-    if wrong := test.orbit.misses(test.patch.time):
-        raise test.error(wrong, ("patch", "time"))
-
-
-def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec) -> None:
-    """InputError unless the camera has the three lines, and points and changes lie on them."""
-    if missing := [name for name in LINES if name not in camera.lines]:
-        found = f"{names_text(tuple(camera.lines))} in {camera.name}"
-        problem = f"the camera has no {' and no '.join(missing)} line"
-        raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
-    _require_lines(test, test.perturb, LINES)
-    _require_lines(test, test.drift, LINES, "drift")
-    _require_places(test, (*test.perturb, *test.drift), camera)
-    if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
-        raise test.error(
-            "the nadir line's principal point is the gauge",
-            ("perturb", "nadir", "principal_point"),
-            allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
-        )
-    fewest = min(camera.pixels_of(name) for name in LINES)
-    if test.points is not None:
-        _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
-    if test.images is None:
-        return
-    _require_images_of(test, LINES, camera)
-    for k, place in enumerate(test.images.patches):
-        key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
-        _require_pixel(test, key, place.pixel, pixels, f"the nadir line of {camera.name}")
-
-
 _THREE_LINES = "a camera with lines forward, nadir and backward"
 
 
@@ -426,13 +555,6 @@ def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraS
         if name in camera.lines and camera.lines[name].by_look_angles:
             problem = f"{name} of {camera.name} is known by look angles, which say nothing of a changed lens"
             raise test.error(problem, ("perturb", name), allowed="a line with `shift` and `rotate` of its CCDs")
-
-
-def _require_lines(test: Spec, changes: Iterable[str], lines: tuple[str, ...], key: str = "perturb") -> None:
-    """InputError unless every change is one of a line."""
-    for name in changes:
-        if name not in lines:
-            raise test.error(unknown("no such line", name, lines), (key, name))
 
 
 def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec) -> None:

@@ -18,14 +18,11 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.lens.__main__ import app
 from scenes.lens.batoid_reader import read_batoid
-from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
-from scenes.lens.camera_writer import perturbed_prescription, prescription_of
-from scenes.lens.glass_catalogue import own_glasses, read_catalogues
+from scenes.lens.camera_writer import batoid_text, perturbed_prescription, prescription_of, zemax_text
 from scenes.lens.prescription import SEQUENCE, Prescription, joined
-from scenes.lens.statements import Glasses
+from scenes.lens.statements import Glasses, own_glasses, read_catalogues
 from scenes.lens.zemax_reader import read_zemax
-from scenes.lens.zemax_writer import zemax_text
 from scenes.models.camera_model import collimated, derive_camera, field_direction
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.camera import CameraSpec

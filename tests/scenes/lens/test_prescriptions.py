@@ -14,12 +14,10 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.lens.__main__ import app
 from scenes.lens.batoid_reader import read_batoid
-from scenes.lens.camera_reader import camera_of
+from scenes.lens.camera_reader import camera_of, unfolded, with_flat_image
 from scenes.lens.codev_reader import read_codev
-from scenes.lens.glass_catalogue import own_glasses, read_catalogue, read_catalogues
 from scenes.lens.prescription import SEQUENCE, Prescription, polynomial_of
-from scenes.lens.statements import glass_key
-from scenes.lens.unfolding import unfolded, with_flat_image
+from scenes.lens.statements import glass_key, own_glasses, read_catalogue, read_catalogues
 from scenes.lens.zemax_reader import read_zemax
 from scenes.models.camera_model import derive_camera
 from scenes.specs.glass import LensGlassSpec

@@ -13,31 +13,30 @@ import numpy as np
 from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.camera_reader import camera_of
 from scenes.lens.codev_reader import read_codev
-from scenes.lens.glass_catalogue import own_glasses, read_catalogue
+from scenes.lens.statements import own_glasses, read_catalogue
 from scenes.lens.zemax_reader import read_zemax
-from scenes.models.camera_design import resolve_design
+from scenes.models.camera_design import CameraDesignSetup
 from scenes.models.camera_model import build_camera_under_test, derive_camera
 from scenes.models.disturbances import motions_of_spec, stated_motions
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.monitor_layout import resolve_monitor_design
+from scenes.models.monitor_layout import MonitorDesignSetup
 from scenes.models.scenery import measured_finishes
 from scenes.schema import MODELS
 from scenes.specs import load
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import checked_nodes
-from scenes.specs.measured.adjust_setup import resolve_adjust, resolve_measured_adjust
-from scenes.specs.measured.monitor_frames import read_frame_table, resolve_measurement
-from scenes.specs.measured.orbit_data_setup import resolve_match
+from scenes.specs.monitor_frames import MeasurementSetup, read_frame_table
 from scenes.specs.operation import read_operation
 from scenes.specs.orbit import setup as orbit_setup
 from scenes.specs.orbit.flight import ErrorsSpec, OrbitSpec
 from scenes.specs.perturbation import NodeInfo
-from scenes.specs.resolved import resolve, resolve_distortion, resolve_focus
+from scenes.specs.procedures import PROCEDURES
+from scenes.specs.resolved import FocusSetup, resolve
 from scenes.specs.spectrum import SpectrumSpec
 from scenes.specs.study import StudySpec
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.finish_files import read_bsdf, read_coating
-from scenes.yaml.json_file import read_json
+from scenes.yaml.input_file import read_json
 from scenes.yaml.node_table import read_nodes, read_temperatures
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.units import ANGLE, LENGTH
@@ -86,14 +85,14 @@ autocollimators = _plain(load.load_autocollimator_test)
 operation = _plain(read_operation)
 orbit, errors, study, spectrum = map(_spec, (OrbitSpec, ErrorsSpec, StudySpec, SpectrumHolder))
 camera_text = _spec(CameraSpec)
-angle, monitor, simulate = map(
-    _plain, (orbit_setup.resolve_angle, orbit_setup.resolve_monitor, orbit_setup.resolve_simulate)
-)
-calibration, jitter, adjust = map(_plain, (orbit_setup.resolve_calibration, orbit_setup.resolve_jitter, resolve_adjust))
-match, measured_adjust = _plain(resolve_match), _plain(resolve_measured_adjust)
-resolved, focus_setup, distortion = _plain(resolve), _plain(resolve_focus), _plain(resolve_distortion)
+measured_adjust, resolved = _plain(orbit_setup.MeasuredAdjustSetup.read), _plain(resolve)
 zemax, codev = _plain(read_zemax), _plain(read_codev)
 batoid = _plain(lambda path: read_batoid(path, 650e-9))
+
+
+def test(*command: str) -> Callable[[Path, Fixture], Read]:
+    """The test of a command with all that it refers to."""
+    return _plain(PROCEDURES[" ".join(command)].resolve)
 
 
 def job_nodes(folder: Path, fixture: Fixture) -> Read:
@@ -117,7 +116,7 @@ def focus(folder: Path, fixture: Fixture) -> Read:
     backend = fixture("backend")
 
     def read(path: Path) -> object:
-        setup = resolve_focus(path)
+        setup = FocusSetup.read(path)
         return build_camera_under_test(setup.test, setup.camera, backend)
 
     return read
@@ -170,7 +169,7 @@ def layout_search(folder: Path, fixture: Fixture) -> Read:
     """A search for a layout; beside it an instrument as built, and one of which nothing is stated to move."""
     (folder / "built.yaml").write_text(good("as built"), "utf-8")
     (folder / "still.yaml").write_text(good("room in an instrument").replace("disturbances: orbit\n", ""), "utf-8")
-    return resolve_monitor_design
+    return MonitorDesignSetup.read
 
 
 def camera_design(folder: Path, fixture: Fixture) -> Read:
@@ -179,7 +178,7 @@ def camera_design(folder: Path, fixture: Fixture) -> Read:
         (load.SCENES / "library/cameras/gf7.yaml").read_text("utf-8"), "@mirrors.M1.rotate => [0 deg, 1 arcsec, 0 deg]"
     )
     (folder / "tilted.yaml").write_text(camera, "utf-8")
-    return resolve_design
+    return CameraDesignSetup.read
 
 
 def of_a_job(folder: Path, fixture: Fixture) -> Read:
@@ -202,7 +201,7 @@ def payload(kind: str) -> Callable[[Path, Fixture], Read]:
         orbit = "{epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}"
         text = f"name: small\ncamera: own.yaml\norbit: {orbit}\n{PAYLOAD_TESTS[kind]}"
         (folder / "test.yaml").write_text(text, "utf-8")
-        return lambda path: getattr(orbit_setup, f"resolve_{kind}")(folder / "test.yaml")
+        return lambda path: getattr(orbit_setup, f"{kind.title()}Setup").read(folder / "test.yaml")
 
     return reader
 
@@ -269,7 +268,7 @@ def measurement(folder: Path, fixture: Fixture) -> Read:
     rows = "".join(f"{name},before,a.fits\n{name},after,a.fits\n" for name in channels)
     (folder / "frames.csv").write_text(f"channel,when,file\n{rows}", "utf-8")
     (folder / "a.fits").touch()
-    return resolve_measurement
+    return MeasurementSetup.read
 
 
 def derived(folder: Path, fixture: Fixture) -> Read:

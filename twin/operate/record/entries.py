@@ -41,7 +41,7 @@ class Entry:
     """One reading, or one event.
 
     Attributes:
-        kind: of reading, as `scenes.specs.measured.telemetry` names them.
+        kind: of reading, as `scenes.specs.operation` names them.
         subject: body, star tracker or camera; name of an event; for a run the kind again.
         time: microseconds of TAI since 2000-01-01T00:00:00 TAI.
         content: what was read, plain data in SI units, or in those that the keys of a run's numbers end in.

@@ -16,7 +16,7 @@ from optics.numerics.backend import load_backend
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import Problem, names_text
-from scenes.yaml.json_file import parse_json
+from scenes.yaml.input_file import parse_json
 from twin.operate.record import NotARecord, RecordFailed, schema
 from twin.operate.record.entries import (
     DECISION,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from scenes.specs.measured.telemetry import RUNS
+from scenes.specs.operation import RUNS
 from twin.operate.record.entries import MICRO
 from twin.operate.record.history import History, content_of
 from twin.run.data_files import DataTable

@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, func, insert, select
 
-from scenes.yaml.json_file import parse_json
+from scenes.yaml.input_file import parse_json
 from twin.operate.record.entries import MICRO, Entry, Given, Refused, canonical, digest_of_data, now, utc_text
 from twin.operate.record.schema import CHECKPOINT, ENTRY, FRAME, REFUSED, SOURCE
 

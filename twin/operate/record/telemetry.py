@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from scenes.specs.load import INSTRUMENTS, find_named
-from scenes.specs.measured.telemetry import (
+from scenes.specs.operation import (
     EVENT,
+    EVENTS,
     QUATERNION,
     RUNS,
     VALUES,
@@ -22,12 +22,10 @@ from scenes.specs.measured.telemetry import (
     ReadingTableSpec,
     TelemetrySpec,
 )
-from scenes.specs.operation import EVENTS
-from scenes.specs.resolved import resolve_with
+from scenes.specs.resolved import resolve_on
 from scenes.yaml.csv_table import rows_apart
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown, unknown
-from scenes.yaml.input_file import digest_of, is_file
-from scenes.yaml.json_file import parse_json, read_json
+from scenes.yaml.input_file import digest_of, is_file, parse_json, read_json
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
@@ -186,12 +184,10 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
         InputError: it cannot be read, is not valid, or is of another instrument than the record.
     """
     spec = validate(TelemetrySpec, read_yaml(path))
-    find_named(INSTRUMENTS, spec.instrument, spec, ("instrument",), ("cameras",))
-    folder, named = path.parent, spec.instrument
-    digest = digest_of_job(resolve_with(str(folder / named) if named.endswith((".yaml", ".yml")) else named))
+    digest = digest_of_job(resolve_on(spec, spec.instrument))
     if digest != history.sha256:
         problem = f"tables of another instrument than the record's ({digest[:12]}, not {history.sha256[:12]})"
-        raise spec.error(problem, ("instrument",), found=named, allowed=history.name)
+        raise spec.error(problem, ("instrument",), found=spec.instrument, allowed=history.name)
     for k, table in enumerate(spec.readings):
         known = {"temperature": history.bodies["warm"], "focus": history.bodies["cameras"]}.get(table.kind)
         for subject in table.columns if known is not None else ():

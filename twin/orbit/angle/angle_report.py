@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from analysis.arrays import ARCSEC
 from scenes.specs.course import DEFAULT_PIVOT
-from scenes.specs.measured.orbit_data_setup import MeasuredAngleSetup
+from scenes.specs.orbit.setup import MeasuredAngleSetup
 from scenes.specs.perturbation import PlainPerturbationSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.angle.angle_numbers import UNLIKELY

@@ -42,8 +42,7 @@ from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.measured.orbit_data_setup import AnyAngle
-    from scenes.specs.orbit.setup import AngleSetup
+    from scenes.specs.orbit.setup import AngleSetup, AnyAngle
 
 EFFECTS = ("light_time", "aberration", "refraction")
 BEND = 0.01 * ARCSEC

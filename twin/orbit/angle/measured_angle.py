@@ -22,8 +22,8 @@ from analysis.orbit.resection import ResectionError
 from optics.numerics.array_math import in_span
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
-from scenes.specs.measured.orbit_data_setup import AnyAngle, MeasuredAngleSetup
 from scenes.specs.orbit.angle import LEAST_POINTS, usual_angles
+from scenes.specs.orbit.setup import AnyAngle, MeasuredAngleSetup
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.units import MOMENT, format_quantity
 from scenes.yaml.yaml_file import dump_yaml
@@ -40,7 +40,7 @@ from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.measured.orbit_data import ReadingErrorsSpec
+    from scenes.specs.orbit.measurements import ReadingErrorsSpec
 
 
 def run_angle_test(setup: AnyAngle, backend: Backend | None, seed: int, advance: Advance = silent) -> AngleRun:

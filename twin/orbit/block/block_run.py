@@ -18,7 +18,7 @@ from analysis.block.processes import BlockError
 from analysis.orbit.forward_intersection import Accuracy, level_axes, predicted, realised
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
-from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup
+from scenes.specs.orbit.setup import AnyAdjust, MeasuredAdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import measured_block
 from twin.orbit.block.pass_knowledge import MonitorSource

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.orbit.calibration_parameters import level_covariance
-from scenes.specs.measured.orbit_data_setup import AnyCalibration, MeasuredCalibrationSetup
+from scenes.specs.orbit.setup import AnyCalibration, MeasuredCalibrationSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.arrays import ARCSEC
-from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
+from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration import calibration_sections
 from twin.orbit.calibration.calibration_numbers import CALIBRATION

@@ -17,8 +17,8 @@ from analysis.orbit.forward_intersection import CheckErrors, ThirdDifference, th
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
-from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.specs.orbit.calibration import LEAST_TIES
+from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from twin.orbit.calibration.camera_drift import Monitoring, monitored
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, drift_looked_for, gauge_of, simultaneous
@@ -52,8 +52,7 @@ from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.measured.orbit_data_setup import AnyCalibration
-    from scenes.specs.orbit.setup import CalibrationSetup
+    from scenes.specs.orbit.setup import AnyCalibration, CalibrationSetup
 
 _EVEN = 1e-3
 """Largest deviation of an interval between readings from their median interval, relative, for even times."""

@@ -31,9 +31,9 @@ from twin.orbit.flight.trajectory import MeasurementErrors, Trajectory
 from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 
 if TYPE_CHECKING:
-    from scenes.specs.measured.orbit_data import MeasuredCalibrationSpec, ReadingErrorsSpec
     from scenes.specs.orbit.calibration import OrbitCalibrationSpec
     from scenes.specs.orbit.flight import ErrorsSpec
+    from scenes.specs.orbit.measurements import MeasuredCalibrationSpec, ReadingErrorsSpec
     from twin.orbit.calibration.field_images import FieldImages
 
 

@@ -21,7 +21,7 @@ from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import FALSE_ALARM, Adjustment, Rates, Steps
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
-from scenes.specs.measured.orbit_data import MeasuredCalibrationSpec
+from scenes.specs.orbit.measurements import MeasuredCalibrationSpec
 from twin.orbit.calibration.campaign import Campaign, FoundDrift
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
 from twin.orbit.calibration.observations import EFFECTS

@@ -25,7 +25,7 @@ from twin.run.procedure import Advance, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.measured.orbit_data_setup import CheckSetup
+    from scenes.specs.orbit.setup import CheckSetup
 
 Verdict = Literal["stands", "another", "none"]
 DECIDED = 20.0

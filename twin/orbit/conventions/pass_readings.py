@@ -23,7 +23,7 @@ from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReading
 from twin.orbit.measured.xml_file import first_lines
 
 if TYPE_CHECKING:
-    from scenes.specs.measured.orbit_data import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
+    from scenes.specs.orbit.measurements import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
     from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 
 

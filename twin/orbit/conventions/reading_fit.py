@@ -30,7 +30,7 @@ from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.orbit.measured.platform_files import Conventions, platform_table
 
 if TYPE_CHECKING:
-    from scenes.specs.measured.orbit_data import UncertaintySpec
+    from scenes.specs.orbit.measurements import UncertaintySpec
 
 _TURN, _SHIFT, _DELAY, _RISE = 1e-5, 10.0, 1e-3, 10.0
 """Steps of the derivatives: radians, metres, seconds, metres."""

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from analysis.orbit.forward_intersection import CalibratedLine
 from analysis.orbit.image_correction import Kind
 from optics.numerics.number_tree import FrozenMap
-from scenes.kinds.file_kinds import kind_of
 from scenes.models.instrument_builder import build_instrument
-from scenes.specs.measured.pass_files import GroundFileSpec
-from scenes.specs.orbit.setup import AngleSetup, SimulateSetup, resolve_angle, resolve_simulate
+from scenes.specs.file_kinds import kind_of
+from scenes.specs.orbit.measurements import GroundFileSpec
+from scenes.specs.orbit.setup import AngleSetup, SimulateSetup
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.orbit.angle.angle_flight import angle_camera, fly
@@ -307,7 +307,7 @@ def read_source(path: Path, seed: int | None = None) -> ExportSource:
         hint = _PAYLOAD_HINT if kind is not None and kind.name in ("three_line_camera", "instrument") else allowed
         raise InputError(Issue("twin.orbit export does not read this", str(path), found=found, allowed=hint))
     resolve: Callable[[Path], SimulateSetup | AngleSetup] = (
-        resolve_simulate if kind.name == "orbit_simulate" else resolve_angle
+        SimulateSetup.read if kind.name == "orbit_simulate" else AngleSetup.read
     )
     setup = resolve(path)
     return ExportSource(setup, setup.to_yaml(), None, setup.test.seed if seed is None else seed, FrozenMap())
@@ -319,9 +319,9 @@ def _of_run(folder: Path) -> ExportSource:
         found = None if manifest is None else f"a run of {' '.join(filter(None, (manifest.program, manifest.test)))}"
         raise InputError(Issue("not the run folder of twin.orbit simulate or angle", str(folder), found=found))
     if manifest.test == "angle":  # has no images
-        tested = resolve_angle(folder / "config.yaml")
+        tested = AngleSetup.read(folder / "config.yaml")
         return ExportSource(tested, tested.to_yaml(), None, manifest.seed, FrozenMap())
-    setup = resolve_simulate(folder / "config.yaml")
+    setup = SimulateSetup.read(folder / "config.yaml")
     numbers = read_yaml(folder / "simulate.json").data
     try:
         windows = {}

@@ -40,7 +40,7 @@ from twin.monitor.truth import LineSight
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import OrbitCalibrationSpec
-    from scenes.specs.orbit.simulate import OrbitSimulateSpec
+    from scenes.specs.orbit.scene import OrbitSimulateSpec
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,8 @@ import numpy as np
 from analysis.orbit.jitter import Course, Found, JitterError, search, splined
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
-from scenes.specs.measured.orbit_data_setup import AnyJitter, MeasuredJitterSetup
 from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
-from scenes.specs.orbit.setup import JitterSetup
+from scenes.specs.orbit.setup import AnyJitter, JitterSetup, MeasuredJitterSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.jitter import Jitter

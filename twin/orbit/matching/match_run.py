@@ -48,8 +48,8 @@ from twin.run.quantity import Quantity, Record
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.measured.orbit_data import LineImageFileSpec, OrbitMatchSpec
-    from scenes.specs.measured.orbit_data_setup import MatchSetup
+    from scenes.specs.orbit.measurements import LineImageFileSpec, OrbitMatchSpec
+    from scenes.specs.orbit.setup import MatchSetup
 
 _BORDER = 5
 """Places along each side of an image that are followed to the ground."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from scenes.yaml.csv_table import Column, read_table, table_text
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, shown
-from scenes.yaml.json_file import parse_json
+from scenes.yaml.input_file import parse_json
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.measured.datum import Datum, Geoid
@@ -20,7 +20,7 @@ from twin.orbit.measured.pass_measurements import ROLES, GroundPoints
 from twin.orbit.measured.xml_file import numbers, text_lines
 
 if TYPE_CHECKING:
-    from scenes.specs.measured.pass_files import GroundFileSpec
+    from scenes.specs.orbit.measurements import GroundFileSpec
 
 _SIGMAS = ("sigma_east", "sigma_north", "sigma_up")
 _PLACES = (("longitude", "latitude", "height"), ("east", "north", "height"), ("x", "y", "z"))

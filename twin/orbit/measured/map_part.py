@@ -16,7 +16,7 @@ from twin.orbit.measured.datum import CGCS2000, Geoid
 from twin.orbit.measured.geotiff import GeoRaster, open_raster, opened
 
 if TYPE_CHECKING:
-    from scenes.specs.measured.pass_files import RasterFileSpec
+    from scenes.specs.orbit.measurements import RasterFileSpec
 
 MOST_HEIGHT = 2.0e4
 """Metres above or below the ellipsoid or a geoid: farther no ground lies, whatever its datum."""

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.numerics.array_math import in_span
-from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec
-from scenes.specs.measured.orbit_data_setup import DATA_FILE
-from scenes.specs.measured.pass_files import PlatformFilesSpec
+from scenes.specs.orbit.measurements import ConventionsSpec, OrbitDataSpec, PassFilesSpec, PlatformFilesSpec
+from scenes.specs.orbit.setup import DATA_FILE
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from optics.numerics.array_math import in_span
-from scenes.specs.measured.pass_files import body_axes_matrix
+from scenes.specs.orbit.measurements import body_axes_matrix
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
@@ -29,8 +29,7 @@ from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReading
 from twin.orbit.measured.xml_file import first_lines, require_rising
 
 if TYPE_CHECKING:
-    from scenes.specs.measured.orbit_data import LineTimesFileSpec
-    from scenes.specs.measured.pass_files import AttitudeFileSpec, OrbitFileSpec, PlatformFilesSpec
+    from scenes.specs.orbit.measurements import AttitudeFileSpec, LineTimesFileSpec, OrbitFileSpec, PlatformFilesSpec
 
 _ORBIT = tuple(Column(name, DISTANCE) for name in "xyz") + tuple(Column(f"v{n}", SPEED, needed=False) for n in "xyz")
 _CLOCK = (Column("time", TIME, needed=False), Column("date_time", text=True, needed=False))
@@ -49,7 +48,7 @@ _EME2000_FROM_GCRS = np.asarray(erfa.bp06(2451545.0, 0.0)[0])
 
 @dataclass(frozen=True)
 class Conventions:
-    """What the numbers of orbit and attitude files mean; names as in `scenes.specs.measured.pass_files`.
+    """What the numbers of orbit and attitude files mean; names as in `scenes.specs.orbit.measurements`.
 
     Attributes:
         orbit_frame, attitude_frame: axes.

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.arrays import Array
-from scenes.specs.measured.orbit_data import ConventionsSpec
-from scenes.specs.measured.pass_files import body_axes_matrix
+from scenes.specs.orbit.measurements import ConventionsSpec, body_axes_matrix
 from scenes.yaml.csv_table import Table
 from scenes.yaml.errors import InputError, Issue, names_text, shown
 from twin.orbit.flight.light_effects import carried_with_earth

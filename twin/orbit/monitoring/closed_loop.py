@@ -30,8 +30,8 @@ from analysis.statistics import chance_beyond, limit_of
 from optics.geometry.tree import State, compose
 from optics.numerics.backend import cores, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
+from scenes.models.disturbances import drawn_motions
 from scenes.models.disturbances import states_of as amounts_as_states
-from scenes.models.drawn_motions import drawn_motions
 from scenes.specs.course import moment
 from scenes.specs.motion_text import AXES, node_named
 from scenes.specs.orbit.monitor import PARAMETERS, CorrectionSpec, OrbitMonitorSpec

@@ -13,8 +13,8 @@ from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from scenes.kinds.file_kinds import read_for
 from scenes.models.camera_sharpness import blur_warnings
+from scenes.specs.file_kinds import read_for
 from scenes.yaml.errors import key_text
 from twin.run import cli, command, page, procedure, provenance, reference_frames, run_folder, svg
 from twin.run.artefact import Cell, SvgFigure, Table, plain, significant

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from scenes.specs.samplers import GRID, SAMPLERS
+from scenes.specs.study import GRID, SAMPLERS
 from twin.run.artefact import decimals_for, fixed, significant
 from twin.run.report import answer
 from twin.study.report.sensitivity_indices import MANY_FAILED, RESAMPLES, Indices, NoIndices

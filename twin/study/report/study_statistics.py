@@ -11,8 +11,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from scenes.specs.samplers import GRID
-from scenes.specs.study import NOISE, FactorSpec, StudySpec
+from scenes.specs.study import GRID, NOISE, FactorSpec, StudySpec
 from scenes.yaml.errors import InputError, Issue, key_text
 from twin.run.artefact import significant
 from twin.study.runs.plan import axes_of

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.specs.samplers import GRID, unit_cube
-from scenes.specs.study import FactorSpec, StudySpec
+from scenes.specs.study import GRID, FactorSpec, StudySpec, unit_cube
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit

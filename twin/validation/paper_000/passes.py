@@ -15,7 +15,7 @@ from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
-from scenes.specs.orbit.setup import AngleSetup, resolve_angle
+from scenes.specs.orbit.setup import AngleSetup
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, Measurement, angle_camera, fly
 from twin.orbit.angle.angle_run import resected
 from twin.orbit.flight.light_effects import NO_EFFECTS
@@ -93,7 +93,7 @@ def planes_of(measured: Measurement, method: Method, lines: Iterable[str] = LINE
 
 def setup_of(name: str, **changes: object) -> AngleSetup:
     """A test of the library; changes: fields of its `errors`, or latitude, longitude and direction of its pass."""
-    setup = resolve_angle(name)
+    setup = AngleSetup.read(name)
     test = setup.test
     place: dict[str, object] = {
         key: changes.pop(key) for key in ("latitude", "longitude", "direction") if key in changes

@@ -17,7 +17,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES, EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
-from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
+from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass, line_model
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
@@ -40,7 +40,7 @@ _TURN = 1.5e-5
 
 def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> CalibrationSetup:
     """A file of the library with some of its fields and with other values of its test's attributes."""
-    setup = resolve_calibration(SCENES / ORBIT / file)
+    setup = CalibrationSetup.read(SCENES / ORBIT / file)
     if fields:
         chosen = FrozenMap({name: setup.test.fields[name] for name in fields})
         changes = {"fields": chosen, "schemes": (tuple(fields[:1]),), **changes}

@@ -11,7 +11,7 @@ from analysis.arrays import ARCSEC, Array
 from analysis.arrays import MM_PER_M as MM
 from analysis.arrays import UM_PER_M as UM
 from optics.numerics.backend import one_blas_thread
-from scenes.specs.resolved import resolve_distortion
+from scenes.specs.resolved import DistortionSetup
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import SimulatedDistortion, measure
 from twin.laboratory.turntable_run import rms
@@ -52,7 +52,7 @@ def measured_tests(context: Context) -> list[SimulatedDistortion]:
     """Tests from rendered spots, each with a turntable of its own."""
     with one_blas_thread():
         context.progress(0.0, "build the bench")
-        bench = DistortionBench.build(resolve_distortion(TEST), context.backend)
+        bench = DistortionBench.build(DistortionSetup.read(TEST), context.backend)
         count = context.count(TESTS, FAST_TESTS)
         runs = []
         for k, seed in enumerate(np.random.SeedSequence(context.seed).generate_state(count)):

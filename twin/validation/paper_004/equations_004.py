@@ -22,7 +22,7 @@ from analysis.orientation.interior import distortion, principal_distance, princi
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
 from scenes.models.camera_model import ROOT, build_camera_under_test
-from scenes.specs.resolved import DistortionSetup, resolve_distortion
+from scenes.specs.resolved import DistortionSetup
 from twin.laboratory.distortion_run import SimulatedDistortion
 from twin.laboratory.turntable_run import rms
 from twin.targets.target_path import TargetPath
@@ -326,7 +326,7 @@ def chief_rays(setup: DistortionSetup, backend: Backend) -> Callable[[Array], Ar
 def run(context: Context) -> Iterator[CheckResult]:
     """The printed equations on traced chief rays, without noise."""
     context.progress(0.0, "trace chief rays")
-    setup = resolve_distortion(TEST)
+    setup = DistortionSetup.read(TEST)
     places = chief_rays(setup, context.backend)
     band, test = setup.camera.bands[setup.test.band], setup.test
     half = 0.5 * test.reach * band.pixels * band.pitch

@@ -16,7 +16,7 @@ from analysis.focal_plane.through_focus import focus_vertex
 from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.backend import one_blas_thread
-from scenes.specs.resolved import resolve_focus
+from scenes.specs.resolved import FocusSetup
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_run import FocusState, SimulatedFocus, align, line_turn, mount_of
 from twin.laboratory.focus_scan import NYQUIST
@@ -175,7 +175,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     """Align mis-set focal planes, one if only the MTF is wanted."""
     context.progress(0.0, "build the bench")
     with one_blas_thread():
-        bench = FocusBench(resolve_focus(TEST), context.backend)
+        bench = FocusBench(FocusSetup.read(TEST), context.backend)
         if "004.alignment.coupling" in context.selected:
             yield evaluate_coupling(context.check("004.alignment.coupling"), bench)
             if len(context.selected) == 1:

@@ -15,7 +15,7 @@ from analysis.arrays import ARCSEC, Array
 from analysis.turntable.angle_network import NotConvergedError
 from analysis.turntable.dividing_error import FITS, CalibrationSeries, fit, rejection_rate
 from optics.numerics.backend import one_blas_thread
-from scenes.specs.resolved import resolve_turntable
+from scenes.specs.resolved import TurntableSetup
 from scenes.specs.turntable import TurntableTestSpec
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import rms, run_turntable
@@ -54,7 +54,7 @@ class FittedTable:
 
 def run(context: Context) -> Iterator[CheckResult]:
     """Calibrate many tables; fit some of them."""
-    spec = resolve_turntable(TEST).test
+    spec = TurntableSetup.read(TEST).test
     # two streams, so that what one part draws does not hang on whether the other runs
     first, second = np.random.SeedSequence(context.seed).spawn(2)
     if context.wants(*_REPEATED):

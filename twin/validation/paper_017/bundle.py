@@ -17,8 +17,8 @@ from analysis.orbit.forward_intersection import intersect
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.adjust_setup import AdjustSetup, resolve_adjust
 from scenes.specs.orbit.adjust import BlockPointsSpec, CameraChangeSpec, ReadingLawsSpec
+from scenes.specs.orbit.setup import AdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.run.random_streams import stream
 from twin.validation.checks.check import CheckResult, Chosen, Supposed, mean_of
@@ -43,7 +43,7 @@ def strip(image: float, attitude: float) -> AdjustSetup:
         image: standard deviation of an image point, pixels of 5 m.
         attitude: of a reading of the attitude, twice a second, arcseconds.
     """
-    setup = resolve_adjust(SCENES / ORBIT / "adjust.yaml")
+    setup = AdjustSetup.read(SCENES / ORBIT / "adjust.yaml")
     test, lines = setup.test, ("forward", "nadir", "backward")
     readings = {"law": "white", "sigma": 3 * [f"{attitude} arcsec"], "interval": "0.5 s"}
     orbit = {"law": "constant", "sigma": 3 * ["10 mm"]}

@@ -16,15 +16,15 @@ from scenes.specs.detector import DetectorSpec, PixelPitch
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import SIDES, Exposure, FieldPlace, LookAngle
 from scenes.specs.job import AnalysisSpec, JobSpec
-from scenes.specs.load import DETECTORS, find_named, load_detector
-from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
+from scenes.specs.load import load_detector
+from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_job
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import file_beside, is_file, unusable
 from scenes.yaml.quantity import PositiveLength
-from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Reference, Spec, Whole, one_given, short_for, validate
+from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Ref, Reference, Spec, Whole, one_given, short_for
 from scenes.yaml.units import MOMENT, parse_quantity
-from scenes.yaml.yaml_file import LARGEST_BYTES, read_yaml
+from scenes.yaml.yaml_file import LARGEST_BYTES
 
 ALL = "all"
 """In place of a channel: every channel."""
@@ -102,7 +102,7 @@ class MeasurementSpec(Spec):
         analysis: how the centres of the spots are found.
     """
 
-    instrument: Reference | None = None
+    instrument: Ref | None = None
     geometry: Annotated[Named[GeometrySpec], Field(min_length=1)] | None = None
     frames: Reference | Paths[ChannelFramesSpec]
     times: (
@@ -110,7 +110,7 @@ class MeasurementSpec(Spec):
     ) = None
     disturbances: JobDisturbances | None = None
     template: Literal["twin", "measured"] = "twin"
-    detector: Reference | None = None
+    detector: Ref | None = None
     exposure: Exposure | None = None
     photon_transfer: Literal["stated", "measured"] = "stated"
     dark: PerChannel | None = None
@@ -205,45 +205,36 @@ class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
     model: ResolvedJob | None = None
     detector: DetectorSpec
 
+    @classmethod
+    def parts(cls, test: MeasurementSpec) -> dict[str, Any]:
+        """Return the model of the instrument and the data sheet, and the measurement with absolute paths."""
+        model = None if test.instrument is None else _model(test, test.instrument)
+        if test.detector is not None:
+            detector = load_detector(test.detector, test, ("detector",))
+        else:
+            assert model is not None
+            detector = model.area_detector
+        if model is not None:
+            model = model.model_copy(update={"detector": detector})
+        test = _located(test, _channels(test, model), Path(test.source.file).parent)
+        return {"test": test, "model": model, "detector": detector}
+
     @property
     def channels(self) -> tuple[str, ...]:
         """``CAMERA/CHANNEL`` of every channel, in the order of the spots."""
         return _channels(self.test, self.model)
 
 
-def resolve_measurement(path: str | Path) -> MeasurementSetup:
-    """Read a measurement and all it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: any of the files cannot be read or is not valid, or frames are missing.
-    """
-    if (again := read_setup(MeasurementSetup, path)) is not None:
-        return again
-    spec = validate(MeasurementSpec, read_yaml(path))
-    model = _model(spec)
-    if spec.detector is not None:
-        detector = load_detector(find_named(DETECTORS, spec.detector, spec, ("detector",)))
-    else:
-        assert model is not None
-        detector = model.area_detector
-    if model is not None:
-        model = model.model_copy(update={"detector": detector})
-    spec = _located(spec, _channels(spec, model), Path(spec.source.file).parent)
-    return MeasurementSetup.model_construct(test=spec, model=model, detector=detector)
-
-
-def _model(spec: MeasurementSpec) -> ResolvedJob | None:
-    if spec.instrument is None:
-        return None
-    job = JobSpec.model_construct(instrument=spec.instrument, disturbances=spec.disturbances, analysis=spec.analysis)
+def _model(spec: MeasurementSpec, instrument: str) -> ResolvedJob:
+    job = JobSpec.model_construct(instrument=instrument, disturbances=spec.disturbances, analysis=spec.analysis)
     # its keys are called as the measurement's, so that faults are told at their lines
     model = resolve_job(job.with_source(spec.source))
     if spec.exposure is None:
         return model
     monitor = model.instrument.autocollimator
     ccd = monitor.area_ccd.model_copy(update={"exposure": spec.exposure})
-    instrument = model.instrument.model_copy(update={"monitor": monitor.model_copy(update={"area_ccd": ccd})})
-    return model.model_copy(update={"instrument": instrument})
+    own = model.instrument.model_copy(update={"monitor": monitor.model_copy(update={"area_ccd": ccd})})
+    return model.model_copy(update={"instrument": own})
 
 
 def _channels(spec: MeasurementSpec, model: ResolvedJob | None) -> tuple[str, ...]:

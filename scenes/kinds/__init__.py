@@ -1,1 +1,0 @@
-"""All kinds of YAML files."""

@@ -1,1 +1,0 @@
-"""Tests that run on what somebody measured, and what their files say of it."""
