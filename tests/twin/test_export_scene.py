@@ -17,7 +17,7 @@ from tests.twin.dimap_bench import Scene, rpc, write
 from tests.twin.study_bench import REFUSED
 from twin.orbit.export import ground_accuracy, line_scanner
 from twin.orbit.export.export_report import _warnings as export_warnings
-from twin.orbit.export.quality_sections import quality_warnings
+from twin.orbit.export.export_report import quality_warnings
 from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
 from twin.orbit.measured.dimap_sensor import read_scene
 from twin.run.data_files import FrameFacts, tiff

@@ -10,8 +10,13 @@ import rasterio
 from analysis.orbit.image_correction import Kind, image_correction
 from tests.tiers import quick
 from tests.twin.dimap_bench import Scene, rpc, write
-from twin.orbit.export.polynomial_control import controlled, image_slope, polynomial_correction
-from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
+from twin.orbit.export.rational_polynomial import (
+    RationalPolynomial,
+    controlled,
+    image_slope,
+    polynomial_correction,
+    read_rpc,
+)
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.measured.dimap_sensor import read_scene
 from twin.run.data_files import FrameFacts, tiff

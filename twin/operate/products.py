@@ -26,8 +26,8 @@ from twin.operate.estimated_motions import EstimatedMotions, LeftOut, Prior, pri
 from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
 from twin.operate.record.schema import ENTRY
 from twin.operate.validity import Mark, Validity, validity
-from twin.orbit.export.estimated_change import EstimatedChange
 from twin.orbit.export.export_run import USUAL_HEIGHTS, Export, run_export
+from twin.orbit.export.ground_accuracy import EstimatedChange
 from twin.run.data_files import WRITER
 from twin.run.procedure import BenchError
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from scenes.specs.measured.adjust_setup import AnyAdjust
     from twin.orbit.block.block_run import BlockRun
     from twin.orbit.export.export_run import ExportSource, SceneSource, Wishes
-    from twin.orbit.export.polynomial_export import PolynomialSource
+    from twin.orbit.export.quality_run import PolynomialSource
 
     Exportable = ExportSource | SceneSource | PolynomialSource
 
@@ -207,7 +207,7 @@ def export(
     def resolve() -> tuple[Exportable, tuple[float, float] | None, Wishes]:
         from twin.orbit.export.export_run import Wishes, read_control, read_exportable
         from twin.orbit.export.ground_accuracy import CameraUncertainty
-        from twin.orbit.export.polynomial_export import read_polynomial_source
+        from twin.orbit.export.quality_run import read_polynomial_source
 
         stated = {name: _sigma(name, *one) for name, one in sigmas.items() if one[0] is not None}
         uncertainty = CameraUncertainty.of(**stated) if stated else None
@@ -217,18 +217,17 @@ def export(
 
     def work(given: tuple[Exportable, tuple[float, float] | None, Wishes], session: Session) -> Result:
         from scenes.yaml.errors import InputError, Issue
-        from twin.orbit.export import export_report, polynomial_export
+        from twin.orbit.export import export_report, quality_run
         from twin.orbit.export.export_run import SceneSource, run_export
-        from twin.orbit.export.polynomial_export import PolynomialSource, run_polynomial_export
-        from twin.orbit.export.quality_run import with_quality
+        from twin.orbit.export.quality_run import PolynomialSource, run_polynomial_export, with_quality
         from twin.run.procedure import BenchError
 
         read, heights, wishes = given
         contents: dict[str, bytes]
         if isinstance(read, PolynomialSource):
             alone = run_polynomial_export(read, wishes)
-            contents, drawn = polynomial_export.polynomial_files(alone), 0
-            shown, numbers = polynomial_export.polynomial_report(alone), polynomial_export.POLYNOMIALS(alone)
+            contents, drawn = quality_run.polynomial_files(alone), 0
+            shown, numbers = quality_run.polynomial_report(alone), quality_run.POLYNOMIALS(alone)
         else:
             try:
                 run = with_quality(run_export(read, session.backend, heights, truth, session.advance), wishes)

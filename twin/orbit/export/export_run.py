@@ -31,11 +31,9 @@ from scenes.specs.orbit.setup import AngleSetup, SimulateSetup, resolve_angle, r
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.orbit.angle.angle_flight import angle_camera, fly
-from twin.orbit.export.estimated_change import EstimatedChange, GroundSigma, ground_sigma
-from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty
+from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty, EstimatedChange, GroundSigma, ground_sigma
 from twin.orbit.export.line_scanner import LineScanner, line_scanner
-from twin.orbit.export.polynomial_control import ControlledPolynomial
-from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.export.rational_polynomial import ControlledPolynomial, RationalPolynomial
 from twin.orbit.flight.line_camera import LineCamera, calibrated_lines, corrected_line
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory

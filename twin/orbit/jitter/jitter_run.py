@@ -17,13 +17,12 @@ from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
 from scenes.specs.orbit.setup import JitterSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.jitter import Jitter
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineTimes, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.flight.trajectory import Trajectory
+from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.jitter.sights import Sights, SightsError, sights_of
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements

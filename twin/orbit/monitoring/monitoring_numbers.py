@@ -12,8 +12,15 @@ from analysis.arrays import Array
 from analysis.monitor.model_fit import UnseenMode
 from analysis.monitor.monitoring import PER_SI
 from scenes.specs.course import moment
-from twin.orbit.monitoring.line_images import ImagedPair
-from twin.orbit.monitoring.loop_run import GAIN_MARGIN, PHASE_MARGIN_DEG, LoopFacts, LoopPass, LoopRun, height_rms
+from twin.orbit.monitoring.loop_run import (
+    GAIN_MARGIN,
+    PHASE_MARGIN_DEG,
+    ImagedPair,
+    LoopFacts,
+    LoopPass,
+    LoopRun,
+    height_rms,
+)
 from twin.orbit.monitoring.monitoring_run import Cause, MonitorFlight, MonitorRun, Smoothing
 from twin.orbit.monitoring.pair_flight import CaseErrors, rms
 from twin.run.artefact import significant
