@@ -140,7 +140,7 @@ def test_tables_of_accuracy_and_control_have_their_units() -> None:
     numbers = {"line": np.array([1.0, 2.0, 0.0]), "pixel": np.array([3.0, 4.0, 0.0]), "horizontal": lambda: (1.5, 0.5)}
     maps = {"nadir": Ns(seen=seen, **places, **errors, **numbers)}
     table, _, grid = export_report._map_section(maps).artefacts
-    assert table.rows == [("nadir", 6.0, 7.0, 2.5, 3.0, 1.5, 0.5)]
+    assert table.rows == [["nadir", 6.0, 7.0, 2.5, 3.0, 1.5, 0.5]]
     assert grid.rows[0] == pytest.approx(("nadir", 1.0, 3.0, 116.0, 40.0, 300.0, 5.0, 2.0, 2.0, 3.0, 4.0))
     assert [row[3] for row in grid.rows] == pytest.approx([116.0, 117.0])
     at, spread = np.array([[3.0, -4.0]]), np.array([np.diag([0.04, 0.25])])
@@ -148,7 +148,7 @@ def test_tables_of_accuracy_and_control_have_their_units() -> None:
     correction = Ns(**vars(correction), residual=np.array([[0.1, 0.2]]), used=np.array([False]))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(export_report, "residual_sigma", lambda _: np.array([[0.3, 0.4]]))
-        control = {"nadir": Ns(polynomial=Ns(correction=correction), names=IDS[:1])}
+        control = {"nadir": Ns(correction=correction, names=IDS[:1])}
         table, full = export_report.control_section(control).artefacts
     assert table.rows == [("nadir", 3.0, pytest.approx(0.2), -4.0, pytest.approx(0.5), 5.0, 2)]
     assert full.rows == [("nadir", "a", 0.1, 0.3, 0.2, 0.4, "left out")]
@@ -157,12 +157,12 @@ def test_tables_of_accuracy_and_control_have_their_units() -> None:
 def test_sentences_of_accuracy_and_residuals_name_their_own_numbers() -> None:
     """Points that are used, the bias after the correction, the largest CE90 and the LE90 of intersected points."""
     correction = Ns(used=np.array([True, False]), kind="shift")
-    polynomial = Ns(correction=correction, before=Ns(bias_m=9.0), after=Ns(bias_m=0.25))
+    controlled = Ns(correction=correction, after=Ns(bias_m=0.25), names=IDS)
     maps = {
         TOGETHER: Ns(ce90=np.array([1.0, 2.0]), le90=np.array([3.0, np.nan])),
         "nadir": Ns(ce90=np.array([4.0, np.nan])),
     }
-    first, second, third = quality_answers(Ns(control={"nadir": Ns(polynomial=polynomial, names=IDS)}, maps=maps))
+    first, second, third = quality_answers(Ns(control={"nadir": controlled}, maps=maps))
     assert first.startswith("1 of 2 control points correct the polynomials of nadir by a shift, to 0.25 m")
     assert second == "CE90 is at most 4.00 m, of points of nadir"
     assert third == "LE90 of intersected points is at most 3.00 m"

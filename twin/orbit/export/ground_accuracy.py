@@ -24,12 +24,11 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.arrays import Array
 from analysis.orbit.forward_intersection import CalibratedLine
 from analysis.orbit.ground_errors import circular_error, linear_error
-from optics.geometry.pose import rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.export.rational_polynomial import axis_sigma
 from twin.orbit.flight.earth import east_north_up
 from twin.orbit.flight.line_camera import LineCamera, corrected_line
-from twin.orbit.flight.sensor import Platform, Sensor
+from twin.orbit.flight.sensor import MovedPlatform, Sensor
 
 _GRID = (13, 13)
 """Lines and pixels of an image at which errors are taken; they are smooth."""
@@ -140,25 +139,6 @@ class AccuracyMap:
 
 
 @dataclass(frozen=True, eq=False)
-class _Moved:
-    """A platform that is not quite where it is."""
-
-    platform: Platform
-    shift: Array
-    turn: Array
-
-    def position(self, seconds: Array) -> Array:
-        at = self.platform.position(seconds)
-        return np.asarray(at + np.einsum("nij,j->ni", self.platform.body_to_itrs(seconds), self.shift))
-
-    def inertial_velocity(self, seconds: Array) -> Array:
-        return self.platform.inertial_velocity(seconds)
-
-    def body_to_itrs(self, seconds: Array) -> Array:
-        return np.asarray(self.platform.body_to_itrs(seconds) @ rotation_matrix(self.turn))
-
-
-@dataclass(frozen=True, eq=False)
 class _Derivatives:
     """Of where pixels (N,) see a height, east and north, metres.
 
@@ -179,7 +159,7 @@ def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level
     def seen(at: Array, which: Array, up: float = height, moved: Array | None = None) -> Array:
         where = sensor
         if moved is not None:
-            where = replace(sensor, trajectory=_Moved(sensor.trajectory, moved[:3], moved[3:]))
+            where = replace(sensor, trajectory=MovedPlatform(sensor.trajectory, moved[:3], moved[3:]))
         return np.einsum("nij,nj->ni", level, where.ground(at, which, up))
 
     by_line = (seen(line + _EDGE, pixel) - seen(line - _EDGE, pixel)) / (2.0 * _EDGE)

@@ -25,10 +25,9 @@ from twin.orbit.export.export_run import (
     ProductPolynomial,
     Quality,
     SceneSource,
-    Wishes,
     no_bands,
 )
-from twin.orbit.export.ground_accuracy import AccuracyMap, maps_of
+from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty, maps_of
 from twin.orbit.export.rational_polynomial import (
     RationalPolynomial,
     controlled,
@@ -46,27 +45,26 @@ _COMPARED = (15, 15, 3)
 """Lines, pixels and heights at which polynomials are compared."""
 
 
-def with_quality(run: Export, wishes: Wishes) -> Export:
+def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: ControlPoints | None) -> Export:
     """The export with what was asked for: corrected polynomials, ERR_BIAS and ERR_RAND in them, notes in the ISD.
 
     Args:
         run: its models.
-        wishes: what is asked for.
+        uncertainty: of camera and way; None for no map.
+        points: that correct the polynomials; None for none.
 
     Raises:
         InputError: control points that are of none of the images, or do not determine a correction.
     """
     lines = dict(run.lines)
     products = _products(run, run.source.scene) if isinstance(run.source, SceneSource) else {}
-    control = {}
-    if wishes.control is not None:
-        control = _controlled(wishes.control, lines)
-        for name, one in control.items():
-            lines[name] = replace(lines[name], polynomial=one.polynomial.after)
+    control = {} if points is None else _controlled(points, lines)
+    for name, one in control.items():
+        lines[name] = replace(lines[name], polynomial=one.after)
     maps: Mapping[str, AccuracyMap] = {}
-    if wishes.uncertainty is not None:
+    if uncertainty is not None:
         places = {n: (x.window.sensor, x.window.first_pixel, x.window.pixels) for n, x in lines.items()}
-        maps = maps_of(places, wishes.uncertainty, run.heights[1])
+        maps = maps_of(places, uncertainty, run.heights[1])
         lines = {name: _with_errors(line, maps[name], name in control) for name, line in lines.items()}
     return replace(run, lines=FrozenMap(lines), quality=Quality(FrozenMap(maps), FrozenMap(control), products))
 
@@ -128,7 +126,7 @@ def controlled_line(
         correction = polynomial_correction(
             polynomial, ground.itrs, ground.covariance, rows[:, 1:3], spread, control.kind
         )
-        return Controlled(ground.ids, controlled(polynomial, correction))
+        return Controlled(ground.ids, correction, controlled(polynomial, correction))
     except ValueError as error:
         allowed = f"{LEAST_POINTS[control.kind]} points or more, spread over the image of {name}"
         raise InputError(Issue(str(error), control.file, allowed=allowed)) from None
@@ -158,10 +156,9 @@ def compared(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPol
     longitude, latitude, _ = sensor.earth.geodetic(sensor.ground(line, pixel, height))
     there = np.stack(model.image(np.degrees(latitude), np.degrees(longitude), height), axis=-1)
     off = there - np.stack([line, pixel], axis=-1)
-    mean, rms = np.mean(off, axis=0), np.std(off, axis=0)
-    found = [float(value) for value in (*mean, *rms)]
-    heights = float(low), float(high)
-    return ProductPolynomial(file, found[0], found[1], found[2], found[3], float(np.max(np.abs(off))), heights)
+    (line_mean, sample_mean), (line_rms, sample_rms) = off.mean(axis=0).tolist(), off.std(axis=0).tolist()
+    most, heights = float(np.max(np.abs(off))), (float(low), float(high))
+    return ProductPolynomial(file, (line_mean, sample_mean), (line_rms, sample_rms), most, heights)
 
 
 _ENDING = re.compile(r"(_RPC|_rpc)$")
@@ -216,26 +213,29 @@ def read_polynomial_source(path: Path, band: str | None = None) -> PolynomialSou
     return PolynomialSource(name, str(path), read_rpc(path), dump_yaml({"source": str(path)}))
 
 
-def run_polynomial_export(source: PolynomialSource, wishes: Wishes) -> PolynomialExport:
+def run_polynomial_export(
+    source: PolynomialSource, uncertainty: CameraUncertainty | None, points: ControlPoints | None
+) -> PolynomialExport:
     """Correct the polynomials.
 
     Args:
         source: what was read.
-        wishes: control points.
+        uncertainty: which only a rigorous model can have.
+        points: that correct them.
 
     Raises:
         InputError: there are none, they do not determine a correction, or something was asked for that takes a rigorous
             model.
     """
-    if wishes.uncertainty is not None:
+    if uncertainty is not None:
         allowed = "a source with a rigorous model for --position-sigma, --attitude-sigma and the like"
         raise InputError(Issue("polynomials alone know no camera and no orbit", source.file, allowed=allowed))
-    if wishes.control is None:
+    if points is None:
         raise InputError(Issue("nothing to do with polynomials alone", source.file, allowed="--control points.gcp"))
-    found = controlled_line(wishes.control, source.name, source.polynomial, alone=True)
+    found = controlled_line(points, source.name, source.polynomial, alone=True)
     if found is None:
         problem = "no control point is in the image of these polynomials"
-        raise InputError(Issue(problem, wishes.control.file, allowed=f"points in {source.name}.tif"))
+        raise InputError(Issue(problem, points.file, allowed=f"points in {source.name}.tif"))
     return PolynomialExport(source, found)
 
 
@@ -243,9 +243,7 @@ POLYNOMIALS: Record[PolynomialExport] = Record(
     "export.json of rational polynomials alone.",
     Quantity("source", lambda run: run.source.file, "that they were read from"),
     Quantity("rpc", lambda run: _file(run), "path in the run folder of the corrected ones"),
-    Quantity(
-        "control", lambda run: {run.source.name: run.control}, "how control points corrected them", record=CONTROL
-    ),
+    Quantity("control", lambda run: {run.source.name: run.control}, "how points corrected them", record=CONTROL),
 )
 
 
@@ -255,19 +253,15 @@ def _file(run: PolynomialExport) -> str:
 
 def polynomial_files(run: PolynomialExport) -> dict[str, bytes]:
     """Path in the run folder -> contents."""
-    return {_file(run): run.control.polynomial.after.text().encode()}
+    return {_file(run): run.control.after.text().encode()}
 
 
 def polynomial_report(run: PolynomialExport) -> Report:
     """What was corrected."""
-    quality = Quality(FrozenMap(), FrozenMap({run.source.name: run.control}), FrozenMap())
-    sentences = quality_answers(quality)
-    verdict, more = answer(*sentences)
-    before, after = run.source.polynomial, run.control.polynomial.after
-    rows = [
-        (name, float(old), float(new))
-        for name, old, new in zip(("line", "sample"), before.offset[:2], after.offset[:2], strict=True)
-    ]
+    quality = Quality(control=FrozenMap({run.source.name: run.control}))
+    verdict, more = answer(*quality_answers(quality))
+    before, after = run.source.polynomial, run.control.after
+    rows = list(zip(("line", "sample"), before.offset[:2].tolist(), after.offset[:2].tolist(), strict=True))
     table = Table("polynomials", "Offsets", "Middle of the image, pixels.", ("of", "before [px]", "after [px]"), rows)
     size = " x ".join(f"{2.0 * value:.0f}" for value in before.scale[:2])
     low, high = before.offset[4] + np.array([-1.0, 1.0]) * before.scale[4]

@@ -210,17 +210,20 @@ def _seen(
     """Line, sample, latitude, longitude (degrees) and height (metres) over an image, (N, 5); image coordinates from the
     window's first pixel.
     """
-    spans = ((-0.5, sensor.lines - 0.5), (-0.5, pixels - 0.5), heights)
-    axes = []
-    for count, (low, high) in zip(counts, spans, strict=True):
-        step = np.linspace(0.0, np.pi, count) if at_ends else (np.arange(count) + 0.5) * np.pi / count
-        axes.append(0.5 * (low + high) - 0.5 * (high - low) * np.cos(step))
-    line, sample, height = (v.ravel() for v in np.meshgrid(*axes, indexing="ij"))
+    low, high = np.array([(-0.5, sensor.lines - 0.5), (-0.5, pixels - 0.5), heights]).T
+    line, sample, height = _places(0.5 * (low + high), 0.5 * (high - low), counts, at_ends)
     ground = sensor.ground(line, first_pixel + sample, height)
     if not np.all(np.isfinite(ground)):
         raise ValueError("a look misses the Earth")
     longitude, latitude, _ = sensor.earth.geodetic(ground)
     return np.stack([line, sample, np.degrees(latitude), np.degrees(longitude), height], axis=-1)
+
+
+def _places(middle: Array, half: Array, counts: tuple[int, ...], at_ends: bool) -> list[Array]:
+    """Lines, samples and heights of a grid of Chebyshev points, with the ends or between those that have them."""
+    angles = (np.linspace(0.0, np.pi, n) if at_ends else (np.arange(n) + 0.5) * np.pi / n for n in counts)
+    axes = (m - h * np.cos(angle) for m, h, angle in zip(middle, half, angles, strict=True))
+    return [v.ravel() for v in np.meshgrid(*axes, indexing="ij")]
 
 
 def _monomials(unit: Array) -> Array:
@@ -395,21 +398,6 @@ _UNLIKELY = 0.05
 """Chance of a chi-square from which residuals scatter beyond their covariances."""
 
 
-@dataclass(frozen=True, eq=False)
-class ControlledPolynomial:
-    """Polynomials, and how control points corrected them.
-
-    Attributes:
-        before: as they were.
-        correction: in the image.
-        after: with it, ERR_BIAS and ERR_RAND of what is uncertain of them.
-    """
-
-    before: RationalPolynomial
-    correction: ImageCorrection
-    after: RationalPolynomial
-
-
 def polynomial_correction(
     polynomial: RationalPolynomial,
     itrs: Array,
@@ -440,19 +428,6 @@ def polynomial_correction(
     return image_correction(predicted, measured, spread, kind, screened)
 
 
-def controlled(polynomial: RationalPolynomial, correction: ImageCorrection) -> ControlledPolynomial:
-    """Polynomials with a correction inside.
-
-    Args:
-        polynomial: of the image.
-        correction: that was found for it.
-
-    Raises:
-        ValueError: polynomials that do not lead back to the ground, ground at a pole or the 180th meridian.
-    """
-    return ControlledPolynomial(polynomial, correction, _corrected(polynomial, correction))
-
-
 def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Array, height: Array) -> Array:
     """Derivatives of line and sample by metres east, north and up, (N, 2, 3), at places (N,) in radians and metres."""
     meridian, normal = curvature_radii(latitude)
@@ -476,29 +451,27 @@ def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Arra
     return np.stack(columns, axis=-1)
 
 
-def _corrected(polynomial: RationalPolynomial, correction: ImageCorrection) -> RationalPolynomial:
-    """Polynomials with the correction inside, and what is uncertain of them on the ground."""
-    grids = []
+def controlled(polynomial: RationalPolynomial, correction: ImageCorrection) -> RationalPolynomial:
+    """Return the polynomials with a correction inside, and what is uncertain of them on the ground.
+
+    Args:
+        polynomial: of the image.
+        correction: that was found for it.
+
+    Raises:
+        ValueError: polynomials that do not lead back to the ground, ground at a pole or the 180th meridian.
+    """
+    grids, kept = [], [0, 1, 4]
     for at_ends in (True, False):
         counts = _CORRECTED_GRID if at_ends else tuple(count - 1 for count in _CORRECTED_GRID)
-        axes = [
-            polynomial.offset[k] - polynomial.scale[k] * np.cos(_angles(count, at_ends))
-            for k, count in zip((0, 1, 4), counts, strict=True)
-        ]
-        line, sample, height = (v.ravel() for v in np.meshgrid(*axes, indexing="ij"))
+        line, sample, height = _places(polynomial.offset[kept], polynomial.scale[kept], counts, at_ends)
         latitude, longitude = polynomial.ground(line, sample, height)
-        seen = np.isfinite(latitude)
         moved = np.stack([line, sample], axis=-1) + correction.at(line, sample)
-        grids.append(np.stack([*moved.T, latitude, longitude, height], axis=-1)[seen])
+        grids.append(np.stack([*moved.T, latitude, longitude, height], axis=-1)[np.isfinite(latitude)])
     if min(map(len, grids)) < np.prod(_CORRECTED_GRID) // 2:
         raise ValueError("the polynomials do not lead back to the ground over the image that they state")
     bias, random = _on_the_ground(polynomial, correction)
     return replace(RationalPolynomial.through(*grids), bias_m=bias, random_m=random)
-
-
-def _angles(count: int, at_ends: bool) -> Array:
-    """Of Chebyshev's places."""
-    return np.linspace(0.0, np.pi, count) if at_ends else (np.arange(count) + 0.5) * np.pi / count
 
 
 def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) -> tuple[float, float]:
