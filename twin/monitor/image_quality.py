@@ -353,15 +353,19 @@ class _Traced:
     Attributes:
         rays: at the design wavelength.
         size: of the line CCD in each, (B,).
+        origin: of its points on the line CCD, (B, 1, 3).
         shadows: in them; None for free beams.
         outlines: of edges and bodies on their stops; None for a camera whose surfaces have no edges.
+        free: nodes that no edge and no body takes, (B, N); None likewise.
         again: the same beams in light of another wavelength, metres.
     """
 
     rays: ImagingRays
     size: np.ndarray
+    origin: np.ndarray
     shadows: shadow.Shadows | None
     outlines: StopOutlines | None
+    free: np.ndarray | None
     again: Callable[[float], ImagingRays]
 
 
@@ -479,23 +483,22 @@ class _CameraBench:
         imaging, rays = sent(self.model.spec.wavelength)
         beams = shadow.TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
         shadows = None if self.shadows is None else self.shadows.cast(beams)
-        outlines = None
+        outlines: StopOutlines | None = None
+        covers: np.ndarray | None = None
         if self.model.edges:
             free = shadow.no_shadows(len(every)) if shadows is None else shadows
             seen = shadow.SeenEdges.of(beams, self.model, self.name, self.backend)
             outlines = seen.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(free.pieces, 1, 0)))
             shadows = free.and_edges(seen.outlines, f"edges of {name}")
-        return _Traced(rays, imaging.size, shadows, outlines, lambda colour: sent(colour)[1])
+            covers = ~covered(shadows.pieces, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
+        origin = (imaging.size[:, None] * np.tile(self.points, (len(states), 1)))[:, None]
+        return _Traced(rays, imaging.size, origin, shadows, outlines, covers, lambda colour: sent(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values (V, B) of _COLUMNS, the share of each beam that is cut, and whether an MTF is not to be had."""
-        rays, size, shadows = traced.rays, traced.size, traced.shadows
-        origin = (size[:, None] * np.tile(self.points, (len(rays.path) // len(self.points), 1)))[:, None]
+        rays, shadows, free = traced.rays, traced.shadows, traced.free
         radius = float(self.model.first_order.exit_pupil_distance[0])
-        error = path_to_sphere(rays.position, rays.direction, rays.path, origin, radius)
-        free = None
-        if self.model.edges and shadows is not None:
-            free = ~covered(shadows.pieces, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
+        error = path_to_sphere(rays.position, rays.direction, rays.path, traced.origin, radius)
         mean = PupilMean(self.nodes, None if shadows is None or not shadows.owners else shadows, free)
         error = -mean.flat(error)
         focus = mean.flat(np.abs(rays.direction[..., 2]))
@@ -505,26 +508,21 @@ class _CameraBench:
         dark = np.mean((rays.amplitude == 0.0) & (True if free is None else free), axis=-1)
         mtf = np.full((2, len(dark)), np.nan)
         lost = np.zeros(len(dark))
-        pieces = None if shadows is None else shadows.pieces
         lit = np.flatnonzero(dark == 0.0)
         if len(lit):
-            taken = None if pieces is None else pieces[lit]
-            free = None if free is None else free[lit]
-            pupils, smooth, cosines = self._pupils(rays, size, origin, lit, taken, free, float(np.min(self.colours)))
+            pupils, smooth, cosines = self._pupils(traced, rays, lit, float(np.min(self.colours)))
             lost[lit] = 1.0 - pupils.light
             if self.model.edges:
                 # as many nodes as such a phase takes would be minutes, for a contrast that is next to nothing
                 smooth &= wfe[lit] * self.wavelength <= MOST_BLUR * float(np.min(self.colours))
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
-                outlines = None if traced.outlines is None else traced.outlines.take(lit[good])
-                dark_in, lit_in = (None if one is None else one[good] for one in (taken, free))
                 if self.refracts:
-                    otf, known = self._in_colours(traced, origin, lit[good], dark_in, lit_in, outlines)
+                    otf, known = self._in_colours(traced, lit[good])
                 else:
                     own = pupils if len(good) == len(lit) else pupils.take(good)
                     seen = tuple(part[good] for part in cosines)
-                    otf, known = self._transfer(own, seen, lit_in, outlines, self.colours, self.weights)
+                    otf, known = self._transfer(traced, lit[good], own, seen, self.colours, self.weights)
                 good, otf = good[known], otf[known]
                 hold_within(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
                 mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
@@ -536,69 +534,54 @@ class _CameraBench:
         return values, dark, np.isnan(mtf[0])
 
     def _pupils(
-        self,
-        rays: ImagingRays,
-        size: np.ndarray,
-        origin: np.ndarray,
-        lit: np.ndarray,
-        taken: np.ndarray | None,
-        free: np.ndarray | None,
-        colour: float,
+        self, traced: _Traced, rays: ImagingRays, lit: np.ndarray, colour: float
     ) -> tuple[PupilStack, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Pupils of the beams ``lit``, which of them are smooth for light of a wavelength, metres, and the direction
         cosines of their rays, (B, N) each.
         """
         # the image's first axis runs along the line, Y', the second along the track, X'
         # per length of the nominal CCD, in which the pixels keep their pitch
-        v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
-        path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
-        traced = u, v, path - path[:, :1], rays.amplitude[lit], self.nodes
-        if free is None:
-            pupils = PupilStack.fit(*traced, DEGREE, taken, FEW_SIDES)
+        v, u = np.moveaxis(traced.size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
+        path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], traced.origin[lit])
+        beams = u, v, path - path[:, :1], rays.amplitude[lit], self.nodes
+        taken = None if traced.shadows is None else traced.shadows.pieces[lit]
+        if traced.free is None:
+            pupils = PupilStack.fit(*beams, DEGREE, taken, FEW_SIDES)
         else:
-            pupils = PupilStack.followed(*traced, colour, taken, free)
+            pupils = PupilStack.followed(*beams, colour, taken, traced.free[lit])
         return pupils, pupils.residual <= WORST_RESIDUAL * colour, (u, v)
 
-    def _in_colours(
-        self,
-        traced: _Traced,
-        origin: np.ndarray,
-        lit: np.ndarray,
-        taken: np.ndarray | None,
-        free: np.ndarray | None,
-        outlines: StopOutlines | None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _in_colours(self, traced: _Traced, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``_transfer`` of beams ``lit`` through lenses: each wavelength by its own rays, all about one place, so that
         lateral colour blurs.
         """
         total, known = np.zeros((len(lit), len(self.frequency)), complex), np.ones(len(lit), bool)
         for colour, weight in zip(self.colours, self.weights / np.sum(self.weights), strict=True):
-            rays = traced.again(float(colour))
-            pupils, good, cosines = self._pupils(rays, traced.size, origin, lit, taken, free, float(colour))
-            otf, told = self._transfer(pupils, cosines, free, outlines, np.array([colour]), np.ones(1))
+            pupils, good, cosines = self._pupils(traced, traced.again(float(colour)), lit, float(colour))
+            otf, told = self._transfer(traced, lit, pupils, cosines, np.array([colour]), np.ones(1))
             known &= good & told & (pupils.bend <= WORST_BEND)
             total += weight * otf
         return total, known
 
     def _transfer(
         self,
+        traced: _Traced,
+        lit: np.ndarray,
         pupils: PupilStack,
         cosines: tuple[np.ndarray, ...],
-        free: np.ndarray | None,
-        outlines: StopOutlines | None,
         colours: np.ndarray,
         weights: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Transfer functions, complex (B, M), and which of them are known, (B,): of pupils that edges cut by lines."""
         known = np.ones(len(pupils.centre), bool)
-        if outlines is None or free is None:
+        if traced.outlines is None or traced.free is None:
             return pupils.transfer(self.frequency, colours, weights), known
         total, shares = np.zeros((len(known), len(self.frequency)), complex), weights / np.sum(weights)
-        for k, pupil in enumerate(pupils.functions()):
-            one = slice(k, k + 1)
-            u, v = (part[one] for part in cosines)
+        for k, (beam, pupil) in enumerate(zip(lit, pupils.functions(), strict=True)):
+            u, v = (part[k : k + 1] for part in cosines)
+            own = slice(beam, beam + 1)
             try:
-                cut = cut_pupils([pupil], u, v, self.nodes, outlines.take(one), free[one])
+                cut = cut_pupils([pupil], u, v, self.nodes, traced.outlines.take(own), traced.free[own])
                 for colour, share in zip(colours, shares, strict=True):
                     (ways,) = line_transfers(cut, [float(colour)], np.eye(2), self.nyquist, 2)
                     total[k] += share * np.array([way.values[1] for way in ways])

@@ -377,8 +377,7 @@ def _by_differences(
     count = len(components)
     rows = np.moveaxis(place, 1, 2).reshape(-1, 2 * count)
     truth = trace_truth(instrument, backend, states)
-    changes = [np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f]) for c in truth.cameras.values()]
-    both = np.concatenate(changes)
+    both = np.concatenate([truth.vector(name).T for name in truth.cameras])
     return (rows[:, :count] - rows[:, count:]) / (2.0 * steps), (both[:, :count] - both[:, count:]) / (2.0 * steps)
 
 
@@ -572,6 +571,5 @@ def traced_states(path: MonitorPath, sight: LineSight, states: Sequence[State]) 
     """
     placed = path.instrument.assembly.place(states)
     shifts = np.moveaxis(path.coarse_trace(states, placed).place - path.place_at_rest, 1, 0).reshape(len(states), -1)
-    changes = sight.truth(states, placed).cameras.values()
-    rows = [np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=1) for c in changes]
-    return Retraced(shifts, np.concatenate(rows, axis=1))
+    truth = sight.truth(states, placed)
+    return Retraced(shifts, np.concatenate([truth.vector(name) for name in truth.cameras], axis=1))

@@ -72,22 +72,20 @@ class Jitter:
         """
         if not spec.stated:
             return None
-        streams = seed.spawn(len(spec.lines) + len(spec.bands))
-        frequencies, sines, cosines = [], [], []
-        for line, own in zip(spec.lines, streams[: len(spec.lines)], strict=True):
+        streams, terms = seed.spawn(len(spec.lines) + len(spec.bands)), []
+        for line, own in zip(spec.lines, streams, strict=False):
             drawn = np.random.default_rng(own).uniform(0.0, 2.0 * np.pi, 3)
             phase = drawn if line.phase is None else np.array(line.phase)
-            frequencies.append(np.array([line.frequency]))
-            sines.append((np.array(line.amplitude) * np.cos(phase))[None])
-            cosines.append((np.array(line.amplitude) * np.sin(phase))[None])
+            both = (np.array([line.amplitude]) * turn(phase) for turn in (np.cos, np.sin))
+            terms.append((np.array([line.frequency]), *both))
         for band, own in zip(spec.bands, streams[len(spec.lines) :], strict=True):
             random, width = np.random.default_rng(own), band.last - band.first
             count = int(np.clip(np.ceil(_RESOLVED * width), _LEAST, _MOST))
-            frequencies.append(band.first + width * (np.arange(count) + random.uniform(size=count)) / count)
+            frequency = band.first + width * (np.arange(count) + random.uniform(size=count)) / count
             sigma = np.sqrt(np.array(band.level) * width / count)
-            sines.append(sigma * random.standard_normal((count, 3)))
-            cosines.append(sigma * random.standard_normal((count, 3)))
-        return cls(np.concatenate(frequencies), np.concatenate(sines), np.concatenate(cosines))
+            terms.append((frequency, *(sigma * random.standard_normal((count, 3)) for _ in range(2))))
+        frequencies, sines, cosines = (np.concatenate(part) for part in zip(*terms, strict=True))
+        return cls(frequencies, sines, cosines)
 
     def __call__(self, seconds: np.ndarray) -> np.ndarray:
         """Rotation vectors in body axes at times (...), seconds: (..., 3), radians."""
@@ -243,7 +241,7 @@ def _walk(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> 
     return CubicSpline(time, sigma * (course - course[int(np.argmin(np.abs(time)))]))
 
 
-def _drift(time: np.ndarray, sigma: np.ndarray, correlation_time: float, seed: np.random.SeedSequence) -> Series:
+def _drift(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence, correlation_time: float) -> Series:
     """A stationary first-order Gauss-Markov process: correlation exp(-|dt| / correlation_time), exact at readings."""
     draws = np.random.default_rng(seed).standard_normal((time.size, 3))
     kept = np.exp(-(time[1] - time[0]) / correlation_time)
@@ -271,7 +269,7 @@ class MeasurementErrors:
     bias: np.ndarray
     thermal: np.ndarray
     reference: float
-    rate: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    rate: np.ndarray
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
         """Position errors along the orbital frame's axes, metres; (...) -> (..., 3)."""
@@ -316,36 +314,28 @@ def _draw_errors(
         raise ValueError(f"no such error: {', '.join(unknown)}; there are {', '.join(TERMS)}")
     streams = dict(zip(TERMS, np.random.SeedSequence(seed).spawn(len(TERMS)), strict=True))
     gps, star = spec.gps, spec.star_tracker
-    fixes = readings(first, last, gps.interval)
-    position: list[Series] = []
-    velocity: list[Series] = []
-    attitude: list[Series] = []
-    if "gps_noise" in terms and any(gps.noise):
-        position.append(_noise(fixes, np.array(gps.noise), streams["gps_noise"]))
-    if "gps_drift" in terms and any(gps.drift):
-        position.append(_drift(fixes, np.array(gps.drift), gps.correlation_time, streams["gps_drift"]))
-    if "gps_velocity" in terms and any(gps.velocity):
-        velocity.append(_noise(fixes, np.array(gps.velocity), streams["gps_velocity"]))
-    if "attitude_noise" in terms and any(star.noise):
-        looks = readings(first, last, star.interval)
-        attitude.append(_noise(looks, np.array(star.noise), streams["attitude_noise"]))
-    if "attitude_slow" in terms and any(star.slow.noise):
-        values = readings(first, last, star.slow.interval)
-        attitude.append(_noise(values, np.array(star.slow.noise), streams["attitude_slow"]))
-    rate = np.zeros(3)
-    if "attitude_drift" in terms and any(star.drift):
-        rate = np.array(star.drift) * np.random.default_rng(streams["attitude_drift"]).standard_normal(3)
-    if "attitude_walk" in terms and any(star.walk):
-        looks = readings(first, last, star.interval)
-        attitude.append(_walk(looks, np.array(star.walk), streams["attitude_walk"]))
+
+    def drawn(
+        name: str, sigma: Sequence[float], interval: float, make: Callable[..., Series] = _noise, *more: float
+    ) -> tuple[Series, ...]:
+        """The series of a term; none where it is off."""
+        if name not in terms or not any(sigma):
+            return ()
+        return (make(readings(first, last, interval), np.array(sigma), streams[name], *more),)
+
+    drift = drawn("gps_drift", gps.drift, gps.interval, _drift, gps.correlation_time)
+    slow = drawn("attitude_slow", star.slow.noise, star.slow.interval)
+    walk = drawn("attitude_walk", star.walk, star.interval, _walk)
     return MeasurementErrors(
-        tuple(position),
-        tuple(velocity),
-        tuple(attitude),
+        (*drawn("gps_noise", gps.noise, gps.interval), *drift),
+        drawn("gps_velocity", gps.velocity, gps.interval),
+        (*drawn("attitude_noise", star.noise, star.interval), *slow, *walk),
         np.array(star.bias) * ("attitude_bias" in terms),
         np.array(star.thermal.amplitude) * ("attitude_thermal" in terms),
         star.thermal.reference,
-        rate,
+        np.random.default_rng(streams["attitude_drift"]).standard_normal(3)
+        * np.array(star.drift)
+        * ("attitude_drift" in terms),
     )
 
 

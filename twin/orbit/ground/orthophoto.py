@@ -13,8 +13,8 @@ frequencies.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import cv2
@@ -216,6 +216,8 @@ SCALE = 10_000.0
 """Grey values of an orthophoto for a reflectance of 1."""
 _PER_LENGTH = 8.0
 """Cells of the smooth error in plan, in its correlation length."""
+_ROWS_AT_ONCE = 256
+"""Rows of control that are sampled at once, to bound memory."""
 _MARGIN = 50.0
 """Metres of true ground that are kept about the map, beside ten sigmas of its error in plan."""
 
@@ -331,27 +333,25 @@ def make_control(
     smooth = _plan_error(extent, spec, plan_seed)
     full = apparent(reflectance(extent, texture, ground, spec.changed), terrain, spec.light)
 
-    def shifted(east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return (east - spec.shift[0] - smooth[0](east, north), north - spec.shift[1] - smooth[1](east, north))
+    def sampled(ground: Callable[..., np.ndarray], spacing: float) -> Raster:
+        """The ground where the control says that it is, rows from the north."""
+        east, north = inside.axes(spacing)
+        values = np.empty((len(north), len(east)), np.float32)
+        for first in range(0, len(north), _ROWS_AT_ONCE):
+            part = slice(first, first + _ROWS_AT_ONCE)
+            x, y = np.meshgrid(east, north[::-1][part])
+            values[part] = ground(x - spec.shift[0] - smooth[0](x, y), y - spec.shift[1] - smooth[1](x, y))
+        return Raster(values, frame, float(east[0]), float(north[-1]), spacing)
 
-    east, north = inside.axes(spec.spacing)
-    values = np.empty((len(north), len(east)), np.float32)
-    for part in _parts(len(north)):
-        values[part] = full(*shifted(*np.meshgrid(east, north[::-1][part])))
+    photo, dem = sampled(full, spec.spacing), sampled(terrain.height, spec.dem.post)
     # a Gaussian has the transfer exp(-2 (pi sigma f)^2), at Nyquist f = 1/2
-    values = gaussian_filter(values, np.sqrt(-2.0 * np.log(spec.mtf)) / np.pi, mode="nearest")
+    values = gaussian_filter(photo.values, np.sqrt(-2.0 * np.log(spec.mtf)) / np.pi, mode="nearest")
     random = np.random.Generator(np.random.SFC64(noise_seed))
     values += np.float32(spec.noise) * random.standard_normal(values.shape, dtype=np.float32)
     grey = np.clip(np.rint(SCALE * values), 0, 65535).astype(np.uint16)
-    photo = Raster(grey, frame, float(east[0]), float(north[-1]), spec.spacing)
-
-    post = spec.dem.post
-    east, north = inside.axes(post)
-    heights = np.empty((len(north), len(east)), np.float32)
-    for part in _parts(len(north)):
-        heights[part] = terrain.height(*shifted(*np.meshgrid(east, north[::-1][part])))
-    heights += np.float32(spec.dem.sigma) * correlated_field(heights.shape, post, spec.dem.correlation, dem_seed)
-    dem = Raster(heights, frame, float(east[0]), float(north[-1]), post)
+    rough = correlated_field(dem.values.shape, spec.dem.post, spec.dem.correlation, dem_seed)
+    dem = replace(dem, values=dem.values + np.float32(spec.dem.sigma) * rough)
+    photo = replace(photo, values=grey)
     return Control(photo, dem, spec.shift, smooth)
 
 
@@ -365,7 +365,3 @@ def _plan_error(extent: Extent, spec: ControlSpec, seed: np.random.SeedSequence)
         coefficients = spline_filter(error.astype(np.float64), order=3, mode="mirror")
         grids.append(SplineGrid(coefficients, (spacing, spacing), (float(east[0]), float(north[0])), "mirror"))
     return grids[0], grids[1]
-
-
-def _parts(rows: int, at_once: int = 256) -> list[slice]:
-    return [slice(i, i + at_once) for i in range(0, rows, at_once)]
