@@ -360,7 +360,7 @@ MULTIPLE: Record[BlindMultiple] = Record(
     Quantity("second", lambda one: one.second, "the other", "second"),
     Quantity("gap_ms", lambda one: one.gap, "between their sights", "gap", 2),
     Quantity("periods", lambda one: one.order, "in the gap", "periods"),
-    Quantity("frequency_hz", lambda one: one.frequency, "periods over gap", "frequency", 3),
+    Quantity("frequency_hz", lambda one: one.frequency, "periods over gap", "frequency [Hz]", 3),
     Quantity("response", lambda one: one.response, "of all lines together, as against their best", "response", 3),
     Quantity("blind", lambda one: one.blind, "whether all lines together see nothing there either", "by all lines"),
 )
