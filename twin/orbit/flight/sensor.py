@@ -62,7 +62,7 @@ class MovedPlatform:
         return at + self.base.body_to_itrs(seconds) @ self.shift if np.any(self.shift) else at
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """The same velocities."""
+        """Velocities against the stars, which stay as they are."""
         return self.base.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
