@@ -117,7 +117,7 @@ def quality_answers(quality: Quality) -> tuple[str, ...]:
 
 
 def quality_warnings(quality: Quality) -> tuple[str, ...]:
-    """What a reader has to know."""
+    """Warnings of polynomials and control points."""
     found = []
     for name, product in quality.products.items():
         if product.most > _OFF:

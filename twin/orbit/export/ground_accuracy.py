@@ -396,7 +396,7 @@ def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, heigh
 
 
 def ground_sigma(sensor: Sensor, calibrated: CalibratedLine, change: EstimatedChange, height: float) -> GroundSigma:
-    """What the error of an estimated change is on the ground.
+    """Return the error of an estimated change on the ground.
 
     Args:
         sensor: with the corrected line.

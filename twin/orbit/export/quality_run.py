@@ -1,4 +1,4 @@
-"""What exported models are worth: errors on the ground, polynomials after control, a product's own polynomials.
+"""The worth of exported models: errors on the ground, polynomials after control, a product's own polynomials.
 
 Rational polynomials that come alone, without a rigorous model, corrected by control points.
 """
@@ -257,7 +257,7 @@ def polynomial_files(run: PolynomialExport) -> dict[str, bytes]:
 
 
 def polynomial_report(run: PolynomialExport) -> Report:
-    """What was corrected."""
+    """Report of the correction."""
     quality = Quality(control=FrozenMap({run.source.name: run.control}))
     verdict, more = answer(*quality_answers(quality))
     before, after = run.source.polynomial, run.control.after

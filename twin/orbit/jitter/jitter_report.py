@@ -25,7 +25,7 @@ _MOST_WRONG = 0.3
 _NAMED = 8
 """Aliases that are named."""
 _FIT = 1.3
-"""What remains over what the covariances say, from which it is told."""
+"""Noise that remains, in sigmas of the covariances, from which it is told."""
 
 
 def jitter_report(run: JitterRun) -> Report:
