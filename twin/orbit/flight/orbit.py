@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.spatial.transform import Rotation
 
 from optics.numerics.array_math import in_span
 from optics.numerics.invariants import UnphysicalError
@@ -239,8 +238,11 @@ def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
 
 def _radial_and_along(inclination: float, node: float, argument: float) -> np.ndarray:
     """Unit vectors away from the Earth and along the circular orbit, shape (2, 3), in the frame of integration."""
-    axes = Rotation.from_euler("ZXZ", [node, inclination, argument]).as_matrix()
-    return np.asarray(axes[:, :2].T)
+    cu, su, cn, sn = math.cos(argument), math.sin(argument), math.cos(node), math.sin(node)
+    ci, si = math.cos(inclination), math.sin(inclination)
+    radial = [cn * cu - sn * su * ci, sn * cu + cn * su * ci, su * si]
+    along = [-cn * su - sn * cu * ci, -sn * su + cn * cu * ci, cu * si]
+    return np.array([radial, along])
 
 
 def _element_state(spec: ElementsSpec, rotation: EarthRotation, ut1: tuple[float, float]) -> np.ndarray:
