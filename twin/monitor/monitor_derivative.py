@@ -23,18 +23,16 @@ from itertools import pairwise
 import numpy as np
 
 from analysis.monitor import model_fit
-from analysis.monitor.curvature import MotionModel, Retraced
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances, TimeLaw
 from analysis.monitor.parameters import CameraCalibration
+from analysis.monitor.recovery import MotionModel, Retraced
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, Motion, PlacedBodies, State, compose
-from optics.numerics.array_math import inverse, turned
+from optics.numerics.array_math import PhysicalError, inverse, turned
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError
 from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.aim import RayFan, aim, transverse_axes
-from optics.raytrace.derivatives import RayTangents, jvp, vjp
 from optics.raytrace.system import SystemBatch, assemble
-from optics.raytrace.trace import make_rays, trace
+from optics.raytrace.trace import RayTangents, jvp, make_rays, trace, vjp
 from scenes.models.disturbances import Component, StatedMotions, states_of
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel

@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from analysis.orbit.angles import AXES
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
+from analysis.orbit.planes import AXES
 from scenes.specs.measured.orbit_data_setup import MeasuredAngleSetup
 from scenes.specs.perturbation import in_words
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity

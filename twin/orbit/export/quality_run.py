@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from analysis.orbit.image_correction import LEAST_POINTS
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.export.export_report import CONTROL, FOLDER, control_section, quality_answers, quality_warnings

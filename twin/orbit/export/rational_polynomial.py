@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from analysis.arrays import Array
 from analysis.orbit.image_correction import ImageCorrection, Kind, image_correction
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import why_unreadable
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up

@@ -27,7 +27,7 @@ from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.model_fit import UnseenMode, floor, unseen_modes
 from analysis.orbit.forward_intersection import check_errors, intersect_pair
 from optics.numerics.array_math import number_of
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.specs.orbit.scene import ControlSpec, LineImageSpec
 from scenes.specs.resolved import target_band
