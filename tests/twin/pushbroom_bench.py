@@ -10,11 +10,10 @@ from scenes.specs.load import load_detector
 from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.orbit.setup import load_three_line_camera
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.jitter import Jitter
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.flight.trajectory import Attitude, Trajectory
+from twin.orbit.flight.trajectory import Attitude, Jitter, Trajectory
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import ImagedLine, imaged_lines
 

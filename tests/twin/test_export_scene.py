@@ -17,7 +17,8 @@ from tests.twin.dimap_bench import Scene, rpc, write
 from tests.twin.study_bench import REFUSED
 from twin.orbit.export import ground_accuracy, line_scanner
 from twin.orbit.export.export_report import _warnings as export_warnings
-from twin.orbit.export.quality_sections import quality_warnings
+from twin.orbit.export.export_report import quality_warnings
+from twin.orbit.export.export_run import Controlled, Quality
 from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
 from twin.orbit.measured.dimap_sensor import read_scene
 from twin.run.data_files import FrameFacts, tiff
@@ -194,11 +195,10 @@ def test_doubts_of_polynomials_and_control_points_are_told() -> None:
 
     def control(used=True, probability=2e-3, freedom=1) -> Any:
         correction = SimpleNamespace(used=np.array([True, used]), probability=probability, factor=9.0, freedom=freedom)
-        one = SimpleNamespace(polynomial=SimpleNamespace(correction=correction), names=np.array(["1", "2"]))
-        return SimpleNamespace(products={}, control={"A": one})
+        return Quality(control={"A": Controlled(np.array(["1", "2"], object), correction, None)})
 
     stands = "the correction by control points stands in the polynomials, not in the ISD"
-    assert quality_warnings(None) == ()
+    assert quality_warnings(Quality()) == ()
     assert quality_warnings(SimpleNamespace(products={"A": SimpleNamespace(most=0.99)}, control={})) == ()
     assert quality_warnings(control()) == (stands,)
     off = SimpleNamespace(products={"A": SimpleNamespace(most=1.2)}, control={})

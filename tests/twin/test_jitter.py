@@ -9,8 +9,7 @@ import pytest
 from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec
 from tests.tiers import quick
 from tests.twin.pushbroom_bench import LINE_TIME, PLACE, Ground, lines
-from twin.orbit.flight.jitter import Jitter
-from twin.orbit.flight.trajectory import Trajectory
+from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.images.jitter_exposure import collected, exposures
 from twin.orbit.images.patch import window_of

@@ -16,9 +16,8 @@ from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.jitter import sights
-from twin.orbit.jitter.jitter_numbers import JITTER, blind_multiples
 from twin.orbit.jitter.jitter_report import _warnings as jitter_warnings
-from twin.orbit.jitter.jitter_run import JitterRun, fly_strip, run_jitter
+from twin.orbit.jitter.jitter_run import JITTER, JitterRun, blind_multiples, fly_strip, run_jitter
 from twin.orbit.jitter.sights import SightsError, SteadyPlatform, sights_of
 
 ARCSEC = np.pi / 648000.0

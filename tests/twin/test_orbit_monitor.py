@@ -151,7 +151,7 @@ def test_monitoring_takes_out_nearly_all(quiet) -> None:
 def test_height_without_monitoring_is_the_angle_times_metres_per_arcsec(quiet) -> None:
     """Traced metres of each camera's turn predict the height to 2%: the latitude changes the altitude by 1%, the scale
     and d_gamma add millimetres. Of the angle alone it is 5%, for the cameras do not turn by exactly half each."""
-    run, flight = quiet, quiet.flight
+    run = flight = quiet
     height = run.cases["none"].camera
     size = rms(height)
     told = run.conversion
@@ -186,13 +186,13 @@ def test_noise_is_as_large_as_its_sigma(noisy) -> None:
 @pytest.mark.second
 def test_the_noise_is_not_the_whole_error(stated) -> None:
     """The truth is missed by what the spots leave open, as the total sigma says."""
-    later = np.arange(5) != stated.flight.spec.referred
+    later = np.arange(5) != stated.spec.referred
     assert np.all(stated.sigma_total[later] > 20.0 * stated.sigma[later])
     wrong = stated.cases["monitored"].camera
     assert rms(wrong) > 5.0 * rms(stated.sigma)
     # 4.9 sigmas: one in a million
     assert np.abs(wrong[later] / stated.sigma_total[later]).max() < 4.9
-    assert stated.angle[0] == stated.angle_sigma[0] == stated.sigma_total[0] == 0.0
+    assert stated.angle.change_rad[0] == stated.angle.sigma_rad[0] == stated.sigma_total[0] == 0.0
 
 
 @pytest.mark.second

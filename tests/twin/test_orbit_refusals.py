@@ -58,11 +58,10 @@ from twin.orbit.block.block_run import run_adjustment
 from twin.orbit.block.point_workers import PointWorkers
 from twin.orbit.calibration.observations import light_shift
 from twin.orbit.conventions.check_run import run_check
-from twin.orbit.export.estimated_change import ground_rows
 from twin.orbit.export.export_run import read_exportable, run_export
-from twin.orbit.export.polynomial_control import controlled
-from twin.orbit.export.polynomial_export import read_polynomial_source
-from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
+from twin.orbit.export.ground_accuracy import ground_rows
+from twin.orbit.export.quality_run import read_polynomial_source
+from twin.orbit.export.rational_polynomial import RationalPolynomial, controlled, read_rpc
 from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
@@ -80,7 +79,7 @@ from twin.orbit.measured.ground_files import read_ground_points
 from twin.orbit.measured.map_part import UserMap
 from twin.orbit.measured.pass_measurements import GroundPoints
 from twin.orbit.measured.platform_files import platform_table, read_platform
-from twin.orbit.monitoring import closed_loop, line_images, monitoring_run
+from twin.orbit.monitoring import closed_loop, loop_run, monitoring_run
 from twin.orbit.monitoring.monitor_series import MonitorSeries
 from twin.run.cli import InputErrorText
 from twin.run.cluster import ClusterError
@@ -503,9 +502,9 @@ FEW: dict[str, Any] = {
 
 def test_line_images_with_too_few_points_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     for part, made in FEW.items():
-        monkeypatch.setattr(line_images, part, made)
+        monkeypatch.setattr(loop_run, part, made)
     known = dict.fromkeys(PAIR.pair)
     flight, flown = Ns(lines=[known], calibrated=known), Ns(true=None, measured=None, earth=Earth())
     with pytest.raises(BenchError, match=r"^line images: only 7 of 20 points were matched$") as caught:
-        line_images.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
+        loop_run.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
     assert caught.value.key == ("mechanisms", "images")

@@ -17,10 +17,10 @@ from twin.orbit.block import block_report
 from twin.orbit.calibration import calibration_report, influences
 from twin.orbit.calibration.calibration_numbers import FIT, STEPWISE
 from twin.orbit.conventions import check_report
-from twin.orbit.export import export_report, quality_sections
+from twin.orbit.export import export_report
+from twin.orbit.export.export_report import quality_answers
 from twin.orbit.export.ground_accuracy import TOGETHER
-from twin.orbit.export.polynomial_control import residual_sigma
-from twin.orbit.export.quality_sections import quality_answers
+from twin.orbit.export.rational_polynomial import residual_sigma
 from twin.orbit.images import simulate_report
 from twin.orbit.matching import match_report
 from twin.orbit.monitoring import monitoring_numbers, monitoring_report
@@ -68,8 +68,8 @@ WARNINGS: dict[str, Callable[[Any], Any]] = {
     "match": match_report._warnings,
     "simulate": simulate_report._warnings,
     "export": export_report._warnings,
-    "quality": quality_sections.quality_warnings,
-    "control": lambda run: quality_sections.quality_warnings(run)[:-1],
+    "quality": export_report.quality_warnings,
+    "control": lambda run: export_report.quality_warnings(run)[:-1],
     "calibration": calibration_report._warnings,
     "drift": lambda drift: influences.drift_warnings(made(UNTOLD), drift),
     "steps": lambda run: influences.step_warnings(run.all),
@@ -139,17 +139,17 @@ def test_tables_of_accuracy_and_control_have_their_units() -> None:
     errors = {"ce90": np.array([5.0, 7.0, 99.0]), "le90": np.array([2.0, 3.0, 99.0]), "covariance": covariance}
     numbers = {"line": np.array([1.0, 2.0, 0.0]), "pixel": np.array([3.0, 4.0, 0.0]), "horizontal": lambda: (1.5, 0.5)}
     maps = {"nadir": Ns(seen=seen, **places, **errors, **numbers)}
-    table, _, grid = quality_sections._map_section(maps).artefacts
-    assert table.rows == [("nadir", 6.0, 7.0, 2.5, 3.0, 1.5, 0.5)]
+    table, _, grid = export_report._map_section(maps).artefacts
+    assert table.rows == [["nadir", 6.0, 7.0, 2.5, 3.0, 1.5, 0.5]]
     assert grid.rows[0] == pytest.approx(("nadir", 1.0, 3.0, 116.0, 40.0, 300.0, 5.0, 2.0, 2.0, 3.0, 4.0))
     assert [row[3] for row in grid.rows] == pytest.approx([116.0, 117.0])
     at, spread = np.array([[3.0, -4.0]]), np.array([np.diag([0.04, 0.25])])
     correction = Ns(at=lambda *_: at, covariance_at=lambda *_: spread, middle=(0.0, 0.0), chi_square=5.0, freedom=2)
     correction = Ns(**vars(correction), residual=np.array([[0.1, 0.2]]), used=np.array([False]))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quality_sections, "residual_sigma", lambda _: np.array([[0.3, 0.4]]))
-        control = {"nadir": Ns(polynomial=Ns(correction=correction), names=IDS[:1])}
-        table, full = quality_sections.control_section(control).artefacts
+        patch.setattr(export_report, "residual_sigma", lambda _: np.array([[0.3, 0.4]]))
+        control = {"nadir": Ns(correction=correction, names=IDS[:1])}
+        table, full = export_report.control_section(control).artefacts
     assert table.rows == [("nadir", 3.0, pytest.approx(0.2), -4.0, pytest.approx(0.5), 5.0, 2)]
     assert full.rows == [("nadir", "a", 0.1, 0.3, 0.2, 0.4, "left out")]
 
@@ -157,12 +157,12 @@ def test_tables_of_accuracy_and_control_have_their_units() -> None:
 def test_sentences_of_accuracy_and_residuals_name_their_own_numbers() -> None:
     """Points that are used, the bias after the correction, the largest CE90 and the LE90 of intersected points."""
     correction = Ns(used=np.array([True, False]), kind="shift")
-    polynomial = Ns(correction=correction, before=Ns(bias_m=9.0), after=Ns(bias_m=0.25))
+    controlled = Ns(correction=correction, after=Ns(bias_m=0.25), names=IDS)
     maps = {
         TOGETHER: Ns(ce90=np.array([1.0, 2.0]), le90=np.array([3.0, np.nan])),
         "nadir": Ns(ce90=np.array([4.0, np.nan])),
     }
-    first, second, third = quality_answers(Ns(control={"nadir": Ns(polynomial=polynomial, names=IDS)}, maps=maps))
+    first, second, third = quality_answers(Ns(control={"nadir": controlled}, maps=maps))
     assert first.startswith("1 of 2 control points correct the polynomials of nadir by a shift, to 0.25 m")
     assert second == "CE90 is at most 4.00 m, of points of nadir"
     assert third == "LE90 of intersected points is at most 3.00 m"

@@ -9,8 +9,7 @@ from scenes.specs.orbit.scene import ControlSpec, LightSpec, TerrainSpec, Textur
 from tests.tiers import quick
 from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame, SplineGrid, Terrain, correlated_field, fractal_field
-from twin.orbit.ground.orthophoto import SCALE, make_control
-from twin.orbit.ground.texture import Extent, apparent, reflectance
+from twin.orbit.ground.orthophoto import SCALE, Extent, apparent, make_control, reflectance
 from twin.orbit.images.image_points import ReferenceHeights
 
 SEED = np.random.SeedSequence(7)

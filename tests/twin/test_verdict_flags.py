@@ -56,10 +56,7 @@ PER_SI |= {"pm": 1e12, "nm": 1e9, "um": 1e6, "mm": 1e3, "km": 1e-3, "us": 1e6, "
 PER_SI |= {"percent": 1e2, "ppm": 1e6, "urad": 1e6, "mrad": 1e3}
 """How many of a unit are one of SI, by the definition of the second of arc; 1 of all others."""
 STRICT = [(True, ["--strict"], 0), (False, ["--strict"], 3), (False, [], 0)]
-CONVERTED_BY_HAND = frozenset(
-    "amplitude_arcsec amplitude_arcsec_sigma detectable_arcsec gap_ms ground_um phase_deg phase_margin_deg "
-    "shim_changes_um shim_um shims_um true_amplitude_arcsec".split()
-)
+CONVERTED_BY_HAND = frozenset("ground_um phase_margin_deg shim_changes_um shim_um shims_um".split())
 """Keys whose sources are in the unit already."""
 
 

@@ -22,16 +22,8 @@ from twin.monitor.truth import truth_jacobian
 _SEEN_WITHIN = 0.1
 """Relative error up to which the words say that a change is seen."""
 
-PRINTED = {
-    ("paper_single", 0): "eq. (3)",
-    ("paper_single", 1): "eq. (2)",
-    ("paper_single", 2): "eq. (5)",
-    ("paper_single", 3): "eq. (7)",
-    ("paper_joint", 0): "Table 1, joint",
-    ("paper_joint", 1): "Table 1, joint",
-    ("paper_joint", 2): "Table 1, joint",
-    ("paper_joint", 3): "Table 1, joint",
-}
+PRINTED = {("paper_single", k): f"eq. ({number})" for k, number in enumerate((3, 2, 5, 7))}
+PRINTED |= {("paper_joint", k): "Table 1, joint" for k in range(4)}
 
 
 @dataclass(frozen=True)

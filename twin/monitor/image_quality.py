@@ -9,6 +9,8 @@ with the radius of the nominal exit pupil; piston and tilt are taken out. Best f
 is least, with the exact phase sqrt(1 - u^2 - v^2) of a shift. The MTF is that of the traced pupil, polychromatic if
 the camera describes a band, times the pixel and all else that the band says of its line CCD. What prisms and other
 bodies of the instrument take of the beam (``scenes.models.shadow``) is missing in both, unless it is to be ignored.
+
+Means over the light of pupils that bodies and edges cut.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from analysis.arrays import shows
+from optics.geometry import zernike
 from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
 from optics.geometry.tree import State
@@ -27,6 +30,7 @@ from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError, hold_below, hold_equal, hold_within
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
+from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.first_order import chief_rays
@@ -37,18 +41,77 @@ from optics.waves.imaging import ImagingRays, eikonal, imaging_rays, path_to_sph
 from optics.waves.line_transfer import LINE_SIDES, cut_pupils, line_transfers
 from optics.waves.pupil_shadow import FEW_SIDES, SMALLEST
 from optics.waves.pupil_stack import CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
-from optics.waves.pupil_terms import WORST_BEND
+from optics.waves.pupil_terms import WORST_BEND, products, smooth_terms, to_terms
 from scenes.models import shadow
 from scenes.models.camera_axis import LAUNCH_DISTANCE
 from scenes.models.camera_model import coloured, lenses, line_body
 from scenes.models.instrument_model import Instrument
+from scenes.models.shadow import Shadows
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import target_band
 from scenes.specs.spectrum import SpectrumSpec
-from twin.monitor.pupil_mean import PupilMean
 from twin.run.quantity import Quantity, Record
 from twin.sensors.line_ccd import band_factors
+
+CUT_MEAN_DEGREE = 14
+"""Degree of the polynomials that continue the wavefront of a beam that edges of surfaces cut."""
+
+
+class PupilMean:
+    """Mean over the free part of each stop, of values at nodes of it.
+
+    Polynomials continue the values into the shadows, where they are taken off. They stand for the rays in the dark of
+    edges, too, which may pass the rims of lenses far outside.
+
+    Args:
+        nodes: N of the stop.
+        shadows: in B stops; None for free beams.
+        free: which nodes of each stop light comes through, (B, N); None where rays in the dark are as those in the
+            light.
+    """
+
+    def __init__(self, nodes: PupilNodes, shadows: Shadows | None, free: np.ndarray | None = None) -> None:
+        self._free, self._nodes = free, nodes
+        tilts = zernike.basis(3, nodes.x, nodes.y)
+        self._share, self._tilts = nodes.share[None], tilts[None]
+        self._added: np.ndarray | None = None
+        if shadows is None:
+            return
+        points, weight = shadows.points, shadows.weights
+        count = len(points)
+        all_weights = np.concatenate([np.broadcast_to(nodes.weight, (count, nodes.count)), -weight], axis=1)
+        self._share = all_weights / np.maximum(np.sum(all_weights, axis=1, keepdims=True), _SOME)
+        own = zernike.basis(3, points.real.ravel(), points.imag.ravel()).reshape(*points.shape, 3)
+        self._tilts = np.concatenate([np.broadcast_to(tilts, (count, *tilts.shape)), own], axis=1)
+        degree = DEGREE if free is None else CUT_MEAN_DEGREE
+        self._to_terms = to_terms(nodes, degree)
+        self._on_stop = products(nodes.x, nodes.y, degree)
+        self._added = products(points.real, points.imag, degree)
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Mean (B,) of values as ``flat`` gives them."""
+        return np.asarray(np.sum(values * self._share, axis=-1))
+
+    def flat(self, values: np.ndarray) -> np.ndarray:
+        """Values (B, N) less piston and tilt, (B, N + Q): also at nodes in the shadows."""
+        values = values - values[:, :1]
+        if self._added is not None:
+            if self._free is None:
+                terms = values @ self._to_terms.T
+            else:
+                terms = smooth_terms(self._on_stop, self._nodes.weight, self._free, values[..., None])[..., 0]
+                values = np.where(self._free, values, terms @ self._on_stop.T)
+            values = np.concatenate([values, np.squeeze(self._added @ terms[..., None], -1)], axis=1)
+        weighted = self._tilts * self._share[..., None]
+        turned = np.swapaxes(weighted, 1, 2)
+        level = np.linalg.solve(turned @ self._tilts, turned @ values[..., None])
+        return np.asarray(values - np.squeeze(self._tilts @ level, -1))
+
+
+_SOME = 1e-3
+"""Smallest lit area of a stop, in units of its radius squared, for which a mean is defined."""
+
 
 FIELDS = (1.0, 0.7, 0.0, -0.7, -1.0)
 """Field points, as shares of half the line, left end first."""
@@ -287,15 +350,19 @@ class _Traced:
     Attributes:
         rays: at the design wavelength.
         size: of the line CCD in each, (B,).
+        origin: of its points on the line CCD, (B, 1, 3).
         shadows: in them; None for free beams.
         outlines: of edges and bodies on their stops; None for a camera whose surfaces have no edges.
+        free: nodes that no edge and no body takes, (B, N); None likewise.
         again: the same beams in light of another wavelength, metres.
     """
 
     rays: ImagingRays
     size: np.ndarray
+    origin: np.ndarray
     shadows: shadow.Shadows | None
     outlines: StopOutlines | None
+    free: np.ndarray | None
     again: Callable[[float], ImagingRays]
 
 
@@ -413,23 +480,22 @@ class _CameraBench:
         imaging, rays = sent(self.model.spec.wavelength)
         beams = shadow.TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
         shadows = None if self.shadows is None else self.shadows.cast(beams)
-        outlines = None
+        outlines: StopOutlines | None = None
+        covers: np.ndarray | None = None
         if self.model.edges:
             free = shadow.no_shadows(len(every)) if shadows is None else shadows
             seen = shadow.SeenEdges.of(beams, self.model, self.name, self.backend)
             outlines = seen.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(free.pieces, 1, 0)))
             shadows = free.and_edges(seen.outlines, f"edges of {name}")
-        return _Traced(rays, imaging.size, shadows, outlines, lambda colour: sent(colour)[1])
+            covers = ~covered(shadows.pieces, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
+        origin = (imaging.size[:, None] * np.tile(self.points, (len(states), 1)))[:, None]
+        return _Traced(rays, imaging.size, origin, shadows, outlines, covers, lambda colour: sent(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values (V, B) of _COLUMNS, the share of each beam that is cut, and whether an MTF is not to be had."""
-        rays, size, shadows = traced.rays, traced.size, traced.shadows
-        origin = (size[:, None] * np.tile(self.points, (len(rays.path) // len(self.points), 1)))[:, None]
+        rays, shadows, free = traced.rays, traced.shadows, traced.free
         radius = float(self.model.first_order.exit_pupil_distance[0])
-        error = path_to_sphere(rays.position, rays.direction, rays.path, origin, radius)
-        free = None
-        if self.model.edges and shadows is not None:
-            free = ~covered(shadows.pieces, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
+        error = path_to_sphere(rays.position, rays.direction, rays.path, traced.origin, radius)
         mean = PupilMean(self.nodes, None if shadows is None or not shadows.owners else shadows, free)
         error = -mean.flat(error)
         focus = mean.flat(np.abs(rays.direction[..., 2]))
@@ -439,26 +505,21 @@ class _CameraBench:
         dark = np.mean((rays.amplitude == 0.0) & (True if free is None else free), axis=-1)
         mtf = np.full((2, len(dark)), np.nan)
         lost = np.zeros(len(dark))
-        pieces = None if shadows is None else shadows.pieces
         lit = np.flatnonzero(dark == 0.0)
         if len(lit):
-            taken = None if pieces is None else pieces[lit]
-            free = None if free is None else free[lit]
-            pupils, smooth, cosines = self._pupils(rays, size, origin, lit, taken, free, float(np.min(self.colours)))
+            pupils, smooth, cosines = self._pupils(traced, rays, lit, float(np.min(self.colours)))
             lost[lit] = 1.0 - pupils.light
             if self.model.edges:
                 # as many nodes as such a phase takes would be minutes, for a contrast that is next to nothing
                 smooth &= wfe[lit] * self.wavelength <= MOST_BLUR * float(np.min(self.colours))
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
-                outlines = None if traced.outlines is None else traced.outlines.take(lit[good])
-                dark_in, lit_in = (None if one is None else one[good] for one in (taken, free))
                 if self.refracts:
-                    otf, known = self._in_colours(traced, origin, lit[good], dark_in, lit_in, outlines)
+                    otf, known = self._in_colours(traced, lit[good])
                 else:
                     own = pupils if len(good) == len(lit) else pupils.take(good)
                     seen = tuple(part[good] for part in cosines)
-                    otf, known = self._transfer(own, seen, lit_in, outlines, self.colours, self.weights)
+                    otf, known = self._transfer(traced, lit[good], own, seen, self.colours, self.weights)
                 good, otf = good[known], otf[known]
                 hold_within(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
                 mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
@@ -470,69 +531,54 @@ class _CameraBench:
         return values, dark, np.isnan(mtf[0])
 
     def _pupils(
-        self,
-        rays: ImagingRays,
-        size: np.ndarray,
-        origin: np.ndarray,
-        lit: np.ndarray,
-        taken: np.ndarray | None,
-        free: np.ndarray | None,
-        colour: float,
+        self, traced: _Traced, rays: ImagingRays, lit: np.ndarray, colour: float
     ) -> tuple[PupilStack, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Pupils of the beams ``lit``, which of them are smooth for light of a wavelength, metres, and the direction
         cosines of their rays, (B, N) each.
         """
         # the image's first axis runs along the line, Y', the second along the track, X'
         # per length of the nominal CCD, in which the pixels keep their pitch
-        v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
-        path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
-        traced = u, v, path - path[:, :1], rays.amplitude[lit], self.nodes
-        if free is None:
-            pupils = PupilStack.fit(*traced, DEGREE, taken, FEW_SIDES)
+        v, u = np.moveaxis(traced.size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
+        path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], traced.origin[lit])
+        beams = u, v, path - path[:, :1], rays.amplitude[lit], self.nodes
+        taken = None if traced.shadows is None else traced.shadows.pieces[lit]
+        if traced.free is None:
+            pupils = PupilStack.fit(*beams, DEGREE, taken, FEW_SIDES)
         else:
-            pupils = PupilStack.followed(*traced, colour, taken, free)
+            pupils = PupilStack.followed(*beams, colour, taken, traced.free[lit])
         return pupils, pupils.residual <= WORST_RESIDUAL * colour, (u, v)
 
-    def _in_colours(
-        self,
-        traced: _Traced,
-        origin: np.ndarray,
-        lit: np.ndarray,
-        taken: np.ndarray | None,
-        free: np.ndarray | None,
-        outlines: StopOutlines | None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _in_colours(self, traced: _Traced, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``_transfer`` of beams ``lit`` through lenses: each wavelength by its own rays, all about one place, so that
         lateral colour blurs.
         """
         total, known = np.zeros((len(lit), len(self.frequency)), complex), np.ones(len(lit), bool)
         for colour, weight in zip(self.colours, self.weights / np.sum(self.weights), strict=True):
-            rays = traced.again(float(colour))
-            pupils, good, cosines = self._pupils(rays, traced.size, origin, lit, taken, free, float(colour))
-            otf, told = self._transfer(pupils, cosines, free, outlines, np.array([colour]), np.ones(1))
+            pupils, good, cosines = self._pupils(traced, traced.again(float(colour)), lit, float(colour))
+            otf, told = self._transfer(traced, lit, pupils, cosines, np.array([colour]), np.ones(1))
             known &= good & told & (pupils.bend <= WORST_BEND)
             total += weight * otf
         return total, known
 
     def _transfer(
         self,
+        traced: _Traced,
+        lit: np.ndarray,
         pupils: PupilStack,
         cosines: tuple[np.ndarray, ...],
-        free: np.ndarray | None,
-        outlines: StopOutlines | None,
         colours: np.ndarray,
         weights: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Transfer functions, complex (B, M), and which of them are known, (B,): of pupils that edges cut by lines."""
         known = np.ones(len(pupils.centre), bool)
-        if outlines is None or free is None:
+        if traced.outlines is None or traced.free is None:
             return pupils.transfer(self.frequency, colours, weights), known
         total, shares = np.zeros((len(known), len(self.frequency)), complex), weights / np.sum(weights)
-        for k, pupil in enumerate(pupils.functions()):
-            one = slice(k, k + 1)
-            u, v = (part[one] for part in cosines)
+        for k, (beam, pupil) in enumerate(zip(lit, pupils.functions(), strict=True)):
+            u, v = (part[k : k + 1] for part in cosines)
+            own = slice(beam, beam + 1)
             try:
-                cut = cut_pupils([pupil], u, v, self.nodes, outlines.take(one), free[one])
+                cut = cut_pupils([pupil], u, v, self.nodes, traced.outlines.take(own), traced.free[own])
                 for colour, share in zip(colours, shares, strict=True):
                     (ways,) = line_transfers(cut, [float(colour)], np.eye(2), self.nyquist, 2)
                     total[k] += share * np.array([way.values[1] for way in ways])

@@ -36,9 +36,8 @@ from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.calibration_cache import CacheEntry
-from twin.monitor.line_curvature import motion_models
 from twin.monitor.monitor_beams import SpotFocus
-from twin.monitor.monitor_derivative import disturbances_of, spot_jacobian
+from twin.monitor.monitor_derivative import disturbances_of, motion_models, spot_jacobian
 from twin.monitor.monitor_memory import MonitorSize, require_memory
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import line_family

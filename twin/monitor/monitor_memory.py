@@ -179,31 +179,21 @@ def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str, detector: Emva
         what, unit = f"for the images of area CCDs of {rows} x {columns} pixels", "rows and columns"
         owner, least, number = resolved.instrument, LEAST_SIDE, max(rows, columns)
         key: KeyPath = ("monitor", "area_ccd", "rows" if rows >= columns else "columns")
-
-        def at(n: int) -> MonitorSize:
-            return replace(size, rows=min(rows, n), columns=min(columns, n))
-
+        each = {"rows": 1, "columns": 1}
     elif part == "times":
         assert job.course is not None
-        what, unit = f"for {size.times} times of the course", "times"
+        what, unit, each = f"for {size.times} times of the course", "times", {"times": 1}
         owner, least, number, key = job.course, FEWEST, size.times, ("times",)
-
-        def at(n: int) -> MonitorSize:
-            return replace(size, times=n)
-
     elif part == "pictures":
         number, unit, key = resolved.targets.frames or frames, "frames", ("render", "targets", "frames")
-        each, what = size.pictures // number, f"for {number} frames of test targets"
-
-        def at(n: int) -> MonitorSize:
-            return replace(size, pictures=n * each)
-
+        each, what = {"pictures": size.pictures // number}, f"for {number} frames of test targets"
     else:
         what, unit, number = f"for {frames} frames of area CCDs of {rows} x {columns} pixels", "frames", frames
-        own = job.render.frames is not None
+        own, each = job.render.frames is not None, {"frames": 1}
         owner, key = (job if own else resolved.instrument), ("render" if own else "monitor", "frames")
 
-        def at(n: int) -> MonitorSize:
-            return replace(size, frames=n)
+    def needed(n: int) -> float:
+        fewer = {name: min(getattr(size, name), n * one) for name, one in each.items()}
+        return replace(size, **fewer).bytes(detector)
 
-    return what, Lowered(owner, key, number, unit, lambda n: at(n).bytes(detector), least)
+    return what, Lowered(owner, key, number, unit, needed, least)

@@ -260,20 +260,11 @@ class ErrorBudget:
             progress(0.1 + 0.9 * (found.numbers[-1] + 1) / len(states), "all causes: render and measure")
         angle = self.radians_per_pixel * np.concatenate([p.after - p.before for _, p in pieces])
         parameters: dict[str, dict[str, tuple[float, float]]] = {}
+        cameras = self.experiment.instrument.cameras
         for estimator in next(iter(pieces[0][1].parameters.values())):
-            parameters[estimator] = {}
-            for name in _PARAMETER_FIELDS:
-                values = [
-                    np.concatenate(
-                        [
-                            np.asarray(getattr(p.parameters[c][estimator], name))
-                            - getattr(true.cameras[c], name.rpartition("_")[0])
-                            for true, p in pieces
-                        ]
-                    )
-                    for c in self.experiment.instrument.cameras
-                ]
-                parameters[estimator][name] = _three_sigma(np.stack(values, axis=-1))
+            errors = [[p.parameters[c][estimator].vector - true.vector(c) for true, p in pieces] for c in cameras]
+            off = np.stack([np.concatenate(own) for own in errors], axis=-1)
+            parameters[estimator] = {name: _three_sigma(off[:, k]) for k, name in enumerate(_PARAMETER_FIELDS)}
         return Together(_three_sigma(angle), parameters)
 
 

@@ -143,6 +143,16 @@ _MOTIONS: Record[Sequence[Motion]] = Record(
     Quantity("shift_um", lambda moves: [one.shift for one in moves], "shift along X, Y and Z"),
     Quantity("scale_ppm", lambda moves: [one.scale for one in moves], "relative growth"),
 )
+
+
+def _agreement(course: TimeSeries) -> dict[str, Any] | None:
+    return None if course.smoothed is None else course.smoothed.to_dict()
+
+
+def _between(course: TimeSeries) -> dict[str, Any] | None:
+    return course.smoothed.between_dict() if course.smoothed and len(course.smoothed.times) else None
+
+
 COURSE: Record[TimeSeries] = Record(
     "course.json: as truth.json and recovered.json, with a list over the times for each number.",
     Quantity("times_s", lambda course: course.times, "times of the measurements"),
@@ -152,23 +162,9 @@ COURSE: Record[TimeSeries] = Record(
     Quantity("motions", lambda course: course.motions or None, "motions by body", record=_MOTIONS, where_known=True),
     Quantity("intersection_angle", _angle, "the angle between two cameras", where_known=True),
     Quantity("ground", lambda course: course.group("ground"), "errors of points on the ground", where_known=True),
-    Quantity(
-        "sigma_holds",
-        lambda course: course.sigma_holds,
-        "whether sigmas hold at each time, filtered and smoothed ones too",
-    ),
-    Quantity(
-        "disturbances",
-        lambda course: None if course.smoothed is None else course.smoothed.to_dict(),
-        "whether all measurements agree with what is stated to move",
-        where_known=True,
-    ),
-    Quantity(
-        "between",
-        lambda course: course.smoothed.between_dict() if course.smoothed and len(course.smoothed.times) else None,
-        "filtered and smoothed changes between the times",
-        where_known=True,
-    ),
+    Quantity("sigma_holds", lambda course: course.sigma_holds, "whether sigmas hold at each time"),
+    Quantity("disturbances", _agreement, "whether all measurements agree with what is stated", where_known=True),
+    Quantity("between", _between, "filtered and smoothed changes between the times", where_known=True),
 )
 
 

@@ -36,9 +36,9 @@ from twin.operate.estimate.operation_model import plan_digest
 from twin.operate.estimated_motions import EstimatedMotions, LeftOut, Prior, prior_files, state_file
 from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
 from twin.operate.record.schema import ENTRY
-from twin.orbit.export.estimated_change import EstimatedChange
 from twin.orbit.export.export_report import LINE, export_files
 from twin.orbit.export.export_run import USUAL_HEIGHTS, Export, run_export
+from twin.orbit.export.ground_accuracy import EstimatedChange
 from twin.run.data_files import WRITER
 from twin.run.procedure import BenchError
 from twin.run.quantity import Quantity, Record

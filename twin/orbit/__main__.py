@@ -11,7 +11,7 @@ import os
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -26,9 +26,9 @@ from twin.run.procedure import Advance, Session
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.orbit.setup import AnyAdjust
-    from twin.orbit.block.block_run import BlockRun
-    from twin.orbit.export.export_run import ExportSource, SceneSource, Wishes
-    from twin.orbit.export.polynomial_export import PolynomialSource
+    from twin.orbit.export.export_run import ControlPoints, ExportSource, SceneSource
+    from twin.orbit.export.ground_accuracy import CameraUncertainty
+    from twin.orbit.export.quality_run import PolynomialSource
 
     Exportable = ExportSource | SceneSource | PolynomialSource
 
@@ -96,16 +96,12 @@ def adjust(
         return without_sensors(setup, without or ())
 
     options = Options(out, seed, backend, force, as_json, quiet, strict=strict)
-    if workers is None and scheduler is None:
-        run_test(PROGRAM, "adjust", procedure, file, options, changed=reduced)
-        return
 
-    def run(setup: AnyAdjust, backend: Backend, seed: int, advance: Advance) -> BlockRun:
-        from twin.orbit.block.block_run import run_adjustment
+    def run(setup: AnyAdjust, backend: Backend, seed: int, advance: Advance) -> Any:
         from twin.orbit.block.point_workers import point_workers
 
         with point_workers(workers, scheduler, lambda text: print_warnings(errors, (text,))) as pool:
-            return run_adjustment(setup, backend, seed, advance, pool)
+            return procedure.run(setup, backend, seed, advance, pool)
 
     errors = Console(stderr=True)
     run_test(PROGRAM, "adjust", replace(procedure, run=run), file, options, changed=reduced)
@@ -189,41 +185,44 @@ def export(
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     sigmas = {
-        "position": (position_sigma, "--position-sigma"),
-        "attitude": (attitude_sigma, "--attitude-sigma"),
-        "interior": (interior_sigma, "--interior-sigma"),
-        "image": (image_sigma, "--image-sigma"),
-        "height": (height_sigma, "--height-sigma"),
+        "position": position_sigma,
+        "attitude": attitude_sigma,
+        "interior": interior_sigma,
+        "image": image_sigma,
+        "height": height_sigma,
     }
+    asked = [word for name, one in sigmas.items() if one is not None for word in (f"--{name}-sigma", str(one))]
+    asked += [] if band is None else ["--band", band]
+    asked += [] if control is None else ["--control", str(control), "--correction", correction.value]
 
-    def resolve() -> tuple[Exportable, tuple[float, float] | None, Wishes]:
-        from twin.orbit.export.export_run import Wishes, read_control, read_exportable
+    def resolve() -> tuple[Exportable, tuple[float, float] | None, CameraUncertainty | None, ControlPoints | None]:
+        from twin.orbit.export.export_run import read_control, read_exportable
         from twin.orbit.export.ground_accuracy import CameraUncertainty
-        from twin.orbit.export.polynomial_export import read_polynomial_source
+        from twin.orbit.export.quality_run import read_polynomial_source
 
-        stated = {name: _sigma(name, *one) for name, one in sigmas.items() if one[0] is not None}
+        stated = {name: _sigma(name, one) for name, one in sigmas.items() if one is not None}
         uncertainty = CameraUncertainty.of(**stated) if stated else None
         points = None if control is None else read_control(control, correction.value)
         read = read_polynomial_source(source, band) or read_exportable(source, seed, band)
-        return read, _ground(lowest, highest), Wishes(uncertainty, points)
+        return read, _ground(lowest, highest), uncertainty, points
 
-    def work(given: tuple[Exportable, tuple[float, float] | None, Wishes], session: Session) -> Result:
+    def work(given: tuple[Any, ...], session: Session) -> Result:
         from scenes.yaml.errors import InputError, Issue
-        from twin.orbit.export import export_report, polynomial_export
+        from twin.orbit.export import export_report, quality_run
         from twin.orbit.export.export_run import SceneSource, run_export
-        from twin.orbit.export.polynomial_export import PolynomialSource, run_polynomial_export
-        from twin.orbit.export.quality_run import with_quality
+        from twin.orbit.export.quality_run import PolynomialSource, run_polynomial_export, with_quality
         from twin.run.procedure import BenchError
 
-        read, heights, wishes = given
+        read, heights, uncertainty, points = given
         contents: dict[str, bytes]
         if isinstance(read, PolynomialSource):
-            alone = run_polynomial_export(read, wishes)
-            contents, drawn = polynomial_export.polynomial_files(alone), 0
-            shown, numbers = polynomial_export.polynomial_report(alone), polynomial_export.POLYNOMIALS(alone)
+            alone = run_polynomial_export(read, uncertainty, points)
+            contents, drawn = quality_run.polynomial_files(alone), 0
+            shown, numbers = quality_run.polynomial_report(alone), quality_run.POLYNOMIALS(alone)
         else:
             try:
-                run = with_quality(run_export(read, session.backend, heights, truth, session.advance), wishes)
+                run = run_export(read, session.backend, heights, truth, session.advance)
+                run = with_quality(run, uncertainty, points)
             except BenchError as error:
                 if isinstance(read, SceneSource):
                     raise InputError(Issue(str(error), read.scene.read.file, allowed=error.remedy)) from error
@@ -234,10 +233,7 @@ def export(
             session.folder.write_bytes(name, content)
         ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
-        asked = [word for one in sigmas.values() if one[0] is not None for word in (one[1], str(one[0]))]
-        asked += [] if band is None else ["--band", band]
-        asked += [] if control is None else ["--control", str(control), "--correction", correction.value]
-        options = (*ends, *(("--truth",) if truth else ()), *asked, "--seed", str(drawn))
+        options = (*ends, *(["--truth"] if truth else []), *asked, "--seed", str(drawn))
         again = (PROGRAM, "export", str(source), *options, *(() if name == "llvm" else ("--backend", name)))
         inputs = (source,) if control is None else (source, control)
         facts = {"config": read.config, "seed": drawn, "again": again, "given": inputs}
@@ -247,15 +243,15 @@ def export(
     run_command(f"{stem}-export", Options(out, seed, backend, force, as_json, quiet), resolve, work)
 
 
-def _sigma(name: str, given: str | float | None, option: str) -> float:
+def _sigma(name: str, given: str | float) -> float:
     """A standard deviation in SI units; pixels stay pixels.
 
     Raises:
         InputErrorText: none, or one that is too large.
     """
     if not isinstance(given, str):
-        return float(given or 0.0)
-    kind, most, example = _SIGMAS[name]
+        return float(given)
+    (kind, most, example), option = _SIGMAS[name], f"--{name}-sigma"
     try:
         value = parse_quantity(given, kind)
     except Problem as problem:

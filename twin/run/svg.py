@@ -157,6 +157,18 @@ def to_svg(figure: Figure) -> str:
     return f'{opening} role="img">{rest}'
 
 
+def drawn(name: str, draw: Callable[..., Figure], *given: Any) -> str:
+    """The <svg> element of a figure.
+
+    Args:
+        name: of the figure, which makes its identifiers its own.
+        draw: makes the figure.
+        given: arguments of ``draw``.
+    """
+    with look(name):
+        return to_svg(draw(*given))
+
+
 def to_png(figure: Figure, dpi: int) -> bytes:
     """The figure as PNG.
 

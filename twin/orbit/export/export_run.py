@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from analysis.orbit.forward_intersection import CalibratedLine
-from analysis.orbit.image_correction import Kind
+from analysis.orbit.image_correction import ImageCorrection, Kind
 from optics.numerics.number_tree import FrozenMap
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.file_kinds import kind_of
@@ -31,10 +31,8 @@ from scenes.specs.orbit.setup import AngleSetup, SimulateSetup
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.orbit.angle.angle_flight import angle_camera, fly
-from twin.orbit.export.estimated_change import EstimatedChange, GroundSigma, ground_sigma
-from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty
+from twin.orbit.export.ground_accuracy import AccuracyMap, EstimatedChange, GroundSigma, ground_sigma
 from twin.orbit.export.line_scanner import LineScanner, line_scanner
-from twin.orbit.export.polynomial_control import ControlledPolynomial
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.flight.line_camera import LineCamera, calibrated_lines, corrected_line
 from twin.orbit.flight.sensor import Sensor
@@ -66,29 +64,23 @@ class ControlPoints:
 
 
 @dataclass(frozen=True, eq=False)
-class Wishes:
-    """What is asked for beside the models.
-
-    Attributes:
-        uncertainty: of camera and way; None for no map.
-        control: points that correct the polynomials; None for none.
-    """
-
-    uncertainty: CameraUncertainty | None = None
-    control: ControlPoints | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class Controlled:
     """A line's polynomials after control.
 
     Attributes:
         names: (N,) of the points.
-        polynomial: before, after, and what is between.
+        correction: of the image.
+        after: polynomials with the correction inside.
     """
 
     names: NDArray[np.object_]
-    polynomial: ControlledPolynomial
+    correction: ImageCorrection
+    after: RationalPolynomial
+
+    @property
+    def left_out(self) -> list[str]:
+        """Names of the points that lie beyond their covariances."""
+        return [str(name) for name in self.names[~self.correction.used]]
 
 
 @dataclass(frozen=True)
@@ -98,17 +90,15 @@ class ProductPolynomial:
 
     Attributes:
         file: where they are from.
-        mean_line, mean_sample: mean difference, pixels.
-        rms_line, rms_sample: root mean square about the mean, pixels.
+        mean: mean difference of line and sample, pixels.
+        rms: root mean square about the mean, likewise.
         most: largest of all differences, pixels.
         heights: lowest and highest ground that the polynomials cover, metres.
     """
 
     file: str
-    mean_line: float
-    mean_sample: float
-    rms_line: float
-    rms_sample: float
+    mean: tuple[float, float]
+    rms: tuple[float, float]
     most: float
     heights: tuple[float, float]
 
@@ -123,9 +113,9 @@ class Quality:
         products: line -> polynomials that came with it.
     """
 
-    maps: Mapping[str, AccuracyMap]
-    control: Mapping[str, Controlled]
-    products: Mapping[str, ProductPolynomial]
+    maps: Mapping[str, AccuracyMap] = field(default_factory=FrozenMap)
+    control: Mapping[str, Controlled] = field(default_factory=FrozenMap)
+    products: Mapping[str, ProductPolynomial] = field(default_factory=FrozenMap)
 
 
 def read_control(path: Path, kind: Kind) -> ControlPoints:
@@ -255,7 +245,7 @@ class Export:
     truth: bool
     heights: tuple[float, float, float]
     lines: Mapping[str, ExportedLine]
-    quality: Quality | None = None
+    quality: Quality = field(default_factory=Quality)
 
 
 def read_exportable(path: Path, seed: int | None = None, band: str | None = None) -> ExportSource | SceneSource:

@@ -4,6 +4,13 @@ The rigorous sensor is asked where pixels see the ground after each error was gi
 covariances to the ground. A point of one line has a height from elsewhere. A point that several lines see is
 intersected from all of them, weighted by the covariance of its places in the images; the errors of orbit and attitude
 are those of the pass, which its lines have in common, and each line has its own interior.
+
+What is estimated of a camera's change in orbit, and what is still uncertain of it: on the ground it is the error of
+the exported models, which rational polynomials state as ERR_BIAS and ERR_RAND.
+
+A line is corrected by the estimate. Each of the four numbers of the change is then moved a little, the rigorous sensor
+is asked where the same pixels see the ground now, and these derivatives take the covariance of the estimate's error to
+the horizontal plane of each point.
 """
 
 from __future__ import annotations
@@ -15,12 +22,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
-from analysis.orbit.forward_intersection import circular_error, linear_error
-from optics.geometry.pose import rotation_matrix
+from analysis.orbit.forward_intersection import CalibratedLine, circular_error, linear_error
 from optics.numerics.number_tree import FrozenMap
 from twin.orbit.export.rational_polynomial import axis_sigma
 from twin.orbit.flight.earth import east_north_up
-from twin.orbit.flight.sensor import Platform, Sensor
+from twin.orbit.flight.line_camera import LineCamera, corrected_line
+from twin.orbit.flight.sensor import MovedPlatform, Sensor
 
 _GRID = (13, 13)
 """Lines and pixels of an image at which errors are taken; they are smooth."""
@@ -131,25 +138,6 @@ class AccuracyMap:
 
 
 @dataclass(frozen=True, eq=False)
-class _Moved:
-    """A platform that is not quite where it is."""
-
-    platform: Platform
-    shift: Array
-    turn: Array
-
-    def position(self, seconds: Array) -> Array:
-        at = self.platform.position(seconds)
-        return np.asarray(at + np.einsum("nij,j->ni", self.platform.body_to_itrs(seconds), self.shift))
-
-    def inertial_velocity(self, seconds: Array) -> Array:
-        return self.platform.inertial_velocity(seconds)
-
-    def body_to_itrs(self, seconds: Array) -> Array:
-        return np.asarray(self.platform.body_to_itrs(seconds) @ rotation_matrix(self.turn))
-
-
-@dataclass(frozen=True, eq=False)
 class _Derivatives:
     """Of where pixels (N,) see a height, east and north, metres.
 
@@ -170,7 +158,7 @@ def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level
     def seen(at: Array, which: Array, up: float = height, moved: Array | None = None) -> Array:
         where = sensor
         if moved is not None:
-            where = replace(sensor, trajectory=_Moved(sensor.trajectory, moved[:3], moved[3:]))
+            where = replace(sensor, trajectory=MovedPlatform(sensor.trajectory, moved[:3], moved[3:]))
         return np.einsum("nij,nj->ni", level, where.ground(at, which, up))
 
     by_line = (seen(line + _EDGE, pixel) - seen(line - _EDGE, pixel)) / (2.0 * _EDGE)
@@ -324,3 +312,101 @@ def maps_of(
 
 TOGETHER = "together"
 """Name of the map of intersected points."""
+
+
+_STEPS = (1e-7, 1e-7, 1e-7, 1e-6)
+"""Half steps of d_alpha, d_beta, d_gamma (rad) and d_f (m): centimetres on the ground, over which it is linear to 1e-7
+and its coordinates are rounded to 1e-9 m."""
+_CHANGE_GRID = (3, 9)
+"""Lines and pixels of an image at which errors are taken; they are smooth along a line and hardly change along the
+track."""
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedChange:
+    """A camera's change since its calibration.
+
+    Attributes:
+        values: (4,) d_alpha, d_beta, d_gamma (rad) and d_f (m).
+        constant: (4, 4) covariance of their error, as far as it goes on from image to image.
+        random: (4, 4) covariance of what is another in every image.
+        notes: on the estimate, for formats that hold remarks.
+    """
+
+    values: Array
+    constant: Array
+    random: Array
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class GroundSigma:
+    """Horizontal error on the ground of points of known height that an image's model locates, root mean square over the
+    image; the camera's change alone makes it, and not the orbit or the attitude.
+
+    Attributes:
+        height_m: of the points above the ellipsoid.
+        bias_m: that other images near in time have as well, of each horizontal axis: ERR_BIAS.
+        random_m: likewise of what is another in every image.
+        bias_east_m, bias_north_m: the two axes, whose mean square is that of ``bias_m``.
+        random_east_m, random_north_m: likewise of ``random_m``.
+    """
+
+    height_m: float
+    bias_m: float
+    random_m: float
+    bias_east_m: float
+    bias_north_m: float
+    random_east_m: float
+    random_north_m: float
+
+
+def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, height: float) -> Array:
+    """Derivatives of where pixels over an image see the ground by their camera's change, (N, 2, 4): east and north in
+    metres per rad and per metre of principal distance.
+
+    Args:
+        sensor: with the corrected line.
+        calibrated: the line without the change.
+        values: (4,) of the change.
+        height: of the ground above the ellipsoid, metres.
+
+    Raises:
+        ValueError: a look misses the Earth.
+    """
+    line = np.linspace(-0.5, sensor.lines - 0.5, _CHANGE_GRID[0])
+    pixel = np.linspace(-0.5, sensor.camera.pixels - 0.5, _CHANGE_GRID[1])
+    at, which = (v.ravel() for v in np.meshgrid(line, pixel, indexing="ij"))
+
+    def seen(change: Array) -> Array:
+        camera: LineCamera = corrected_line(sensor.camera, calibrated, change)
+        return replace(sensor, camera=camera).ground(at, which, height)
+
+    middle = seen(values)
+    if not np.all(np.isfinite(middle)):
+        raise ValueError("a look misses the Earth")
+    longitude, latitude, _ = sensor.earth.geodetic(middle)
+    level = east_north_up(longitude, latitude)[:, :2]
+    columns = [
+        np.einsum("nij,nj->ni", level, seen(values + step) - seen(values - step)) / (2.0 * size)
+        for size, step in zip(_STEPS, np.diag(_STEPS), strict=True)
+    ]
+    return np.stack(columns, axis=-1)
+
+
+def ground_sigma(sensor: Sensor, calibrated: CalibratedLine, change: EstimatedChange, height: float) -> GroundSigma:
+    """Return the error of an estimated change on the ground.
+
+    Args:
+        sensor: with the corrected line.
+        calibrated: the line without the change.
+        change: that is estimated.
+        height: of the ground above the ellipsoid, metres.
+
+    Raises:
+        ValueError: a look misses the Earth.
+    """
+    rows = ground_rows(sensor, calibrated, change.values, height)
+    spreads = [rows @ covariance @ np.swapaxes(rows, 1, 2) for covariance in (change.constant, change.random)]
+    axes = [float(np.sqrt(np.mean(spread[:, k, k]))) for spread in spreads for k in (0, 1)]
+    return GroundSigma(height, *map(axis_sigma, spreads), *axes)

@@ -97,6 +97,11 @@ class ModelError:
     sample_px: float
     line_px: float
 
+    @property
+    def worst_px(self) -> float:
+        """The larger one, pixels."""
+        return max(self.sample_px, self.line_px)
+
 
 @dataclass(frozen=True, eq=False)
 class LineScanner:
@@ -360,10 +365,6 @@ def _isd(
     second = np.zeros(10)
     second[list(_CUBIC)] = camera.along
     quaternion = np.roll(_joined(camera.rotation), 1, axis=1)
-    rate = _turning(camera)
-    still = [[1.0, 0.0, 0.0, 0.0]] * len(nodes)
-    zero = [[0.0, 0.0, 0.0]] * len(nodes)
-    unit = [1, 0, 0, 0, 1, 0, 0, 0, 1]
     per_mm = 1e-3 / camera.pitch
     return {
         "isis_camera_version": 1,
@@ -399,24 +400,8 @@ def _isd(
             "ephemeris_times": nodes,
             "reference_frame": 1,
         },
-        "instrument_pointing": {
-            "quaternions": quaternion.tolist(),
-            "ephemeris_times": nodes,
-            "angular_velocities": rate.tolist(),
-            "reference_frame": 1,
-            "time_dependent_frames": [-1, 1],
-            "constant_frames": [-1],
-            "constant_rotation": unit,
-        },
-        "body_rotation": {
-            "quaternions": still,
-            "ephemeris_times": nodes,
-            "angular_velocities": zero,
-            "reference_frame": 1,
-            "time_dependent_frames": [-2, 1],
-            "constant_frames": [-2],
-            "constant_rotation": unit,
-        },
+        "instrument_pointing": _turns(1, nodes, quaternion, _turning(camera)),
+        "body_rotation": _turns(2, nodes, np.tile([1.0, 0.0, 0.0, 0.0], (len(nodes), 1)), np.zeros((len(nodes), 3))),
         "sun_position": {
             "unit": "km",
             "positions": [_sun(sensor, epoch, center).tolist()],
@@ -425,6 +410,19 @@ def _isd(
             "reference_frame": 1,
         },
         "notes": _notes(sensor, heights, errors),
+    }
+
+
+def _turns(number: int, nodes: list[float], quaternion: Array, rate: Array) -> dict[str, Any]:
+    """Turns of frame number 1 against frame -``number``, over the nodes."""
+    return {
+        "quaternions": quaternion.tolist(),
+        "ephemeris_times": nodes,
+        "angular_velocities": rate.tolist(),
+        "reference_frame": 1,
+        "time_dependent_frames": [-number, 1],
+        "constant_frames": [-number],
+        "constant_rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1],
     }
 
 

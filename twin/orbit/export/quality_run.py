@@ -1,9 +1,13 @@
-"""What exported models are worth: errors on the ground, polynomials after control, a product's own polynomials."""
+"""The worth of exported models: errors on the ground, polynomials after control, a product's own polynomials.
+
+Rational polynomials that come alone, without a rigorous model, corrected by control points.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +15,8 @@ import numpy as np
 from analysis.orbit.image_correction import LEAST_POINTS
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text
+from scenes.yaml.yaml_file import dump_yaml
+from twin.orbit.export.export_report import CONTROL, FOLDER, control_section, quality_answers, quality_warnings
 from twin.orbit.export.export_run import (
     Controlled,
     ControlPoints,
@@ -19,39 +25,46 @@ from twin.orbit.export.export_run import (
     ProductPolynomial,
     Quality,
     SceneSource,
-    Wishes,
+    no_bands,
 )
-from twin.orbit.export.ground_accuracy import AccuracyMap, maps_of
-from twin.orbit.export.polynomial_control import controlled, polynomial_correction
-from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
+from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty, maps_of
+from twin.orbit.export.rational_polynomial import (
+    RationalPolynomial,
+    controlled,
+    is_rpc,
+    polynomial_correction,
+    read_rpc,
+)
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.dimap_sensor import DimapScene
+from twin.run.artefact import Table
+from twin.run.quantity import Quantity, Record
+from twin.run.report import Report, answer
 
 _COMPARED = (15, 15, 3)
 """Lines, pixels and heights at which polynomials are compared."""
 
 
-def with_quality(run: Export, wishes: Wishes) -> Export:
+def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: ControlPoints | None) -> Export:
     """The export with what was asked for: corrected polynomials, ERR_BIAS and ERR_RAND in them, notes in the ISD.
 
     Args:
         run: its models.
-        wishes: what is asked for.
+        uncertainty: of camera and way; None for no map.
+        points: that correct the polynomials; None for none.
 
     Raises:
         InputError: control points that are of none of the images, or do not determine a correction.
     """
     lines = dict(run.lines)
     products = _products(run, run.source.scene) if isinstance(run.source, SceneSource) else {}
-    control = {}
-    if wishes.control is not None:
-        control = _controlled(wishes.control, lines)
-        for name, one in control.items():
-            lines[name] = replace(lines[name], polynomial=one.polynomial.after)
+    control = {} if points is None else _controlled(points, lines)
+    for name, one in control.items():
+        lines[name] = replace(lines[name], polynomial=one.after)
     maps: Mapping[str, AccuracyMap] = {}
-    if wishes.uncertainty is not None:
+    if uncertainty is not None:
         places = {n: (x.window.sensor, x.window.first_pixel, x.window.pixels) for n, x in lines.items()}
-        maps = maps_of(places, wishes.uncertainty, run.heights[1])
+        maps = maps_of(places, uncertainty, run.heights[1])
         lines = {name: _with_errors(line, maps[name], name in control) for name, line in lines.items()}
     return replace(run, lines=FrozenMap(lines), quality=Quality(FrozenMap(maps), FrozenMap(control), products))
 
@@ -113,7 +126,7 @@ def controlled_line(
         correction = polynomial_correction(
             polynomial, ground.itrs, ground.covariance, rows[:, 1:3], spread, control.kind
         )
-        return Controlled(ground.ids, controlled(polynomial, correction))
+        return Controlled(ground.ids, correction, controlled(polynomial, correction))
     except ValueError as error:
         allowed = f"{LEAST_POINTS[control.kind]} points or more, spread over the image of {name}"
         raise InputError(Issue(str(error), control.file, allowed=allowed)) from None
@@ -143,7 +156,116 @@ def compared(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPol
     longitude, latitude, _ = sensor.earth.geodetic(sensor.ground(line, pixel, height))
     there = np.stack(model.image(np.degrees(latitude), np.degrees(longitude), height), axis=-1)
     off = there - np.stack([line, pixel], axis=-1)
-    mean, rms = np.mean(off, axis=0), np.std(off, axis=0)
-    found = [float(value) for value in (*mean, *rms)]
-    heights = float(low), float(high)
-    return ProductPolynomial(file, found[0], found[1], found[2], found[3], float(np.max(np.abs(off))), heights)
+    (line_mean, sample_mean), (line_rms, sample_rms) = off.mean(axis=0).tolist(), off.std(axis=0).tolist()
+    most, heights = float(np.max(np.abs(off))), (float(low), float(high))
+    return ProductPolynomial(file, (line_mean, sample_mean), (line_rms, sample_rms), most, heights)
+
+
+_ENDING = re.compile(r"(_RPC|_rpc)$")
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialSource:
+    """Rational polynomials of a file.
+
+    Attributes:
+        name: of the image that they belong to, as far as the file's name tells it.
+        file: that they are from.
+        polynomial: as they were read.
+        config: the file's path, as YAML.
+    """
+
+    name: str
+    file: str
+    polynomial: RationalPolynomial
+    config: str
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialExport:
+    """Polynomials after control.
+
+    Attributes:
+        source: what was read.
+        control: what the points made of it.
+    """
+
+    source: PolynomialSource
+    control: Controlled
+
+
+def read_polynomial_source(path: Path, band: str | None = None) -> PolynomialSource | None:
+    """Rational polynomials, where a file holds them alone; None for another file.
+
+    Args:
+        path: of it.
+        band: that was asked for, which polynomials do not have.
+
+    Raises:
+        InputError: it holds polynomials that cannot be read, or a band is asked for.
+    """
+    if not path.is_file() or not is_rpc(path):
+        return None
+    if band is not None:
+        raise no_bands(path, band)
+    name = _UNSAFE.sub("_", _ENDING.sub("", path.stem)) or "image"
+    return PolynomialSource(name, str(path), read_rpc(path), dump_yaml({"source": str(path)}))
+
+
+def run_polynomial_export(
+    source: PolynomialSource, uncertainty: CameraUncertainty | None, points: ControlPoints | None
+) -> PolynomialExport:
+    """Correct the polynomials.
+
+    Args:
+        source: what was read.
+        uncertainty: which only a rigorous model can have.
+        points: that correct them.
+
+    Raises:
+        InputError: there are none, they do not determine a correction, or something was asked for that takes a rigorous
+            model.
+    """
+    if uncertainty is not None:
+        allowed = "a source with a rigorous model for --position-sigma, --attitude-sigma and the like"
+        raise InputError(Issue("polynomials alone know no camera and no orbit", source.file, allowed=allowed))
+    if points is None:
+        raise InputError(Issue("nothing to do with polynomials alone", source.file, allowed="--control points.gcp"))
+    found = controlled_line(points, source.name, source.polynomial, alone=True)
+    if found is None:
+        problem = "no control point is in the image of these polynomials"
+        raise InputError(Issue(problem, points.file, allowed=f"points in {source.name}.tif"))
+    return PolynomialExport(source, found)
+
+
+POLYNOMIALS: Record[PolynomialExport] = Record(
+    "export.json of rational polynomials alone.",
+    Quantity("source", lambda run: run.source.file, "that they were read from"),
+    Quantity("rpc", lambda run: _file(run), "path in the run folder of the corrected ones"),
+    Quantity("control", lambda run: {run.source.name: run.control}, "how points corrected them", record=CONTROL),
+)
+
+
+def _file(run: PolynomialExport) -> str:
+    return f"{FOLDER}/{run.source.name}_RPC.TXT"
+
+
+def polynomial_files(run: PolynomialExport) -> dict[str, bytes]:
+    """Path in the run folder -> contents."""
+    return {_file(run): run.control.after.text().encode()}
+
+
+def polynomial_report(run: PolynomialExport) -> Report:
+    """Report of the correction."""
+    quality = Quality(control=FrozenMap({run.source.name: run.control}))
+    verdict, more = answer(*quality_answers(quality))
+    before, after = run.source.polynomial, run.control.after
+    rows = list(zip(("line", "sample"), before.offset[:2].tolist(), after.offset[:2].tolist(), strict=True))
+    table = Table("polynomials", "Offsets", "Middle of the image, pixels.", ("of", "before [px]", "after [px]"), rows)
+    size = " x ".join(f"{2.0 * value:.0f}" for value in before.scale[:2])
+    low, high = before.offset[4] + np.array([-1.0, 1.0]) * before.scale[4]
+    facts = (("Read", run.source.file), ("Image", f"{size} pixels"), ("Ground", f"{low:.0f} to {high:.0f} m high"))
+    warnings = tuple(one for one in quality_warnings(quality) if "ISD" not in one)
+    sections = (control_section(quality.control),)
+    return Report("Corrected rational polynomials", verdict, more, facts, table, sections, warnings=warnings)

@@ -9,13 +9,16 @@ of DIMAP 2 and 3.
 
 DIMAP's model from the ground to the image is read. Version 2 counts lines and samples from 1, which becomes 0 here;
 version 3 counts them from 0, as a scene of Pléiades Neo shows, whose RPC file has the first pixel at 0.0005, -0.0006.
+
+Rational polynomials corrected by control points: what is off in the image, with its covariance and residuals, and
+polynomials of the same form with the correction inside.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +26,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import Array
+from analysis.orbit.image_correction import ImageCorrection, Kind, image_correction
 from optics.numerics.backend import one_blas_thread
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import why_unreadable
+from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.xml_file import Element, first_lines, numbers, read_xml, text_lines
 
@@ -205,17 +210,20 @@ def _seen(
     """Line, sample, latitude, longitude (degrees) and height (metres) over an image, (N, 5); image coordinates from the
     window's first pixel.
     """
-    spans = ((-0.5, sensor.lines - 0.5), (-0.5, pixels - 0.5), heights)
-    axes = []
-    for count, (low, high) in zip(counts, spans, strict=True):
-        step = np.linspace(0.0, np.pi, count) if at_ends else (np.arange(count) + 0.5) * np.pi / count
-        axes.append(0.5 * (low + high) - 0.5 * (high - low) * np.cos(step))
-    line, sample, height = (v.ravel() for v in np.meshgrid(*axes, indexing="ij"))
+    low, high = np.array([(-0.5, sensor.lines - 0.5), (-0.5, pixels - 0.5), heights]).T
+    line, sample, height = _places(0.5 * (low + high), 0.5 * (high - low), counts, at_ends)
     ground = sensor.ground(line, first_pixel + sample, height)
     if not np.all(np.isfinite(ground)):
         raise ValueError("a look misses the Earth")
     longitude, latitude, _ = sensor.earth.geodetic(ground)
     return np.stack([line, sample, np.degrees(latitude), np.degrees(longitude), height], axis=-1)
+
+
+def _places(middle: Array, half: Array, counts: tuple[int, ...], at_ends: bool) -> list[Array]:
+    """Lines, samples and heights of a grid of Chebyshev points, with the ends or between those that have them."""
+    angles = (np.linspace(0.0, np.pi, n) if at_ends else (np.arange(n) + 0.5) * np.pi / n for n in counts)
+    axes = (m - h * np.cos(angle) for m, h, angle in zip(middle, half, angles, strict=True))
+    return [v.ravel() for v in np.meshgrid(*axes, indexing="ij")]
 
 
 def _monomials(unit: Array) -> Array:
@@ -379,3 +387,119 @@ def _from_tiff(path: Path) -> RationalPolynomial:
     scale = [rpc.line_scale, rpc.samp_scale, rpc.lat_scale, rpc.long_scale, rpc.height_scale]
     parts = [rpc.line_num_coeff, rpc.line_den_coeff, rpc.samp_num_coeff, rpc.samp_den_coeff]
     return _made(file, offset, scale, [np.array(part, np.float64) for part in parts], [rpc.err_bias, rpc.err_rand])
+
+
+_SLOPE_STEP = 10.0
+"""Metres on the ground of a derivative: polynomials are straight to 1e-9 over it."""
+_CORRECTED_GRID = (21, 21, 7)
+"""Lines, samples and heights through which corrected polynomials go."""
+_GROUND_GRID = 5
+_UNLIKELY = 0.05
+"""Chance of a chi-square from which residuals scatter beyond their covariances."""
+
+
+def polynomial_correction(
+    polynomial: RationalPolynomial,
+    itrs: Array,
+    ground_covariance: Array,
+    measured: Array,
+    image_covariance: Array,
+    kind: Kind,
+    screened: bool = True,
+) -> ImageCorrection:
+    """By how much polynomials are off in the image.
+
+    Args:
+        polynomial: of the image.
+        itrs: (N, 3) of the points, metres.
+        ground_covariance: (N, 3, 3) in its axes, m^2.
+        measured: (N, 2) line and sample, the centre of the first pixel being 0, 0.
+        image_covariance: (N, 2, 2), pixels^2.
+        kind: of the correction, shift or affine.
+        screened: whether points far beyond their covariances are left out.
+
+    Raises:
+        ValueError: as `analysis.orbit.image_correction.image_correction`.
+    """
+    longitude, latitude, height = Earth().geodetic(itrs)
+    slope = image_slope(polynomial, latitude, longitude, height) @ east_north_up(longitude, latitude)
+    spread = image_covariance + slope @ ground_covariance @ np.swapaxes(slope, 1, 2)
+    predicted = np.stack(polynomial.image(np.degrees(latitude), np.degrees(longitude), height), axis=-1)
+    return image_correction(predicted, measured, spread, kind, screened)
+
+
+def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Array, height: Array) -> Array:
+    """Derivatives of line and sample by metres east, north and up, (N, 2, 3), at places (N,) in radians and metres."""
+    meridian, normal = curvature_radii(latitude)
+    moves = (
+        (0.0, _SLOPE_STEP / ((normal + height) * np.cos(latitude)), 0.0),
+        (_SLOPE_STEP / (meridian + height), 0.0, 0.0),
+        (0.0, 0.0, _SLOPE_STEP),
+    )
+    columns = []
+    for north, east, up in moves:
+        ends = [
+            np.stack(
+                polynomial.image(
+                    np.degrees(latitude + sign * north), np.degrees(longitude + sign * east), height + sign * up
+                ),
+                axis=-1,
+            )
+            for sign in (0.5, -0.5)
+        ]
+        columns.append((ends[0] - ends[1]) / _SLOPE_STEP)
+    return np.stack(columns, axis=-1)
+
+
+def controlled(polynomial: RationalPolynomial, correction: ImageCorrection) -> RationalPolynomial:
+    """Return the polynomials with a correction inside, and what is uncertain of them on the ground.
+
+    Args:
+        polynomial: of the image.
+        correction: that was found for it.
+
+    Raises:
+        ValueError: polynomials that do not lead back to the ground, ground at a pole or the 180th meridian.
+    """
+    grids, kept = [], [0, 1, 4]
+    for at_ends in (True, False):
+        counts = _CORRECTED_GRID if at_ends else tuple(count - 1 for count in _CORRECTED_GRID)
+        line, sample, height = _places(polynomial.offset[kept], polynomial.scale[kept], counts, at_ends)
+        latitude, longitude = polynomial.ground(line, sample, height)
+        moved = np.stack([line, sample], axis=-1) + correction.at(line, sample)
+        grids.append(np.stack([*moved.T, latitude, longitude, height], axis=-1)[np.isfinite(latitude)])
+    if min(map(len, grids)) < np.prod(_CORRECTED_GRID) // 2:
+        raise ValueError("the polynomials do not lead back to the ground over the image that they state")
+    bias, random = _on_the_ground(polynomial, correction)
+    return replace(RationalPolynomial.through(*grids), bias_m=bias, random_m=random)
+
+
+def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) -> tuple[float, float]:
+    """Root mean square errors of a horizontal axis over the image, metres: of the correction, and of what scatters at
+    the control points beyond their own covariances.
+    """
+    steps = np.linspace(-1.0, 1.0, _GROUND_GRID)
+    line, sample = (
+        v.ravel()
+        for v in np.meshgrid(*(polynomial.offset[k] + polynomial.scale[k] * steps for k in (0, 1)), indexing="ij")
+    )
+    height = np.full_like(line, polynomial.offset[4])
+    latitude, longitude = (np.radians(v) for v in polynomial.ground(line, sample, height))
+    seen = np.isfinite(latitude)
+    slope = image_slope(polynomial, latitude[seen], longitude[seen], height[seen])[:, :, :2]
+    to_ground = np.linalg.inv(slope)
+    used = correction.used
+    own = np.einsum("nii->ni", correction.variance)[used]
+    beyond = np.zeros(2)
+    if correction.probability < _UNLIKELY:
+        beyond = np.maximum(np.mean(correction.residual[used] ** 2 - own, axis=0), 0.0)
+    known = correction.covariance_at(line[seen], sample[seen])
+    found = []
+    for variance in (known, np.broadcast_to(np.diag(beyond), known.shape)):
+        found.append(axis_sigma(to_ground @ variance @ np.swapaxes(to_ground, 1, 2)))
+    return found[0], found[1]
+
+
+def residual_sigma(correction: ImageCorrection) -> Array:
+    """(N, 2) standard deviations of the residuals of line and sample, pixels."""
+    return np.sqrt(np.maximum(np.einsum("nii->ni", correction.variance), 0.0))

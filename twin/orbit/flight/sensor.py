@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
+from optics.geometry.pose import rotation_matrix
 from optics.numerics.array_math import in_span
 from twin.orbit.flight import light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
@@ -39,6 +40,34 @@ class Platform(Protocol):
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
         """Columns = body axes X, Y, Z, (N, 3, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MovedPlatform:
+    """A platform that is elsewhere and holds itself otherwise.
+
+    Attributes:
+        base: without.
+        shift: in body axes, metres.
+        turn: rotation vector in body axes, radians.
+    """
+
+    base: Platform
+    shift: np.ndarray
+    turn: np.ndarray
+
+    def position(self, seconds: np.ndarray) -> np.ndarray:
+        """Positions, shifted."""
+        at = self.base.position(seconds)
+        return at + self.base.body_to_itrs(seconds) @ self.shift if np.any(self.shift) else at
+
+    def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
+        """Velocities against the stars, which stay as they are."""
+        return self.base.inertial_velocity(seconds)
+
+    def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
+        """Axes, turned."""
+        return np.asarray(self.base.body_to_itrs(seconds) @ rotation_matrix(self.turn))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,19 @@ Readings come at a fixed interval. What depends on chance is drawn for every rea
 by a cubic spline, as a user of the data would interpolate them: at a reading the error has the stated deviation,
 halfway between two it is somewhat smaller. Each term draws from a random stream of its own, so that leaving one out
 does not change the others.
+
+Jitter: small fast turns of a body about its own axes, by frequency.
+
+It is a sum of sinusoids and is evaluated, never interpolated. The noise of a band consists of sinusoids, too: the band
+is cut into equal parts, each has one frequency drawn evenly within it, and two normal amplitudes whose variance is the
+level times the part's width. The motion is then Gaussian at every time with exactly the stated variance, its expected
+spectrum is exactly the stated one, and it does not repeat. Over longer than the inverse width of a part, some seconds,
+its spectrum shows as the lines that it consists of.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +29,126 @@ from scipy.signal import lfilter
 
 from optics.geometry.pose import rotation_matrix
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
-from twin.orbit.flight.jitter import JITTER_STREAM, Jitter
 from twin.orbit.flight.orbit import Orbit
 from twin.run.random_streams import stream
+from twin.sensors.charge_transfer import Collection
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec
+    from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec, JitterSpec
+
+JITTER_STREAM = 2**31
+"""Number of the random stream of jitter among those of a pass; far from those that are counted."""
+_RESOLVED = 10.0
+"""Seconds over which the noise of a band is to be told from lines."""
+_LEAST, _MOST = 64, 4096
+"""Sinusoids of a band."""
+_AT_ONCE = 4_000_000
+"""Phases that are held at a time."""
+_MOMENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
+
+
+@dataclass(frozen=True, eq=False)
+class Jitter:
+    """Turns of a body over time: the sum of sine and cosine terms, seen at once or in the mean of a collection.
+
+    Attributes:
+        frequency: (K,) hertz.
+        sine, cosine: (K, 3) rotation vectors about body X, Y and Z, radians.
+        collection: over which it is meant; None for its values themselves.
+    """
+
+    frequency: np.ndarray
+    sine: np.ndarray
+    cosine: np.ndarray
+    collection: Collection | None = None
+
+    @classmethod
+    def of(cls, spec: JitterSpec, seed: np.random.SeedSequence) -> Jitter | None:
+        """As a file states it; None where it states none.
+
+        Args:
+            spec: lines and bands.
+            seed: of random phases and of bands. Each has a stream of its own.
+        """
+        if not spec.stated:
+            return None
+        streams, terms = seed.spawn(len(spec.lines) + len(spec.bands)), []
+        for line, own in zip(spec.lines, streams, strict=False):
+            drawn = np.random.default_rng(own).uniform(0.0, 2.0 * np.pi, 3)
+            phase = drawn if line.phase is None else np.array(line.phase)
+            both = (np.array([line.amplitude]) * turn(phase) for turn in (np.cos, np.sin))
+            terms.append((np.array([line.frequency]), *both))
+        for band, own in zip(spec.bands, streams[len(spec.lines) :], strict=True):
+            random, width = np.random.default_rng(own), band.last - band.first
+            count = int(np.clip(np.ceil(_RESOLVED * width), _LEAST, _MOST))
+            frequency = band.first + width * (np.arange(count) + random.uniform(size=count)) / count
+            sigma = np.sqrt(np.array(band.level) * width / count)
+            terms.append((frequency, *(sigma * random.standard_normal((count, 3)) for _ in range(2))))
+        frequencies, sines, cosines = (np.concatenate(part) for part in zip(*terms, strict=True))
+        return cls(frequencies, sines, cosines)
+
+    def __call__(self, seconds: np.ndarray) -> np.ndarray:
+        """Rotation vectors in body axes at times (...), seconds: (..., 3), radians."""
+        t = np.asarray(seconds, np.float64)
+        # image lines are asked for at many pixels
+        moments, where = np.unique(t, return_inverse=True)
+        kept = 1.0 if self.collection is None else self.collection.mean(self.frequency)[:, None]
+        sine, cosine = kept * self.sine, kept * self.cosine
+        found = np.empty((len(moments), 3))
+        size = max(_AT_ONCE // len(self.frequency), 1)
+        for part in (slice(k, k + size) for k in range(0, len(moments), size)):
+            angle = 2.0 * np.pi * (moments[part, None] * self.frequency)
+            found[part] = np.sin(angle) @ sine + np.cos(angle) @ cosine
+        return np.asarray(found[where.reshape(t.shape)])
+
+    @property
+    def amplitude(self) -> np.ndarray:
+        """(K,) of each sinusoid, about all axes together, radians."""
+        return np.sqrt(np.sum(self.sine**2 + self.cosine**2, axis=1))
+
+    def later(self, seconds: float) -> Jitter:
+        """The jitter whose value at a time is that of this one so much later."""
+        angle = 2.0 * np.pi * self.frequency[:, None] * seconds
+        sine = self.sine * np.cos(angle) - self.cosine * np.sin(angle)
+        cosine = self.sine * np.sin(angle) + self.cosine * np.cos(angle)
+        return replace(self, sine=sine, cosine=cosine)
+
+    def over(self, collection: Collection) -> Jitter:
+        """Its mean over a collection about each time: where the image of a TDI line lies."""
+        return replace(self, collection=collection)
+
+    def exposures(self, collection: Collection, pixel: float, tolerance: float) -> list[tuple[float, Jitter]]:
+        """Shares of the light of a collection, and the jitter that each saw; their mean is the image.
+
+        Args:
+            collection: of the line.
+            pixel: its angle, radians.
+            tolerance: of the image's place and smear, pixels.
+
+        Raises:
+            ValueError: an oscillation so fast and large that no reasonable number of moments is enough.
+        """
+        own, size = replace(self, collection=None), self.amplitude / pixel
+        exact = [collection.mean(k * self.frequency) for k in (1, 2)]
+        for count in _MOMENTS:
+            moments, weights = collection.moments(count)
+            angle = 2.0 * np.pi * self.frequency[:, None] * moments
+            # what is even in time is all there is: the rule is symmetric
+            off = [np.abs(np.cos(k * angle) @ weights - w) for k, w in zip((1, 2), exact, strict=True)]
+            # at Nyquist the second harmonic of an oscillation of A pixels weighs J_2(pi A), or (pi A)^2 / 8
+            if np.sqrt(np.sum((size * off[0] + np.minimum(1.25 * size**2, size) * off[1]) ** 2)) <= tolerance:
+                return [(float(w), own.later(float(s))) for s, w in zip(moments, weights, strict=True)]
+        highest = float(np.max(self.frequency))
+        raise ValueError(
+            f"jitter of up to {highest:g} Hz and {float(np.max(size)):.3g} pixels within {collection.length:.3g} s of "
+            "collection is too fast to be imaged moment by moment"
+        )
+
+    def read(self, times: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """As one knows it who reads it at some times (K,) only and joins the readings by a cubic spline: what is faster
+        than half of the readings' rate is mistaken for something slower.
+        """
+        return CubicSpline(times, self(times))
 
 
 @dataclass(frozen=True)
@@ -119,7 +241,7 @@ def _walk(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> 
     return CubicSpline(time, sigma * (course - course[int(np.argmin(np.abs(time)))]))
 
 
-def _drift(time: np.ndarray, sigma: np.ndarray, correlation_time: float, seed: np.random.SeedSequence) -> Series:
+def _drift(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence, correlation_time: float) -> Series:
     """A stationary first-order Gauss-Markov process: correlation exp(-|dt| / correlation_time), exact at readings."""
     draws = np.random.default_rng(seed).standard_normal((time.size, 3))
     kept = np.exp(-(time[1] - time[0]) / correlation_time)
@@ -147,7 +269,7 @@ class MeasurementErrors:
     bias: np.ndarray
     thermal: np.ndarray
     reference: float
-    rate: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    rate: np.ndarray
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
         """Position errors along the orbital frame's axes, metres; (...) -> (..., 3)."""
@@ -173,7 +295,7 @@ class MeasurementErrors:
 
 
 def _draw_errors(
-    spec: ErrorsSpec, first: float, last: float, seed: int, terms: Collection[str] = TERMS
+    spec: ErrorsSpec, first: float, last: float, seed: int, terms: Sequence[str] = TERMS
 ) -> MeasurementErrors:
     """Errors over a span of time.
 
@@ -192,36 +314,28 @@ def _draw_errors(
         raise ValueError(f"no such error: {', '.join(unknown)}; there are {', '.join(TERMS)}")
     streams = dict(zip(TERMS, np.random.SeedSequence(seed).spawn(len(TERMS)), strict=True))
     gps, star = spec.gps, spec.star_tracker
-    fixes = readings(first, last, gps.interval)
-    position: list[Series] = []
-    velocity: list[Series] = []
-    attitude: list[Series] = []
-    if "gps_noise" in terms and any(gps.noise):
-        position.append(_noise(fixes, np.array(gps.noise), streams["gps_noise"]))
-    if "gps_drift" in terms and any(gps.drift):
-        position.append(_drift(fixes, np.array(gps.drift), gps.correlation_time, streams["gps_drift"]))
-    if "gps_velocity" in terms and any(gps.velocity):
-        velocity.append(_noise(fixes, np.array(gps.velocity), streams["gps_velocity"]))
-    if "attitude_noise" in terms and any(star.noise):
-        looks = readings(first, last, star.interval)
-        attitude.append(_noise(looks, np.array(star.noise), streams["attitude_noise"]))
-    if "attitude_slow" in terms and any(star.slow.noise):
-        values = readings(first, last, star.slow.interval)
-        attitude.append(_noise(values, np.array(star.slow.noise), streams["attitude_slow"]))
-    rate = np.zeros(3)
-    if "attitude_drift" in terms and any(star.drift):
-        rate = np.array(star.drift) * np.random.default_rng(streams["attitude_drift"]).standard_normal(3)
-    if "attitude_walk" in terms and any(star.walk):
-        looks = readings(first, last, star.interval)
-        attitude.append(_walk(looks, np.array(star.walk), streams["attitude_walk"]))
+
+    def drawn(
+        name: str, sigma: Sequence[float], interval: float, make: Callable[..., Series] = _noise, *more: float
+    ) -> tuple[Series, ...]:
+        """The series of a term; none where it is off."""
+        if name not in terms or not any(sigma):
+            return ()
+        return (make(readings(first, last, interval), np.array(sigma), streams[name], *more),)
+
+    drift = drawn("gps_drift", gps.drift, gps.interval, _drift, gps.correlation_time)
+    slow = drawn("attitude_slow", star.slow.noise, star.slow.interval)
+    walk = drawn("attitude_walk", star.walk, star.interval, _walk)
     return MeasurementErrors(
-        tuple(position),
-        tuple(velocity),
-        tuple(attitude),
+        (*drawn("gps_noise", gps.noise, gps.interval), *drift),
+        drawn("gps_velocity", gps.velocity, gps.interval),
+        (*drawn("attitude_noise", star.noise, star.interval), *slow, *walk),
         np.array(star.bias) * ("attitude_bias" in terms),
         np.array(star.thermal.amplitude) * ("attitude_thermal" in terms),
         star.thermal.reference,
-        rate,
+        np.random.default_rng(streams["attitude_drift"]).standard_normal(3)
+        * np.array(star.drift)
+        * ("attitude_drift" in terms),
     )
 
 
@@ -299,7 +413,7 @@ class Trajectory:
         latitude = self.orbit.earth.geodetic(true[0])[1]
         return body @ rotation_matrix(self.errors.attitude(seconds, latitude))
 
-    def with_errors(self, spec: ErrorsSpec, seed: int, terms: Collection[str] = TERMS) -> Trajectory:
+    def with_errors(self, spec: ErrorsSpec, seed: int, terms: Sequence[str] = TERMS) -> Trajectory:
         """The trajectory as the satellite measures it: this one with errors, in place of those it may have, and with
         jitter as readings of the attitude show it.
 

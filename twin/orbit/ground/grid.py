@@ -192,13 +192,10 @@ class SplineGrid:
         if self.beyond == "nothing":
             self._require_inside(east, north)
         rows, columns = self.coefficients.shape
-        along = (
-            self._weights((east - self.first[0]) / self.spacing[0], columns, derivative[0])
-            / self.spacing[0] ** derivative[0]
-        )
-        across = (
-            self._weights((north - self.first[1]) / self.spacing[1], rows, derivative[1])
-            / self.spacing[1] ** derivative[1]
+        sides = ((east, columns, derivative[0]), (north, rows, derivative[1]))
+        along, across = (
+            self._weights((place - first) / step, count, order) / step**order
+            for (place, count, order), first, step in zip(sides, self.first, self.spacing, strict=True)
         )
         return np.asarray((along @ (across @ self.coefficients).T).T)
 
@@ -226,12 +223,8 @@ class SplineGrid:
 
     def _require_inside(self, east: np.ndarray, north: np.ndarray) -> None:
         west_end, east_end, south_end, north_end = self.reach
-        if not (
-            np.min(east) >= west_end
-            and np.max(east) <= east_end
-            and np.min(north) >= south_end
-            and np.max(north) <= north_end
-        ):
+        low, high = (np.min(east), np.min(north)), (np.max(east), np.max(north))
+        if not (low[0] >= west_end and high[0] <= east_end and low[1] >= south_end and high[1] <= north_end):
             raise UnphysicalError(
                 f"ground beyond what is known: east {np.min(east):.0f} to {np.max(east):.0f} m, north "
                 f"{np.min(north):.0f} to {np.max(north):.0f} m; it reaches from {west_end:.0f} to {east_end:.0f} m and "

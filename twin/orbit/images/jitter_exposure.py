@@ -13,9 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin.orbit.flight.jitter import Jitter
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.flight.trajectory import Trajectory
+from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.images.line_optics import LineOptics
 from twin.sensors.charge_transfer import Collection
 

@@ -24,8 +24,7 @@ from optics.numerics.array_math import PhysicalError
 from optics.numerics.number_tree import FrozenMap
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
-from twin.orbit.ground.orthophoto import Control, make_control
-from twin.orbit.ground.texture import Extent, apparent, around, reflectance
+from twin.orbit.ground.orthophoto import Control, Extent, apparent, around, make_control, reflectance
 from twin.orbit.images import pushbroom
 from twin.orbit.images.image_points import ImagedGround, LineFrame
 from twin.orbit.images.jitter_exposure import collected

@@ -23,7 +23,7 @@ from optics.numerics.array_math import PhysicalError, UnphysicalError
 from optics.numerics.backend import cores, one_blas_thread
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
-from twin.orbit.ground.texture import Extent
+from twin.orbit.ground.orthophoto import Extent
 from twin.orbit.images.jitter_exposure import exposures, steady
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
 

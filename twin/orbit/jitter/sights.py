@@ -25,14 +25,13 @@ from scipy.spatial.transform import Rotation
 
 from analysis.orbit.jitter import Observations
 from analysis.statistics import robust_sigma
-from optics.geometry.pose import rotation_matrix
 from optics.numerics.array_math import PhysicalError, in_span
 from scenes.specs.orbit.jitter_search import AXES, JitterSearchSpec
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import LightEffects, carried_with_earth
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import MovedPlatform, Sensor
 from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured.pass_measurements import PassMeasurements
 
@@ -106,31 +105,6 @@ class SteadyPlatform:
         first, last = self.span
         x = (2.0 * np.asarray(seconds, np.float64) - first - last) / (last - first)
         return np.asarray(np.moveaxis(chebyshev.chebval(x, coefficients), 0, -1))
-
-
-@dataclass(frozen=True, eq=False)
-class TurnedPlatform:
-    """A platform whose body is turned about its own axes by a constant.
-
-    Attributes:
-        base: the platform.
-        turn: rotation matrix, (3, 3); x_itrs = base @ turn @ x_body.
-    """
-
-    base: SteadyPlatform
-    turn: np.ndarray
-
-    def position(self, seconds: Any) -> np.ndarray:
-        """Position in the ITRS, metres; (...) -> (..., 3)."""
-        return self.base.position(seconds)
-
-    def inertial_velocity(self, seconds: Any) -> np.ndarray:
-        """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3)."""
-        return self.base.inertial_velocity(seconds)
-
-    def body_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Axes of the body as columns, (...) -> (..., 3, 3)."""
-        return np.asarray(self.base.body_to_itrs(seconds) @ self.turn)
 
 
 def _inside(time: np.ndarray, first: float, last: float, path: TabulatedTrajectory) -> np.ndarray:
@@ -256,13 +230,13 @@ def _lines(
     begin, end = float(np.min(ends)), float(np.max(ends))
     path = TabulatedTrajectory(one.platform)
     steady = SteadyPlatform.of(path, max(begin, path.first), min(end, path.last))
-    turns = [rotation_matrix(_TURN * np.eye(3)[AXES.index(axis)]) for axis in search.axes]
+    turned = [MovedPlatform(steady, np.zeros(3), _TURN * np.eye(3)[AXES.index(axis)]) for axis in search.axes]
     found = {}
     for name, row in rows.items():
         sensor = Sensor.of_lines(cameras[name], steady, Earth(), times[name], effects)
         place = np.stack([row.line - first[name], row.pixel], axis=-1)
-        turned = tuple(replace(sensor, trajectory=TurnedPlatform(steady, turn)) for turn in turns)
-        found[name] = _Line(sensor, row.point, place, row.covariance, times[name].at(place[:, 0]), turned)
+        about = tuple(replace(sensor, trajectory=platform) for platform in turned)
+        found[name] = _Line(sensor, row.point, place, row.covariance, times[name].at(place[:, 0]), about)
     return found
 
 

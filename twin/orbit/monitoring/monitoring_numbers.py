@@ -12,9 +12,16 @@ from analysis.arrays import Array
 from analysis.monitor.model_fit import UnseenMode
 from analysis.monitor.monitoring import PER_SI
 from scenes.specs.course import moment
-from twin.orbit.monitoring.line_images import ImagedPair
-from twin.orbit.monitoring.loop_run import GAIN_MARGIN, PHASE_MARGIN_DEG, LoopFacts, LoopPass, LoopRun, height_rms
-from twin.orbit.monitoring.monitoring_run import Cause, MonitorFlight, MonitorRun, Smoothing
+from twin.orbit.monitoring.loop_run import (
+    GAIN_MARGIN,
+    PHASE_MARGIN_DEG,
+    ImagedPair,
+    LoopFacts,
+    LoopPass,
+    LoopRun,
+    height_rms,
+)
+from twin.orbit.monitoring.monitoring_run import Cause, MonitorRun, Smoothing
 from twin.orbit.monitoring.pair_flight import CaseErrors, rms
 from twin.run.artefact import significant
 from twin.run.quantity import Quantity, Record
@@ -35,7 +42,7 @@ CHANGES: Record[Array] = Record(
     Quantity("d_gamma_arcsec", lambda values: _unsigned(values[..., 2]), "Δγ"),
     Quantity("d_f_um", lambda values: _unsigned(values[..., 3]), "change of the principal distance"),
 )
-CAMERA: Record[tuple[MonitorFlight, str]] = Record(
+CAMERA: Record[tuple[MonitorRun, str]] = Record(
     "Changes of one camera since the reference, over the times.",
     Quantity("true", lambda one: one[0].truth[one[1]], record=CHANGES),
     Quantity("monitored", lambda one: one[0].monitored[one[1]].to_dict(), "by the monitor, with sigmas"),
@@ -44,11 +51,11 @@ CAMERA: Record[tuple[MonitorFlight, str]] = Record(
 )
 ANGLE: Record[MonitorRun] = Record(
     "The angle between the lines of sight at the reference, and its changes over the times.",
-    Quantity("reference_deg", lambda run: run.flight.angle[run.flight.spec.referred], "true, at the reference"),
+    Quantity("reference_deg", lambda run: run.true_angle[run.spec.referred], "true, at the reference"),
     Quantity("true_change_arcsec", lambda run: _unsigned(run.angle_change), "true change since the reference"),
-    Quantity("monitored_change_arcsec", lambda run: _unsigned(run.angle), "change by the monitor"),
-    Quantity("monitored_change_arcsec_sigma", lambda run: _unsigned(run.angle_sigma), "sigma of its error"),
-    Quantity("monitored_change_arcsec_sigma_noise", lambda run: _unsigned(run.angle_noise), "of that the noise's part"),
+    Quantity("monitored_change_arcsec", lambda run: _unsigned(run.angle.change_rad), "change by the monitor"),
+    Quantity("monitored_change_arcsec_sigma", lambda run: _unsigned(run.angle.sigma_rad), "sigma of its error"),
+    Quantity("monitored_change_arcsec_sigma_noise", lambda run: _unsigned(run.angle.noise_rad), "of that by noise"),
     Quantity("true_change_span_arcsec", lambda run: np.ptp(run.angle_change), "largest less smallest true change"),
 )
 SUMMARY: Record[CaseErrors] = Record(
@@ -73,7 +80,7 @@ CASE: Record[CaseErrors] = Record(
 INTERVAL: Record[tuple[MonitorRun, float]] = Record(
     "Errors where values are interpolated over an interval.",
     Quantity("interval_s", lambda one: one[1], "between measurements", "interval", 1, shown="min"),
-    Quantity("measurements", lambda one: len(one[0].flight.spec.measured(one[1])), "of them", "measurements"),
+    Quantity("measurements", lambda one: len(one[0].spec.measured(one[1])), "of them", "measurements"),
     *SUMMARY.of_part(lambda one: one[0].intervals[one[1]]),
 )
 CONVERSION: Record[MonitorRun] = Record(
@@ -108,7 +115,7 @@ PROPAGATION: Record[MonitorRun] = Record(
     "Standard deviation of the mean height, and that of the noise against repeats at one time.",
     Quantity("height_m_sigma_noise", lambda run: _unsigned(run.sigma), "over the times, by the monitor's noise"),
     Quantity("height_m_sigma", lambda run: _unsigned(run.sigma_total), "of the whole error; null without a prior"),
-    Quantity("time_s", lambda run: run.flight.times[run.flight.worst], "of the repeats"),
+    Quantity("time_s", lambda run: run.times[run.worst], "of the repeats"),
     Quantity("repeats", lambda run: len(run.scatter.heights), "how often the monitor measures"),
     Quantity("sigma_m", lambda run: run.scatter.sigma, "propagated"),
     Quantity("spread_m", lambda run: run.scatter.spread, "standard deviation over the repeats"),
@@ -120,11 +127,9 @@ PROPAGATION: Record[MonitorRun] = Record(
 SMOOTHED: Record[tuple[MonitorRun, float, Smoothing]] = Record(
     "Heights by values smoothed from the measurements at one interval.",
     Quantity("interval_s", lambda one: one[1], "between measurements", "interval", 1, shown="min"),
-    Quantity("measurements", lambda one: len(one[0].flight.spec.measured(one[1])), "of them", "measurements"),
+    Quantity("measurements", lambda one: len(one[0].spec.measured(one[1])), "of them", "measurements"),
     Quantity("height_rms_m", lambda one: one[2].case.height_rms, "RMS error in height over all times"),
-    Quantity(
-        "height_linear_rms_m", lambda one: one[2].interpolated.camera_height_rms, "by the cameras, linear", "linear", 3
-    ),
+    Quantity("height_linear_rms_m", lambda one: one[2].interpolated.camera_height_rms, "interpolated", "linear", 3),
     Quantity("height_camera_rms_m", lambda one: one[2].case.camera_height_rms, "the same smoothed", "smoothed", 3),
     Quantity("better_than_interpolation", lambda one: one[2].factor, "factor between the two", "factor", 2),
     Quantity("height_sigma_rms_m", lambda one: rms(one[2].sigma), "RMS of the sigma that the smoother states", "σ", 3),
@@ -139,8 +144,8 @@ SMOOTHED: Record[tuple[MonitorRun, float, Smoothing]] = Record(
 
 
 def _readings(run: MonitorRun) -> dict[str, Any]:
-    readings = run.flight.smoothed[run.flight.spec.every].readings
-    return {name: readings[name].to_dict() for name in run.flight.pair}
+    readings = run.together[run.spec.every].readings
+    return {name: readings[name].to_dict() for name in run.pair}
 
 
 def _wrong(run: MonitorRun) -> str:
@@ -179,39 +184,37 @@ CAUSE: Record[tuple[MonitorRun, Cause]] = Record(
     Quantity("true", lambda one: one[1].truth, "true changes, by camera", record=CHANGES),
     Quantity("monitor_error", lambda one: one[1].error, "reading without noise minus truth, by camera", record=CHANGES),
     Quantity("height_without_monitoring_m", lambda one: one[0].cause_heights(one[1])[0], "caused", "unmonitored", 3),
-    Quantity(
-        "height_left_by_monitor_m", lambda one: one[0].cause_heights(one[1])[1], "made by misreading", "misread", 3
-    ),
+    Quantity("height_left_by_monitor_m", lambda one: one[0].cause_heights(one[1])[1], "by misreading", "misread", 3),
 )
 
 
 def _sensitivity(run: MonitorRun) -> dict[str, Array]:
-    return {name: run.flight.slopes[name][run.flight.spec.referred] / PER_SI for name in run.flight.pair}
+    return {name: run.slopes[name][run.spec.referred] / PER_SI for name in run.pair}
 
 
 MONITOR: Record[MonitorRun] = Record(
     "monitor.json. Errors at the top are those with the file's interval.",
     Quantity("seed", lambda run: run.seed, "of all random numbers"),
-    Quantity("interval_s", lambda run: run.flight.spec.every, "between measurements, of the file"),
+    Quantity("interval_s", lambda run: run.spec.every, "between measurements, of the file"),
     Quantity("height_rms_m", lambda run: run.cases["interval"].height_rms, "RMS error in height"),
     Quantity("height_worst_m", lambda run: run.cases["interval"].worst, "RMS error in height at the worst time"),
     Quantity("height_camera_rms_m", lambda run: run.cases["interval"].camera_height_rms, "in height by the cameras"),
     Quantity("plan_rms_m", lambda run: run.cases["interval"].plan_rms, "RMS error in plan"),
     Quantity("height_m_per_arcsec", lambda run: run.conversion.of_angle, "by the angle", converted=False),
-    Quantity("times_s", lambda run: run.flight.times, "of the course"),
-    Quantity("reference_time_s", lambda run: run.flight.spec.reference_time, "when cameras and monitor are calibrated"),
-    Quantity("monitored_times_s", lambda run: run.flight.times[run.flight.spec.measured(run.flight.spec.every)]),
-    Quantity("cameras", lambda run: {name: (run.flight, name) for name in run.flight.pair}, record=CAMERA),
+    Quantity("times_s", lambda run: run.times, "of the course"),
+    Quantity("reference_time_s", lambda run: run.spec.reference_time, "when cameras and monitor are calibrated"),
+    Quantity("monitored_times_s", lambda run: run.times[run.spec.measured(run.spec.every)]),
+    Quantity("cameras", lambda run: {name: (run, name) for name in run.pair}, record=CAMERA),
     Quantity("intersection_angle", lambda run: run, record=ANGLE),
     Quantity("cases", lambda run: run.cases, "by what the cameras are corrected with", record=CASE),
     Quantity("intervals", lambda run: [(run, interval) for interval in run.intervals], record=INTERVAL),
     Quantity("conversion", lambda run: run, record=CONVERSION),
     Quantity("sensitivity", _sensitivity, record=SLOPES),
     Quantity("propagation", lambda run: run, record=PROPAGATION),
-    Quantity("estimator", lambda run: run.flight.estimator, "by which the monitor's shifts are read"),
+    Quantity("estimator", lambda run: run.estimator, "by which the monitor's shifts are read"),
     Quantity("smoothing", lambda run: run if run.smoothing else None, record=SMOOTHING),
     Quantity("parts", lambda run: run.parts, "by source", record=PART),
-    Quantity("causes", lambda run: [(run, cause) for cause in run.flight.causes], record=CAUSE),
+    Quantity("causes", lambda run: [(run, cause) for cause in run.causes], record=CAUSE),
     Quantity("correction_residual_arcsec", lambda run: run.residual, "largest direction error of the correction"),
 )
 

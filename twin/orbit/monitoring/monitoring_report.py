@@ -1,14 +1,22 @@
-"""Report of a monitored orbit, with the loop open or closed."""
+"""Report of a monitored orbit, with the loop open or closed.
+
+Figures of a monitored orbit: the angle, heights with and without monitoring, the interval, what is left; of a closed
+loop what is left over the orbit, where mechanisms stand, the open loop.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from analysis.monitor import disturbances
+from analysis.monitor.control_loop import open_loop, rejection
 from analysis.monitor.model_fit import UnseenMode
 from analysis.monitor.monitoring import PER_SI
 from scenes.specs.course import moment
@@ -17,18 +25,216 @@ from scenes.yaml.errors import names_text
 from twin.monitor.time_series import jump_text
 from twin.orbit.monitoring import monitoring_numbers as numbers
 from twin.orbit.monitoring.loop_run import LoopRun, height_rms
-from twin.orbit.monitoring.monitoring_plots import PARTS, monitoring_figure
+from twin.orbit.monitoring.monitoring_numbers import positions
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun
 from twin.orbit.monitoring.pair_flight import rms
-from twin.run.artefact import SYMBOLS, CsvFile, Table, significant
+from twin.run import svg
+from twin.run.artefact import SYMBOLS, CsvFile, SvgFigure, Table, shown_unit, significant
 from twin.run.data_files import csv_table
 from twin.run.report import Report, Section, answer
 from twin.sensors.area_detector import coarse_warnings
 
+PARTS = {
+    "prisms": ("temperatures of the monitor's prisms", svg.VERMILION),
+    "other_systematic": ("other errors of the monitor without noise", svg.ORANGE),
+    "noise": ("noise of the monitor", svg.GREY),
+    "not_applied": ("parameters that are not applied", svg.PURPLE),
+    "beyond_parameters": ("beyond the four parameters", svg.SKY),
+    "interpolation": ("interpolation over the interval", svg.GREEN),
+}
+"""Part of the height error -> how reports call it, and its colour."""
+_DRAWN_PART = 5e-3
+"""Metres; parts that are smaller at all times are not drawn."""
+_COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
+_BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+"""Where a legend stands that would hide curves."""
 _BODIES, _MOTIONS = 3, 3
 """Bodies and motions of a mode that are named in words."""
 _LEAST = 1e-6
 """Numbers of a mode below this are rounding."""
+
+
+def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], run: Any) -> SvgFigure:
+    return SvgFigure(name, title, caption, svg.drawn(f"monitor-{name}", draw, run))
+
+
+def _panels(height: float, rows: int, zero: bool = True, label: str = "time [min]", **how: Any) -> Any:
+    """A figure of panels below each other, with one axis of time, and with a line where there is no error."""
+    figure = svg.new_figure(height)
+    panels = list(np.ravel(figure.subplots(rows, 1, sharex=True, **how)))
+    panels[-1].set_xlabel(label)
+    for axes in panels:
+        svg.gridded(axes)
+        if zero:
+            axes.axhline(0.0, color=svg.GREY, lw=0.7, zorder=0.5)
+    return figure, panels
+
+
+def _band(axes: Axes, minutes: np.ndarray, middle: Any, sigma: np.ndarray, colour: str, **how: Any) -> None:
+    axes.fill_between(minutes, middle - sigma, middle + sigma, color=colour, lw=0, **how)
+
+
+def _angle_figure(run: MonitorRun) -> Figure:
+    """Change of the intersection angle, true and monitored, and their difference."""
+    minutes = run.times / 60.0
+    figure, (above, below) = _panels(4.4, 2, height_ratios=(2.2, 1.0))
+    true, monitored = run.angle_change / ARCSEC, run.angle.change_rad / ARCSEC
+    above.plot(minutes, true, color=svg.INK, lw=1.3, label="true, traced")
+    above.plot(minutes, monitored, "o", color=svg.BLUE, ms=4, label="monitored")
+    above.set_ylabel("change of the angle [arcsec]")
+    _band(below, minutes, 0.0, run.angle.sigma_rad / ARCSEC, svg.SKY, alpha=0.4, label="σ")
+    below.plot(minutes, monitored - true, "o-", color=svg.VERMILION, ms=3, lw=1.0)
+    below.set_ylabel("monitored − true,\narcsec")
+    for axes in (above, below):
+        axes.legend(loc="best")
+    return figure
+
+
+def _height_figure(run: MonitorRun) -> Figure:
+    """Mean height error of the cameras alone, and the points' RMS, over the orbit."""
+    minutes, cases = run.times / 60.0, run.cases
+    figure, (above, below) = _panels(5.2, 2)
+    for name, colour, style, label in (
+        ("none", svg.VERMILION, "o-", "without monitoring"),
+        ("interval", svg.GREEN, "s--", f"monitored every {run.spec.every / 60.0:g} min, linear between"),
+        ("monitored", svg.BLUE, "o-", "monitored at every time"),
+    ):
+        above.plot(minutes, cases[name].camera, style, color=colour, ms=3.5, lw=1.2, label=label)
+        below.plot(minutes, cases[name].height, style, color=colour, ms=3.5, lw=1.2)
+    below.plot(minutes, cases["true"].height, ":", color=svg.INK, lw=1.3, label="true cameras: image, orbit, attitude")
+    above.set_ylabel("mean height error\nby the cameras [m]")
+    below.set_ylabel("RMS in height of\nall errors [m]")
+    below.set_ylim(bottom=0.0)
+    for axes in (above, below):
+        axes.legend(loc="best")
+    return figure
+
+
+def _smoothed_figure(run: MonitorRun) -> Figure:
+    """Mean height error of the cameras smoothed and interpolated, with the sigma that the smoother states."""
+    spec, minutes, chosen = run.spec, run.times / 60.0, run.smoothed
+    figure, (axes,) = _panels(3.8, 1)
+    for many, alpha, label in ((2.0, 0.2, "2σ as the smoother states it"), (1.0, 0.4, "σ as the smoother states it")):
+        _band(axes, minutes, 0.0, many * chosen.sigma, svg.SKY, alpha=alpha, label=label)
+    axes.plot(minutes, run.cases["interval"].camera, "s--", color=svg.GREEN, ms=3.5, lw=1.0, label="linear between")
+    axes.plot(minutes, chosen.case.camera, "o-", color=svg.PURPLE, ms=3.5, lw=1.2, label="smoothed")
+    at = spec.measured(spec.every)
+    low = axes.get_ylim()[0]
+    axes.plot(minutes[at], np.full(len(at), low), "|", color=svg.INK, ms=9, mew=1.4, label="measurements")
+    axes.set_ylim(bottom=low)
+    axes.set_ylabel("mean height error\nby the cameras [m]")
+    axes.legend(**_BESIDE)
+    return figure
+
+
+def _interval_figure(run: MonitorRun) -> Figure:
+    """RMS in height against the interval."""
+    figure, (axes,) = _panels(3.6, 1, False, "interval between measurements [min]")
+    minutes, intervals = np.array(list(run.intervals)) / 60.0, run.intervals.values()
+    curves = [
+        ([case.height_rms for case in intervals], "o-", svg.BLUE, 5, "all errors"),
+        ([case.camera_height_rms for case in intervals], "s--", svg.GREEN, 4, "by the cameras alone, linear between"),
+    ]
+    if run.smoothing:
+        chosen = [run.smoothing[interval] for interval in run.intervals]
+        smoothed = [one.case.camera_height_rms for one in chosen]
+        curves.append((smoothed, "D-", svg.PURPLE, 4, "by the cameras alone, smoothed"))
+        curves.append(([rms(one.sigma) for one in chosen], ":", svg.PURPLE, 4, "σ that the smoother states"))
+    for values, style, colour, size, label in curves:
+        axes.loglog(minutes, values, style, color=colour, ms=size, lw=1.2, label=label)
+    axes.axhline(run.cases["none"].height_rms, color=svg.VERMILION, lw=1.1, label="without monitoring")
+    axes.axhline(run.cases["true"].height_rms, color=svg.INK, lw=1.1, ls=":", label="true cameras")
+    axes.set_xticks(minutes, [f"{m:g}" for m in minutes])
+    axes.minorticks_off()
+    low, high = axes.get_ylim()
+    marks = [v for v in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0) if low <= v <= high]
+    if marks:
+        axes.set_yticks(marks, [f"{v:g}" for v in marks])
+    axes.set_ylabel("RMS in height [m]")
+    axes.legend(loc="best")
+    return figure
+
+
+def _parts_figure(run: MonitorRun) -> Figure:
+    """Height error of the corrected cameras, in parts."""
+    minutes = run.times / 60.0
+    figure, (axes,) = _panels(3.8, 1)
+    axes.plot(minutes, run.cases["interval"].camera, color=svg.INK, lw=1.6, label="together, with the file's interval")
+    for name, part in run.parts.items():
+        if np.abs(part).max() > _DRAWN_PART:
+            label, colour = PARTS[name]
+            axes.plot(minutes, part, "o-", color=colour, ms=3, lw=1.0, label=label)
+    axes.set_ylabel("mean height error [m]")
+    axes.legend(**_BESIDE)
+    return figure
+
+
+def _course_figure(run: LoopRun) -> Figure:
+    """Angle, height and foci over the orbit, with the loop open and closed."""
+    minutes = run.closed.course.times / 60.0
+    label = "time [min]; bands: what the posterior says, ±σ"
+    figure, panels = _panels(2.2 * (2 + len(run.pair)), 2 + len(run.pair), label=label)
+    for state, one, style, colour in (("open", run.open, "s--", svg.VERMILION), ("closed", run.closed, "o-", svg.BLUE)):
+        shown = {
+            "angle [arcsec]": (one.true(one.angle), one.angle, ARCSEC),
+            "height by the\ncameras [m]": (one.heights.camera, one.slopes, 1.0),
+        }
+        for name in run.pair:
+            row = run.model.unit(name, "defocus")
+            shown[f"defocus of\n{name} [µm]"] = one.true(row), row, 1e-6
+        for axes, (quantity, (true, rows, size)) in zip(panels, shown.items(), strict=True):
+            middle, sigma = one.posterior(rows)
+            _band(axes, minutes, middle / size, sigma / size, colour, alpha=0.2)
+            axes.plot(minutes, true / size, style, color=colour, ms=3.0, lw=1.1, label=f"loop {state}, true")
+            axes.set_ylabel(quantity)
+    panels[0].legend(loc="best")
+    return figure
+
+
+def _positions_figure(run: LoopRun) -> Figure:
+    """Where the mechanisms stand."""
+    units = list(dict.fromkeys(one.unit[0] for one in run.model.correctors))
+    figure, panels = _panels(
+        1.0 + 2.2 * len(units), len(units), False, "time [min]; dotted: held by the end of a range"
+    )
+    minutes = run.closed.course.times / 60.0
+    for axes, unit in zip(panels, units, strict=True):
+        for k, one in enumerate(one for one in run.model.correctors if one.unit[0] == unit):
+            colour = _COLOURS[k % len(_COLOURS)]
+            axes.step(minutes, positions(run, one.name), where="post", color=colour, lw=1.2, label=one.name)
+            for number in run.loops[one.name].ends:
+                axes.axvline(minutes[number], color=colour, lw=0.8, ls=":")
+        axes.set_ylabel(f"position [{shown_unit(unit)}]")
+        axes.legend(loc="best", ncols=2)
+    return figure
+
+
+def _loop_figure(run: LoopRun) -> Figure:
+    """The open loop in the complex plane, and what the closed one leaves of a swing."""
+    figure = svg.new_figure(4.2)
+    left, right = figure.subplots(1, 2)
+    svg.gridded(left)
+    svg.gridded(right)
+    step, frequency = run.setup.test.step, np.geomspace(1e-3, 0.5, 400)
+    turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
+    left.plot(turn.real, turn.imag, color=svg.LIGHT, lw=1.0)
+    left.plot([-1.0], [0.0], "x", color=svg.INK, ms=7)
+    drawn: dict[tuple[float, int], list[str]] = {}
+    for name, one in run.loops.items():
+        if one.loop_gain:
+            drawn.setdefault((one.loop_gain, one.corrector.spec.delay), []).append(name)
+    for k, ((gain, delay), names) in enumerate(drawn.items()):
+        colour, at = _COLOURS[k % len(_COLOURS)], open_loop(gain, delay, frequency)
+        left.plot(at.real, at.imag, color=colour, lw=1.2, label=f"gain {gain:.3g}, delay {delay}")
+        share = np.maximum(rejection(gain, delay, frequency), 1e-4)
+        right.loglog(frequency / step * 3600.0, share, color=colour, lw=1.2, label=", ".join(names))
+    left.set(xlim=(-2.5, 1.5), ylim=(-2.5, 1.5), xlabel="real part of L", ylabel="imaginary part of L", aspect="equal")
+    right.axhline(1.0, color=svg.GREY, lw=0.7)
+    right.set(xlabel="frequency of the drift [1/h]", ylabel="share that is left", ylim=(1e-3, 5.0))
+    if drawn:
+        left.legend(loc="lower right")
+        right.legend(loc="lower right")
+    return figure
 
 
 def monitor_report(run: MonitorRun | LoopRun) -> Report:
@@ -57,28 +263,21 @@ def _facts(run: MonitorRun | LoopRun) -> tuple[tuple[str, str], ...]:
     setup, test, errors, on = run.setup, run.setup.test, run.setup.test.errors, run.setup.test.errors.switched_on
     span = f"{moment(test.times[0])} to {moment(test.times[-1])} in steps of {moment(test.step)}"
     stated = setup.disturbances.name if setup.disturbances else "none stated: sigmas are of the noise alone"
-    own: tuple[tuple[str, str], ...] = (
-        (
-            ("Reference", moment(test.reference_time)),
-            ("Applied", ", ".join(test.apply)),
-            ("Disturbances", stated),
-            ("Check points", f"{test.ground.points} at each time, both views from the state at that time"),
-            ("Calibration at the reference", "taken as exact"),
-        )
-        if isinstance(run, MonitorRun)
-        else (
-            ("Readings", f"{len(test.times)}, rendered and recovered"),
-            ("Disturbances", f"{stated}, whose laws in time the estimate knows"),
-            ("Motions", "of the course" if test.course is not None else "drawn by these laws"),
-            ("Check points", f"{test.ground.points} at each moment, both views from the state at that moment"),
-            ("Lines of sight", "exact, traced; points are drawn about them; matched where line images are rendered"),
-        )
+    own = (
+        ("Readings", f"{len(test.times)}, rendered and recovered"),
+        ("Motions", "of the course" if test.course is not None else "drawn by the disturbances' laws in time"),
+        ("Lines of sight", "exact, traced; points are drawn about them; matched where line images are rendered"),
     )
+    if isinstance(run, MonitorRun):
+        applied = ("Applied", ", ".join(test.apply))
+        own = (("Reference", moment(test.reference_time)), applied, ("Calibration at the reference", "taken as exact"))
     return (
         ("Instrument", f"{setup.instrument.name}, {setup.instrument.description}"),
         ("Pair", f"{setup.pair[0]} against {setup.pair[1]}"),
         ("Course", f"{span}, from {test.orbit.epoch}"),
         *own,
+        ("Disturbances", stated),
+        ("Check points", f"{test.ground.points} at each time, both views from the state at that time"),
         ("Image points", f"σ {errors.image:g} px, drawn" if on else "exact"),
         ("Monitor's frames", "with noise" if on and errors.monitor else "without noise"),
         ("Effects on the light", "taken as corrected"),
@@ -87,7 +286,7 @@ def _facts(run: MonitorRun | LoopRun) -> tuple[tuple[str, str], ...]:
 
 
 def _verdict(run: MonitorRun) -> tuple[str, tuple[str, ...]]:
-    cases, spec = run.cases, run.flight.spec
+    cases, spec = run.cases, run.spec
     none, chosen, floor = cases["none"], cases["interval"], cases["true"]
     bought = none.height_rms - chosen.height_rms
     others = floor.height_rms**2 > 0.5 * chosen.height_rms**2
@@ -129,7 +328,7 @@ def _gain(run: MonitorRun) -> str:
 
 
 def _table(run: MonitorRun) -> Table:
-    spec = run.flight.spec
+    spec = run.spec
     names = {
         "none": "as calibrated, no monitoring",
         "interval": f"monitored every {moment(spec.every)}",
@@ -149,25 +348,22 @@ def _table(run: MonitorRun) -> Table:
 
 
 def _angle(run: MonitorRun) -> Section:
-    error = (run.angle - run.angle_change) / ARCSEC
+    error = (run.angle.change_rad - run.angle_change) / ARCSEC
     text = (
         f"Traced, the angle changes by {np.ptp(run.angle_change) / ARCSEC:.3g} arcsec over the course. The monitor "
-        f"follows it to {rms(error):.2g} arcsec RMS, {np.abs(error).max():.2g} arcsec at worst. Both are counted from "
-        f"the reference at {moment(run.flight.spec.reference_time)}, when the cameras were calibrated and the monitor "
-        "took its reference.",
+        f"follows it to {rms(error):.2g} arcsec RMS, {np.abs(error).max():.2g} arcsec at worst.",
     )
-    caption = f"Estimator {run.flight.estimator}, all frames."
-    figure = monitoring_figure("angle", "Intersection angle over the orbit", caption, run)
-    return Section("Intersection angle", text, (figure, *(_changes(run, name) for name in run.flight.pair)))
+    caption = f"Estimator {run.estimator}, all frames."
+    figure = _figure("angle", "Intersection angle over the orbit", caption, _angle_figure, run)
+    return Section("Intersection angle", text, (figure, *(_changes(run, name) for name in run.pair)))
 
 
 def _changes(run: MonitorRun, name: str) -> Table:
-    flight = run.flight
-    both = np.stack([flight.truth[name], flight.monitored[name].vector], axis=-1) * PER_SI[:, None]
+    both = np.stack([run.truth[name], run.monitored[name].vector], axis=-1) * PER_SI[:, None]
     heads = ["time [min]"]
     for key in PARAMETERS:
         heads += [f"{SYMBOLS[key]} [{'µm' if key == 'd_f' else 'arcsec'}]", "monitored"]
-    rows = np.column_stack([flight.times / 60.0, both.reshape(len(both), -1)]) + 0.0
+    rows = np.column_stack([run.times / 60.0, both.reshape(len(both), -1)]) + 0.0
     title = f"Changes of {name}, true and monitored"
     decimals = (1, *([3] * 6), 1, 1)
     return Table(f"changes-{name.lower()}", title, "Since the reference.", heads, rows.tolist(), decimals)
@@ -175,17 +371,16 @@ def _changes(run: MonitorRun, name: str) -> Table:
 
 def _height(run: MonitorRun) -> Section:
     text = (
-        "Attitude errors that both cameras share turn the body, not the angle: the monitor does not see them. One "
-        f"arcsecond in pitch of both makes {abs(run.conversion.of_common):.2f} m of height, for the pair does not look "
-        "evenly forward and back.",
+        f"One arcsecond in pitch of both cameras, which the monitor does not see, makes "
+        f"{abs(run.conversion.of_common):.2f} m of height.",
     )
     caption = "Above: mean over the points. Below: all errors, with the points' noise."
-    figure = monitoring_figure("height", "Height errors over the orbit", caption, run)
+    figure = _figure("height", "Height errors over the orbit", caption, _height_figure, run)
     return Section("Heights with and without monitoring", text, (figure,))
 
 
 def _smoothed(run: MonitorRun) -> Section:
-    spec, stated = run.flight.spec, run.setup.disturbances
+    spec, stated = run.spec, run.setup.disturbances
     assert stated is not None
     chosen = run.smoothed
     found = chosen.consistency
@@ -198,14 +393,13 @@ def _smoothed(run: MonitorRun) -> Section:
         numbers.SMOOTHED.headed,
     )
     text = (
-        f"All measurements together, by the prior ({stated.name}) and its time laws: the best "
-        f"linear estimate at every time. Measured every {moment(spec.every)}, it makes the cameras' height error "
-        f"{_times(chosen.factor, 'smaller')} than values that are linear between the measurements.",
+        f"Measured every {moment(spec.every)}, all measurements together, by the prior {stated.name}, make the "
+        f"cameras' height error {_times(chosen.factor, 'smaller')} than values that are linear between them.",
         f"Measured shifts {'agree' if found.agrees else 'do not agree'} with the prior: chi-square "
         f"{found.chi_square:.4g} of {found.degrees} degrees of freedom, limit {found.limit:.4g}.",
     )
     caption = "Mean over the points, with the total sigma of the smoothed height."
-    figure = monitoring_figure("smoothed", "Heights between the measurements", caption, run)
+    figure = _figure("smoothed", "Heights between the measurements", caption, _smoothed_figure, run)
     return Section("Between the measurements", text, (figure, table))
 
 
@@ -217,12 +411,11 @@ def _interval(run: MonitorRun) -> Section:
         [numbers.INTERVAL((run, interval)) for interval in run.intervals],
         numbers.INTERVAL.headed,
     )
-    figure = monitoring_figure("interval", "RMS in height against the interval", "Over all times.", run)
+    figure = _figure("interval", "RMS in height against the interval", "Over all times.", _interval_figure, run)
     return Section("How often to measure", (), (figure, table))
 
 
 def _rest(run: MonitorRun) -> Section:
-    flight = run.flight
     parts = numbers.PART.table(
         "parts",
         "Parts of the corrected cameras' height error",
@@ -233,32 +426,30 @@ def _rest(run: MonitorRun) -> Section:
     )
     causes = numbers.CAUSE.table(
         "causes",
-        f"Each cause alone, at {moment(float(flight.times[flight.worst]))}",
+        f"Each cause alone, at {moment(float(run.times[run.worst]))}",
         "Height that it makes without monitoring, and height that the monitor makes by misreading it.",
-        [numbers.CAUSE((run, cause)) for cause in flight.causes],
+        [numbers.CAUSE((run, cause)) for cause in run.causes],
         ("what", "node", "height_without_monitoring_m", "height_left_by_monitor_m"),
     )
     largest = max(run.parts, key=lambda name: rms(run.parts[name]))
     text = (
-        f"Most of the rest comes from {PARTS[largest][0]}, {rms(run.parts[largest]):.2g} m RMS. A prism that bends "
-        "the beam by its own temperature looks to the monitor like a camera that has turned.",
-        "The true four parameters put through the correction leave "
-        f"{1e3 * rms(run.parts['beyond_parameters']):.2g} mm RMS in height and {run.residual / ARCSEC:.2g} arcsec at "
-        "the worst place of a line: what a camera does beyond them, such as a change of distortion.",
+        f"Most of the rest comes from {PARTS[largest][0]}, {rms(run.parts[largest]):.2g} m RMS. The true four "
+        f"parameters leave {1e3 * rms(run.parts['beyond_parameters']):.2g} mm RMS in height and "
+        f"{run.residual / ARCSEC:.2g} arcsec at the worst place of a line.",
         *_worse(run),
     )
     caption = "Mean over the points; parts below 5 mm are left out."
-    figure = monitoring_figure("remainder", "What the correction leaves", caption, run)
+    figure = _figure("remainder", "What the correction leaves", caption, _parts_figure, run)
     return Section("Where the rest comes from", text, (figure, parts, causes))
 
 
 def _worse(run: MonitorRun) -> tuple[str, ...]:
     """Name the changes that the monitor says worse than nothing would."""
-    flight, worse = run.flight, []
-    for name in flight.pair:
+    worse = []
+    for name in run.pair:
         for k, key in enumerate(PARAMETERS):
-            error, change = (rms(v[:, k]) for v in (flight.clean[name] - flight.truth[name], flight.truth[name]))
-            if error > change and key in flight.spec.apply:
+            error, change = (rms(v[:, k]) for v in (run.clean[name] - run.truth[name], run.truth[name]))
+            if error > change and key in run.spec.apply:
                 worse.append(
                     f"{SYMBOLS[key]} of {name}, by {error * PER_SI[k]:.2g} {'µm' if key == 'd_f' else 'arcsec'} RMS"
                 )
@@ -277,12 +468,12 @@ def _conversion(run: MonitorRun) -> Section:
         "Metres of height",
         "Of a whole camera turned by 1 arcsec about its Y and traced, by base to height, and of each parameter that "
         "the analysis is told wrongly: a bias of the monitor acts like this.",
-        {name: numbers.BY_CAMERA((run, name)) for name in run.flight.pair},
+        {name: numbers.BY_CAMERA((run, name)) for name in run.pair},
         label="camera",
     )
     text = (
         f"Base to height is {conversion.base_to_height:.3f}. An arcsecond of the angle, half from each camera, is "
-        f"{abs(conversion.of_angle):.2f} m; it is more by the camera that looks farther aside.",
+        f"{abs(conversion.of_angle):.2f} m.",
     )
     return Section("From arcseconds to metres", text, (table,))
 
@@ -291,7 +482,7 @@ def _noise(run: MonitorRun) -> Section:
     seen, (low, high) = run.scatter, run.scatter.limits
     verdict = "agrees" if seen.agrees else "does not agree"
     text = (
-        f"Measured {len(seen.heights)} times at {moment(float(run.flight.times[run.flight.worst]))}, reference images "
+        f"Measured {len(seen.heights)} times at {moment(float(run.times[run.worst]))}, reference images "
         f"and detectors' patterns drawn anew, heights scatter by {1e3 * seen.spread:.2f} mm; the monitor's covariance "
         f"propagates to {1e3 * seen.sigma:.2f} mm. The ratio {seen.spread / seen.sigma:.3f} {verdict} with its limits "
         f"{low:.2f} to {high:.2f} (false alarm {FALSE_ALARM:g}).",
@@ -300,8 +491,8 @@ def _noise(run: MonitorRun) -> Section:
 
 
 def _warnings(run: MonitorRun) -> tuple[str, ...]:
-    out = [*coarse_warnings(run.setup), *run.flight.doubts]
-    together = run.flight.smoothed.get(run.flight.spec.every)
+    out = [*coarse_warnings(run.setup), *run.doubts]
+    together = run.together.get(run.spec.every)
     out += [jump_text(one) for one in (together.jumps if together is not None else None) or ()]
     out += numbers.MONITOR.warnings(run)
     if run.cases["monitored"].camera_height_rms > run.cases["none"].camera_height_rms:
@@ -358,18 +549,14 @@ def _loop_summary(run: LoopRun) -> Table:
 
 def _orbit(run: LoopRun) -> Section:
     caption = "True values by the exact trace; bands are what the posterior says after each reading, ±σ."
-    course = monitoring_figure("course", "What is left over the orbit", caption, run)
-    places = monitoring_figure("positions", "Where the mechanisms stand", "When images are taken.", run)
-    heads = ["time [s]"]
-    columns: list[np.ndarray] = [run.closed.course.times]
+    course = _figure("course", "What is left over the orbit", caption, _course_figure, run)
+    places = _figure("positions", "Where the mechanisms stand", "When images are taken.", _positions_figure, run)
+    columns: dict[str, list[float]] = {"time_s": run.closed.course.times.tolist()}
     for label, one in (("open", run.open), ("closed", run.closed)):
-        told, sigma = one.posterior(one.slopes)
-        heads += [f"{label} angle [arcsec]", f"{label} height [m]", f"{label} height told [m]", f"{label} σ [m]"]
-        columns += [one.true(one.angle) / ARCSEC, one.heights.camera, told, sigma]
+        columns |= {f"{label}_{key}": values for key, values in numbers.MOMENTS(one).items()}
     for corrector in run.model.correctors:
-        heads.append(f"{corrector.name} [{corrector.unit[0]}]")
-        columns.append(numbers.positions(run, corrector.name))
-    rows = csv_table([heads, *np.stack(columns, axis=-1).tolist()]).decode()
+        columns[f"{corrector.name} [{corrector.unit[0]}]"] = numbers.positions(run, corrector.name).tolist()
+    rows = csv_table([list(columns), *zip(*columns.values(), strict=True)]).decode()
     text = (
         f"True cameras leave {significant(run.closed.flight.true_case.height_rms, 2)} m RMS in height by image points, "
         "orbit and attitude.",
@@ -421,7 +608,7 @@ def _loops(run: LoopRun) -> Section:
     caption = (
         "Left: L in the complex plane with the point −1. Right: share of a swing that is left when images are taken."
     )
-    figure = monitoring_figure("open-loop", "Open loop, and what the closed loop leaves of a drift", caption, run)
+    figure = _figure("open-loop", "Open loop, and what the closed loop leaves of a drift", caption, _loop_figure, run)
     return Section("Stability", text, (table, figure))
 
 
@@ -446,8 +633,7 @@ def _unseen(run: LoopRun) -> Section:
     text = (
         f"{run.model.stated.spots.shape[0]} spot coordinates stand against {len(run.model.stated.labels)} stated "
         f"motions. What they do to heights and no spot shows is {significant(hidden, 2)} m, to the focus {foci} µm, "
-        "one standard deviation; no gain, no rate of readings and no filter goes below, unless something else than the "
-        "spots is measured.",
+        "one standard deviation.",
     )
     return Section("What the loop cannot see", text, (table,))
 

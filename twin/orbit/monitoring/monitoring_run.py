@@ -7,8 +7,9 @@ where errors are counted, and in two cases that are bounds: the true four parame
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.stats import chi2, norm
 
 from analysis.arrays import ARCSEC
 from analysis.monitor.disturbances import Consistency
-from analysis.monitor.monitoring import exact
+from analysis.monitor.monitoring import IntersectionAngleChange, exact
 from analysis.orbit.forward_intersection import IntersectionError, between
 from optics.geometry.tree import Motion, State, compose
 from optics.numerics.number_tree import FrozenMap
@@ -45,11 +46,6 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.monitor import OrbitMonitorSpec
     from scenes.specs.orbit.setup import MonitorSetup
 
-CASES = ("none", "monitored", "interval", "smoothed", "parameters", "true")
-"""Cases of the line geometry: as calibrated; corrected at every time; corrected by values interpolated over the file's
-interval; by values smoothed from the same measurements, if there is a prior; by the true four parameters; the true
-lines. The last two are bounds that no measurement gives.
-"""
 FALSE_ALARM = 1e-4
 """Chance that right sigmas are called wrong, both sides together."""
 
@@ -69,167 +65,6 @@ class Cause:
     path: str
     truth: Mapping[str, np.ndarray]
     error: Mapping[str, np.ndarray]
-
-
-@dataclass(frozen=True, eq=False)
-class MonitorFlight(PairFlight):
-    """Truth and measurements at T times, counted from the reference, at which the lines were calibrated.
-
-    Attributes:
-        spec: the test.
-        looks: nominal look angles of the two cameras, radians.
-        truth: camera -> (T, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) since the reference.
-        angle: (T,) true angle between the lines of sight, radians.
-        estimator: by which the monitor's shifts are read.
-        monitored: what the monitor says of the cameras' changes since the reference.
-        smoothed: seconds -> what all its measurements at this interval say together; empty where nothing is stated to
-            move.
-        clean: camera -> (T, 4) as monitored, from expected images without noise.
-        prisms: camera -> (T, 4) what temperatures that the file gives to prisms alone make it say, without noise.
-        repeated: what the monitor says at time `worst`, measured again and again.
-        worst: number of the time with the largest change of the angle.
-        causes: what each temperature and motion of the file does alone at time `worst`, without noise.
-        turned: camera -> its line at the reference when the whole camera is turned by 1 arcsec about its Y.
-        doubts: where the monitor's sigmas do not hold, for its spots are not as calibrated.
-    """
-
-    spec: OrbitMonitorSpec
-    looks: tuple[float, float]
-    truth: Mapping[str, np.ndarray]
-    angle: np.ndarray
-    estimator: str
-    monitored: Readings
-    smoothed: Mapping[float, SmoothedReadings]
-    clean: Mapping[str, np.ndarray]
-    prisms: Mapping[str, np.ndarray]
-    repeated: Readings
-    worst: int
-    causes: tuple[Cause, ...]
-    turned: Mapping[str, LineCamera]
-    doubts: tuple[str, ...] = ()
-
-    @property
-    def mask(self) -> np.ndarray:
-        """(4,) 1 for parameters that are applied."""
-        return np.array([float(name in self.spec.apply) for name in PARAMETERS])
-
-    def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(T,) of the mean height, metres, by parameters (T, 4) of each camera that the analysis is told too much."""
-        every = [np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair]
-        return np.asarray(np.sum(every, axis=0))
-
-    def variance(self, covariance: np.ndarray, at: int | None = None) -> np.ndarray:
-        """Variance (S,) of the mean height by the pair's values, m^2.
-
-        Args:
-            covariance: (S, 8, 8) of the pair's values.
-            at: number of the time to which all of them belong; None for one of each time.
-        """
-        both = np.concatenate([self.slopes[n] * self.mask for n in self.pair], axis=1)
-        slope = both if at is None else both[at]
-        return np.asarray(np.einsum("...i,...ij,...j->...", slope, covariance, slope))
-
-
-def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorFlight:
-    """Trace, render, measure, look down.
-
-    Raises:
-        InputError: an unknown node or an impossible temperature.
-        BenchError: the test cannot be carried out as its file says.
-        AimError, BeamMissedError: light is lost.
-    """
-    spec, pair = setup.test, setup.pair
-    ground_seed, monitor_seed = np.random.SeedSequence(seed).spawn(2)
-    number = int(np.random.default_rng(monitor_seed).integers(2**31))
-    parts = 6
-    advance("monitor", 0, parts)
-    experiment = MonitorExperiment(setup.resolved, backend)
-    spec.check_nodes(experiment.instrument.nodes)
-    states = states_of(experiment, spec)
-    advance("monitor", 1, parts)
-    reference, bodies = states[spec.referred], {body.path: body for body in experiment.instrument.assembly.tree.bodies}
-
-    def turned(camera: str) -> State:
-        return compose(reference, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
-
-    lines = tuple(traced_pair(experiment, state, pair) for state in states)
-    by_arcsec = {name: traced_pair(experiment, turned(name), pair)[name] for name in pair}
-    advance("monitor", 2, parts)
-    angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
-    worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
-    # before the images, which take longer
-    views = look_down(spec, pair, lines, ground_seed, advance)
-    monitor = MonitorSeries(experiment, spec, reference, pair)
-    noisy, clean = monitor.measured(states, number)
-    truth, distance = _changes(clean.truth, spec.referred)
-    used = noisy if spec.errors.switched_on and spec.errors.monitor else clean
-    gains = monitor.gains(used, range(len(states)))
-    advance("monitor", 3, parts)
-    prisms = monitor.of_prisms()
-    advance("monitor", 4, parts)
-    repeated = monitor.repeated(states[worst], spec.repeats, number + 1, worst)
-    advance("monitor", 5, parts)
-    causes = _causes(experiment, spec, monitor, worst, gains[worst])
-    advance("monitor", 6, parts)
-    axes, smoothed = experiment.sight.axes, {}
-    if experiment.disturbances is not None:
-        smoothed = {interval: monitor.smoothed(used, interval) for interval in {spec.every, *spec.compared}}
-    return MonitorFlight(
-        pair,
-        np.array(spec.times),
-        lines,
-        FrozenMap({n: calibrated_line(lines[spec.referred][n], axes[n], distance[n]) for n in pair}),
-        views,
-        spec,
-        (experiment.instrument.spec.cameras[pair[0]].look, experiment.instrument.spec.cameras[pair[1]].look),
-        FrozenMap({name: truth[name] for name in pair}),
-        angle,
-        monitor.estimator,
-        monitor.readings(used, range(len(states))),
-        FrozenMap(smoothed),
-        FrozenMap(monitor.by_camera(gains, clean.shifts)),
-        FrozenMap(monitor.by_camera(gains, prisms)),
-        monitor.readings(repeated, [worst] * spec.repeats),
-        worst,
-        causes,
-        FrozenMap(by_arcsec),
-        used.doubts(spec.times, [channel.key for channel in experiment.path.channels]),
-    )
-
-
-def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Camera -> (T, 4) true changes since the reference, and camera -> principal distance there.
-
-    The trace refers changes to the nominal camera; their differences are those between two states but for products of
-    two arcseconds, 1e-11 rad.
-    """
-    out, distance = {}, {}
-    for name in truths[0].cameras:
-        every = [one.cameras[name] for one in truths]
-        values = np.concatenate([change.vector for change in every])
-        out[name] = values - values[reference]
-        distance[name] = float(np.concatenate([c.principal_distance for c in every])[reference])
-    return out, distance
-
-
-def _causes(
-    experiment: MonitorExperiment, spec: OrbitMonitorSpec, monitor: MonitorSeries, worst: int, gain: np.ndarray
-) -> tuple[Cause, ...]:
-    """Return what each temperature of the course and each motion does from the reference to time number ``worst``, at
-    which the estimator has this gain (8, 2 C).
-    """
-    assert spec.course is not None
-    named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]
-    states = [s for what, path in named for s in states_of(experiment, spec, (spec.referred, worst), (what, path))]
-    found = monitor.clean(states)
-    truth, _ = _changes(found.truth, 0)
-    estimates = monitor.by_camera(gain, found.shifts)
-    out = []
-    for k, (what, path) in enumerate(named):
-        true, read = ({n: v[n][2 * k + 1] - v[n][2 * k] for n in monitor.pair} for v in (truth, estimates))
-        error = {n: read[n] - true[n] for n in monitor.pair}
-        out.append(Cause(what, path, FrozenMap(true), FrozenMap(error)))
-    return tuple(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,61 +171,220 @@ class Smoothing:
 
 
 @dataclass(frozen=True, eq=False)
-class MonitorRun:
-    """A finished test.
+class MonitorRun(PairFlight):
+    """A finished test: truth and measurements at T times, counted from the reference, at which the lines were
+    calibrated, and what follows from them for heights.
 
     Attributes:
         setup: what its file says.
         seed: of all random numbers.
-        flight: truth and measurements.
-        cases: of `CASES` -> errors.
-        intervals: seconds -> errors with values interpolated over it.
-        angle: (T,) change of the intersection angle by the monitor, radians; angle_sigma: of its error, angle_noise: of
-            that what the noise does.
-        sigma: (T,) of the mean height by the noise of the monitor, propagated, metres.
-        sigma_total: (T,) likewise of the whole error; None where nothing is stated to move.
-        smoothing: seconds -> heights smoothed from measurements at this interval; empty likewise.
-        parts: name -> (T,) parts of the monitored cameras' mean height error, metres.
-        conversion: arcseconds to metres.
-        scatter: of repeated measurements.
-        residual: largest angle between a true line and the calibrated one corrected by the true four parameters, over
-            the line and all times, radians.
+        looks: nominal look angles of the two cameras, radians.
+        truth: camera -> (T, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) since the reference.
+        true_angle: (T,) true angle between the lines of sight, radians.
+        estimator: by which the monitor's shifts are read.
+        monitored: what the monitor says of the cameras' changes since the reference.
+        together: seconds -> what all its measurements at this interval say together; empty where nothing is stated to
+            move.
+        clean: camera -> (T, 4) as monitored, from expected images without noise.
+        prisms: camera -> (T, 4) what temperatures that the file gives to prisms alone make it say, without noise.
+        repeated: what the monitor says at time `worst`, measured again and again.
+        worst: number of the time with the largest change of the angle.
+        causes: what each temperature and motion of the file does alone at time `worst`, without noise.
+        turned: camera -> its line at the reference when the whole camera is turned by 1 arcsec about its Y.
+        doubts: where the monitor's sigmas do not hold, for its spots are not as calibrated.
     """
 
     setup: MonitorSetup
     seed: int
-    flight: MonitorFlight
-    cases: Mapping[str, CaseErrors]
-    intervals: Mapping[float, CaseErrors]
-    angle: np.ndarray
-    angle_sigma: np.ndarray
-    angle_noise: np.ndarray
-    sigma: np.ndarray
-    sigma_total: np.ndarray | None
-    smoothing: Mapping[float, Smoothing]
-    parts: Mapping[str, np.ndarray]
-    conversion: Conversion
-    scatter: Scatter
-    residual: float
+    looks: tuple[float, float]
+    truth: Mapping[str, np.ndarray]
+    true_angle: np.ndarray
+    estimator: str
+    monitored: Readings
+    together: Mapping[float, SmoothedReadings]
+    clean: Mapping[str, np.ndarray]
+    prisms: Mapping[str, np.ndarray]
+    repeated: Readings
+    worst: int
+    causes: tuple[Cause, ...]
+    turned: Mapping[str, LineCamera]
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def spec(self) -> OrbitMonitorSpec:
+        """The test."""
+        return self.setup.test
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(4,) 1 for parameters that are applied."""
+        return np.array([float(name in self.spec.apply) for name in PARAMETERS])
+
+    def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(T,) of the mean height, metres, by parameters (T, 4) of each camera that the analysis is told too much."""
+        every = [np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair]
+        return np.asarray(np.sum(every, axis=0))
+
+    def variance(self, covariance: np.ndarray, at: int | None = None) -> np.ndarray:
+        """Variance (S,) of the mean height by the pair's values, m^2.
+
+        Args:
+            covariance: (S, 8, 8) of the pair's values.
+            at: number of the time to which all of them belong; None for one of each time.
+        """
+        both = np.concatenate([self.slopes[n] * self.mask for n in self.pair], axis=1)
+        slope = both if at is None else both[at]
+        return np.asarray(np.einsum("...i,...ij,...j->...", slope, covariance, slope))
+
+    def applied(self, readings: Readings) -> dict[str, np.ndarray]:
+        """Camera -> (S, 4) values that correct it: of the parameters that are applied."""
+        return {name: readings[name].vector * self.mask for name in self.pair}
+
+    def _interpolated(self, interval: float) -> CaseErrors:
+        at = self.spec.measured(interval)
+        every = self.applied(self.monitored)
+        return self.case({name: between(self.times, self.times[at], v[at]) for name, v in every.items()})
+
+    @cached_property
+    def cases(self) -> Mapping[str, CaseErrors]:
+        """Errors by what corrects the cameras.
+
+        none: as calibrated; monitored: at every time; interval: by values interpolated over the file's interval;
+        smoothed: by values smoothed from the same measurements, if there is a prior; parameters: by the true four
+        parameters; true: the true lines. The last two are bounds that no measurement gives.
+        """
+        found = {
+            "none": self.case({name: np.zeros((len(self.times), 4)) for name in self.pair}),
+            "monitored": self.case(self.applied(self.monitored)),
+            "interval": self._interpolated(self.spec.every),
+        }
+        if self.smoothing:
+            found["smoothed"] = self.smoothed.case
+        return FrozenMap(found | {"parameters": self.case(self.truth), "true": self.true_case})
+
+    @cached_property
+    def intervals(self) -> Mapping[float, CaseErrors]:
+        """Seconds -> errors with values interpolated over the interval."""
+        return FrozenMap({interval: self._interpolated(interval) for interval in self.spec.compared})
+
+    @cached_property
+    def angle(self) -> IntersectionAngleChange:
+        """Changes (T,) of the intersection angle by the monitor."""
+        first, second = (self.monitored[name] for name in self.pair)
+        return exact(first, second, *self.looks, *self.monitored.across)
 
     @property
     def angle_change(self) -> np.ndarray:
         """(T,) true, radians."""
-        return np.asarray(self.flight.angle - self.flight.angle[self.flight.spec.referred])
+        return np.asarray(self.true_angle - self.true_angle[self.spec.referred])
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(T,) of the mean height by the noise of the monitor, propagated, metres."""
+        return np.sqrt(self.variance(self.monitored.noise))
+
+    @property
+    def sigma_total(self) -> np.ndarray | None:
+        """(T,) likewise of the whole error; None where nothing is stated to move."""
+        total = self.monitored.total
+        return None if total is None else np.sqrt(self.variance(total))
+
+    @cached_property
+    def smoothing(self) -> Mapping[float, Smoothing]:
+        """Seconds -> heights smoothed from measurements at this interval; empty where nothing is stated to move."""
+        return FrozenMap({interval: self._smoothing(interval) for interval in sorted(self.together)})
 
     @property
     def smoothed(self) -> Smoothing:
         """Heights smoothed from the measurements at the file's interval; there is none without a prior."""
-        return self.smoothing[self.flight.spec.every]
+        return self.smoothing[self.spec.every]
+
+    def _smoothing(self, interval: float) -> Smoothing:
+        found, mask = self.together[interval], self.mask
+        readings = found.readings
+        assert readings.total is not None
+        case = self.case(self.applied(readings))
+        wrong = self.height({n: mask * (readings[n].vector - self.truth[n]) for n in self.pair})
+        # what rounding leaves at the reference is no sigma
+        variance = np.maximum(self.variance(readings.total), 0.0)
+        interpolated = self.intervals[interval] if interval in self.intervals else self._interpolated(interval)
+        return Smoothing(case, interpolated, wrong, np.sqrt(variance), found.consistency)
+
+    @cached_property
+    def parts(self) -> Mapping[str, np.ndarray]:
+        """Name -> (T,) parts of the monitored cameras' mean height error, metres."""
+
+        def applied(values: Callable[[str], np.ndarray]) -> np.ndarray:
+            return self.height({name: self.mask * values(name) for name in self.pair})
+
+        cases = self.cases
+        return FrozenMap(
+            {
+                "prisms": applied(lambda name: self.prisms[name]),
+                "other_systematic": applied(lambda name: self.clean[name] - self.truth[name] - self.prisms[name]),
+                "noise": applied(lambda name: self.monitored[name].vector - self.clean[name]),
+                "not_applied": self.height({n: -self.truth[n] * (1.0 - self.mask) for n in self.pair}),
+                "beyond_parameters": cases["parameters"].camera,
+                "interpolation": cases["interval"].camera - cases["monitored"].camera,
+            }
+        )
+
+    @cached_property
+    def conversion(self) -> Conversion:
+        """Arcseconds to metres, at the reference, where the calibrated cameras are the true ones."""
+        k = self.spec.referred
+        view, traced = self.views[k], {}
+        first, second = self.pair
+        calm = point_errors(self.true_pair(k), view, exact_data=True)[:, 2].mean()
+        slant, incidence = {}, {}
+        up = view.ground / np.linalg.norm(view.ground, axis=1, keepdims=True)
+        for i, name in enumerate(self.pair):
+            pair = self.true_pair(k)
+            pair[i] = in_analysis(self.turned[name], self.calibrated[name])
+            traced[name] = float(point_errors(pair, view, exact_data=True)[:, 2].mean() - calm)
+            arm = view.exact[i].station - view.ground
+            slant[name] = np.linalg.norm(arm, axis=1)
+            forward = np.cross(up, view.exact[i].attitude[:, :, 1])  # along the track, level
+            incidence[name] = np.arctan2(-np.sum(arm * forward, axis=1), np.sum(arm * up, axis=1))
+        ratio = np.tan(incidence[first]) - np.tan(incidence[second])
+        # a ray that is taken to look farther forward passes above the point, and the other ray is met the higher, the
+        # more it comes from ahead
+        theory = {
+            name: float(np.mean(sign * slant[name] * ARCSEC / np.cos(incidence[name]) / ratio))
+            for name, sign in ((first, 1.0), (second, -1.0))
+        }
+        return Conversion(FrozenMap(traced), FrozenMap(theory), float(np.mean(np.abs(ratio))))
+
+    @cached_property
+    def scatter(self) -> Scatter:
+        """Heights of repeated measurements, by exact image points, so that the monitor's noise is all there is."""
+        monitored, heights = self.applied(self.repeated), []
+        for row in range(self.spec.repeats):
+            pair = [self.calibrated[n].corrected(monitored[n][row]) for n in self.pair]
+            heights.append(point_errors(pair, self.views[self.worst], exact_data=True)[:, 2].mean())
+        variance = self.variance(self.repeated.noise, self.worst)
+        return Scatter(np.array(heights), float(np.sqrt(np.mean(variance))))
+
+    @cached_property
+    def residual(self) -> float:
+        """Largest angle between a true line and the calibrated one corrected by the true four parameters, over the
+        line and all times, radians.
+        """
+        away = []
+        for k, lines in enumerate(self.lines):
+            for name, line in lines.items():
+                pixel = np.linspace(0.0, line.pixels - 1.0, 101)
+                model = self.calibrated[name].corrected(self.truth[name][k]).look(pixel)
+                away.append(float(np.max(np.linalg.norm(model - line.look(pixel), axis=-1))))
+        return max(away)
 
     def cause_heights(self, cause: Cause) -> tuple[float, float]:
         """Height errors that a cause alone makes at its time, metres: without monitoring, and by what the monitor
         misreads.
         """
-        flight, mask = self.flight, self.flight.mask
-        slopes = {n: flight.slopes[n][flight.worst] for n in flight.pair}
-        without = sum(float(-slopes[n] @ cause.truth[n]) for n in flight.pair)
-        return without, sum(float(slopes[n] @ (mask * cause.error[n])) for n in flight.pair)
+        slopes = {n: self.slopes[n][self.worst] for n in self.pair}
+        without = sum(float(-slopes[n] @ cause.truth[n]) for n in self.pair)
+        return without, sum(float(slopes[n] @ (self.mask * cause.error[n])) for n in self.pair)
 
 
 def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance = silent) -> MonitorRun | LoopRun:
@@ -404,123 +398,114 @@ def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advan
     try:
         if spec.mechanisms is not None:
             return run_loop(setup, backend, seed, advance)
-        return _analysed(fly_monitored(setup, backend, seed, advance), setup, seed)
+        run = fly_monitored(setup, backend, seed, advance)
+        # intersections that fail are told here
+        run.cases, run.intervals, run.conversion, run.scatter  # noqa: B018
+        return run
     except (AimError, BeamMissedError) as error:
         raise BenchError(f"the instrument cannot be rendered: {error}", spec.times_key, TOO_FAR) from error
     except IntersectionError as error:
         raise BenchError(str(error), ("cameras",), "cameras that look different ways") from error
 
 
-def _analysed(flight: MonitorFlight, setup: MonitorSetup, seed: int) -> MonitorRun:
-    """All cases of a flight."""
-    count, spec = len(flight.times), flight.spec
-    monitored = {n: flight.monitored[n].vector * flight.mask for n in flight.pair}
+def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorRun:
+    """Trace, render, measure, look down.
 
-    def interpolated(interval: float) -> CaseErrors:
-        at = spec.measured(interval)
-        return flight.case({n: between(flight.times, flight.times[at], v[at]) for n, v in monitored.items()})
+    Raises:
+        InputError: an unknown node or an impossible temperature.
+        BenchError: the test cannot be carried out as its file says.
+        AimError, BeamMissedError: light is lost.
+    """
+    spec, pair = setup.test, setup.pair
+    ground_seed, monitor_seed = np.random.SeedSequence(seed).spawn(2)
+    number = int(np.random.default_rng(monitor_seed).integers(2**31))
+    parts = 6
+    advance("monitor", 0, parts)
+    experiment = MonitorExperiment(setup.resolved, backend)
+    spec.check_nodes(experiment.instrument.nodes)
+    states = states_of(experiment, spec)
+    advance("monitor", 1, parts)
+    reference, bodies = states[spec.referred], {body.path: body for body in experiment.instrument.assembly.tree.bodies}
 
-    cases = {
-        "none": flight.case({n: np.zeros((count, 4)) for n in flight.pair}),
-        "monitored": flight.case(monitored),
-        "interval": interpolated(spec.every),
-        "parameters": flight.case(flight.truth),
-        "true": flight.true_case,
-    }
-    intervals = {interval: interpolated(interval) for interval in spec.compared}
-    smoothing = {
-        interval: _smoothing(flight, interval, intervals.get(interval, cases["interval"]))
-        for interval in sorted(flight.smoothed)
-    }
-    if smoothing:
-        cases["smoothed"] = smoothing[spec.every].case
-    first, second = (flight.monitored[n] for n in flight.pair)
-    angle = exact(first, second, *flight.looks, *flight.monitored.across)
-    total = flight.monitored.total
+    def turned(camera: str) -> State:
+        return compose(reference, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
+
+    lines = tuple(traced_pair(experiment, state, pair) for state in states)
+    by_arcsec = {name: traced_pair(experiment, turned(name), pair)[name] for name in pair}
+    advance("monitor", 2, parts)
+    angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
+    worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
+    # before the images, which take longer
+    views = look_down(spec, pair, lines, ground_seed, advance)
+    monitor = MonitorSeries(experiment, spec, reference, pair)
+    noisy, clean = monitor.measured(states, number)
+    truth, distance = _changes(clean.truth, spec.referred)
+    used = noisy if spec.errors.switched_on and spec.errors.monitor else clean
+    gains = monitor.gains(used, range(len(states)))
+    advance("monitor", 3, parts)
+    prisms = monitor.of_prisms()
+    advance("monitor", 4, parts)
+    repeated = monitor.repeated(states[worst], spec.repeats, number + 1, worst)
+    advance("monitor", 5, parts)
+    causes = _causes(experiment, spec, monitor, worst, gains[worst])
+    advance("monitor", 6, parts)
+    axes, smoothed = experiment.sight.axes, {}
+    if experiment.disturbances is not None:
+        smoothed = {interval: monitor.smoothed(used, interval) for interval in {spec.every, *spec.compared}}
     return MonitorRun(
+        pair,
+        np.array(spec.times),
+        lines,
+        FrozenMap({n: calibrated_line(lines[spec.referred][n], axes[n], distance[n]) for n in pair}),
+        views,
         setup,
         seed,
-        flight,
-        FrozenMap({name: cases[name] for name in CASES if name in cases}),
-        FrozenMap(intervals),
-        angle.change_rad,
-        angle.sigma_rad,
-        angle.noise_rad,
-        np.sqrt(flight.variance(flight.monitored.noise)),
-        None if total is None else np.sqrt(flight.variance(total)),
-        FrozenMap(smoothing),
-        FrozenMap(_parts(flight, cases)),
-        _conversion(flight),
-        _scatter(flight),
-        max(_residual(flight, n, k) for n in flight.pair for k in range(count)),
+        (experiment.instrument.spec.cameras[pair[0]].look, experiment.instrument.spec.cameras[pair[1]].look),
+        FrozenMap({name: truth[name] for name in pair}),
+        angle,
+        monitor.estimator,
+        monitor.readings(used, range(len(states))),
+        FrozenMap(smoothed),
+        FrozenMap(monitor.by_camera(gains, clean.shifts)),
+        FrozenMap(monitor.by_camera(gains, prisms)),
+        monitor.readings(repeated, [worst] * spec.repeats),
+        worst,
+        causes,
+        FrozenMap(by_arcsec),
+        used.doubts(spec.times, [channel.key for channel in experiment.path.channels]),
     )
 
 
-def _smoothing(flight: MonitorFlight, interval: float, interpolated: CaseErrors) -> Smoothing:
-    found = flight.smoothed[interval]
-    readings, mask = found.readings, flight.mask
-    assert readings.total is not None
-    case = flight.case({n: readings[n].vector * mask for n in flight.pair})
-    wrong = flight.height({n: mask * (readings[n].vector - flight.truth[n]) for n in flight.pair})
-    # what rounding leaves at the reference is no sigma
-    variance = np.maximum(flight.variance(readings.total), 0.0)
-    return Smoothing(case, interpolated, wrong, np.sqrt(variance), found.consistency)
+def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Camera -> (T, 4) true changes since the reference, and camera -> principal distance there.
+
+    The trace refers changes to the nominal camera; their differences are those between two states but for products of
+    two arcseconds, 1e-11 rad.
+    """
+    out, distance = {}, {}
+    for name in truths[0].cameras:
+        every = [one.cameras[name] for one in truths]
+        values = np.concatenate([change.vector for change in every])
+        out[name] = values - values[reference]
+        distance[name] = float(np.concatenate([c.principal_distance for c in every])[reference])
+    return out, distance
 
 
-def _parts(flight: MonitorFlight, cases: Mapping[str, CaseErrors]) -> dict[str, np.ndarray]:
-    def applied(values: Mapping[str, np.ndarray]) -> np.ndarray:
-        return flight.height({n: flight.mask * values[n] for n in flight.pair})
-
-    system = {n: flight.clean[n] - flight.truth[n] for n in flight.pair}
-    return {
-        "prisms": applied(flight.prisms),
-        "other_systematic": applied({n: system[n] - flight.prisms[n] for n in flight.pair}),
-        "noise": applied({n: flight.monitored[n].vector - flight.clean[n] for n in flight.pair}),
-        "not_applied": flight.height({n: -flight.truth[n] * (1.0 - flight.mask) for n in flight.pair}),
-        "beyond_parameters": cases["parameters"].camera,
-        "interpolation": cases["interval"].camera - cases["monitored"].camera,
-    }
-
-
-def _conversion(flight: MonitorFlight) -> Conversion:
-    """At the reference, where the calibrated cameras are the true ones."""
-    k = flight.spec.referred
-    view, traced = flight.views[k], {}
-    first, second = flight.pair
-    calm = point_errors(flight.true_pair(k), view, exact_data=True)[:, 2].mean()
-    slant, incidence = {}, {}
-    up = view.ground / np.linalg.norm(view.ground, axis=1, keepdims=True)
-    for i, name in enumerate(flight.pair):
-        pair = flight.true_pair(k)
-        pair[i] = in_analysis(flight.turned[name], flight.calibrated[name])
-        traced[name] = float(point_errors(pair, view, exact_data=True)[:, 2].mean() - calm)
-        arm = view.exact[i].station - view.ground
-        slant[name] = np.linalg.norm(arm, axis=1)
-        forward = np.cross(up, view.exact[i].attitude[:, :, 1])  # along the track, level
-        incidence[name] = np.arctan2(-np.sum(arm * forward, axis=1), np.sum(arm * up, axis=1))
-    ratio = np.tan(incidence[first]) - np.tan(incidence[second])
-    # a ray that is taken to look farther forward passes above the point, and the other ray is met the higher, the more
-    # it comes from ahead
-    theory = {
-        name: float(np.mean(sign * slant[name] * ARCSEC / np.cos(incidence[name]) / ratio))
-        for name, sign in ((first, 1.0), (second, -1.0))
-    }
-    return Conversion(FrozenMap(traced), FrozenMap(theory), float(np.mean(np.abs(ratio))))
-
-
-def _scatter(flight: MonitorFlight) -> Scatter:
-    """Exact image points, so that the monitor's noise is all there is."""
-    k = flight.worst
-    monitored = {n: flight.repeated[n].vector * flight.mask for n in flight.pair}
-    heights = []
-    for row in range(flight.spec.repeats):
-        pair = [flight.calibrated[n].corrected(monitored[n][row]) for n in flight.pair]
-        heights.append(point_errors(pair, flight.views[k], exact_data=True)[:, 2].mean())
-    variance = flight.variance(flight.repeated.noise, k)
-    return Scatter(np.array(heights), float(np.sqrt(np.mean(variance))))
-
-
-def _residual(flight: MonitorFlight, name: str, k: int) -> float:
-    pixel = np.linspace(0.0, flight.lines[k][name].pixels - 1.0, 101)
-    model = flight.calibrated[name].corrected(flight.truth[name][k]).look(pixel)
-    return float(np.max(np.linalg.norm(model - flight.lines[k][name].look(pixel), axis=-1)))
+def _causes(
+    experiment: MonitorExperiment, spec: OrbitMonitorSpec, monitor: MonitorSeries, worst: int, gain: np.ndarray
+) -> tuple[Cause, ...]:
+    """Return what each temperature of the course and each motion does from the reference to time number ``worst``, at
+    which the estimator has this gain (8, 2 C).
+    """
+    assert spec.course is not None
+    named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]
+    states = [s for what, path in named for s in states_of(experiment, spec, (spec.referred, worst), (what, path))]
+    found = monitor.clean(states)
+    truth, _ = _changes(found.truth, 0)
+    estimates = monitor.by_camera(gain, found.shifts)
+    out = []
+    for k, (what, path) in enumerate(named):
+        true, read = ({n: v[n][2 * k + 1] - v[n][2 * k] for n in monitor.pair} for v in (truth, estimates))
+        error = {n: read[n] - true[n] for n in monitor.pair}
+        out.append(Cause(what, path, FrozenMap(true), FrozenMap(error)))
+    return tuple(out)
