@@ -12,9 +12,9 @@ from analysis.turntable.angle_network import NotConvergedError
 from optics.numerics.backend import load_backend
 from tests.tiers import quick
 from twin.validation import registry
-from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, REFUTED, REPRODUCED
+from twin.validation.check import CONFIRMED, CONSISTENT, CORRECTED, REFUTED, REPRODUCED
 from twin.validation.paper_004 import focus_checks, turntable_checks
-from twin.validation.paper_004.equations_004 import Perspective
+from twin.validation.paper_004.distortion import Perspective
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
