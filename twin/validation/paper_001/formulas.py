@@ -357,16 +357,16 @@ def _singles(context: Context, images: SingleMotions, shown: dict[str, Ratio]) -
 
     def row(identifier: str, ratio: Ratio, *explained: float | None, **facts: object) -> CheckResult:
         shown.setdefault(identifier, ratio)
-        more = {"ratio": ratio, "images": images, "f": f, "f_x": f_x, "cos2": cos2, **_FACTS, **facts}
+        more = {"ratio": ratio, "images": images, "f": f, "f_x": f_x, "local": local, "cos2": cos2, **_FACTS, **facts}
         implied = {"001.eq2.cos2": cos2, "001.eq3.cos2": 1.0}.get(identifier)
         return context.row(identifier, ratio.value, ratio.sigma, implied, explained, **more)
 
-    f, f_x = focal_lengths(images.first)
+    (f, f_x), local = focal_lengths(images.first), images.local_share
     cos2 = math.cos(images.first.field_beta_rad) ** 2
     both = {direction: images.displacement(direction) for direction in ("along", "across")}
     far = max(both.values(), key=lambda ratio: abs(ratio.value - 1.0))
     yield row("001.eq1.displacement", far, both=both, tangent=1.0 / cos2)
-    yield row("001.eq2", images.over("along Y", "d_beta"), without_cos2(images.first, images.local_share))
+    yield row("001.eq2", images.over("along Y", "d_beta"), without_cos2(images.first, local))
     yield row("001.eq2.cos2", images.needed_factor("d_beta"), 1.0)
     yield row("001.eq3", images.over("along X", "d_alpha"), f_x / f)
     # how far off the axis of the mirrors the line stands
