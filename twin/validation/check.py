@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from analysis.units import ARCMIN, ARCSEC
-from optics.numerics.frozen_map import FrozenMap
+from analysis.arrays import ARCMIN, ARCSEC
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.spec import Number, Spec, Text
 from twin.run.artefact import plain, significant

@@ -10,7 +10,7 @@ import numpy as np
 from analysis.block.block_adjustment import LawTest
 from analysis.block.network import DatumTest, Network, Open
 from analysis.block.reweighting import GroupTest
-from analysis.orbit.ground_errors import Accuracy
+from analysis.orbit.forward_intersection import Accuracy
 from twin.orbit.block.block_run import BlockRun, CameraChange, Worth
 from twin.run.quantity import Quantity, Record
 

@@ -11,7 +11,7 @@ from analysis.block import block as known
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.measured.adjust_setup import MeasuredAdjustSetup
 from twin.orbit.block.pass_knowledge import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
 from twin.orbit.calibration.campaign import line_model

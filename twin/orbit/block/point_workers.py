@@ -7,8 +7,8 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from analysis.measurement_error import MeasurementError
-from optics.numerics.threads import one_blas_thread
+from analysis.arrays import MeasurementError
+from optics.numerics.backend import one_blas_thread
 from twin.run.cluster import ClusterError, Workers, local_workers, refuse_both, remote_workers
 
 _LOST = "a worker was lost with its share of the points; adjust the block again"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
+from analysis.arrays import ARCSEC
 from analysis.orbit.three_line_model import BIAS, misclosure
-from analysis.units import ARCSEC
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.camera_drift import Monitoring
 from twin.orbit.calibration.flown_campaign import true_bias

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.forward_intersection import CheckErrors
-from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration import field_sections
 from twin.orbit.calibration.calibration_plots import drift_svg, figure_svg

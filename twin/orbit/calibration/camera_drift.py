@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment, adjust
 from analysis.orbit.calibration_parameters import Prior, Unknowns, monitor_priors
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
-from analysis.units import ARCSEC
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import KeyPath
 from twin.orbit.calibration.observations import FieldPoints, PassData
 from twin.orbit.flight.light_effects import LightEffects

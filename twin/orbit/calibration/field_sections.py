@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
-from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_numbers import IMAGES
 from twin.orbit.calibration.calibration_plots import figure_svg

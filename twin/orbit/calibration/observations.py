@@ -20,7 +20,7 @@ import numpy as np
 from analysis.orbit.calibration_parameters import CalibrationField, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import pixel_places

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.orbit.three_line_model import BIAS, LineModel
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.orbit.calibration.flown_campaign import fly_fields

@@ -18,8 +18,8 @@ from analysis.calibration.strip_adjustment import Datum, StripAdjustment, adjust
 from analysis.orbit.calibration_parameters import CalibrationField
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.orbit.three_line_model import LineModel, Rays
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import gauge_of
 from twin.orbit.calibration.schemes import averaged

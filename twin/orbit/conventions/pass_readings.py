@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import names_text, nearest, shown
 from scenes.yaml.units import TIME

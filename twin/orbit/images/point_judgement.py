@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.stats import chi2
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.images.image_points import MatchedPoints
 from twin.orbit.images.patch import Patch
 

@@ -12,15 +12,21 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from analysis.arrays import Array
-from analysis.orbit.angles import angles_between, height_error, intersection_angles, off_axis_angle
-from analysis.orbit.planes import Method, NearVerticalWarning, PlaneFit, fit_plane
+from analysis.arrays import ARCSEC, Array
+from analysis.orbit.planes import (
+    Method,
+    NearVerticalWarning,
+    PlaneFit,
+    angles_between,
+    fit_plane,
+    height_error,
+    intersection_angles,
+    off_axis_angle,
+)
 from analysis.orbit.resection import Resection
-from analysis.units import ARCSEC
 from optics.geometry.pose import rotation_matrix
-from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import Backend, one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, Measurement, angle_camera, fly

@@ -16,11 +16,9 @@ from typing import Literal
 import numpy as np
 from matplotlib.figure import Figure
 
-from analysis.arrays import Array
-from analysis.orbit.angles import Sensitivity, intersection_angles, sensitivity
-from analysis.orbit.planes import Method, Station, Strip
-from analysis.units import ARCSEC
-from optics.numerics.threads import one_blas_thread
+from analysis.arrays import ARCSEC, Array
+from analysis.orbit.planes import Method, Sensitivity, Station, Strip, intersection_angles, sensitivity
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from twin.orbit.angle.angle_flight import AnglePass, Measurement
 from twin.orbit.angle.angle_run import effect_rows, values_of

@@ -16,9 +16,9 @@ from typing import TypeVar
 import numpy as np
 from matplotlib.figure import Figure
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import autocollimator, recovery
 from analysis.monitor.monitoring import MonitorGeometry
-from analysis.units import ARCSEC
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.numerics.backend import Backend

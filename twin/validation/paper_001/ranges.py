@@ -12,17 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import monitoring
 from analysis.monitor.monitoring import PER_SI, MonitorGeometry
 from analysis.monitor.recovery import measure_spots
-from analysis.units import ARCSEC
 from optics.geometry import zernike
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree, State
-from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import cores
+from optics.numerics.backend import Backend, cores
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.trace import BeamMissedError, make_rays, trace

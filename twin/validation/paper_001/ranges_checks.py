@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.monitoring import MonitorGeometry
-from analysis.units import ARCSEC
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from twin.run.artefact import SYMBOLS, Cell

@@ -11,11 +11,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.angles import height_error
+from analysis.arrays import ARCSEC
 from analysis.orbit.forward_intersection import third_difference
+from analysis.orbit.planes import height_error
 from analysis.orbit.three_line_model import BIAS, INTERIOR
-from analysis.units import ARCSEC
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.calibration_run import source_of

@@ -12,14 +12,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment, adjust
 from analysis.calibration.strip_adjustment import Stepwise, stepwise
+from analysis.orbit.calibration_parameters import Combination, Gauge
 from analysis.orbit.forward_intersection import CheckErrors
-from analysis.orbit.null_space import Combination, Gauge
 from analysis.orbit.three_line_model import BIAS, INTERIOR, Rays, misclosure, partials
-from analysis.units import ARCSEC
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES, EffectsSpec
 from scenes.specs.orbit.calibration import CalibrationImagesSpec

@@ -18,19 +18,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 
-from analysis.arrays import Array
-from analysis.orientation.distortion_model import (
-    distortion,
-    principal_distance,
-    principal_distance_and_point,
-    principal_point,
-)
-from analysis.units import ARCSEC
-from analysis.units import MM_PER_M as MM
-from analysis.units import UM_PER_M as UM
+from analysis.arrays import ARCSEC, Array
+from analysis.arrays import MM_PER_M as MM
+from analysis.arrays import UM_PER_M as UM
+from analysis.orientation.interior import distortion, principal_distance, principal_distance_and_point, principal_point
 from optics.geometry.pose import rotation_matrix
-from optics.numerics.backend import Backend
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import Backend, one_blas_thread
 from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.resolved import DistortionSetup, resolve_distortion
 from twin.laboratory.distortion_bench import DistortionBench
