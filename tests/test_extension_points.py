@@ -85,8 +85,8 @@ from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.study_files import write_data
 from twin.targets.target_images import BandPupils, View
-from twin.validation.checks.check import Check
-from twin.validation.checks.group import CheckGroup
+from twin.validation.check import Check
+from twin.validation.group import CheckGroup
 
 PAGE = Path(__file__).resolve().parent.parent / "docs/architecture.md"
 FALSE_ALARM = 1e-6

@@ -10,11 +10,11 @@ if __name__ == "__main__":
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Column
 from rich.text import Text
 
@@ -111,7 +111,7 @@ def main(
                 _print_list(selections, fast, as_json)
             return
         from twin.run.run_folder import RunFolder
-        from twin.validation.checks.check import FAILED
+        from twin.validation.check import FAILED
 
         folder = None if out is None else RunFolder(out, force)
         with exit_on_terminate():
@@ -146,18 +146,13 @@ def _run(
     from twin.validation.runner import rough_seconds, run_checks
     from twin.validation.validation_report import write_validation
 
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis")),
-        BarColumn(bar_width=14),
-        TimeElapsedColumn(),
-        _TimeLeft(),
-    )
+    text = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
     tracer = load_backend(backend)
     program_digest()  # of the files that compute, which may be others when the checks end
     total = rough_seconds(selections, fast)
     if total > cli.LONG:
         errors.print(f"note: this takes about {cli.time_text(total)}", highlight=False)
+    columns = (SpinnerColumn(), text, BarColumn(bar_width=14), TimeElapsedColumn())
     with Progress(*columns, console=errors, disable=not errors.is_terminal, transient=True) as bar:
         task = bar.add_task("start", total=total)
 
@@ -167,7 +162,7 @@ def _run(
             nonlocal at
             left = (time.monotonic() - begun) * (total - done) / done if done > 0.05 * total else total - done
             at = f"{text}, about {cli.time_text(left)} left"
-            bar.update(task, completed=done, description=text)
+            bar.update(task, completed=done, description=at)
 
         beat = cli.heartbeat(errors, lambda: at, silent=False)
 
@@ -181,70 +176,41 @@ def _run(
         return validation
 
 
-class _TimeLeft(ProgressColumn):
-    """Time left: the groups' rough seconds, corrected by the pace so far."""
-
-    def render(self, task: Task) -> Text:
-        """Minutes and seconds."""
-        left = task.remaining or 0.0
-        if task.elapsed and task.completed > 0.05 * (task.total or 0.0):
-            left *= task.elapsed / task.completed
-        minutes, seconds = divmod(round(left), 60)
-        return Text(f"about {minutes}:{seconds:02d} left", style="cyan", no_wrap=True)
-
-
 def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> None:
     """Ids, statements and rough times of the selected checks."""
+    groups = [(one.group, [c for c in one.group.checks if c.id in one.ids]) for one in selections]
     if as_json:
         rows = [
             {
                 **{name: getattr(check, name) for name in LISTED},
-                "group": selection.group.prefix,
-                "group_seconds": selection.group.rough_seconds(fast),
+                "group": group.prefix,
+                "group_seconds": group.rough_seconds(fast),
             }
-            for selection in selections
-            for check in selection.group.checks
-            if check.id in selection.ids
+            for group, checks in groups
+            for check in checks
         ]
         print_json({"checks": rows})
         return
     console = Terminal()
-    for selection in selections:
-        group = selection.group
-        console.print(
-            f"{group.prefix}: {group.title} (together about {group.rough_seconds(fast):g} s)",
-            style="bold", markup=False, highlight=False, soft_wrap=True,
-        )  # fmt: skip
-        for check in group.checks:
-            if check.id in selection.ids:
-                console.print(
-                    f"  {check.id}  {check.equation}: {check.statement}", markup=False, highlight=False, soft_wrap=True
-                )
+    plainly: Any = {"markup": False, "highlight": False, "soft_wrap": True}
+    for group, checks in groups:
+        seconds = f"together about {group.rough_seconds(fast):g} s"
+        console.print(f"{group.prefix}: {group.title} ({seconds})", style="bold", **plainly)
+        for check in checks:
+            console.print(f"  {check.id}  {check.equation}: {check.statement}", **plainly)
 
 
 def _print_result(validation: Validation, target: Path | None) -> None:
     """Every check in a line, and where to read more."""
-    from twin.validation.checks import check
+    from twin.validation import check
     from twin.validation.validation_report import claim_text, comparison_text, measured_text, sigma_text, verdict
 
-    styles = {
-        check.CONFIRMED: "green",
-        check.REPRODUCED: "dark_sea_green4",
-        check.CONSISTENT: "blue",
-        check.CORRECTED: "yellow",
-        check.REFUTED: "cyan",
-        check.UNDECIDED: "magenta",
-        check.NOT_CHECKABLE: "dim",
-        check.FAILED: "bold red",
-    }
+    colours = ("green", "dark_sea_green4", "blue", "yellow", "cyan", "magenta", "dim", "bold red")
+    styles = dict(zip(check.VERDICTS, colours, strict=True))
     table = cli.result_table()
-    table.add_column("check", no_wrap=True)
-    table.add_column("claim", justify="right", no_wrap=True)
-    table.add_column("sides", no_wrap=True)
-    table.add_column("measured", justify="right", no_wrap=True)
-    table.add_column("sigma", justify="right", no_wrap=True)
-    table.add_column("unit", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
+    for head in ("check", "claim", "sides", "measured", "sigma", "unit", "verdict"):
+        justify: Any = "right" if head in ("claim", "measured", "sigma") else "left"
+        table.add_column(head, justify=justify, no_wrap=True)
     for r in validation.results:
         unit = "" if r.unit == "1" else r.unit
         cells = (r.id, claim_text(r), comparison_text(r), measured_text(r), sigma_text(r), unit)

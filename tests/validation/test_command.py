@@ -14,7 +14,7 @@ from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED
 from twin.run.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation import registry
-from twin.validation.checks.check import (
+from twin.validation.check import (
     CONFIRMED,
     CONSISTENT,
     CORRECTED,
@@ -28,9 +28,8 @@ from twin.validation.checks.check import (
     Chosen,
     Explanation,
 )
-from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.checks.row_names import names_in_files
-from twin.validation.registry import UnknownCheck, select
+from twin.validation.group import CheckGroup, Context
+from twin.validation.registry import UnknownCheck, names_in_files, select
 from twin.validation.runner import run_checks
 
 run = partial(invoke, command.app)

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from twin.validation import registry
-from twin.validation.checks.check import PAPERS, REFUTED
-from twin.validation.checks.row_names import matches
+from twin.validation.check import PAPERS, REFUTED
+from twin.validation.registry import matches
 from twin.validation.runner import run_checks
 
 SUMMARY = Path(__file__).resolve().parents[2] / "docs" / "validation" / "README.md"

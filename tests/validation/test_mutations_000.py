@@ -18,9 +18,9 @@ from optics.numerics.backend import load_backend
 from scenes.specs.orbit.angle import LINES
 from tests.validation.mutated import break_it, undrawn, with_fields
 from twin.orbit.angle import angle_flight as flight_module
-from twin.validation.checks.check import VERDICTS
-from twin.validation.checks.group import Context
-from twin.validation.paper_000 import equations_000, figures, suppositions
+from twin.validation.check import VERDICTS
+from twin.validation.group import Context
+from twin.validation.paper_000 import method, results
 from twin.validation.registry import GROUPS as ALL
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
@@ -34,24 +34,24 @@ def drawn():
     """Measurements of the groups, made once."""
     checks = {check.id: check for group in GROUPS for check in group.checks}
     context = Context(load_backend("llvm"), 1, frozenset(checks), checks, fast=True)
-    made = equations_000.make_passes(context)
+    made = method.make_passes(context)
     return {
         "equations": replace(made, measured=made.measured[:120]),
-        "figures": figures.make_passes(context, count=2),
-        "uses": suppositions.height_passes(context),
-        "off_axis": suppositions.off_axis_passes(context),
+        "figures": results.make_passes(context, count=2),
+        "uses": method.height_passes(context),
+        "off_axis": method.off_axis_passes(context),
     }
 
 
 @pytest.fixture
 def quick(drawn, monkeypatch):
     """The groups on these measurements, without pictures."""
-    monkeypatch.setattr(equations_000, "make_passes", lambda _: drawn["equations"])
-    monkeypatch.setattr(figures, "make_passes", lambda *_, **__: drawn["figures"])
-    monkeypatch.setattr(suppositions, "height_passes", lambda _: drawn["uses"])
-    monkeypatch.setattr(suppositions, "off_axis_passes", lambda _: drawn["off_axis"])
-    monkeypatch.setattr(figures, "_places", lambda _: {})
-    monkeypatch.setattr(figures, "_show", lambda *_: None)
+    monkeypatch.setattr(method, "make_passes", lambda _: drawn["equations"])
+    monkeypatch.setattr(results, "make_passes", lambda *_, **__: drawn["figures"])
+    monkeypatch.setattr(method, "height_passes", lambda _: drawn["uses"])
+    monkeypatch.setattr(method, "off_axis_passes", lambda _: drawn["off_axis"])
+    monkeypatch.setattr(results, "_places", lambda _: {})
+    monkeypatch.setattr(results, "_show", lambda *_: None)
     return monkeypatch
 
 
@@ -72,7 +72,7 @@ def solved(change, method="corrected"):
 
         return wrong
 
-    return equations_000, "planes_of", broken
+    return method, "planes_of", broken
 
 
 def _with_slopes(fit, change):
@@ -95,7 +95,7 @@ def ends_swapped(right):
 
 def curves(read, factor=1.0):
     """Figs. 3-5: each curve by another one's key, times a factor."""
-    return figures, "answers", with_fields(change=lambda f: {key: factor * f.change[read(*key)] for key in f.change})
+    return results, "answers", with_fields(change=lambda f: {key: factor * f.change[read(*key)] for key in f.change})
 
 
 ENDS = {"forward": "backward", "backward": "forward", "alpha": "beta", "beta": "alpha"}
@@ -107,16 +107,16 @@ MUTATIONS = {
         lambda right: property(lambda fit: (*right.fget(fit)[:2], 2 * fit.station.position[2] - right.fget(fit)[2])),
         ["000.eq1"]),
     ("000.eq2", "factor 2"): (
-        equations_000, "sum_of_squares", lambda right: lambda s, p, o: right(np.array(s) * [2.0, 1.0], p, o),
+        method, "sum_of_squares", lambda right: lambda s, p, o: right(np.array(s) * [2.0, 1.0], p, o),
         ["000.eq2", "000.eq4"]),
     ("000.eq3", "not at zero"): (*solved(lambda m, r: solve(m, 1.0001 * r)), ["000.eq3"]),
     ("000.eq4", "x and y swapped"): (
-        equations_000, "derivatives", lambda right: lambda *given: right(*given)[::-1], ["000.eq4"]),
+        method, "derivatives", lambda right: lambda *given: right(*given)[::-1], ["000.eq4"]),
     ("000.eq5", "printed with the right sign"): (*solved(lambda m, r: solve(m, r), "printed"), ["000.eq5"]),
     ("000.eq5", "factor 2"): (*solved(lambda m, r: solve(m, 2 * r)), ["000.eq2", "000.eq5.angles", "000.eq6"]),
     ("000.eq6", "factor 2"): (
-        equations_000, "intersection_angles", with_fields(printed=lambda f: f.printed * [2.0, 1.0]), ["000.eq6"]),
-    ("000.eq7", "ends swapped"): (equations_000, "intersection_angles", ends_swapped, ["000.eq7"]),
+        method, "intersection_angles", with_fields(printed=lambda f: f.printed * [2.0, 1.0]), ["000.eq6"]),
+    ("000.eq7", "ends swapped"): (method, "intersection_angles", ends_swapped, ["000.eq7"]),
     ("000.fig3", "sign"): (
         *curves(lambda *key: key, -1.0), ["000.fig3.alpha_signs", "000.fig3.beta_signs", "000.fig3.ordinate"]),
     ("000.fig4", "ends swapped"): (

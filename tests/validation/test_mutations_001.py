@@ -24,9 +24,9 @@ from analysis.monitor import autocollimator, monitoring, recovery
 from scenes.specs.load import load_autocollimator_test
 from tests.validation.mutated import break_it, times
 from twin.laboratory.autocollimator_bench import Reader, run_autocollimator_test
-from twin.validation.checks.check import REPRODUCED, UNDECIDED
-from twin.validation.checks.group import Context
-from twin.validation.paper_001 import budget, budget_checks, formulas, formulas_images, joint, table2
+from twin.validation.check import REPRODUCED, UNDECIDED
+from twin.validation.group import Context
+from twin.validation.paper_001 import budget, formulas, table2
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
@@ -38,26 +38,29 @@ LIMITS = "001.table2.mean_error 001.table2.below_1"
 
 @pytest.fixture(scope="module")
 def groups(backend):
-    """Name -> (group, module, what ``measured`` found): everything that is rendered, once."""
+    """Name -> (group, module, its function that renders, what that found, ids): everything that is rendered, once."""
     experiments = {}
     out = {}
-    for module in (formulas, joint, budget_checks):
-        group = module.GROUP
+    for name, module, group, render in (
+        ("formulas", formulas, formulas.GROUP, "single_images"),
+        ("joint", formulas, formulas.JOINT, "joint_images"),
+        ("budget", budget, budget.GROUP, "measured"),
+    ):
         checks = {check.id: check for check in group.checks}
         chosen = set(checks)
-        if module is budget_checks:
+        if module is budget:
             # another instrument, and no formula is in it
             chosen -= {c for c in chosen if c.endswith("halved")}
         context = Context(backend, SEED, frozenset(chosen), checks, fast=True, experiments=experiments)
-        if module is budget_checks:
+        if module is budget:
             context.count = lambda full, fast: {60: 20, 80: 60}[fast]  # sigmas twice as large do for factors of two
-        out[module.__name__.rpartition(".")[2]] = (module, module.measured(context), frozenset(chosen))
+        out[name] = (group, module, render, getattr(module, render)(context), frozenset(chosen))
     setup = load_autocollimator_test()
     reader = Reader(setup, backend)
     ideal = run_autocollimator_test(setup, backend, seed=SEED, ideal=True, reader=reader)
     real = tuple(run_autocollimator_test(setup, backend, seed=SEED + n, reader=reader) for n in range(12))
     ids = frozenset(table2.GROUP.ids)
-    out["table2"] = (table2, table2.Measured(setup, reader, ideal, real), ids)
+    out["table2"] = (table2.GROUP, table2, "measured", table2.Measured(setup, reader, ideal, real), ids)
     return out
 
 
@@ -66,10 +69,10 @@ def turned(groups, backend, monkeypatch):
     """Function: run a group on its images and say which verdicts are not the expected ones."""
 
     def run(name):
-        module, images, ids = groups[name]
-        monkeypatch.setattr(module, "measured", lambda context: images)
+        group, module, render, images, ids = groups[name]
+        monkeypatch.setattr(module, render, lambda context: images)
         monkeypatch.setattr(table2, "_show", lambda context, found: None)  # draws with one more trace
-        checks = run_checks([Selection(module.GROUP, ids)], backend, SEED, fast=True)
+        checks = run_checks([Selection(group, ids)], backend, SEED, fast=True)
         assert not [r.how for r in checks.results if r.verdict == "failed"]
         return {result.id for result, _ in checks.unexpected}
 
@@ -123,26 +126,26 @@ MUTATIONS = {
     "001.table1.d_f: left and right swapped": (
         *factors("paper_joint", D_F, lambda row: row[LEFT_RIGHT]), "joint", "001.table1.d_f"),
     "001.table5.d_f: (7)'s factor": (
-        *factors("paper_joint", D_F, lambda row: 2 * row), "budget_checks", "001.table5.d_f.by_table1"),
-    "001.eq4: sign": (formulas_images, "roll_displacement", times(-1.0), "formulas", "001.eq5"),
-    "001.eq6: half": (formulas_images, "scale_displacement", times(0.5), "formulas", "001.eq7"),
+        *factors("paper_joint", D_F, lambda row: 2 * row), "budget", "001.table5.d_f.by_table1"),
+    "001.eq4: sign": (formulas, "roll_displacement", times(-1.0), "formulas", "001.eq5"),
+    "001.eq6: half": (formulas, "scale_displacement", times(0.5), "formulas", "001.eq7"),
     "001.eq8: sign": (
-        formulas_images, "superposed", lambda right: lambda first, second: first - second, "joint",
+        formulas, "superposed", lambda right: lambda first, second: first - second, "joint",
         "001.eq8.y 001.eq8.x"),
-    "001.eq9: twice": (formulas_images, "right_of_focal_length", times(2.0), "joint", "001.eq9.d_f"),
+    "001.eq9: twice": (formulas, "right_of_focal_length", times(2.0), "joint", "001.eq9.d_f"),
     "001.eq10: left and right swapped": (
-        formulas_images, "parts_along", lambda right: lambda one, other: right(other, one), "joint", "001.eq10.d_f"),
+        formulas, "parts_along", lambda right: lambda one, other: right(other, one), "joint", "001.eq10.d_f"),
     "001.eq11: sum for difference": (
-        formulas_images, "parts_across", lambda right: lambda one, other: right(one, other)[::-1], "joint",
+        formulas, "parts_across", lambda right: lambda one, other: right(one, other)[::-1], "joint",
         "001.eq11.d_alpha 001.eq11.d_gamma"),
     "001.fig4: forward and backward swapped": (
         recovery, "exact", lambda right: lambda f, b, *given: right(b, f, *given), "joint",
         "001.fig4.angle"),
     "001.eq12: frames not averaged": (
-        budget, "frame_mean", lambda right: lambda error, frames=9: error, "budget_checks",
+        budget, "frame_mean", lambda right: lambda error, frames=9: error, "budget",
         "001.eq12.frames 001.table4.printed_lines"),
     "001.table4: a quarter": (
-        budget, "root_sum", times(0.25), "budget_checks", "001.eq12 001.table4.printed_lines 001.table4.root_sum"),
+        budget, "root_sum", times(0.25), "budget", "001.eq12 001.table4.printed_lines 001.table4.root_sum"),
     "001.table2: cosine for sine about Z": (
         *relation("Z", 2, lambda between, right: np.cos(between)), "table2",
         f"001.table2.z 001.table2.relation.z {LIMITS}"),
@@ -169,7 +172,7 @@ def test_worse_benches_do_not_keep_table_2(groups, backend, monkeypatch):
     """With 2.5 times the declared errors the mean difference is 0.9 arcsec, and six benches know it to 0.2 arcsec: no
     agreement with 0.5.
     """
-    _, found, _ = groups["table2"]
+    *_, found, _ = groups["table2"]
     errors = found.setup.spec.errors
     worse = errors.model_copy(update={name: 2.5 * value for name, value in errors})
     setup = replace(found.setup, spec=found.setup.spec.model_copy(update={"errors": worse}))

@@ -22,8 +22,8 @@ from twin.orbit.calibration import schemes as calibration_schemes
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.run.random_streams import stream
 from twin.validation import registry
-from twin.validation.paper_003 import exact, fields, flights, model, rendered
-from twin.validation.paper_003.exact import FIELDS, changed, setup_of, without_light
+from twin.validation.paper_003 import fields, model
+from twin.validation.paper_003.model import FIELDS, changed, setup_of, without_light
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
@@ -42,15 +42,15 @@ def exact_passes():
     setup = model.exact_and_images()
     points = setup.test.points.model_copy(update={"control": 30, "check": 20})
     setup = changed(setup, points=points)
-    campaign = exact.exact_campaign(setup, stream(SEED, 0))
-    return setup, campaign, rendered.rendered_marks(setup, campaign, stream(SEED, 1))
+    campaign = model.exact_campaign(setup, stream(SEED, 0))
+    return setup, campaign, model.rendered_marks(setup, campaign, stream(SEED, 1))
 
 
 @cache
 def campaigns():
     setup = without_light(setup_of(FIELDS))
     points = setup.test.points.model_copy(update={"control": 40, "check": 30})
-    return flights.flown(changed(setup, points=points), SEED.spawn(CAMPAIGNS), lambda _: None)
+    return fields.flown(changed(setup, points=points), SEED.spawn(CAMPAIGNS), lambda _: None)
 
 
 @cache
@@ -59,7 +59,7 @@ def alone(campaign, one):
 
 
 SEEN = {}
-PLACES_SEEN = exact.places_seen
+PLACES_SEEN = model.places_seen
 
 
 def places_seen(setup, one, line, interior, bias):
@@ -74,11 +74,11 @@ def turned(monkeypatch):
     """Function: ids -> those whose verdict is not the expected one, on what is cached."""
     exact_passes(), campaigns()  # before anything is patched
     monkeypatch.setattr(model, "exact_and_images", lambda: exact_passes()[0])
-    monkeypatch.setattr(exact, "exact_campaign", lambda *_: exact_passes()[1])
-    monkeypatch.setattr(exact, "places_seen", places_seen)
-    monkeypatch.setattr(rendered, "rendered_marks", lambda *_: exact_passes()[2])
-    monkeypatch.setattr(flights, "flown", lambda *_: campaigns())
-    monkeypatch.setattr(flights, "calibrated_alone", alone)
+    monkeypatch.setattr(model, "exact_campaign", lambda *_: exact_passes()[1])
+    monkeypatch.setattr(model, "places_seen", places_seen)
+    monkeypatch.setattr(model, "rendered_marks", lambda *_: exact_passes()[2])
+    monkeypatch.setattr(fields, "flown", lambda *_: campaigns())
+    monkeypatch.setattr(fields, "calibrated_alone", alone)
 
     def check(ids):
         chosen = [Selection(group, frozenset(ids) & frozenset(group.ids)) for group in GROUPS]
@@ -93,22 +93,22 @@ def turned(monkeypatch):
 @pytest.mark.second
 def test_sigmas_of_biases_and_interior_are_those_of_the_fields_alone():
     one = campaigns()[0]
-    found = flights.flights_of([one])
+    found = fields.flights_of([one])
     for k, field in enumerate(one.passes):
         sigma = alone(one, field).sigma
         assert found.bias_sigma[0, k].tolist() == [sigma[f"{field.name} {axis}"] for axis in ("roll", "pitch", "yaw")]
-        assert found.interior_sigma[0, k].tolist() == [sigma[name] for name in flights.INNER]
+        assert found.interior_sigma[0, k].tolist() == [sigma[name] for name in fields.INNER]
 
 
 # ---- broken formulas ----
 
 
-EQUATIONS_OF = (exact, normal_equations, forward_intersection)
+EQUATIONS_OF = (model, normal_equations, forward_intersection)
 
 
 def of_model(change):
     """The rigorous model of a changed camera, everywhere."""
-    return (*EQUATIONS_OF, rendered), "misclosure", lambda right: lambda camera, *given: right(change(camera), *given)
+    return EQUATIONS_OF, "misclosure", lambda right: lambda camera, *given: right(change(camera), *given)
 
 
 def pitch_sign(right):

@@ -24,8 +24,8 @@ from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_run import align
 from twin.validation import registry
-from twin.validation.checks.check import FAILED, Chosen, InputRange
-from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks
+from twin.validation.check import FAILED, Chosen, InputRange
+from twin.validation.paper_004 import distortion, focus_checks, turntable_checks
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -62,7 +62,7 @@ def _budget(right):
 @pytest.fixture
 def turned(monkeypatch):
     """Function: ids -> those whose verdict is not the expected one, on the cached images."""
-    monkeypatch.setattr(distortion_checks, "measured_tests", lambda context: list(spot_tests()[1].values()))
+    monkeypatch.setattr(distortion, "measured_tests", lambda context: list(spot_tests()[1].values()))
     right = FocusBench.budget
     monkeypatch.setattr(FocusBench, "budget", lambda self: _budget(right))
     monkeypatch.setattr(focus_checks, "FocusBench", lambda *_: alignment().bench)
@@ -166,13 +166,13 @@ COLUMNS = {"004.table2.largest"}
 # formula, mutation -> where, what and how it is broken, ids to run, ids that turn at least
 MUTATIONS = {
     ("(1)", "sign of p"): (
-        equations_004, "distortion", lambda right: lambda w, t, f, p=0.0: right(w, t, f, -p), SPOTS,
+        distortion, "distortion", lambda right: lambda w, t, f, p=0.0: right(w, t, f, -p), SPOTS,
         {"004.eq1.constant"}),
     ("(2)", "sign in the numerator of f"): (
-        equations_004, "principal_distance_and_point", wrong_distance, SPOTS, F2),
-    ("(3)", "twice"): (equations_004, "principal_distance", times(2.0), SPOTS, F3),
+        distortion, "principal_distance_and_point", wrong_distance, SPOTS, F2),
+    ("(3)", "twice"): (distortion, "principal_distance", times(2.0), SPOTS, F3),
     ("(4)", "sign of the second sum"): (
-        equations_004, "principal_point", lambda right: lambda w, t, f: right(-w, t, f), SPOTS,
+        distortion, "principal_point", lambda right: lambda w, t, f: right(-w, t, f), SPOTS,
         {"004.eq4.solution", "004.eq4.uneven"}),
     ("focus vertex", "half"): (
         focus_checks, "focus_vertex", with_fields(position=lambda f: 0.5 * f.position), PLAN,
@@ -192,7 +192,7 @@ MUTATIONS = {
         dividing_error, "chauvenet", chauvenet_swapped, REPEATS,
         {"004.turntable.criterion", "004.turntable.chauvenet"}),
     ("Table 2", "columns swapped"): (
-        distortion_checks, "lower", lambda right: lambda raw, own: float(100 * (1 - raw / own)), TABLE2, COLUMNS),
+        distortion, "lower", lambda right: lambda raw, own: float(100 * (1 - raw / own)), TABLE2, COLUMNS),
 }  # fmt: skip
 
 

@@ -11,9 +11,8 @@ from optics.numerics.backend import load_backend
 from scenes.specs.orbit.angle import LINES, usual_angles
 from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass
 from tests.validation.mutated import undrawn
-from twin.validation.checks.check import CORRECTED, REFUTED
-from twin.validation.paper_000 import figures
-from twin.validation.paper_000.figures import SENTENCES, Sentence
+from twin.validation.check import CORRECTED, REFUTED
+from twin.validation.paper_000.results import SENTENCES, Answers, Sentence
 from twin.validation.registry import GROUPS as ALL
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
@@ -49,7 +48,7 @@ def test_what_is_found():
 def false_on(scene: Pass, lines: Sequence[str] = LINES) -> set[Sentence]:
     """Sentences that do not hold for a pass made by hand, without the orbit of the library's test."""
     strips = dict(zip(lines, scene.strips(1.5), strict=True))
-    found = figures.Answers.of(sensitivity(Station.of(scene.station, 0.5), strips, usual_angles(LINES)))
+    found = Answers.of(sensitivity(Station.of(scene.station, 0.5), strips, usual_angles(LINES)))
     return {sentence for sentence in SENTENCES if not sentence.holds(found.rises, found.growth)}
 
 

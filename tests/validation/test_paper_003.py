@@ -12,9 +12,9 @@ from analysis.orbit.forward_intersection import CheckErrors
 from optics.numerics.backend import load_backend
 from tests.validation.mutated import undrawn
 from twin.validation import registry
-from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, median_of
-from twin.validation.checks.group import Context
-from twin.validation.paper_003 import fields, flights, model, rendered
+from twin.validation.check import CORRECTED, NOT_CHECKABLE, median_of
+from twin.validation.group import Context
+from twin.validation.paper_003 import fields, model
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
@@ -33,7 +33,7 @@ def test_lost_tables_need_no_work(monkeypatch):
     def build(*_):
         raise AssertionError("not asked for")
 
-    monkeypatch.setattr(flights, "flown", build)
+    monkeypatch.setattr(fields, "flown", build)
     monkeypatch.setattr(model, "exact_and_images", build)
     monkeypatch.setattr(model, "image_setup", build)
     results = found(LOST).results
@@ -76,15 +76,15 @@ def test_a_few_campaigns(monkeypatch):
 def test_marks_that_cannot_be_told_apart_are_refused():
     image = np.zeros((60, 60))
     image[30, 29:31] = 1.0
-    assert rendered._centroid(image, 30, 30) == pytest.approx([30.0, 29.5])
+    assert model._centroid(image, 30, 30) == pytest.approx([30.0, 29.5])
     for row, column in ((30, 1), (58, 30), (1, 30), (30, 58)):
         with pytest.raises(ValueError, match="too near to the window's border"):
-            rendered._centroid(image, row, column)
+            model._centroid(image, row, column)
     at, ground = np.array([[1.0, 1.0], [9.0, 9.0]]), np.array([[4.0], [5.0]])
     near = (np.array([9.1, 1.2]), np.array([9.0, 1.0]))
-    assert rendered._matched(near, at, ground).tolist() == [[5.0], [4.0]]
+    assert model._matched(near, at, ground).tolist() == [[5.0], [4.0]]
     with pytest.raises(ValueError, match="two marks in the image are nearest to one"):
-        rendered._matched((np.array([1.0, 99.0]), np.array([1.0, 99.0])), at, ground)
+        model._matched((np.array([1.0, 99.0]), np.array([1.0, 99.0])), at, ground)
 
 
 def test_the_worst_field_counts_in_what_images_give(monkeypatch):
@@ -95,13 +95,13 @@ def test_the_worst_field_counts_in_what_images_give(monkeypatch):
         errors = (CheckErrors(np.zeros((check, 3)), *rms, check) for rms in (before, after))
         own = dict.fromkeys(names, error)
         way = SimpleNamespace(rounds=9)
-        return rendered.FromImages(name, 20, check, way, None, own, 1e-12 * np.eye(len(names)), *errors)
+        return model.FromImages(name, 20, check, way, None, own, 1e-12 * np.eye(len(names)), *errors)
 
     both = field("A", 8, (90.0, 70.0), (2.0, 5.0), 1e-6), field("B", 50, (80.0, 60.0), (3.0, 4.0), 3e-6)
-    monkeypatch.setattr(rendered, "measured", lambda *_: None)
-    monkeypatch.setattr(rendered, "calibrated", lambda _: both)
+    monkeypatch.setattr(model, "source_of", lambda *_: None)
+    monkeypatch.setattr(model, "calibrated", lambda _: both)
     ids = [f"003.model.{name}" for name in ("bias", "interior", "plan", "height")]
-    context = Context(None, 1, frozenset(ids), CHECKS, fast=True)
+    context = Context(None, 1, frozenset(ids), CHECKS, fast=True, texts=model.GROUP.artefacts)
     results = {r.id: r for r in model._rendered(context, np.random.SeedSequence(1))}
     assert [results[name].measured for name in ids] == pytest.approx([3e-6 / ARCSEC, 3.0, 3.0, 5.0])
     # of n errors in one direction the rms is known to a share of sqrt(1 / 2n), of 3n independent unknowns likewise

@@ -12,9 +12,9 @@ from analysis.turntable.dividing_error import FITS, fit
 from optics.numerics.backend import load_backend
 from tests.tiers import quick
 from twin.validation import registry
-from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, REFUTED, REPRODUCED
+from twin.validation.check import CONFIRMED, CONSISTENT, CORRECTED, REFUTED, REPRODUCED
 from twin.validation.paper_004 import focus_checks, turntable_checks
-from twin.validation.paper_004.equations_004 import Perspective
+from twin.validation.paper_004.distortion import Perspective
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -103,7 +103,7 @@ def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, 
             }
             return setup.model_copy(update={"test": setup.test.model_copy(update=update)})
 
-        monkeypatch.setattr(turntable_checks, "resolve_turntable", changed)
+        monkeypatch.setattr(turntable_checks, "TurntableSetup", changed)
         (found,) = run_checks(select([turntable_checks.GROUP], identifier), load_backend("llvm"), 1, fast=True).results
         return found.verdict
 

@@ -3,16 +3,16 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import parse_yaml
 from tests.twin.study_bench import REFUSED
-from twin.validation.checks.check import Supposed
-from twin.validation.checks.group import Printed, load_printed
-from twin.validation.checks.row_names import FILE
-from twin.validation.registry import GROUPS
+from twin.validation.check import Supposed, sentence
+from twin.validation.group import Printed, load_printed
+from twin.validation.registry import FILE, GROUPS
 
 FOLDERS = sorted((Path(__file__).parents[2] / "twin/validation").glob("paper_*"))
 
@@ -74,10 +74,19 @@ def test_rows() -> None:
     )  # fmt: skip
     assert (size.printed, size.tolerance, size.comparison, size.expected) == (2.3, 0.1, "at most", "reproduced")
     assert (figure.printed, figure.unit, figure.expected) == (None, "1", "not checkable")
+    facts = {"what": "twice", "tool": "a rule", "errors": np.array([2e-9, -3e-9])}
+    found = size.evaluate(4.6, explained=[4.6], inputs=[Supposed("on Earth", "")], facts=facts)
+    assert found.how.splitlines()[0] == "Measured with a rule: 4.6 ± 3 nm."
+    assert "It is twice as large." in found.how
+
+
+def test_texts_list_several_values_and_name_those_of_a_mapping() -> None:
+    facts = {"shares": [0.25, 0.5], "turns": {"x": 1e-3, "y": -2e-3}}
     assert (
-        "It is twice as large."
-        in size.evaluate(4.6, None, "", explained=[4.6], inputs=[Supposed("on Earth", "")], facts={"what": "twice"}).how
+        sentence("{shares:.0%}; {turns:mm +.1f} mm; {turns:abs max .3f}", facts) == "25%, 50%; x +1.0, y -2.0 mm; 0.002"
     )
+    with pytest.raises(KeyError):
+        sentence("{shares:furlong .1f}", facts)
 
 
 @pytest.mark.parametrize(

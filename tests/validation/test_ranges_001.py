@@ -10,13 +10,13 @@ from analysis.spots.spot_positions import SpotError
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from tests.validation.mutated import undrawn
-from twin.validation.checks.check import CORRECTED, REFUTED
-from twin.validation.checks.group import Context
-from twin.validation.paper_001.ranges import ranges_group, show
-from twin.validation.paper_001.ranges.curves import FORMS, Bench, Curves, sampled
-from twin.validation.paper_001.ranges.defocus import FieldPoint, PupilStudy, variant, with_return
-from twin.validation.paper_001.ranges.ranges_group import GROUP
-from twin.validation.paper_001.ranges.turns import BOX, CORNERS, EDGE_PX, WIDE_PX, joint_states, motion_of, single_range
+from twin.validation import group
+from twin.validation.check import CORRECTED, REFUTED
+from twin.validation.group import Context
+from twin.validation.paper_001 import ranges
+from twin.validation.paper_001 import ranges_checks as show
+from twin.validation.paper_001.ranges import FORMS, NAMES, Bench, single_range, variant
+from twin.validation.paper_001.ranges_checks import GROUP
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -25,7 +25,7 @@ EXPECTED = {check.id: check.expected for check in GROUP.checks}
 
 @pytest.fixture(scope="module")
 def resolved():
-    return resolve_job(JobSpec(instrument=ranges_group.INSTRUMENT))
+    return resolve_job(JobSpec(instrument=show.INSTRUMENT))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def bench(resolved, backend):
 
 @pytest.fixture(scope="module")
 def wide(resolved, backend, bench):
-    return Bench(variant(resolved, backend, "forward", pixels=WIDE_PX), bench, shapes=True)
+    return Bench(variant(resolved, backend, "forward", pixels=ranges.WIDE_PX), bench, shapes=True)
 
 
 def test_a_limit_is_found_between_the_points():
@@ -50,7 +50,7 @@ def test_a_limit_is_found_between_the_points():
             "at once": 2 + size,
         }
 
-    curves = sampled(share, [0.1, 1.0, 10.0, 100.0])
+    curves = ranges.sampled(share, [0.1, 1.0, 10.0, 100.0])
     # interpolated on logarithmic axes, in which a power law is straight
     assert curves.crossing("power") == pytest.approx(3.7, rel=1e-9)
     exact = np.roots([1 / 9.0**3, 0.0, 1 / 50, -1.0])
@@ -71,10 +71,10 @@ def test_the_box_just_keeps_the_spots_on_the_area_ccds(bench):
     """At the worst of its corners, by the trace; a seventh more and one leaves it."""
     camera = bench.cameras[0]
     middle = 0.5 * (np.array(bench.experiment.path.shape) - 1)
-    half = middle.min() - EDGE_PX
+    half = middle.min() - ranges.EDGE_PX
     origin, traced = bench.positions([{}]), bench.traced([{}])
     for share, stays in ((1.0, True), (1.15, False)):
-        moved = bench.traced(joint_states(bench, {camera: share * CORNERS * BOX})) - traced
+        moved = bench.traced(ranges.joint_states(bench, {camera: share * ranges.CORNERS * ranges.BOX})) - traced
         assert bool(np.max(np.abs(origin + moved - middle)) <= half) is stays
 
 
@@ -82,8 +82,10 @@ def test_the_figure_over_the_field_shows_readings_over_truth_less_one(monkeypatc
     """In per cent over degrees, each number at its field."""
     rng = np.random.default_rng(3)
     gains = [{form: 1.0 + 0.01 * rng.normal(size=4) for form in (show.PRINTED, show.CORRECTED)} for _ in range(3)]
-    points = [FieldPoint(np.radians(f), 2.0, g, np.zeros(4)) for f, g in zip((0.0, 0.6, 1.2), gains, strict=True)]
-    monkeypatch.setattr(show, "to_svg", lambda figure: figure)
+    points = [
+        ranges.FieldPoint(np.radians(f), 2.0, g, np.zeros(4)) for f, g in zip((0.0, 0.6, 1.2), gains, strict=True)
+    ]
+    monkeypatch.setattr(group, "to_svg", lambda figure: figure)
     (axes,) = show.field_svg(points).axes
     law, *lines = [line for line in axes.get_lines() if len(line.get_xdata()) > 2]
     degrees = law.get_xdata()
@@ -101,9 +103,9 @@ def test_the_figure_of_defocus_shows_false_readings_beside_the_theory(monkeypatc
     rng = np.random.default_rng(4)
     offset = np.array([[-0.2, 0.0], [0.1, 0.0], [0.0, 0.1], [0.0, -0.3], [0.0, 0.0]])
     slope, size = 1e6 * rng.normal(size=(5, 4)), np.array([1e-5, 1e-4, 1e-3])
-    curves = Curves(size, {f"{name} claimed": rng.uniform(0.1, 9.0, 3) for name in show.turns.NAMES})
-    monkeypatch.setattr(show, "to_svg", lambda figure: figure)
-    study = PupilStudy(offset, slope, np.zeros((4, 2)), np.zeros(4))
+    curves = ranges.Curves(size, {f"{name} claimed": rng.uniform(0.1, 9.0, 3) for name in NAMES})
+    monkeypatch.setattr(group, "to_svg", lambda figure: figure)
+    study = ranges.PupilStudy(offset, slope, np.zeros((4, 2)), np.zeros(4))
     left, right = show.defocus_svg(study, curves, (5.0, 6.0)).axes
     for axis, (f, sign) in enumerate(((5.0, -1.0), (6.0, 1.0))):
         theory, marks = left.get_lines()[2 * axis : 2 * axis + 2]
@@ -122,8 +124,8 @@ def test_the_figure_of_single_changes_shows_errors_and_limits_in_its_units(monke
     rng, size = np.random.default_rng(5), np.geomspace(1.0, 1000.0, 6)
     parts = [{form: np.stack([size * up, rng.normal(size=6)], axis=-1) for form in FORMS} for up in (1.0, 2000.0)]
     one = SimpleNamespace(raw=parts[0], raw_traced=parts[1], lost=3e6, window=500.0)
-    monkeypatch.setattr(show, "to_svg", lambda figure: figure)
-    panels = show.singles_svg(dict.fromkeys(show.turns.NAMES, (one,))).axes
+    monkeypatch.setattr(group, "to_svg", lambda figure: figure)
+    panels = show.singles_svg(dict.fromkeys(NAMES, (one,))).axes
     for axes, per, fine in zip(panels, (1.0, 1.0, 1.0, 1e-3), (0.1, 0.1, 0.1, 0.04), strict=True):
         percent, limit, *rest = axes.get_lines()
         np.testing.assert_allclose(percent.get_xdata(), [per, 3e6 * per])
@@ -136,18 +138,18 @@ def test_the_figure_of_single_changes_shows_errors_and_limits_in_its_units(monke
 
 def test_an_unknown_kind_of_return_is_refused(bench):
     with pytest.raises(ValueError, match="no return 'mirror'; there are plane, "):
-        with_return(bench.experiment, "mirror")
-    assert with_return(bench.experiment, "plane") is bench.experiment
+        ranges.with_return(bench.experiment, "mirror")
+    assert ranges.with_return(bench.experiment, "plane") is bench.experiment
 
 
 @pytest.mark.second
 def test_the_edge_of_the_window_is_where_the_centroid_refuses(bench, wide):
     found = single_range(bench, wide, "d_beta", 1, 3)
-    motion, unit = motion_of("forward", "d_beta", bench.geometry("forward"))
+    motion, unit = ranges.motion_of("forward", "d_beta", bench.geometry("forward"))
     scale = found.window / 1.0016  # the traced change is 1.0016 times the nominal one
     inside, outside = (motion.state(unit * scale * share) for share in (0.995, 1.035))
     place = bench.positions([inside])
-    assert np.min(place[..., 0]) == pytest.approx(EDGE_PX, abs=0.5)
+    assert np.min(place[..., 0]) == pytest.approx(ranges.EDGE_PX, abs=0.5)
     with pytest.raises(SpotError, match=r"edge|template"):
         bench.positions([outside])
 
@@ -159,7 +161,7 @@ def test_the_range_of_a_formula_turns_with_a_wrong_factor(bench, wide, backend, 
 
     def judged():
         both = [single_range(bench, wide, parameter, 1, 3)]
-        return ranges_group._range(context, row, both, bench.geometry("forward")).verdict
+        return show._range(context, row, both, bench.geometry("forward")).verdict
 
     assert judged() == verdict
     right = monitoring.coefficients

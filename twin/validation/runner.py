@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from optics.numerics.backend import Backend
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.artefact import Artefact
 from twin.run.provenance import versions
-from twin.validation.checks.check import VERDICTS, CheckResult, Verdict
-from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.check import VERDICTS, CheckResult, Verdict
+from twin.validation.group import CheckGroup, Context
 from twin.validation.registry import Selection
 
 SCHEMA = "space-camera-twin/validation"
@@ -147,25 +148,18 @@ def run_checks(
     runs = []
     done = 0.0
     for selection in selections:
-        share = _Share(progress, done, selection.group, selection.group.rough_seconds(fast))
-        runs.append(_run_group(selection, backend, seed, fast, share, folder, experiments))
-        done += share.seconds
+        seconds = selection.group.rough_seconds(fast)
+        advance = partial(_advance, progress, done, selection.group, seconds)
+        runs.append(_run_group(selection, backend, seed, fast, advance, folder, experiments))
+        done += seconds
     progress(done, "done")
     took = time.monotonic() - clock
     return Validation(tuple(runs), backend.name, seed, only, started, took, fast, written=folder is not None)
 
 
-@dataclass(frozen=True)
-class _Share:
-    """A group's own share of the progress."""
-
-    progress: Progress
-    start: float
-    group: CheckGroup
-    seconds: float
-
-    def __call__(self, fraction: float, text: str) -> None:
-        self.progress(self.start + fraction * self.seconds, f"{self.group.prefix}: {text}")
+def _advance(progress: Progress, start: float, group: CheckGroup, seconds: float, fraction: float, text: str) -> None:
+    """Report how far a group is in its share of the progress."""
+    progress(start + fraction * seconds, f"{group.prefix}: {text}")
 
 
 def _run_group(
@@ -173,7 +167,7 @@ def _run_group(
     backend: Backend,
     seed: int,
     fast: bool,
-    share: _Share,
+    advance: Callable[[float, str], None],
     folder: Path | None,
     experiments: dict[str, MonitorExperiment],
 ) -> GroupRun:
@@ -184,14 +178,14 @@ def _run_group(
     checks = {check.id: check for check in group.checks}
     found = {name: checks[name].without_comparison() for name in selection.ids if checks[name].not_checkable}
     wanted = selection.ids - set(found)
-    context = Context(backend, seed, wanted, checks, fast, share, own, experiments)
+    context = Context(backend, seed, wanted, checks, fast, advance, own, experiments, group.artefacts)
     begin = last = time.monotonic()
     why = "the group gave no result for it"
-    share(0.0, "start")
+    advance(0.0, "start")
     try:
         for result in group.run(context) if wanted else ():
             now = time.monotonic()
-            _keep(result.timed(now - last), found, group, wanted)
+            _keep(replace(result, seconds=now - last), found, group, wanted)
             last = now
     except Exception as error:
         why = _sentence(error)
@@ -202,7 +196,7 @@ def _run_group(
         if check.id in found:
             results.append(found[check.id])
         elif check.id in selection.ids:
-            results.append(check.failed(why).timed(time.monotonic() - last))
+            results.append(replace(check.failed(why), seconds=time.monotonic() - last))
             last = time.monotonic()
     files = _files(own)
     return GroupRun(group, tuple(results), tuple(context.artefacts), time.monotonic() - begin, files)

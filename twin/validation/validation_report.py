@@ -12,7 +12,7 @@ from twin.run.artefact import Data, Marked, PngFigure, SvgFigure, Table, decimal
 from twin.run.page import links, report_page, reproduce
 from twin.run.report import Report, Section, answer
 from twin.run.run_folder import RunFolder, write_manifest
-from twin.validation.checks.check import AGREED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
+from twin.validation.check import AGREED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
 from twin.validation.runner import GroupRun, Validation
 
 PROGRAM = "twin.validate"
@@ -246,16 +246,11 @@ def sigma_text(result: CheckResult) -> str:
     return fixed(result.sigma, decimals_for(result.sigma)) if result.sigma else ""
 
 
-def printed_text(result: CheckResult) -> str:
-    """What the paper prints."""
-    return "\N{EM DASH}" if result.printed is None else plain(result.printed)
-
-
 def claim_text(result: CheckResult) -> str:
     """What the paper prints, or in brackets what its statement implies."""
-    if result.printed is None and result.implied is not None:
-        return f"[{plain(result.implied)}]"
-    return printed_text(result)
+    if result.printed is None:
+        return "\N{EM DASH}" if result.implied is None else f"[{plain(result.implied)}]"
+    return plain(result.printed)
 
 
 def comparison_text(result: CheckResult) -> str:

@@ -1,13 +1,15 @@
-"""Paper 001's (12), what errors of spots do to the parameters, and all that is simulated for the budget's checks."""
+"""Paper 001's error budget: Tables 3 and 4 and (12), with their figure, and Table 5 with section 3.2.3."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from copy import copy
-from dataclasses import dataclass
-from math import sqrt
+from dataclasses import dataclass, replace
+from math import hypot, log, sqrt
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from analysis.monitor import monitoring
@@ -20,7 +22,10 @@ from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_budget
 from twin.monitor.simulated_budget import BudgetLine, ErrorBudget, Together
 from twin.monitor.truth import line_points
-from twin.validation.checks.group import Context, load_printed
+from twin.run.artefact import Cell
+from twin.run.svg import BLUE, INK
+from twin.validation.check import SIGMAS, CheckResult, Chosen, Supposed
+from twin.validation.group import Context, drawing, group_of, load_printed
 
 FRAMES = 9
 """Averaged in one measurement, (12)."""
@@ -42,6 +47,26 @@ FROM_ALL_CAUSES = frozenset(
 )
 """Checks that need all causes at once."""
 _CHUNK = 40
+_LARGEST = ("prism_180_thermal", "prism_0_rotation")
+"""The two lines that make most of (12)."""
+_INPUT_OF = {
+    "centroid": "light",
+    "coordinate_thermal": "temperature of the focal plane",
+    "prism_180_thermal": "gradient in the 180° prism",
+    "prism_0_thermal": "gradient in the 0° prism",
+    "prism_180_rotation": "rotation of the 180° prism",
+    "prism_0_rotation": "rotation of the 0° prism",
+    "central_prism_thermal": "gradient in the central prism",
+}
+"""What a line's input is; those of rotations act through the prisms' residual angle errors, which are chosen too."""
+_ANGLE, _LENGTH = ("arcsec", ARCSEC), ("mm", 1e-3)
+_PARAMETERS = {
+    "d_beta": ("d_beta_rad", "Δβ, 3σ", *_ANGLE),
+    "d_alpha": ("d_alpha_rad", "Δα, 3σ", *_ANGLE),
+    "d_gamma": ("d_gamma_rad", "Δγ by (5), 3σ", *_ANGLE),
+    "d_f": ("d_f_m", "Δf by (7), 3σ", *_LENGTH),
+}
+"""Parameter of Table 5 -> its field in simulated errors, its head, unit and that in SI."""
 
 
 def frame_mean(error: float, frames: int = FRAMES) -> float:
@@ -84,7 +109,6 @@ class BudgetImages:
 
     Attributes:
         geometry: of the first camera; both are alike.
-        radians_per_pixel: the unit of a spot's angle error.
         inputs: trials per line (twice as many for FEW_DRAWS), with all causes, and groups of frames.
         lines: of Table 3.
         focal_plane: true and read change of d_f by the focal plane's temperature, m.
@@ -96,7 +120,6 @@ class BudgetImages:
     """
 
     geometry: MonitorGeometry
-    radians_per_pixel: float
     inputs: tuple[int, int, int]
     lines: dict[str, BudgetLine]
     focal_plane: tuple[float, float] | None
@@ -136,7 +159,7 @@ def measured(context: Context) -> BudgetImages:
     geometry = next(iter(budget.experiment.calibration.cameras.values())).geometry
     inputs = (trials, together, groups)
     pitch = next(iter(budget.experiment.instrument.cameras.values())).spec.line.pitch
-    return BudgetImages(geometry, budget.radians_per_pixel, inputs, lines, grown, halved, causes, scatter, pitch, roll)
+    return BudgetImages(geometry, inputs, lines, grown, halved, causes, scatter, pitch, roll)
 
 
 def three_sigma(budget: ErrorBudget, cause: str) -> float:
@@ -193,3 +216,157 @@ def line_end_shift(budget: ErrorBudget) -> float:
     pixel = experiment.instrument.cameras[camera].spec.line.pitch
     per_pixel = float(np.linalg.norm(sight[0, -1] - sight[0, -2])) / float(ends[1] - ends[0]) * pixel
     return float(np.linalg.norm(sight[1, -1] - sight[0, -1])) / per_pixel
+
+
+@drawing("error-budget", lambda lines: 1.0 + 0.32 * len(lines))
+def budget_svg(figure: Figure, lines: Mapping[str, tuple[float, float, float]]) -> None:
+    """A row per line: text -> (printed, simulated, sigma), arcsec."""
+    axes = figure.subplots()
+    for row, (printed, simulated, sigma) in enumerate(lines.values()):
+        axes.plot([printed], [row], "|", color=INK, ms=16.0, mew=2.0, label="printed" if row == 0 else None)
+        low = max(simulated - 3.0 * sigma, 0.5 * simulated)
+        axes.plot([low, simulated + 3.0 * sigma], [row, row], color=BLUE, lw=2.0)
+        axes.plot([simulated], [row], "o", color=BLUE, ms=6.0, label="simulated" if row == 0 else None)
+    axes.set_xscale("log")
+    axes.set_xlim(1e-3, 0.3)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.set_yticks(range(len(lines)), list(lines))
+    axes.set_ylim(len(lines) - 0.5, -0.6)
+    axes.set_xlabel("error of one spot, 3σ [arcsec]")
+    axes.tick_params(axis="y", length=0)
+    figure.legend(loc="outside upper right", ncols=2, frameon=False)
+
+
+def run(context: Context) -> Iterator[CheckResult]:
+    """Simulate what is wanted; (12) needs all lines."""
+    images = measured(context)
+    for name, line in images.lines.items():
+        value, trials = line.three_sigma, images.inputs[0] * (2 if name in FEW_DRAWS else 1)
+        # proportional to the input, but for the centroid's light, whose power the budget's own search tells
+        power = log(0.1 * ARCSEC / value) / log(line.allowed / line.value)
+        chosen = Chosen.power(_INPUT_OF[name], line.value, line.unit, value / ARCSEC, power)
+        facts = {"line": line, "trials": trials, "images": images}
+        row = f"001.table3.{name}"
+        yield context.row(row, value / ARCSEC, line.sigma / ARCSEC, inputs=[chosen], **facts)
+    if images.halved is not None:
+        before, after, ratio = images.halved
+        yield context.row("001.table3.prism_180_thermal.halved", ratio, implied=0.5, before=before, after=after)
+    yield from _totals(context, images)
+    if images.together is not None:
+        yield from _monitored(context, images, images.together)
+    yield from _propagated(context, images.geometry)
+    if images.roll_pixels is not None:
+        pixel = Chosen.power("pixel of the line CCD", images.line_pixel * 1e6, "µm", images.roll_pixels, -1.0)
+        limit = Supposed("one pixel taken for little", f"holds down to {images.roll_pixels:.2f} px")
+        moved = 0.05 * ARCSEC * images.geometry.principal_distance_m / 7e-6
+        row = "001.table5.d_gamma.positioning"
+        yield context.row(row, images.roll_pixels, implied=1.0, inputs=[pixel, limit], moved=moved)
+    if images.lines:
+        _show(context, images.lines)
+
+
+def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
+    """The input of one line, on which a root of squares hangs only with the line's share; value: of the root."""
+    line = images.lines[name]
+    share = (frame_mean(1.0) if name == "centroid" else 1.0) * line.three_sigma / ARCSEC
+
+    def response(factor: float) -> float:
+        return sqrt(value**2 + (factor**2 - 1.0) * min(share, value) ** 2)
+
+    return Chosen(_INPUT_OF[name], line.value, line.unit, response)
+
+
+def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
+    """(12) and Table 4."""
+    facts: dict[str, object] = {"images": images, "frames": FRAMES}
+    if {"001.eq12", "001.table4.root_sum"} & context.selected:
+        total, sigma = root_sum_of_squares(images.lines)
+        inputs = [_in_sum(images, name, total / ARCSEC) for name in _LARGEST]
+        yield context.row("001.table4.root_sum", total / ARCSEC, sigma / ARCSEC, inputs=inputs, **facts)
+    if "001.eq12" in context.selected:
+        assert images.together is not None
+        value, spread = images.together.spot
+        plain = sum(line.three_sigma for line in images.lines.values())
+        measured, noise = value / total, value / total * hypot(spread / value, sigma / total)
+        # with a correlation of all pairs the square grows by as much of what a plain sum has more
+        largest = 1.0 + context.check("001.eq12").tolerance + SIGMAS * noise
+        most = ((largest / measured) ** 2 - 1.0) / ((plain / total) ** 2 - 1.0)
+        limit = f"holds up to a correlation of {max(most, 0.0):.2g} of all pairs"
+        inputs = [Supposed("causes that are independent", limit)]
+        yield context.row("001.eq12", measured, noise, inputs=inputs, value=value, total=total, plain=plain, **facts)
+    if images.scatter is not None:
+        (single, s_sigma), (mean, m_sigma) = images.scatter
+        rest = root_sum({n: v for n, v in TABLE_3.items() if n != "centroid"})
+        facts = {"single": single, "mean": mean, "rest": rest, "printed": root_sum(TABLE_3), **facts}
+        ratio = mean / frame_mean(single)
+        yield context.row("001.eq12.frames", ratio, ratio * hypot(s_sigma / single, m_sigma / mean), **facts)
+    yield context.row("001.table4.printed_lines", root_sum(TABLE_3))
+
+
+def _show(context: Context, lines: Mapping[str, BudgetLine]) -> None:
+    texts = {n: context.check(f"001.table3.{n}").statement.removesuffix(", error of one spot") for n in lines}
+    rows: list[list[Cell]] = []
+    for name, line in lines.items():
+        rows.append([texts[name], f"{TABLE_3[name]:g}", f"{line.three_sigma / ARCSEC:.4f}",
+                     f"{line.sigma / ARCSEC:.4f}", f"{line.value:.4g} {line.unit}",
+                     f"{line.allowed:.3g} {line.unit}"])  # fmt: skip
+    context.table("table3", rows)
+    data = {n: {"three_sigma_arcsec": l.three_sigma / ARCSEC, "sigma_arcsec": l.sigma / ARCSEC, "input": l.value,
+                "unit": l.unit, "input_for_0.1_arcsec": l.allowed} for n, l in lines.items()}  # fmt: skip  # noqa: E741
+    context.data("budget", data)
+    shown = {texts[n]: (TABLE_3[n], line.three_sigma / ARCSEC, line.sigma / ARCSEC) for n, line in lines.items()}
+    context.figure("table3-figure", budget_svg(shown))
+
+
+def _all_causes(value: float) -> list[Chosen]:
+    """What all inputs make together, to which every error is proportional."""
+    return [Chosen.power("errors by all inputs of scenes/library/budgets/monitor_pair.yaml, times", 1.0, "1", value)]
+
+
+def _monitored(context: Context, images: BudgetImages, together: Together) -> Iterator[CheckResult]:
+    """Rows of all causes at once, Table 5 among them, with its errors by formula and by Monte Carlo."""
+    facts: dict[str, object] = {"images": images, "frames": FRAMES}
+
+    def row(identifier: str, error: tuple[float, float], unit: float, implied: float | None = None) -> CheckResult:
+        value, sigma = error[0] / unit, error[1] / unit
+        return context.row(identifier, value, sigma, implied, inputs=_all_causes(value), **facts)
+
+    yield row("001.table4.together", together.spot, ARCSEC)
+    formula = propagated(together.spot[0], images.geometry)
+    rows: list[list[Cell]] = []
+    for name, (field, text, unit, size) in _PARAMETERS.items():
+        errors = {e: tuple(v / size for v in p[field]) for e, p in together.parameters.items()}
+        facts.update(formula=formula[name] / size, errors=errors, unit=unit)
+        yield row(f"001.table5.{name}", together.parameters["paper_single"][field], size)
+        shown = (f"{errors[e][0]:.4g} ± {errors[e][1]:.2g}" for e in ("paper_single", "paper_joint", "derived"))
+        printed = context.check(f"001.table5.{name}").printed
+        rows.append([f"{text} [{unit}]", f"{printed:g}", f"{formula[name] / size:.3g}", *shown])
+    if any(f"001.table5.{name}" in context.selected for name in _PARAMETERS):
+        context.table("table5", rows)
+    single = facts["single"] = together.parameters["paper_single"]
+    yield row("001.table5.x_and_y", max(single["d_beta_rad"], single["d_alpha_rad"]), ARCSEC)
+    yield row("001.table5.d_f.field", single["d_f_m"], 1e-3, 0.01)
+
+
+def _propagated(context: Context, geometry: MonitorGeometry) -> Iterator[CheckResult]:
+    """Table 5 by formula from the printed Table 4."""
+    for name, (*_, size) in _PARAMETERS.items():
+
+        def error(changed: MonitorGeometry, name: str = name, size: float = size) -> float:
+            return propagated(TABLE_4 * ARCSEC, changed)[name] / size
+
+        inputs = []
+        if context.check(f"001.table5.{name}.propagated").basis == "chosen":
+            for what, field in (("f", "principal_distance_m"), ("L", "separation_m")):
+                value = getattr(geometry, field)
+
+                def response(factor: float, field: str = field, value: float = value, error: Any = error) -> float:
+                    return float(error(replace(geometry, **{field: factor * value})))
+
+                inputs.append(Chosen(what, value, "m", response))
+        yield context.row(f"001.table5.{name}.propagated", error(geometry), inputs=inputs, geometry=geometry)
+    value = propagated(TABLE_4 * ARCSEC, geometry, "paper_joint")["d_f"] / 1e-3
+    yield context.row("001.table5.d_f.by_table1", value, explained=[0.02])
+
+
+GROUP = group_of("001.budget", run)

@@ -1,45 +1,309 @@
-"""Checks of paper 001's formulas for single changes."""
+"""Paper 001's formulas on rendered images: single changes (1) to (7); the joint form, that is superposition (8),
+symmetry (9), separation (10) and (11), Table 1's last column on all four changes at once, and Fig. 4's angle.
+
+A displacement is before - after, in any unit of length; X is across the line, Y along it, L at its +Y end.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 from statistics import fmean
+from typing import TypeVar
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from analysis.monitor.monitoring import MonitorGeometry
 from optics.geometry.surface import plane
-from optics.geometry.tree import Body, Motion, RigidTree
+from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.numerics.backend import Backend
-from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
+from scenes.specs.instrument import BASE
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import Observing, observe, one_detector
+from twin.monitor.truth import Truth
 from twin.run.artefact import Cell
-from twin.validation.checks.check import Check, CheckResult
-from twin.validation.checks.group import Context, group_of
-from twin.validation.paper_001 import formulas_images as motions
+from twin.run.svg import BLUE, GREY, INK, LIGHT
+from twin.validation.check import CheckResult, rms
+from twin.validation.group import Context, drawing, group_of
 
+Value = TypeVar("Value", float, np.ndarray)
+Measured = tuple[float, float]
+"""A value and its standard deviation."""
 MIRROR_TURNS = tuple(math.radians(angle) for angle in (1 / 3600, 1 / 60, 0.5, 2.0, 10.0))
 INSTRUMENT = "monitor_pair"
 """The camera that Table 5 implies: f = 7.7 m, area CCDs 0.73 m apart."""
+FRAMES = 9
+PARAMETERS = ("d_alpha", "d_beta", "d_gamma", "d_f")
+SHIFT, TURN, SCALE, PISTON, FACE = 50e-6, 20 * ARCSEC, 20e-6, 50e-6, 4 * ARCSEC
+"""Motions, SI: of the line CCD along X or Y, about Z; growth of the camera; line CCD along Z; turn of a return face."""
+AMOUNTS = {"d_alpha": SHIFT, "d_beta": SHIFT, "d_gamma": TURN, "d_f": SCALE}
+"""Motion behind each parameter: line CCD along X, along Y (m) and about Z (rad), growth of the camera."""
+SMALLEST = 0.5
+"""Smallest size of a random motion, as a share of its AMOUNTS."""
+UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
+"""Units of the response matrix: arcsec and micrometres."""
+_FACTS = {"frames": FRAMES, "instrument": INSTRUMENT, "amounts": AMOUNTS, "piston": PISTON, "face": FACE}
 
 
-def plane_mirror(check: Check, backend: Backend) -> CheckResult:
-    """Whether the reflected ray turns by twice the turn of the mirror."""
-    turns = np.array(MIRROR_TURNS)
-    turned, moved = mirror_turns(backend, turns)
-    ratio = turned / turns
-    worst = float(ratio[np.argmax(np.abs(ratio - 2.0))])
-    screen = float(np.max(np.abs(moved / np.tan(2 * turns) - 1.0)))
-    how = (
-        f"Exact trace of a ray off a plane mirror at {len(turns)} angles from 1 arcsec to 10°; the ratio farthest from "
-        f"2 counts. On a screen at distance f the ray moves by f tan 2θ, as (1) says, to {screen:.0e} of it."
-    )
-    return check.evaluate(worst, None, how)
+def roll_displacement(x_left: Value, x_right: Value) -> Value:
+    """Eq. (4): how far a roll of the camera moves a spot across the line."""
+    return (x_left - x_right) / 2.0
+
+
+def scale_displacement(y_left: Value, y_right: Value) -> Value:
+    """Eq. (6): how far a change of the focal length moves a spot along the line; (y11 - y01) is minus the left Y."""
+    return (y_right - y_left) / 2.0
+
+
+def superposed(first: Value, second: Value) -> Value:
+    """Eq. (8), of one side: the displacement by two changes at once from those by each of them."""
+    return first + second
+
+
+def right_of_focal_length(left: Value) -> Value:
+    """Eq. (9): Y of the right spot from that of the left one when the focal length changes. When the line of sight
+    turns about X they are alike.
+    """
+    return -left
+
+
+def parts_along(left: Value, right: Value) -> tuple[Value, Value]:
+    """Eq. (10): the shares of the focal length and of the turn about X in Y."""
+    return (left - right) / 2.0, (left + right) / 2.0
+
+
+def parts_across(left: Value, right: Value) -> tuple[Value, Value]:
+    """Eq. (11): the shares of the turn about Y and of the roll in X."""
+    return (left + right) / 2.0, (left - right) / 2.0
+
+
+def focal_lengths(geometry: MonitorGeometry) -> tuple[float, float]:
+    """Focal lengths along and across the line, metres."""
+    f = geometry.principal_distance_m
+    return f, geometry.principal_distance_across_m or f
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A reading divided by what it should be.
+
+    Attributes:
+        value: mean of the cameras.
+        sigma: its standard deviation.
+        cameras: camera -> (value, sigma).
+    """
+
+    value: float
+    sigma: float
+    cameras: Mapping[str, Measured]
+
+    @property
+    def text(self) -> str:
+        """Each camera's own value."""
+        return ", ".join(f"{name} {value:.5f} ± {sigma:.5f}" for name, (value, sigma) in self.cameras.items())
+
+
+def quotient(above: Measured, below: Measured) -> Measured:
+    """Quotient of two measured numbers, (value, sigma) each, with its sigma."""
+    value = above[0] / below[0]
+    return value, float(np.hypot(above[1], value * below[1]) / abs(below[0]))
+
+
+class MonitorImages:
+    """Nine frames before and after every state, measured; what the formulas make of the spots is worked out on demand.
+
+    Args:
+        context: of the group, for the noise.
+        experiment: the instrument.
+        states: name -> state; both cameras' bodies may move in it.
+    """
+
+    def __init__(self, context: Context, experiment: MonitorExperiment, states: Mapping[str, State]) -> None:
+        self.experiment = experiment
+        self.cameras = tuple(experiment.calibration.cameras)
+        self.motions = list(states)
+        every = list(states.values())
+        context.progress(0.2, "trace the truth")
+        self.truth: Truth = experiment.sight.truth(every)
+        context.progress(0.5, "render and measure the spots")
+        how = Observing(one_detector(experiment, FRAMES, context.seed), stated=False)
+        pieces = [found.recovery for found in observe(experiment, every, how)]
+        self.before = np.concatenate([p.before for p in pieces])
+        self.after = np.concatenate([p.after for p in pieces])
+        self.covariance = np.concatenate([p.shift_covariance for p in pieces])
+
+    def geometry(self, camera: str) -> MonitorGeometry:
+        """What the formulas are given of a camera."""
+        return self.experiment.calibration.cameras[camera].geometry
+
+    @property
+    def first(self) -> MonitorGeometry:
+        """The geometry of the first camera; both have the same prescription."""
+        return self.geometry(self.cameras[0])
+
+    def local(self, camera: str) -> float:
+        """Focal length along the line at its centre, where d_beta is taken, over the formulas' f."""
+        model = self.experiment.instrument.cameras[camera]
+        return model.line_principal_distance / self.geometry(camera).principal_distance_m
+
+    @property
+    def local_share(self) -> float:
+        """Mean of `local` over the cameras."""
+        return fmean(self.local(camera) for camera in self.cameras)
+
+    def estimates(self) -> recovery.Estimates:
+        """What each estimator reads from the spots of all states."""
+        return recovery.estimates(self.before, self.after, self.covariance, self.experiment.calibration.cameras)
+
+    def reading(self, camera: str, motion: str, parameter: str) -> Measured:
+        """What the printed formula of a single change reads of one state, SI."""
+        found = self.estimates().parameters[camera]["paper_single"]
+        state, k = self.motions.index(motion), PARAMETERS.index(parameter)
+        return float(found.vector[state, k]), float(found.sigma[state, k])
+
+    def true(self, camera: str, motion: str, parameter: str) -> float:
+        """Traced change of one of PARAMETERS, SI."""
+        return float(getattr(self.truth.cameras[camera], parameter)[self.motions.index(motion)])
+
+    def spots(self, camera: str, motion: str, axis: str) -> tuple[float, float, float]:
+        """Displacements before - after of the left and the right spot along ``axis``, X or Y, and the sigma of each,
+        metres; the two sigmas are taken as equal.
+        """
+        state, k, column = self.motions.index(motion), self.cameras.index(camera), "YX".index(axis)
+        moved = (self.before - self.after)[state, 2 * k : 2 * k + 2, column]
+        pitch = self.geometry(camera).pitch_m
+        variance = np.diagonal(self.covariance[state])[4 * k : 4 * k + 4][column::2]
+        return float(moved[0]) * pitch, float(moved[1]) * pitch, float(np.sqrt(variance.mean())) * pitch
+
+    def ratio(self, of: Callable[[str], Measured]) -> Ratio:
+        """Mean ratio from that of each camera; the noise of the cameras is independent."""
+        cameras = {camera: of(camera) for camera in self.cameras}
+        values, sigmas = np.array(list(cameras.values())).T
+        return Ratio(float(values.mean()), float(np.sqrt(np.sum(sigmas**2)) / len(values)), cameras)
+
+    def over(self, motion: str, parameter: str, amount: float | None = None) -> Ratio:
+        """Reading divided by the amount of the motion, by default by the traced change."""
+        return self.ratio(
+            lambda camera: quotient(
+                self.reading(camera, motion, parameter),
+                (self.true(camera, motion, parameter) if amount is None else amount, 0.0),
+            )
+        )
+
+
+class SingleMotions(MonitorImages):
+    """Images of the motions that the formulas were derived for, one at a time, made by both cameras."""
+
+    def __init__(self, context: Context, experiment: MonitorExperiment) -> None:
+        cameras = [f"{BASE}/{name}" for name in experiment.instrument.cameras]
+        planes = [f"{camera}/focal_plane" for camera in cameras]
+        faces = [channel.face_body for channel in experiment.instrument.channels]
+        moved = {
+            "along X": (planes, Motion(shift=(SHIFT, 0.0, 0.0))),
+            "along Y": (planes, Motion(shift=(0.0, SHIFT, 0.0))),
+            "about Z": (planes, Motion(rotate=(0.0, 0.0, TURN))),
+            "piston": (planes, Motion(shift=(0.0, 0.0, PISTON))),
+            "scale": (cameras, Motion(scale=SCALE)),
+            "face across": (faces, Motion(rotate=(FACE, 0.0, 0.0))),
+            "face along": (faces, Motion(rotate=(0.0, FACE, 0.0))),
+        }
+        states = {name: dict.fromkeys(bodies, motion) for name, (bodies, motion) in moved.items()}
+        super().__init__(context, experiment, states)
+
+    def needed_factor(self, parameter: str) -> Ratio:
+        """The factor that (2) or (3) needs where it has cos²: true change times 2f over the mean spot shift.
+
+        Along the line f is here the focal length at its centre, where d_beta is taken; across it the formula's own.
+        """
+        motion = {"d_beta": "along Y", "d_alpha": "along X"}[parameter]
+
+        def factor(camera: str) -> Measured:
+            geometry = self.geometry(camera)
+            local, field = 1.0, geometry.field_alpha_rad
+            if parameter == "d_beta":
+                local, field = self.local(camera), geometry.field_beta_rad
+            value, sigma = self.reading(camera, motion, parameter)
+            bare = math.tan(value) / math.cos(field) ** 2 / local
+            found = self.true(camera, motion, parameter) / bare
+            return found, abs(found * sigma / value)
+
+        return self.ratio(factor)
+
+    def displacement(self, direction: str) -> Ratio:
+        """Turn of a return face, ``along`` or ``across`` the line, by (1) from the mean displacement of the spots, over
+        the turn that was made; f is the focal length in that direction.
+        """
+
+        def turn(camera: str) -> Measured:
+            f, f_x = focal_lengths(self.geometry(camera))
+            left, right, sigma = self.spots(camera, f"face {direction}", "Y" if direction == "along" else "X")
+            moved = 0.5 * (abs(left) + abs(right))
+            made = float(autocollimator.mirror_rotation(moved, f if direction == "along" else f_x)) / FACE
+            return made, made * sigma / math.sqrt(2.0) / moved
+
+        return self.ratio(turn)
+
+    def roll(self) -> Ratio:
+        """Eq. (4): how far the spots move across the line over how far the line CCD's ends do."""
+
+        def moved(camera: str) -> Measured:
+            left, right, sigma = self.spots(camera, "about Z", "X")
+            end = 0.5 * self.geometry(camera).separation_m * math.tan(TURN)
+            return quotient((roll_displacement(left, right), sigma / math.sqrt(2.0)), (end, 0.0))
+
+        return self.ratio(moved)
+
+    def growth(self) -> Ratio:
+        """Eq. (6): its mean displacement over the growth L Δf / f that (7) makes of it, with the traced Δf."""
+
+        def moved(camera: str) -> Measured:
+            left, right, sigma = self.spots(camera, "scale", "Y")
+            g = self.geometry(camera)
+            should = g.separation_m * self.true(camera, "scale", "d_f") / g.principal_distance_m
+            return quotient((scale_displacement(left, right), sigma / math.sqrt(2.0)), (should, 0.0))
+
+        return self.ratio(moved)
+
+    def growth_by_side(self) -> float:
+        """Largest relative distance of one side's own displacement from the mean of (6)."""
+        worst = 0.0
+        for camera in self.cameras:
+            left, right, _ = self.spots(camera, "scale", "Y")
+            mean = scale_displacement(left, right)
+            worst = max(worst, float(np.max(np.abs(np.array([-left, right]) / mean - 1.0))))
+        return worst
+
+
+@drawing("formulas-001", lambda ratios: 0.8 + 0.27 * len(ratios))
+def _ratios_svg(figure: Figure, ratios: Mapping[str, tuple[str, float]]) -> None:
+    """A row per check: id -> (equation, measured over right)."""
+    axes = figure.subplots()
+    axes.axvline(1.0, color=INK, lw=1.0)
+    for row, (_, value) in enumerate(ratios.values()):
+        axes.plot([1.0, value], [row, row], color=LIGHT, lw=4.0, solid_capstyle="butt", zorder=0)
+        axes.plot([value], [row], "o", color=BLUE, ms=7.0)
+        text = f"{value:.4f}".replace("-", "\N{MINUS SIGN}")
+        axes.text(1.06, row, text, transform=axes.get_yaxis_transform(), ha="right", va="center")
+    axes.text(1.06, -0.75, "measured", transform=axes.get_yaxis_transform(), ha="right", va="center", color=GREY)
+    axes.set_yticks(range(len(ratios)), [f"{name}   {where}" for name, (where, _) in ratios.items()])
+    axes.set_ylim(len(ratios) - 0.5, -0.6)
+    axes.set_xlabel("measured, where 1 is a correct formula")
+    axes.tick_params(axis="y", length=0)
+
+
+def _show_ratios(context: Context, name: str, found: Mapping[str, float]) -> None:
+    """Draw what was measured of the selected rows, id -> value, that are 1 where a formula is right."""
+    checks = {i: context.check(i) for i in found if i in context.selected}
+    exact = {i: (check.equation, found[i]) for i, check in checks.items() if check.printed == 1.0}
+    if exact:
+        context.figure(name, _ratios_svg(exact))
 
 
 def mirror_turns(backend: Backend, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,50 +320,30 @@ def mirror_turns(backend: Backend, turns: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """All checks of the group; the images of all motions are one batch."""
+    """All checks of single changes; the images of all motions are one batch."""
     if "001.eq1.turn" in context.selected:
         context.progress(0.0, "trace a plane mirror")
-        yield plane_mirror(context.check("001.eq1.turn"), context.backend)
+        turns = np.array(MIRROR_TURNS)
+        turned, moved = mirror_turns(context.backend, turns)
+        ratio, screen = turned / turns, np.abs(moved / np.tan(2 * turns) - 1.0)
+        worst = ratio[np.argmax(np.abs(ratio - 2.0))]
+        yield context.row("001.eq1.turn", worst, turns=MIRROR_TURNS, screen=screen)
         if len(context.selected) == 1:
             return
     context.progress(0.1, f"build {INSTRUMENT}")
-    images = measured(context)
-    shown = {}
-    findings: dict[str, list[_Finding]] = {}
-    for finding in _findings(images):
-        findings.setdefault(finding.id, []).append(finding)
-    for identifier, same in findings.items():
-        if identifier in context.selected:
-            check = context.check(identifier)
-            yield check.worse(*(_row(check, finding) for finding in same))
-            shown[identifier] = same[0].ratio
+    ratios: dict[str, Ratio] = {}
+    yield from _singles(context, single_images(context), ratios)
     context.progress(0.9, "draw")
+    shown = {i: ratio for i, ratio in ratios.items() if i in context.selected}
     if shown:
-        _show(context, shown)
+        _show_ratios(context, "ratios", {i: ratio.value for i, ratio in shown.items()})
+        rows = [[i, *(number for pair in ratio.cameras.values() for number in pair)] for i, ratio in shown.items()]
+        context.table("cameras", rows)
 
 
-def measured(context: Context) -> motions.SingleMotions:
-    """The images of all motions and their spots."""
-    experiment = context.experiment(INSTRUMENT)
-    return motions.SingleMotions(experiment, context.seed, lambda done, text: context.progress(0.2 + 0.6 * done, text))
-
-
-@dataclass(frozen=True)
-class _Finding:
-    """What the images say for one check, before it is evaluated; equations that say the same share a check."""
-
-    id: str
-    ratio: motions.Ratio
-    how: str
-    explained: tuple[float | None, ...] = ()
-    implied: float | None = None
-    facts: Mapping[str, float] = FrozenMap()
-
-
-def _row(check: Check, finding: _Finding) -> CheckResult:
-    ratio = finding.ratio
-    how = f"{finding.how} By camera: {ratio.text}."
-    return check.evaluate(ratio.value, ratio.sigma, how, finding.implied, finding.explained, facts=finding.facts)
+def single_images(context: Context) -> SingleMotions:
+    """The images of all single motions and their spots."""
+    return SingleMotions(context, context.experiment(INSTRUMENT))
 
 
 def without_cos2(geometry: MonitorGeometry, local: float) -> float:
@@ -107,106 +351,221 @@ def without_cos2(geometry: MonitorGeometry, local: float) -> float:
     return math.cos(geometry.field_beta_rad) ** 2 * local
 
 
-def _findings(images: motions.SingleMotions) -> Iterator[_Finding]:
-    geometry = images.first
-    f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
-    cos2 = math.cos(geometry.field_beta_rad) ** 2
-    field = f"{math.degrees(geometry.field_beta_rad):.2f}°"
-    rendered = f"{motions.FRAMES} frames of {INSTRUMENT} before and after"
+def _singles(context: Context, images: SingleMotions, shown: dict[str, Ratio]) -> Iterator[CheckResult]:
+    """The rows of (1) to (7); equations that say the same share one."""
+
+    def row(identifier: str, ratio: Ratio, *explained: float | None, **facts: object) -> CheckResult:
+        shown.setdefault(identifier, ratio)
+        more = {"ratio": ratio, "images": images, "f": f, "f_x": f_x, "local": local, "cos2": cos2, **_FACTS, **facts}
+        implied = {"001.eq2.cos2": cos2, "001.eq3.cos2": 1.0}.get(identifier)
+        return context.row(identifier, ratio.value, ratio.sigma, implied, explained, **more)
+
+    (f, f_x), local = focal_lengths(images.first), images.local_share
+    cos2 = math.cos(images.first.field_beta_rad) ** 2
     both = {direction: images.displacement(direction) for direction in ("along", "across")}
     far = max(both.values(), key=lambda ratio: abs(ratio.value - 1.0))
-    yield _Finding(
-        "001.eq1.displacement",
-        far,
-        f"{rendered} a turn of each return face by {motions.FACE / ARCSEC:g} arcsec, θ about either axis, the f of "
-        f"that direction: {both['along'].value:.5f} along the line, {both['across'].value:.5f} across; the one farther "
-        f"from 1 counts. At the area CCDs' field of {field} the tangent alone gives 1/cos²β = {1 / cos2:.5f} along the "
-        "line; the rest is distortion.",
-    )
-    yield _Finding(
-        "001.eq2",
-        images.over_truth("along Y", "paper_single", "d_beta"),
-        f"{rendered} a shift of {motions.SHIFT * 1e6:g} µm. β is not defined in print; taken as the area CCDs' field "
-        f"angle, {field}, cos²β alone makes {cos2:.5f}.",
-        (without_cos2(geometry, images.local_share),),
-        facts={"local": images.local_share},
-    )
-    yield _Finding(
-        "001.eq2.cos2",
-        images.needed_factor("d_beta"),
-        f"The images of 001.eq2; f is the focal length along the line at its centre. With β the area CCDs' field angle "
-        f"of {field} the print implies cos²β = {cos2:.5f}.",
-        (1.0,),
-        cos2,
-    )
-    yield _Finding(
-        "001.eq3",
-        images.over_truth("along X", "paper_single", "d_alpha"),
-        f"{rendered} a shift of {motions.SHIFT * 1e6:g} µm; α is not defined in print and taken as 0, the area CCDs' "
-        "field across the line.",
-        (f_x / f,),
-        facts={"f": f, "f_x": f_x},
-    )
-    yield _Finding(
-        "001.eq3.cos2",
-        images.needed_factor("d_alpha"),
-        "The images of 001.eq3. α is not defined in print; the area CCDs stand on the line of sight's plane, so that "
-        f"cos²α = 1; with α the camera's field bias of {math.degrees(images.field_bias):.2f}° it would be "
-        f"{math.cos(images.field_bias) ** 2:.4f}.",
-        (f / f_x,),
-        1.0,
-    )
-    rolled = images.roll()
-    yield _Finding(
-        "001.eq5",
-        images.over_motion("about Z", "paper_single", "d_gamma", motions.TURN),
-        f"{rendered} a turn of {motions.TURN / ARCSEC:g} arcsec. Δx / L₁ by (4), with L₁ = L/2 · tan Δγ: "
-        f"{rolled.value:.5f}. The middle of the printed line of (4) has a factor L/2 too many; its end is right in "
-        "units.",
-        (2.0,),
-    )
-    yield _Finding(
-        "001.eq5",
-        rolled,
-        f"{rendered} a turn of {motions.TURN / ARCSEC:g} arcsec; Δx / L₁ by (4), L₁ = L/2 · tan Δγ.",
-        (None, 2.0),
-    )
-    scale = f"{rendered} a growth of the whole camera by {motions.SCALE * 1e6:g} ppm, detectors unchanged."
-    grown = images.growth()
-    yield _Finding(
-        "001.eq7",
-        images.over_truth("scale", "paper_single", "d_f"),
-        f"{scale} Δy / (LΔf/f) by (6), with the traced Δf: {grown.value:.5f}; each side by itself is within "
-        f"{images.growth_by_side():.1e} of the mean.",
-    )
-    yield _Finding("001.eq7", grown, f"{scale} Δy / (LΔf/f) by (6); Δf is the traced one.")
-    moved = images.over_motion("piston", "paper_single", "d_f", motions.PISTON)
-    true = fmean(images.true(camera, "piston", "d_f") for camera in images.cameras) / motions.PISTON
-    yield _Finding(
-        "001.eq7.piston",
-        moved,
-        f"{rendered} a motion of {motions.PISTON * 1e6:g} µm away from the optics. The traced principal distance "
-        f"changes by {true:.4f} of the motion. The two cameras' monitor beams cross opposite parts of the pupil, where "
-        "defocus moves spots differently.",
-        (true,),
-    )
+    yield row("001.eq1.displacement", far, both=both, tangent=1.0 / cos2)
+    yield row("001.eq2", images.over("along Y", "d_beta"), without_cos2(images.first, local))
+    yield row("001.eq2.cos2", images.needed_factor("d_beta"), 1.0)
+    yield row("001.eq3", images.over("along X", "d_alpha"), f_x / f)
+    # how far off the axis of the mirrors the line stands
+    bias = float(images.experiment.instrument.cameras[images.cameras[0]].spec.field_bias)
+    yield row("001.eq3.cos2", images.needed_factor("d_alpha"), f / f_x, bias=bias, cos2_bias=math.cos(bias) ** 2)
+    read, rolled = images.over("about Z", "d_gamma", TURN), images.roll()
+    rows = row("001.eq5", read, 2.0, rolled=rolled), row("001.eq5", rolled, None, 2.0, rolled=rolled)
+    yield context.check("001.eq5").worse(*rows)
+    read, grown, sides = images.over("scale", "d_f"), images.growth(), images.growth_by_side()
+    yield context.check("001.eq7").worse(*(row("001.eq7", one, grown=grown, sides=sides) for one in (read, grown)))
+    true = fmean(images.true(camera, "piston", "d_f") for camera in images.cameras) / PISTON
+    yield row("001.eq7.piston", images.over("piston", "d_f", PISTON), true, true=true)
 
 
-def _show(context: Context, ratios: Mapping[str, motions.Ratio]) -> None:
-    """Figure, table and data of what was found."""
-    title = "Readings of paper 001's formulas over what they should be"
-    motions.show_ratios(context, "ratios", title, {identifier: ratio.value for identifier, ratio in ratios.items()})
-    cameras = list(next(iter(ratios.values())).cameras)
-    rows: list[list[Cell]] = [
-        [i, *(number for name in cameras for number in ratio.cameras[name])] for i, ratio in ratios.items()
+def state_of(cameras: tuple[str, ...], shares: Mapping[str, np.ndarray]) -> State:
+    """Camera -> shares of the four AMOUNTS, in the order of PARAMETERS, as a state."""
+    state: dict[str, Motion] = {}
+    for camera in cameras:
+        along_x, along_y, turn, growth = (
+            float(s) * AMOUNTS[p] for s, p in zip(shares[camera], PARAMETERS, strict=True)
+        )
+        state[f"{BASE}/{camera}/focal_plane"] = Motion(shift=(along_x, along_y, 0.0), rotate=(0.0, 0.0, turn))
+        state[f"{BASE}/{camera}"] = Motion(scale=growth)
+    return state
+
+
+def states_of(cameras: tuple[str, ...], rounds: int, seed: int) -> dict[str, State]:
+    """Every change by itself, the two that share an axis, all four, and random mixtures of all four.
+
+    A round of mixtures has every combination of signs once, each camera in an order of its own, sizes at random.
+    """
+    groups = [(p,) for p in PARAMETERS] + [("d_f", "d_beta"), ("d_alpha", "d_gamma"), PARAMETERS]
+    states = {}
+    for group in groups:
+        shares = np.array([float(p in group) for p in PARAMETERS])
+        states["+".join(group)] = state_of(cameras, dict.fromkeys(cameras, shares))
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(11,)))
+    signs = np.array(list(product((-1.0, 1.0), repeat=4)))
+    for r in range(rounds):
+        mixed = {c: rng.permutation(signs) * rng.uniform(SMALLEST, 1.0, signs.shape) for c in cameras}
+        for k in range(len(signs)):
+            states[f"mixture {r}.{k}"] = state_of(cameras, {c: mixed[c][k] for c in cameras})
+    return states
+
+
+class JointMotions(MonitorImages):
+    """Images of changes by themselves and together, and of ``rounds`` of 16 random mixtures."""
+
+    def __init__(self, context: Context, experiment: MonitorExperiment, rounds: int) -> None:
+        super().__init__(context, experiment, states_of(tuple(experiment.instrument.cameras), rounds, context.seed))
+        self.mixtures = [k for k, name in enumerate(self.motions) if name.startswith("mixture")]
+
+    def superposition(self, one: str, other: str, axis: str) -> Ratio:
+        """Displacement of a spot by both changes over what (8) makes of the displacements by each; per camera the side
+        that is farther from 1.
+        """
+
+        def worse(camera: str) -> Measured:
+            both = self.spots(camera, f"{one}+{other}", axis)
+            first, second = self.spots(camera, one, axis), self.spots(camera, other, axis)
+            noise = float(np.hypot(first[2], second[2]))
+            sides = [quotient((both[k], both[2]), (superposed(first[k], second[k]), noise)) for k in (0, 1)]
+            return max(sides, key=lambda side: abs(side[0] - 1.0))
+
+        return self.ratio(worse)
+
+    def symmetry(self, motion: str, right_from_left: Callable[[float], float]) -> Ratio:
+        """Displacement along Y of the right spot over what ``right_from_left`` makes of the left one's."""
+
+        def sides(camera: str) -> Measured:
+            left, right, sigma = self.spots(camera, motion, "Y")
+            return quotient((right, sigma), (right_from_left(left), sigma))
+
+        return self.ratio(sides)
+
+    def stray(self, motion: str, wrong: str, right: str) -> Ratio:
+        """Common displacement along the axis that a change should not move, over the size along the one it should."""
+
+        def share(camera: str) -> Measured:
+            left, other, sigma = self.spots(camera, motion, wrong)
+            size = [abs(v) for v in self.spots(camera, motion, right)[:2]]
+            return quotient(((left + other) / 2.0, sigma / np.sqrt(2.0)), (sum(size) / 2.0, 0.0))
+
+        return self.ratio(share)
+
+    def separated(
+        self, single: str, axis: str, part: int, parts: Callable[[float, float], tuple[float, float]]
+    ) -> Ratio:
+        """A share that ``parts`` takes out of all four changes at once, over the mean size of the spots' displacement
+        by its own change alone, with the sign of the left spot.
+        """
+
+        def share(camera: str) -> Measured:
+            left, right, sigma = self.spots(camera, "+".join(PARAMETERS), axis)
+            found = parts(left, right)[part], sigma / np.sqrt(2.0)
+            left, right, sigma = self.spots(camera, single, axis)
+            alone = 0.5 * (abs(left) + abs(right)) * np.sign(left), sigma / np.sqrt(2.0)
+            return quotient(found, alone)
+
+        return self.ratio(share)
+
+    def response(self, estimator: str) -> tuple[np.ndarray, np.ndarray]:
+        """What an estimator reads per true change when all four change at once, and its sigma.
+
+        Least squares of the readings of the mixtures on the traced changes and a constant, mean of the cameras.
+
+        Returns:
+            (4, 4) readings by changes, in the order of PARAMETERS, arcsec and micrometres, twice.
+        """
+        parameters = self.estimates().parameters
+        matrices, variances = [], []
+        for camera in self.cameras:
+            change = self.truth.cameras[camera]
+            true = np.stack([getattr(change, p)[self.mixtures] for p in PARAMETERS], axis=-1) / UNITS
+            design = np.column_stack([true, np.ones(len(true))])
+            found = parameters[camera][estimator]
+            solution, *_ = np.linalg.lstsq(design, found.vector[self.mixtures] / UNITS, rcond=None)
+            noise = np.mean((found.sigma[self.mixtures] / UNITS) ** 2, axis=0)
+            matrices.append(solution[:4].T)
+            variances.append(np.outer(noise, np.diagonal(np.linalg.inv(design.T @ design))[:4]))
+        sigma = np.sqrt(np.sum(variances, axis=0)) / len(self.cameras)
+        return np.mean(matrices, axis=0), sigma
+
+    def angle(self, estimator: str) -> tuple[float, float, float]:
+        """Slope of the read on the traced change of the intersection angle over the mixtures, its sigma, and the rms
+        of what is left, radians.
+        """
+        found = self.estimates().angle[estimator]
+        true, read = self.truth.angle_change[self.mixtures], found.change_rad[self.mixtures]
+        offset = true - true.mean()
+        slope = float(offset @ read / (offset @ offset))
+        sigma = float(np.sqrt(np.mean(found.sigma_rad[self.mixtures] ** 2) / (offset @ offset)))
+        return slope, sigma, rms(read - read.mean() - slope * offset)
+
+
+def joint_images(context: Context) -> JointMotions:
+    """The images of all states of the joint form and their spots."""
+    context.progress(0.1, f"build {INSTRUMENT}")
+    return JointMotions(context, context.experiment(INSTRUMENT), context.count(full=6, fast=1))
+
+
+def run_joint(context: Context) -> Iterator[CheckResult]:
+    """All checks of the joint form; the images of all states are one batch."""
+    images = joint_images(context)
+    ratios = {
+        "001.eq8.y": images.superposition("d_f", "d_beta", "Y"),
+        "001.eq8.x": images.superposition("d_alpha", "d_gamma", "X"),
+        "001.eq8.d_gamma_alone": images.stray("d_gamma", "Y", "X"),
+        "001.eq8.d_f_alone": images.stray("d_f", "X", "Y"),
+        "001.eq9.d_f": images.symmetry("d_f", right_of_focal_length),
+        "001.eq9.d_beta": images.symmetry("d_beta", lambda left: left),
+        "001.eq10.d_f": images.separated("d_f", "Y", 0, parts_along),
+        "001.eq10.d_beta": images.separated("d_beta", "Y", 1, parts_along),
+        "001.eq11.d_alpha": images.separated("d_alpha", "X", 0, parts_across),
+        "001.eq11.d_gamma": images.separated("d_gamma", "X", 1, parts_across),
+    }
+    for identifier, ratio in ratios.items():
+        yield context.row(identifier, ratio.value, ratio.sigma, ratio=ratio, **_FACTS)
+    further = [*(_table_1(context, images) if context.wants("001.table1") else ()), _angle(context, images)]
+    yield from further
+    shown = {i: ratio.value for i, ratio in ratios.items()} | {r.id: float(r.measured or 0.0) for r in further}
+    _show_ratios(context, "joint-ratios", shown)
+
+
+def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
+    """Table 1's diagonal and its two couplings that are not zero."""
+    matrix, sigma = images.response("paper_joint")
+    right, _ = images.response("derived")
+    g, (f, f_x) = images.first, focal_lengths(images.first)
+    rows = {
+        "d_alpha": (0, 0, f_x / f),
+        "d_beta": (1, 1, without_cos2(g, images.local_share)),
+        "d_gamma": (2, 2, 2.0 * f_x / f),
+        "d_f": (3, 3, 0.5),
+        "d_gamma_by_d_beta": (2, 1, -2.0 * f_x / f * g.d_gamma_per_beta),
+        "d_f_by_d_alpha": (3, 0, -0.5 * g.d_f_per_alpha_m * ARCSEC / 1e-6),
+    }
+    facts = {"images": images, "f": f, "f_x": f_x, "local": images.local_share, **_FACTS}
+    for name, (k, n, predicted) in rows.items():
+        identifier = f"001.table1.{name}"
+        yield context.row(identifier, matrix[k, n], sigma[k, n], None, [predicted], right=right[k, n], **facts)
+    cells: list[list[Cell]] = [
+        [
+            name,
+            *(f"{matrix[k, n]:.4f} ± {sigma[k, n]:.4f}" for n in range(4)),
+            *(f"{right[k, n]:.4f}" for n in range(4)),
+        ]
+        for k, name in enumerate(PARAMETERS)
     ]
-    context.table(
-        "cameras",
-        "The same by camera",
-        "Both cameras have the same prescription and noise of their own.",
-        ("check", *(head for name in cameras for head in (name, f"{name}, sigma"))),
-        rows,
-    )
+    context.table("table1-response", cells)
+
+
+def _angle(context: Context, images: JointMotions) -> CheckResult:
+    slope, sigma, rest = images.angle("paper_joint")
+    better = images.angle("derived")
+    f, f_x = focal_lengths(images.first)
+    change = np.std(images.truth.angle_change[images.mixtures])
+    facts = {"images": images, "change": change, "rest": rest, "better": better}
+    return context.row("001.fig4.angle", slope, sigma, None, [f_x / f], **facts)
 
 
 GROUP = group_of("001.formulas", run)
+JOINT = group_of("001.joint", run_joint)

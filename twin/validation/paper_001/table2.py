@@ -11,7 +11,7 @@ d_gamma sin(theta) = 0.5 d_gamma on both, and a turn about the vertical d_gamma;
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +22,13 @@ from analysis.monitor import autocollimator
 from analysis.monitor.autocollimator import column_component, mean_difference, relation_factor
 from optics.numerics.quadrature import PupilNodes
 from scenes.models.autocollimator_model import UNITS, mirror_body
-from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
+from scenes.specs.autocollimators import AutocollimatorSetup
 from scenes.specs.load import load_autocollimator_test
 from twin.laboratory import autocollimator_bench as laboratory
 from twin.laboratory.autocollimator_images import AutocollimatorPath
-from twin.run.artefact import Cell, PngFigure
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, to_png
-from twin.validation.checks.check import CheckResult, Chosen
-from twin.validation.checks.group import Context, group_of, load_printed
+from twin.validation.check import CheckResult, Chosen
+from twin.validation.group import Context, group_of, load_printed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,34 +69,27 @@ def measured(context: Context) -> Measured:
 
 def run(context: Context) -> Iterator[CheckResult]:
     """Render the benches and set them beside the printed table and its text."""
-    for axis in _CLAIMED:
-        yield _claimed(context, axis)
+    for name, claimed in _CLAIMED.items():
+        value = printed_mean_difference(_AXES[name])
+        explained = [MEAN_DIFFERENCE[_AXES[name]]]
+        yield context.row(f"001.table2.claimed.{name}", value, explained=explained, times=claimed / value)
     if not any(".claimed." not in identifier for identifier in context.selected):
         return
     found = measured(context)
-    differences = mean_differences(found.setup.spec, found.ideal, found.real)
-    for axis, one in differences.items():
-        identifier = f"001.table2.{axis.lower()}"
-        yield context.check(identifier).evaluate(one.value, one.sigma, one.how, inputs=[_errors(one.value)])
+    differences: dict[str, tuple[float, float]] = {}
+    for series in laboratory.series_per_axis(found.setup.spec):
+        row = _mean_difference(context, found, series)
+        differences[series.axis] = float(row.measured or 0.0), float(row.sigma or 0.0)
+        yield row
     yield _z_columns(context, found)
     yield from _relations(context, found)
-    yield from _limits(context, differences, len(found.real))
+    worst, spread = max(differences.values())
+    text = ", ".join(f"about {axis} {value:.3f}" for axis, (value, _) in differences.items())
+    facts = {"found": found, "text": text, "printed": {axis: printed_mean_difference(axis) for axis in differences}}
+    for row in ("mean_error", "below_1"):
+        sigma = spread / math.sqrt(len(found.real))
+        yield context.row(f"001.table2.{row}", worst, sigma, inputs=[_errors(worst)], **facts)
     _show(context, found)
-
-
-@dataclass(frozen=True)
-class MeanDifference:
-    """The last line of Table 2 for one axis, from rendered benches, arcsec.
-
-    Attributes:
-        value: mean over the benches.
-        sigma: standard deviation of one bench under the errors that the scene declares.
-        how: how the numbers came about, and what else they show.
-    """
-
-    value: float
-    sigma: float
-    how: str
 
 
 def printed_mean_difference(axis: str) -> float:
@@ -105,38 +97,29 @@ def printed_mean_difference(axis: str) -> float:
     return mean_difference(ANGLES if axis == "Z" else MIRROR_1[axis], MIRROR_2[axis])
 
 
-def mean_differences(
-    spec: AutocollimatorTestSpec, ideal: laboratory.ReadingTable, real: Sequence[laboratory.ReadingTable]
-) -> dict[str, MeanDifference]:
-    """Axis -> mean difference, of the ideal bench and of at least one with errors."""
-    return {series.axis: _mean_difference(spec, series, ideal, real) for series in laboratory.series_per_axis(spec)}
-
-
-def _mean_difference(
-    spec: AutocollimatorTestSpec,
-    series: laboratory.Series,
-    ideal: laboratory.ReadingTable,
-    real: Sequence[laboratory.ReadingTable],
-) -> MeanDifference:
-    axis = series.axis
-    perfect, result = ideal[axis], real[0][axis]
-    means = [table[axis].mean_difference / ARCSEC for table in real]
-    spread = laboratory.declared_spread(spec, series, float(np.max(result.sigma)) / math.sqrt(2.0)) / ARCSEC
-    value = MEAN_DIFFERENCE[axis]
-    component = column_component(axis)
-    rate = float(perfect.readings[1, -1, component] / series.angles[-1])
-    factor = relation_factor(axis, 2, 2.0 * series.half_angle)
-    against = "the turntable's angle" if axis == "Z" else "mirror 1"
-    off = np.max(np.abs(perfect.from_exact)) / ARCSEC
-    how = (
-        f"mean |{against} - {result.scale:.6f} mirror 2| over {series.steps + 1} rows, from rendered spots of "
-        f"{len(real)} benches with the declared errors ({min(means):.3f} to {max(means):.3f}). The printed rows give "
-        f"{printed_mean_difference(axis):.6f}. Declared errors make {np.mean(spread):.3f} +- {np.std(spread):.3f} to "
-        f"be expected; {np.mean(spread < value):.0%} of benches stay below the printed one. Without errors and noise "
-        f"mirror 2 reads {rate:.6f} of the angle (relation {factor:.6f}) and both mirrors are within {off:.5f} arcsec "
-        "of the exact reflection, second order included."
-    )
-    return MeanDifference(float(np.mean(means)), float(np.std(spread)), how)
+def _mean_difference(context: Context, found: Measured, series: laboratory.Series) -> CheckResult:
+    """Row of the last line of Table 2 for one axis: mean over the benches, and the standard deviation of one bench
+    under the errors that the scene declares.
+    """
+    axis, spec = series.axis, found.setup.spec
+    perfect, result = found.ideal[axis], found.real[0][axis]
+    means = np.array([table[axis].mean_difference for table in found.real])
+    spread = laboratory.declared_spread(spec, series, float(np.max(result.sigma)) / math.sqrt(2.0))
+    facts = {
+        "found": found,
+        "result": result,
+        "rows": series.steps + 1,
+        "means": means,
+        "printed_rows": printed_mean_difference(axis),
+        "spread": spread,
+        "below": np.mean(spread / ARCSEC < MEAN_DIFFERENCE[axis]),
+        "rate": perfect.readings[1, -1, column_component(axis)] / series.angles[-1],
+        "factor": relation_factor(axis, 2, 2.0 * series.half_angle),
+        "off": np.abs(perfect.from_exact),
+    }
+    value = float(np.mean(means)) / ARCSEC
+    sigma = float(np.std(spread)) / ARCSEC
+    return context.row(f"001.table2.{axis.lower()}", value, sigma, inputs=[_errors(value)], **facts)
 
 
 def _z_columns(context: Context, found: Measured) -> CheckResult:
@@ -144,24 +127,24 @@ def _z_columns(context: Context, found: Measured) -> CheckResult:
     first, second = (np.array([table["Z"].columns[k] for table in real]) / ARCSEC for k in (0, 1))
     one = np.array(MIRROR_1["Z"])
     scale = real[0]["Z"].scale
-    rate = float(np.polyfit(ANGLES, one, 1)[0])
     # each of two instruments has the unrest of a reading and of its reading at zero; equal means within half a digit
     unrest = 2.0 * spec.errors.reading / ARCSEC
     chance = math.erf(0.005 / (unrest * math.sqrt(2.0))) ** len(one) if unrest > 0.0 else 0.0
     apart = np.max(np.abs(scale * first - second), axis=1)
-    how = (
-        f"largest |{scale:.6f} mirror 1 - scaled mirror 2| over the rows. Printed: {one[1]:.2f} x 2/sqrt(3) = "
-        f"{one[1] * 2.0 / math.sqrt(3.0):.6f} and so on in every row, to half of the last digit. Two instruments with "
-        f"the scatter that the X and Y columns show would agree so with a chance of {chance:.0e}. The printed column "
-        f"of mirror 1 grows by {rate:.4f} of the table's angle, sin 60 deg = {math.sqrt(0.75):.4f}: it is the "
-        f"reading of mirror 2. Rendered, mirror 1 turns about its own normal and reads at most "
-        f"{np.max(np.abs(first)):.2f} arcsec, while scaled mirror 2 reads {np.mean(second[:, -1]):.2f}."
-    )
+    facts = {
+        "scale": scale,
+        "one": one,
+        "twice": one[1] * 2.0 / math.sqrt(3.0),
+        "chance": chance,
+        "rate": np.polyfit(ANGLES, one, 1)[0],
+        "sine": math.sqrt(0.75),
+        "first": first,
+        "end": second[:, -1],
+    }
     # of the last row: drift, the table's position, and the unrest of both mirrors, each with its reading at zero
     drift = spec.errors.focal_length * float(np.mean(second[:, -1]))
     sigma = math.hypot(drift, spec.errors.turntable_step / ARCSEC, 2.0 * scale * spec.errors.reading / ARCSEC)
-    value = float(np.mean(apart))
-    return context.check("001.table2.z_columns").evaluate(value, sigma, how, None, [float(ANGLES[-1])])
+    return context.row("001.table2.z_columns", float(np.mean(apart)), sigma, explained=[float(ANGLES[-1])], **facts)
 
 
 def _errors(measured: float) -> Chosen:
@@ -172,76 +155,24 @@ def _errors(measured: float) -> Chosen:
 def _relations(context: Context, found: Measured) -> Iterator[CheckResult]:
     """Section 3.1.1's relations on the ideal bench, where nothing but they can differ."""
     for axis in "XYZ":
-        result = found.ideal[axis]
-        series, component = result.series, autocollimator.column_component(axis)
-        own = "X" if component == 0 else "Y"
-        read = float(result.readings[1, -1, component] / series.angles[-1])
-        between = 2.0 * series.half_angle
-        factor = autocollimator.relation_factor(axis, 2, between)
-        identifier = f"001.table2.relation.{axis.lower()}"
-        how = (
-            f"Noise-free images of the ideal bench at {series.angles[-1] / ARCSEC:.0f} arcsec, mirrors "
-            f"{math.degrees(between):.0f}° apart: mirror 2 reads {read:.6f} of the turn, about its own {own}."
-        )
-        if axis == "Z":
-            how += (
-                " The text has it about its own Z; that turn is Δγ cos b, and no autocollimator on its normal can "
-                "see it."
-            )
-        yield context.check(identifier).evaluate(read / factor, None, how)
-    identifier = "001.table2.relation.mirror_1_z"
+        result, component = found.ideal[axis], column_component(axis)
+        between = 2.0 * result.series.half_angle
+        read = float(result.readings[1, -1, component] / result.series.angles[-1])
+        facts = {"series": result.series, "between": between, "read": read, "own": "XY"[component]}
+        row = f"001.table2.relation.{axis.lower()}"
+        yield context.row(row, read / autocollimator.relation_factor(axis, 2, between), **facts)
     result = found.ideal["Z"]
     read = float(result.readings[0, -1, 1] / result.series.angles[-1])
-    how = (
-        f"Noise-free images of the ideal bench at {result.series.angles[-1] / ARCSEC:.0f} arcsec. The printed "
-        "column of mirror 1 grows by 0.866 of the turn, sin 60°, which is mirror 2's."
-    )
     expected = [autocollimator.relation_factor("Z", 1, 0.0)]
-    yield context.check(identifier).evaluate(read, None, how, None, expected)
-
-
-def _limits(context: Context, axes: Mapping[str, MeanDifference], count: int) -> Iterator[CheckResult]:
-    worst = max(axes, key=lambda axis: axes[axis].value)
-    text = ", ".join(f"about {axis} {one.value:.3f}" for axis, one in axes.items())
-    printed = ", ".join(f"{axis} {printed_mean_difference(axis):.3f}" for axis in axes)
-    for identifier in ("001.table2.mean_error", "001.table2.below_1"):
-        how = (
-            f"Mean differences of {count} rendered benches with the declared errors: {text} arcsec. The printed "
-            f"rows give {printed}."
-        )
-        sigma = axes[worst].sigma / math.sqrt(count)
-        value = axes[worst].value
-        yield context.check(identifier).evaluate(value, sigma, how, inputs=[_errors(value)])
-
-
-def _claimed(context: Context, name: str) -> CheckResult:
-    claimed, axis = _CLAIMED[name], _AXES[name]
-    value = printed_mean_difference(axis)
-    how = (
-        f"Worked out from the printed rows; the claimed figure is {claimed / value:.2f} times it. The sentence before "
-        "says that no mean error is above 0.5″, which the printed rows keep and the claimed figures do not."
-    )
-    return context.check(f"001.table2.claimed.{name}").evaluate(value, None, how, None, [MEAN_DIFFERENCE[axis]])
+    yield context.row("001.table2.relation.mirror_1_z", read, explained=expected, series=result.series)
 
 
 def _show(context: Context, found: Measured) -> None:
     context.progress(0.95, "draw")
     table = found.real[0]
-    context.table(
-        "table2",
-        "Table 2 from rendered spots",
-        "One bench with the declared errors, arcsec. Mirror 2 is scaled as the paper scales it: by 1, 2/√3, 2/√3.",
-        ("turntable", *(f"{axis}: mirror {n}" for axis in "XYZ" for n in (1, 2))),
-        _rows(table),
-    )
-    caption = "Left: the bench seen from above, with traced rays. Right: differences from row to row."
-    picture = bench_png(found.reader, [table])
-    context.add(PngFigure("bench", "The principle experiment", caption, picture))
-
-
-def _rows(table: laboratory.ReadingTable) -> list[list[Cell]]:
     columns = [table["X"].series.angles, *(column for axis in "XYZ" for column in table[axis].columns)]
-    return [[round(float(value) / ARCSEC, 4) for value in row] for row in zip(*columns, strict=True)]
+    context.table("table2", [[round(float(v) / ARCSEC, 4) for v in row] for row in zip(*columns, strict=True)])
+    context.figure("bench", bench_png(found.reader, [table]))
 
 
 DPI = 130

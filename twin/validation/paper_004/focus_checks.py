@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
@@ -21,10 +23,10 @@ from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_run import FocusState, SimulatedFocus, align, line_turn, mount_of
 from twin.laboratory.focus_scan import NYQUIST
 from twin.run.artefact import Cell
-from twin.run.svg import AFTER, BEFORE, INK, LIGHT, look, new_figure, plain_axes, to_svg
+from twin.run.svg import AFTER, BEFORE, INK, LIGHT
 from twin.targets.target_images import TRACK
-from twin.validation.checks.check import Check, CheckResult, Chosen, mean_of
-from twin.validation.checks.group import Context, group_of, load_printed
+from twin.validation.check import CheckResult, Chosen, mean_of, rms
+from twin.validation.group import Context, drawing, group_of, load_printed
 
 MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")
 CONFOCAL_MM = load_printed("004").number("alignment.confocal_mm")
@@ -79,27 +81,18 @@ def _parameters(bench: FocusBench, pose: Pose) -> Array:
     return np.array([slope_y, -slope_x, line_turn(pose), *pose.translation[:2], piston])
 
 
-def evaluate_coupling(check: Check, bench: FocusBench) -> CheckResult:
+def _coupling(context: Context, bench: FocusBench) -> CheckResult:
     """How many parameters the adjustments of the mount tie together."""
     change = effects(bench)
-    seen = np.abs(change) > LIMITS
-    text = "; ".join(
+    tilt = float(np.degrees(bench.setup.test.mount.tilt))
+    changed = "; ".join(
         f"{name} changes {', '.join(p for p, s in zip(PARAMETERS, row, strict=True) if s)}"
-        for name, row in zip(ADJUSTMENTS, seen, strict=True)
+        for name, row in zip(ADJUSTMENTS, np.abs(change) > LIMITS, strict=True)
     )
-    lost = change[0, 2] / change[0, 0]
-    how = (
-        "Exact motions of the assembly on its mount, by as much as it is mis-set, and the traced defocus of "
-        f"{len(bench.sites)} sites: {text}. A tilt about the surface's x costs the line {abs(lost):.2f} of it in "
-        "level. Counted is what exceeds 10″, a pixel of 7 µm, or a shim step of 5 µm. The inclination of the mounting "
-        f"surface, {np.degrees(bench.setup.test.mount.tilt):g}°, and its distance from the focal plane are assumed, "
-        "for the paper prints neither."
-    )
-    inclination = Chosen(
-        "inclination of the mounting surface", float(np.degrees(bench.setup.test.mount.tilt)), "deg",
-        lambda factor: coupled(effects(bench, factor)),
-    )  # fmt: skip
-    return check.evaluate(coupled(change), None, how, explained=[3.0], inputs=[inclination])
+    facts = {"sites": bench.sites, "changed": changed, "lost": abs(change[0, 2] / change[0, 0]), "tilt": tilt}
+    chosen = Chosen("inclination of the mounting surface", tilt, "deg", lambda factor: coupled(effects(bench, factor)))
+    row = "004.alignment.coupling"
+    return context.row(row, coupled(change), explained=[3.0], inputs=[chosen], **facts)
 
 
 def coupled(change: Array) -> float:
@@ -111,11 +104,7 @@ def coupled(change: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What the analysis makes of the MTF curves of an alignment's first state.
-
-    Attributes:
-        alignment: with the curves and the truth.
-    """
+    """What the analysis makes of the MTF curves of an alignment's first state."""
 
     alignment: SimulatedFocus
 
@@ -177,12 +166,18 @@ def run(context: Context) -> Iterator[CheckResult]:
     with one_blas_thread():
         bench = FocusBench(FocusSetup.read(TEST), context.backend)
         if "004.alignment.coupling" in context.selected:
-            yield evaluate_coupling(context.check("004.alignment.coupling"), bench)
+            yield _coupling(context, bench)
             if len(context.selected) == 1:
                 return
         alignments = measured_alignments(context, bench)
-        for evaluate in (_mtf, _measured, _reached):
-            yield from evaluate(context, alignments)
+        count = "One alignment" if len(alignments) == 1 else f"{len(alignments)} alignments"
+        facts = {"alignments": count, "sites": bench.sites}
+        if context.wants(*(f"004.table1.{name}" for name in (*MTF_NYQUIST, "frequency"))):
+            yield from _mtf(context, alignments, {**facts, "alignments": count.lower()})
+        if context.wants(*(f"004.alignment.{name}" for name in ("defocus", "plane", "constraint", "shims"))):
+            yield from _measured(context, alignments, facts)
+        if context.wants(*(f"004.alignment.{name}" for name in ("confocal", "level", "rounds"))):
+            yield from _reached(context, alignments, facts)
 
 
 def measured_alignments(context: Context, bench: FocusBench) -> list[SimulatedFocus]:
@@ -203,11 +198,6 @@ def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
     return [measure_edge(frames.mean(axis=0), noise=noise, frames=len(frames), even=True) for frames in stacks]
 
 
-def _true_mtf(alignment: SimulatedFocus, band: str) -> float:
-    """MTF of the traced pupils at the Nyquist frequency, along the track, where the chips stand after the alignment."""
-    return alignment.states[-1].true_mtf[band]
-
-
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
     """An MTF's inputs that the paper does not print: the log of each factor goes as the square of its size, as that of
     small wavefront errors (Maréchal), of diffusion and of small motions does.
@@ -226,11 +216,8 @@ def _slope(edges: Sequence[EdgeMtf]) -> float:
     return float(np.log(1.0 / 0.9) / np.log(below / there))
 
 
-def _mtf(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterator[CheckResult]:
-    if not context.wants(*(f"004.table1.{name}" for name in (*MTF_NYQUIST, "frequency"))):
-        return
+def _mtf(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]) -> Iterator[CheckResult]:
     alignment = alignments[0]
-    true = {band: float(np.mean([_true_mtf(a, band) for a in alignments])) for band in MTF_NYQUIST}
     budget = {line.band: line.factors for line in alignment.bench.budget() if line.edge == TRACK}
     rows: list[list[Cell]] = []
     ratios, logs = [], []
@@ -242,76 +229,45 @@ def _mtf(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterator[Che
         factors = budget[band]
         perfect = factors["diffraction"] * factors["pixel"]
         rest = {name.replace("_", " "): v for name, v in factors.items() if name not in ("diffraction", "pixel")}
-        numbers = (value, sigma, true[band], perfect, *rest.values())
-        rows.append([band, f"{printed:.2f}", *(f"{number:.4f}" for number in numbers)])
-        lost = ", ".join(f"{name} {v:.3f}" for name, v in rest.items())
-        how = (
-            f"{len(edges)} rendered slanted edges along the track, at {len(alignment.bench.setup.test.fields)} fields "
-            f"after {_alignments(len(alignments)).lower()}; traced truth there {true[band]:.4f}. A perfect camera with "
-            f"these pixels has {perfect:.3f}; what the scene file assumes beyond the paper takes the rest ({lost})."
-        )
-        yield context.check(f"004.table1.{band}").evaluate(value, sigma, how, inputs=_losses(rest, value))
+        # of the traced pupils, along the track, where the chips stand after the alignment
+        true = float(np.mean([a.states[-1].true_mtf[band] for a in alignments]))
+        rows.append([band, f"{printed:.2f}", *(f"{v:.4f}" for v in (value, sigma, true, perfect, *rest.values()))])
+        more = {"edges": edges, "fields": alignment.bench.setup.test.fields, "true": true, "perfect": perfect}
+        inputs = _losses(rest, value)
+        yield context.row(f"004.table1.{band}", value, sigma, inputs=inputs, lost=rest, **facts, **more)
         logs.append((_slope(edges), float(np.prod(list(rest.values())))))
     each = np.array(ratios)
-    by_band = ", ".join(f"{band} {value:.3f}" for band, value in zip(MTF_NYQUIST, each.mean(axis=1), strict=True))
-    how = (
-        f"{each.size} rendered slanted edges; by band {by_band}. At half the Nyquist frequency the values would be far "
-        "higher, at twice as much there is hardly any contrast left."
-    )
+    bands = dict(zip(MTF_NYQUIST, each.mean(axis=1), strict=True))
     value, sigma = mean_of(each.mean(axis=1))
     slope, lost = np.mean(logs, axis=0)
     chosen = Chosen(_ALL_LOSSES, 1.0, "1", lambda factor: value * lost ** ((factor**2 - 1.0) * slope))
-    yield context.check("004.table1.frequency").evaluate(value, sigma, how, 1.0, inputs=[chosen])
-    context.table(
-        "table1",
-        "Table 1: MTF at the Nyquist frequency",
-        "Along the track, mean over the fields. Perfect: diffraction and pixel alone, in the middle of the field; "
-        "beside it the factors that make the difference.",
-        ("band", "printed", "measured", "sigma", "true", "perfect", *rest),
-        rows,
-    )
+    yield context.row("004.table1.frequency", value, sigma, 1.0, inputs=[chosen], each=each, bands=bands)
+    context.table("table1", rows)
 
 
-def _measured(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterator[CheckResult]:
+def _measured(
+    context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]
+) -> Iterator[CheckResult]:
     """What the analysis makes of the curves, against the traced pupils."""
-    if not context.wants(*(f"004.alignment.{n}" for n in ("defocus", "plane", "constraint", "shims"))):
-        return
-    count, sites = len(alignments), len(alignments[0].bench.sites)
     looks = [(a.states[0], a.states[-1]) for a in alignments]
     error = np.array([[measured_defocus(state)[0] - state.true_defocus for state in pair] for pair in looks])
-    before, after = (UM_PER_M * float(np.sqrt(np.mean(error[:, k] ** 2))) for k in (0, 1))
-    span = UM_PER_M * float(np.max(np.abs([a.states[0].true_defocus for a in alignments])))
-    how = (
-        f"{_alignments(count)}, {sites} fields and bands, edges in two directions through focus: {before:.2f} µm RMS "
-        f"before, where CCDs stand up to {span:.0f} µm off, {after:.2f} µm after; largest "
-        f"{UM_PER_M * np.max(np.abs(error)):.1f} µm. Truth: focus of the traced pupils."
-    )
-    total = UM_PER_M * float(np.sqrt(np.mean(error**2)))
-    yield context.check("004.alignment.defocus").evaluate(total, None, how, 0.0)
+    span = [a.states[0].true_defocus for a in alignments]
+    more: dict[str, Any] = {"before": error[:, 0], "after": error[:, 1], "error": error, "span": span}
+    yield context.row("004.alignment.defocus", UM_PER_M * rms(error), None, 0.0, **facts, **more)
     plans = [Plan(a) for a in alignments]
     left = np.array([MM_PER_M * np.max(np.abs(p.left)) for p in plans])
-    how = (
-        f"{_alignments(count)}: plane through the measured defocus of the {sites} sites, the assembly moved by exactly "
-        f"that: {_list(left, 4)} mm. What stays is how the chips were glued, and curvature of field."
-    )
     moved = [(a, p.moved, a.states[0].standing.heights) for a, p in zip(alignments, plans, strict=True)]
-    value = float(np.max(left))
-    yield context.check("004.alignment.plane").evaluate(value, None, how, inputs=[_chips(moved)])
+    more = {"left": _list(left, 4)}
+    yield context.row("004.alignment.plane", float(np.max(left)), inputs=[_chips(moved)], **facts, **more)
     turns = np.array([abs(line_turn(p.moved)) / ARCMIN for p in plans])
     begin = np.array([abs(a.states[0].true_level) / ARCMIN for a in alignments])
-    how = f"{_alignments(count)}: before {_list(begin, 2)}′, after {_list(turns, 2)}′; the theodolite errs by 10″."
     value = float(np.max(turns))
-    yield context.check("004.alignment.constraint").evaluate(value, None, how, inputs=[_theodolite(alignments, value)])
-    asked = np.array([p.asked for p in plans])
-    changes = np.array([p.shims.change for p in plans])
+    more = {"begin": _list(begin, 2), "turns": _list(turns, 2)}
+    yield context.row("004.alignment.constraint", value, inputs=[_theodolite(alignments, value)], **facts, **more)
+    asked, changes = (np.array(values) for values in ([p.asked for p in plans], [p.shims.change for p in plans]))
     alone = np.array([abs(p.shims.level_coupling) / ARCMIN for p in plans])
-    how = (
-        f"{_alignments(count)}, {asked.shape[1]} holes: changes up to {UM_PER_M * np.max(np.abs(asked)):.0f} µm. The "
-        "surface of the mount is inclined, so that shims alone, without a turn by hand, would cost the line's level "
-        f"{_list(alone, 2)}′."
-    )
-    value = UM_PER_M * float(np.sqrt(np.mean((changes - asked) ** 2)))
-    yield context.check("004.alignment.shims").evaluate(value, None, how, 0.0)
+    more = {"holes": asked.shape[1], "asked": asked, "alone": _list(alone, 2)}
+    yield context.row("004.alignment.shims", UM_PER_M * rms(changes - asked), None, 0.0, **facts, **more)
 
 
 def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -> Chosen:
@@ -334,76 +290,50 @@ def _theodolite(alignments: Sequence[SimulatedFocus], value: float) -> Chosen:
     )
 
 
-def _reached(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterator[CheckResult]:
+def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]) -> Iterator[CheckResult]:
     """What the loop of measuring, shimming and measuring reaches."""
-    if not context.wants(*(f"004.alignment.{n}" for n in ("confocal", "level", "rounds"))):
-        return
-    count = len(alignments)
     plan = alignments[0].bench.setup.test
     far = np.array([[MM_PER_M * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
     turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
-    sites = f"{_alignments(count)} of {len(alignments[0].bench.sites)} fields and bands, by the traced pupils"
-    how = f"{sites}: before {_list(far[:, 0], 2)} mm, after {_list(far[:, -1], 4)} mm."
-    after = [(a, a.states[-1].standing.pose, a.states[-1].standing.heights) for a in alignments]
-    yield context.check("004.alignment.confocal").evaluate(float(np.max(far[:, -1])), None, how, inputs=[_chips(after)])
-    how = (
-        f"{_alignments(count)}: before {_list(turns[:, 0], 2)}′, after {_list(turns[:, -1], 2)}′; theodolite and "
-        f"setting have {plan.level / ARCMIN:.2f}′ each."
-    )
+    ends = [(a, a.states[-1].standing.pose, a.states[-1].standing.heights) for a in alignments]
+    more: dict[str, Any] = {"before": _list(far[:, 0], 2), "after": _list(far[:, -1], 4)}
+    value = float(np.max(far[:, -1]))
+    yield context.row("004.alignment.confocal", value, inputs=[_chips(ends)], **facts, **more)
+    more = {"before": _list(turns[:, 0], 2), "after": _list(turns[:, -1], 2), "level": plan.level}
     value = float(np.max(turns[:, -1]))
-    yield context.check("004.alignment.level").evaluate(value, None, how, inputs=[_theodolite(alignments, value)])
+    yield context.row("004.alignment.level", value, inputs=[_theodolite(alignments, value)], **facts, **more)
     kept = (far <= CONFOCAL_MM) & (turns <= LINE_LEVEL_ARCMIN)
     rounds = np.where(kept.any(axis=1), np.argmax(kept, axis=1), far.shape[1])
-    more = [_second_round(a) for a in alignments]
-    how = (
-        f"{_alignments(count)}: {int(np.sum(rounds == 0))} needed none, {int(np.sum(rounds == 1))} needed one. A "
-        f"second round would change a shim by {UM_PER_M * max(more):.1f} µm at most; shims are ground in steps of "
-        f"{UM_PER_M * plan.mount.step:g} µm."
-    )
-    value = float(np.max(rounds))
+    more = {"none": np.sum(rounds == 0), "once": np.sum(rounds == 1), "step": plan.mount.step}
+    more["again"] = [_second_round(a) for a in alignments]
+    needed = float(np.max(rounds))
     share = max(float(np.max(far[:, -1])) / CONFOCAL_MM, float(np.max(turns[:, -1])) / LINE_LEVEL_ARCMIN)
-    chosen = Chosen("what one round leaves, times", 1.0, "1", lambda k: value if k * share <= 1.0 else value + 1.0)
-    yield context.check("004.alignment.rounds").evaluate(value, None, how, inputs=[chosen])
-    context.figure(
-        "alignments",
-        "One round of shims",
-        "Every alignment before and after, true values. Grey: within what the paper reached.",
-        alignment_svg(far, turns, CONFOCAL_MM, LINE_LEVEL_ARCMIN),
-    )
+    chosen = Chosen("what one round leaves, times", 1.0, "1", lambda k: needed if k * share <= 1.0 else needed + 1.0)
+    yield context.row("004.alignment.rounds", needed, inputs=[chosen], **facts, **more)
+    context.figure("alignments", alignment_svg(far, turns, CONFOCAL_MM, LINE_LEVEL_ARCMIN))
 
 
-def alignment_svg(far: NDArray[np.float64], turns: NDArray[np.float64], far_bound: float, turn_bound: float) -> str:
-    """Alignments before and after.
-
-    Args:
-        far: largest distance from best focus of each state, mm, (A, S).
-        turns: of the line, arcmin, (A, S).
-        far_bound: what the paper reached, mm.
-        turn_bound: what it reached, arcmin.
+@drawing("alignments-004", 3.6)
+def alignment_svg(
+    figure: Figure, far: NDArray[np.float64], turns: NDArray[np.float64], far_bound: float, turn_bound: float
+) -> None:
+    """Alignments before and after: largest distance from best focus of each state, mm, and turns of the line, arcmin,
+    both (A, S), with what the paper reached.
     """
-    with look("alignments-004"):
-        figure = new_figure(3.6)
-        for axes, values, bound, label in zip(
-            figure.subplots(1, 2),
-            (far, turns),
-            (far_bound, turn_bound),
-            ("farthest CCD from best focus [mm]", "turn of the line [arcmin]"),
-            strict=True,
-        ):
-            number = np.arange(1, len(values) + 1)
-            axes.axhspan(1e-4, bound, color=LIGHT, alpha=0.6, lw=0)
-            axes.vlines(number, values[:, -1], values[:, 0], color=LIGHT, lw=1.0)
-            axes.plot(number, values[:, 0], "o", color=BEFORE, ms=6.0, mec=INK, mew=0.4, label="before")
-            axes.plot(number, values[:, -1], "D", color=AFTER, ms=5.0, label="after one round")
-            axes.set_yscale("log")
-            axes.set_ylim(0.4 * float(np.min(values)), 2.5 * float(np.max(values)))
-            axes.set_xlim(0.3, len(values) + 0.7)
-            axes.set_xticks(number)
-            axes.set_xlabel("alignment")
-            axes.set_ylabel(label)
-            plain_axes(axes)
-        figure.axes[0].legend(loc="best")
-        return to_svg(figure)
+    labels = ("farthest CCD from best focus [mm]", "turn of the line [arcmin]")
+    panels = zip(figure.subplots(1, 2), (far, turns), (far_bound, turn_bound), labels, strict=True)
+    for axes, values, bound, label in panels:
+        number = np.arange(1, len(values) + 1)
+        axes.axhspan(1e-4, bound, color=LIGHT, alpha=0.6, lw=0)
+        axes.vlines(number, values[:, -1], values[:, 0], color=LIGHT, lw=1.0)
+        axes.plot(number, values[:, 0], "o", color=BEFORE, ms=6.0, mec=INK, mew=0.4, label="before")
+        axes.plot(number, values[:, -1], "D", color=AFTER, ms=5.0, label="after one round")
+        axes.set_yscale("log")
+        axes.set_ylim(0.4 * float(np.min(values)), 2.5 * float(np.max(values)))
+        axes.set_xlim(0.3, len(values) + 0.7)
+        axes.set_xticks(number)
+        axes.set(xlabel="alignment", ylabel=label)
+    figure.axes[0].legend(loc="best")
 
 
 def _second_round(alignment: SimulatedFocus) -> float:
@@ -413,10 +343,6 @@ def _second_round(alignment: SimulatedFocus) -> float:
     motion = fit_focal_plane(alignment.places, -where, sigma, estimate_extra=True).correction()
     present = alignment.shimmings[-1].plan.thickness
     return float(np.max(np.abs(shim_plan(motion, mount_of(alignment.test), present).change)))
-
-
-def _alignments(count: int) -> str:
-    return "One alignment" if count == 1 else f"{count} alignments"
 
 
 def _list(values: Array, digits: int) -> str:

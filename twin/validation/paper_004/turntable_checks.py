@@ -19,9 +19,9 @@ from scenes.specs.resolved import TurntableSetup
 from scenes.specs.turntable import TurntableTestSpec
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import rms, run_turntable
-from twin.run.artefact import Cell, Table
-from twin.validation.checks.check import Check, CheckResult, Chosen, median_of
-from twin.validation.checks.group import Context, group_of, load_printed
+from twin.run.artefact import Cell
+from twin.validation.check import CheckResult, Chosen, median_of
+from twin.validation.group import Context, group_of, load_printed
 
 TEST = "turntable"
 REPEATS = load_printed("004").whole("turntable.repeats")
@@ -63,10 +63,9 @@ def run(context: Context) -> Iterator[CheckResult]:
         seeds = first.generate_state(count)
         series = [TurntableModel(spec, int(seed)).calibrate() for seed in seeds]
         if "004.turntable.criterion" in context.selected:
-            yield _criterion(context.check("004.turntable.criterion"), series)
+            yield _criterion(context, series)
         yield from _repeats(context, series, spec, seeds)
-    rows = {"interpolation": _interpolation, "fit": _bound, "network": _network}
-    if not context.wants(*(f"004.turntable.{name}" for name in rows)):
+    if not context.wants(*(f"004.turntable.{name}" for name in ("interpolation", "fit", "network"))):
         return
     tables = []
     count = context.count(FITTED, FAST_FITTED)
@@ -74,24 +73,30 @@ def run(context: Context) -> Iterator[CheckResult]:
         for k, seed in enumerate(second.generate_state(count)):
             context.progress(0.05 + 0.95 * k / count, f"fit table {k + 1} of {count}")
             tables.append(fit_table(spec, int(seed)))
-    for name, row in rows.items():
-        if f"004.turntable.{name}" in context.selected:
-            yield row(context.check(f"004.turntable.{name}"), tables)
-    context.add(_table(tables))
+    lines, chosen, network = (
+        np.array([table.held_out[name or table.chosen] for table in tables]) / ARCSEC
+        for name in ("piecewise_linear", "", NETWORK)
+    )
+    often = {name: sum(table.chosen == name for table in tables) for name in CLOSED_FORMS}
+    names = {FIT_NAMES[name]: count for name, count in often.items() if count}
+    facts = {"tables": tables, "lines": lines, "chosen": chosen, "network": network, "names": names}
+    for name, found in (("interpolation", lines), ("fit", chosen)):
+        value = float(np.max(found))
+        yield context.row(f"004.turntable.{name}", value, inputs=[dividing(value)], **facts)
+    if "004.turntable.network" in context.selected:
+        yield _network(context, tables)
+    _show(context, tables)
 
 
-def _criterion(check: Check, series: Sequence[CalibrationSeries]) -> CheckResult:
+def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckResult:
     """Where the rule begins to reject, from the readings that it kept and rejected."""
     readings, keep = (np.concatenate([getattr(s, name) for s in series]) for name in ("comparisons", "keep"))
     size = np.abs(readings - readings.mean(axis=1, keepdims=True)) / readings.std(axis=1, ddof=1, keepdims=True)
     kept, gone = float(np.max(size[keep])), float(np.min(size[~keep]))
     # half a reading is expected beyond it, two-sided
     wanted = brentq(lambda x: REPEATS * erfc(x / np.sqrt(2.0)) - 0.5, 0.1, 5.0)
-    how = (
-        f"{len(series)} simulated tables, {size.size} readings: largest deviation that is kept {kept:.4f}, smallest "
-        f"that is rejected {gone:.4f}; the middle of the two counts. Implied is the root of 10 P(|z| > x) = 1/2."
-    )
-    return check.evaluate(0.5 * (kept + gone), None, how, wanted)
+    facts = {"series": series, "size": size, "kept": kept, "gone": gone}
+    return context.row("004.turntable.criterion", 0.5 * (kept + gone), None, wanted, **facts)
 
 
 def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
@@ -113,31 +118,25 @@ def _repeats(
     context: Context, series: Sequence[CalibrationSeries], spec: TurntableTestSpec, seeds: NDArray[np.integer]
 ) -> Iterator[CheckResult]:
     values = {
-        "004.turntable.repeat": np.array([np.max(s.rms_before) for s in series]) / ARCSEC,
-        "004.turntable.chauvenet": np.array([np.max(s.rms_after) for s in series]) / ARCSEC,
-        "004.turntable.chauvenet_mean": np.array([s.averaging_alone for s in series]) / ARCSEC,
+        "repeat": np.array([np.max(s.rms_before) for s in series]) / ARCSEC,
+        "chauvenet": np.array([np.max(s.rms_after) for s in series]) / ARCSEC,
+        "chauvenet_mean": np.array([s.averaging_alone for s in series]) / ARCSEC,
     }
-    rejected = float(np.mean([s.rejected for s in series]))
-    good = rejection_rate(REPEATS) * series[0].comparisons.size
-    kept = float(np.median([s.mean_rms for s in series])) / ARCSEC
-    alone = REPEAT_RMS_ARCSEC / REPEATS**0.5
-    more = {
-        "004.turntable.repeat": "Repeatability and gross errors are chosen for this number, so that it shows their "
-        "class only.",
-        "004.turntable.chauvenet": f"The criterion rejects {rejected:.1f} of {series[0].comparisons.size} readings, "
-        f"{good:.1f} of them expected without any gross error. Repeatability is chosen for this number too.",
-        "004.turntable.chauvenet_mean": f"The mean of the readings that the criterion keeps has {kept:.4f}″ at worst.",
+    facts = {
+        "rejected": np.mean([s.rejected for s in series]),
+        "comparisons": series[0].comparisons,
+        "good": rejection_rate(REPEATS) * series[0].comparisons.size,
+        "kept": np.median([s.mean_rms for s in series]),
     }
-    for identifier, found in values.items():
+    for name, found in values.items():
+        identifier = f"004.turntable.{name}"
         if identifier in context.selected:
-            low, high = np.percentile(found, [25.0, 75.0])
-            how = (
-                f"Median of {len(found)} simulated tables; half of them lie between {low:.4f}″ and {high:.4f}″. "
-                f"{more[identifier]}"
-            )
-            check, (value, sigma) = context.check(identifier), median_of(found)
-            inputs = _readings(spec, seeds[:FAST_TABLES], identifier, value) if check.basis == "chosen" else []
-            yield check.evaluate(value, sigma, how, None, [alone] if identifier.endswith("mean") else [], inputs)
+            value, sigma = median_of(found)
+            chosen = context.check(identifier).basis == "chosen"
+            inputs = _readings(spec, seeds[:FAST_TABLES], identifier, value) if chosen else []
+            explained = [REPEAT_RMS_ARCSEC / REPEATS**0.5] if name.endswith("mean") else []
+            more = {"found": found, "quartiles": np.percentile(found, [25.0, 75.0])}
+            yield context.row(identifier, value, sigma, None, explained, inputs, **facts, **more)
 
 
 def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
@@ -177,27 +176,6 @@ def dividing(value: float, power: float = 1.0) -> Chosen:
     return Chosen.power("dividing error of scenes/lab/turntable.yaml, times", 1.0, "1", value, power)
 
 
-def _interpolation(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
-    lines = np.array([table.held_out["piecewise_linear"] for table in tables]) / ARCSEC
-    how = f"{len(tables)} simulated tables, straight lines between 41 means: median {np.median(lines):.3f}″."
-    value = float(np.max(lines))
-    return check.evaluate(value, None, how, inputs=[dividing(value)])
-
-
-def _bound(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
-    chosen = np.array([table.held_out[table.chosen] for table in tables]) / ARCSEC
-    network = np.array([table.held_out[NETWORK] for table in tables]) / ARCSEC
-    often = {name: sum(table.chosen == name for table in tables) for name in CLOSED_FORMS}
-    names = ", ".join(f"{FIT_NAMES[name]} {count}" for name, count in often.items() if count)
-    how = (
-        f"{len(tables)} simulated tables; cross-validation on the calibration points chooses among the fits other than "
-        f"the network ({names}). At the held-out readings: median {np.median(chosen):.3f}″, largest "
-        f"{np.max(chosen):.3f}″; the network: {np.median(network):.3f}″ and {np.max(network):.3f}″."
-    )
-    value = float(np.max(chosen))
-    return check.evaluate(value, None, how, inputs=[dividing(value)])
-
-
 def _ranks(tables: Sequence[FittedTable]) -> dict[str, Array]:
     """Rank of each fit on each table, 1 the best."""
     return {
@@ -205,44 +183,26 @@ def _ranks(tables: Sequence[FittedTable]) -> dict[str, Array]:
     }
 
 
-def _network(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
-    rank = _ranks(tables)[NETWORK]
+def _network(context: Context, tables: Sequence[FittedTable]) -> CheckResult:
     rivals = [min(t.held_out[name] for name in CLOSED_FORMS) for t in tables]
     best = np.array([t.held_out[NETWORK] / rival for t, rival in zip(tables, rivals, strict=True)])
     ratio = np.array([t.held_out[NETWORK] / t.held_out[t.chosen] for t in tables])
-    how = (
-        f"{len(tables)} simulated tables, all fits on the same 41 means. RMS of the network over that of the fit that "
-        f"cross-validation chooses among the others: {np.min(ratio):.3f} to {np.max(ratio):.3f}; over that of the best "
-        f"other fit, known afterwards only: mean {np.mean(best):.3f}. The network is the best of five on "
-        f"{np.sum(rank == 1.0)} tables, its mean rank is {np.mean(rank):.1f}."
-    )
+    rank = _ranks(tables)[NETWORK]
+    facts = {"tables": tables, "ratio": ratio, "best": best, "rank": rank, "wins": np.sum(rank == 1.0)}
     # of a median, by the median distance from it: a training that ends in a bad minimum now and then is far off
     middle = float(np.median(ratio))
     sigma = float(np.sqrt(0.5 * np.pi / len(ratio)) * np.median(np.abs(ratio - middle)) / norm.ppf(0.75))
-    return check.evaluate(middle, sigma, how, 0.9, [1.0])
+    return context.row("004.turntable.network", middle, sigma, 0.9, [1.0], **facts)
 
 
-def _table(tables: Sequence[FittedTable]) -> Table:
+def _show(context: Context, tables: Sequence[FittedTable]) -> None:
     ranks = _ranks(tables)
     rows: list[list[Cell]] = []
     for name in sorted(FITS, key=lambda n: float(np.mean(ranks[n]))):
-        values = np.array([table.held_out[name] for table in tables]) / ARCSEC
-        rows.append(
-            [
-                FIT_NAMES[name],
-                f"{np.mean(ranks[name]):.2f}",
-                int(np.sum(ranks[name] == 1.0)),
-                f"{np.median(values):.4f}",
-                f"{np.max(values):.4f}",
-            ]
-        )
-    return Table(
-        "fits",
-        "Five fits of the dividing error",
-        f"RMS at held-out readings, arcsec, over {len(tables)} simulated tables.",
-        ("fit", "mean rank", "best on", "median", "largest"),
-        rows,
-    )
+        rank, values = ranks[name], np.array([table.held_out[name] for table in tables]) / ARCSEC
+        best = int(np.sum(rank == 1.0))
+        rows.append([FIT_NAMES[name], f"{rank.mean():.2f}", best, f"{np.median(values):.4f}", f"{values.max():.4f}"])
+    context.table("fits", rows, tables=tables)
 
 
 GROUP = group_of("004.turntable_fits", run)

@@ -21,8 +21,8 @@ from scenes.specs.orbit.adjust import BlockPointsSpec, CameraChangeSpec, Reading
 from scenes.specs.orbit.setup import AdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.run.random_streams import stream
-from twin.validation.checks.check import CheckResult, Chosen, Supposed, mean_of
-from twin.validation.checks.group import Context, group_of
+from twin.validation.check import CheckResult, Chosen, Supposed, mean_of
+from twin.validation.group import Context, group_of
 
 FINER = 10.0
 """Times that pixels of 5 m are larger than those of 0.5 m."""
@@ -114,21 +114,24 @@ def run(context: Context) -> Iterator[CheckResult]:
     at = np.log(STATED)
     factor = float(np.exp(np.mean([np.interp(at, np.log(ERRORS), np.log(one)) for one in every])))
     drawn = draw_block(strip(IMAGE, 0.01), stream(root, count))
-    floor = height_error(drawn, True)
     # between the two the limit goes with a power of the image points' error
     power = np.log(measured / fine) / np.log(IMAGE / FINE)
-    facts = {"floor": floor, "factor": factor, "finer": fine, "needed": IMAGE * (STATED / measured) ** (1.0 / power)}
-    how = (
-        f"{count} strips of 500 km with {TIES} ties each; at {', '.join(f'{e:g}″' for e in ERRORS)} of the attitude the"
-        " bundle's errors of heights are "
-        f"{', '.join(f'{r:.2f}' for r in np.mean(every, axis=0))} times those of intersection at 0.5 m."
-    )
+    facts = {
+        "floor": height_error(drawn, True),
+        "factor": factor,
+        "finer": fine,
+        "needed": IMAGE * (STATED / measured) ** (1.0 / power),
+        "strips": count,
+        "ties": TIES,
+        "errors": [f"{error:g}″" for error in ERRORS],
+        "ratios": np.mean(every, axis=0),
+    }
     inputs: list[Chosen | Supposed] = [
         Chosen.power("error of an image point", IMAGE, "px", measured, float(power)),
         Supposed("errors of the attitude are independent twice a second", "every 4 s likewise"),
         Supposed("orbit and cameras are without errors", "they are the same in both"),
     ]
-    yield context.check("017.bundle").evaluate(measured, sigma, how, explained=[measured], inputs=inputs, facts=facts)
+    yield context.row("017.bundle", measured, sigma, explained=[measured], inputs=inputs, **facts)
 
 
 GROUP = group_of("017.bundle", run)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, wraps
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,9 +24,19 @@ from scenes.yaml.errors import InputError, Issue, KeyPath, nearest
 from scenes.yaml.spec import Number, Spec, Text, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run.artefact import Artefact, Cell, SvgFigure, Table
-from twin.validation.checks.check import Check, CheckResult
-from twin.validation.checks.row_names import FILE, FOLDER, matches
+from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table
+from twin.run.svg import look, new_figure, plain_axes, to_svg
+from twin.validation.check import Check, CheckResult, Chosen, Supposed, sentence
+from twin.validation.registry import FILE, FOLDER, matches
+
+
+class ArtefactText(Spec):
+    """What is said of a figure or a table, with facts in braces, see `sentence`; attributes as of `Table`."""
+
+    title: Text
+    caption: Text = ""
+    heads: tuple[Text, ...] = ()
+    decimals: tuple[int | None, ...] = ()
 
 
 @dataclass(eq=False)
@@ -42,6 +52,7 @@ class Context:
         report_progress: takes the fraction of the group's work that is done, and what is being done.
         folder: where the group may put files of its own, which the report lists; None when nothing is written.
         experiments: instrument -> experiment, shared by all groups.
+        texts: name of a figure or table of the group -> what is said of it.
         artefacts: added so far.
     """
 
@@ -53,6 +64,7 @@ class Context:
     report_progress: Callable[[float, str], None] = lambda fraction, text: None
     folder: Path | None = None
     experiments: dict[str, MonitorExperiment] = field(default_factory=dict)
+    texts: Mapping[str, ArtefactText] = FrozenMap()
     artefacts: list[Artefact] = field(default_factory=list)
 
     def wants(self, *prefixes: str) -> bool:
@@ -91,21 +103,36 @@ class Context:
             raise ValueError(f"two artefacts {artefact.name}.{artefact.kind} in one group")
         self.artefacts.append(artefact)
 
-    def figure(self, name: str, title: str, caption: str, svg: str) -> None:
-        """Add a drawing; arguments as of `SvgFigure`."""
-        self.add(SvgFigure(name, title, caption, svg))
+    def figure(self, name: str, drawing: str | bytes, **facts: object) -> None:
+        """Add a drawing, SVG or PNG, under the title and with the caption that stand beside the group's rows."""
+        said = self._said(name, facts)
+        self.add(SvgFigure(name, *said, drawing) if isinstance(drawing, str) else PngFigure(name, *said, drawing))
 
-    def table(
+    def table(self, name: str, rows: Sequence[Sequence[Cell]], **facts: object) -> None:
+        """Add a table under the title, caption and heads that stand beside the group's rows."""
+        text = self.texts[name]
+        self.add(Table(name, *self._said(name, facts), text.heads, rows, text.decimals))
+
+    def data(self, name: str, content: dict[str, Any]) -> None:
+        """Add data with the title and caption that stand beside the group's rows."""
+        self.add(Data(name, *self._said(name, {}), content))
+
+    def _said(self, name: str, facts: Mapping[str, object]) -> tuple[str, str]:
+        text = self.texts[name]
+        return sentence(text.title, facts), sentence(text.caption, facts)
+
+    def row(
         self,
-        name: str,
-        title: str,
-        caption: str,
-        heads: Sequence[str],
-        rows: Sequence[Sequence[Cell]],
-        decimals: Sequence[int | None] = (),
-    ) -> None:
-        """Add a table; arguments as of `Table`."""
-        self.add(Table(name, title, caption, heads, rows, decimals))
+        identifier: str,
+        measured: float,
+        sigma: float | None = None,
+        implied: float | None = None,
+        explained: Sequence[float | None] = (),
+        inputs: Sequence[Chosen | Supposed] = (),
+        **facts: object,
+    ) -> CheckResult:
+        """Evaluate one of the group's checks; arguments as of `Check.evaluate`, facts by name."""
+        return self.checks[identifier].evaluate(measured, sigma, "", implied, explained, inputs, facts)
 
 
 Run = Callable[[Context], Iterable[CheckResult]]
@@ -122,6 +149,7 @@ class CheckGroup:
         checks: everything it checks.
         run: does it; yields one result for every selected check, as soon as it has it.
         fast_seconds: rough time of the fast run, None where that is the same.
+        artefacts: name of a figure or table -> what is said of it.
     """
 
     prefix: str
@@ -130,6 +158,7 @@ class CheckGroup:
     checks: tuple[Check, ...]
     run: Run
     fast_seconds: float | None = None
+    artefacts: Mapping[str, ArtefactText] = FrozenMap()
 
     def __post_init__(self) -> None:
         """Refuse groups that cannot be told apart or shown."""
@@ -154,11 +183,15 @@ _Seconds = Annotated[Number, Field(gt=0.0)]
 
 
 class GroupRows(Spec):
-    """Rows that share work; the attributes are those of `CheckGroup`."""
+    """Rows that share work; the attributes are those of `CheckGroup`, and ``sentences``: texts by name, for which the
+    name stands in braces in the ``how`` of several rows, or in a later one of these texts.
+    """
 
     title: Text
     seconds: _Seconds
     fast_seconds: _Seconds | None = None
+    sentences: Mapping[str, Text] = FrozenMap()
+    artefacts: Mapping[str, ArtefactText] = FrozenMap()
     rows: dict[str, Check]
 
 
@@ -217,10 +250,13 @@ class Printed:
             known = nearest(prefix, self.groups)
             raise InputError(Issue(f"no group {prefix!r}", self.content.file, key=("groups",), suggestion=known))
         found = self.groups[prefix]
-        return CheckGroup(prefix, found.title, found.seconds, tuple(found.rows.values()), run, found.fast_seconds)
+        rows = tuple(found.rows.values())
+        return CheckGroup(prefix, found.title, found.seconds, rows, run, found.fast_seconds, found.artefacts)
 
     def _named(self, data: Any) -> Any:
-        """The data with each row's id in it, and the number in place of the key that stands for what is printed."""
+        """The data with each row's id and shared sentences in it, and the number in place of the key that stands for
+        what is printed.
+        """
         groups = data.get("groups") if isinstance(data, dict) else None
         if not isinstance(groups, dict):
             return data
@@ -228,15 +264,21 @@ class Printed:
         for prefix, group in groups.items():
             rows = group.get("rows") if isinstance(group, dict) else None
             if isinstance(rows, dict):
-                group = {**group, "rows": {name: self._row(name, row) for name, row in rows.items()}}
+                shared = group.get("sentences", {})
+                group = {**group, "rows": {name: self._row(name, row, shared) for name, row in rows.items()}}
             named[prefix] = group
         return {**data, "groups": named}
 
-    def _row(self, name: str, row: Any) -> Any:
+    def _row(self, name: str, row: Any, shared: Any) -> Any:
         if not isinstance(row, dict):
             return row
-        printed = {"printed": self.number(row["printed"])} if isinstance(row.get("printed"), str) else {}
-        return {**row, **printed, "id": name}
+        out = {**row, "id": name}
+        if isinstance(row.get("printed"), str):
+            out["printed"] = self.number(row["printed"])
+        if isinstance(row.get("how"), str) and isinstance(shared, dict):
+            for key, text in reversed(shared.items()):
+                out["how"] = out["how"].replace(f"{{{key}}}", str(text))
+        return out
 
     def _at(self, key: str) -> Any:
         value, path = self.content.data, _path(key)
@@ -294,6 +336,34 @@ def group_of(prefix: str, run: Run = lambda context: ()) -> CheckGroup:
     errors as of `load_printed`.
     """
     return load_printed(prefix.partition(".")[0]).group(prefix, run)
+
+
+Draw = Callable[..., None]
+
+
+def drawing(
+    name: str | Callable[..., str], height: float | Callable[..., float]
+) -> Callable[[Draw], Callable[..., str]]:
+    """Decorator that makes of a function, which draws what it is given into a figure, one that returns the SVG.
+
+    Args:
+        name: makes the SVG's identifiers its own.
+        height: of the figure, inches; both may be functions of what is drawn.
+    """
+
+    def decorate(draw: Draw) -> Callable[..., str]:
+        @wraps(draw)
+        def drawn(*shown: Any) -> str:
+            with look(name(*shown) if callable(name) else name):
+                figure = new_figure(height(*shown) if callable(height) else height)
+                draw(figure, *shown)
+                for axes in figure.axes:
+                    plain_axes(axes)
+                return to_svg(figure)
+
+        return drawn
+
+    return decorate
 
 
 def _path(key: str) -> KeyPath:

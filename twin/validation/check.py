@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from operator import itemgetter
+from string import Formatter
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from analysis.arrays import ARCMIN, ARCSEC
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.spec import Number, Spec, Text
@@ -137,6 +140,52 @@ def mean_of(values: NDArray[Any]) -> tuple[float, float]:
 def median_of(values: NDArray[Any]) -> tuple[float, float]:
     """Median of (n,) independent measurements, n > 1, and its standard deviation from their scatter, were it normal."""
     return float(np.median(values)), float(np.sqrt(0.5 * np.pi / len(values)) * np.std(values, ddof=1))
+
+
+def rms(values: Any) -> float:
+    """Root mean square of all of an array's values."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+_UNITS = {
+    "arcsec": ARCSEC, "arcmin": ARCMIN, "deg": np.pi / 180.0, "km": 1e3, "mm": 1e-3, "µm": 1e-6, "nm": 1e-9, "%": 0.01,
+    "ppm": 1e-6,
+}  # fmt: skip
+_STATISTICS: Mapping[str, Callable[[Any], Any]] = {
+    "abs": np.abs, "count": len, "last": itemgetter(-1), "max": np.max, "mean": np.mean, "median": np.median,
+    "min": np.min, "minus": np.negative, "rms": rms, "sd": lambda values: np.std(values, ddof=1), "sum": np.sum,
+}  # fmt: skip
+
+
+class _Sentences(Formatter):
+    """Formatter of texts with facts, see `sentence`."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """Apply the words before the digits, and name each value of a mapping."""
+        *words, digits = format_spec.split(" ")
+        for word in words:
+            if isinstance(value, Mapping) and word in _UNITS:
+                value = {name: one / _UNITS[word] for name, one in value.items()}
+                continue
+            value = list(value.values()) if isinstance(value, Mapping) else value
+            value = _STATISTICS[word](value) if word in _STATISTICS else np.asarray(value) / _UNITS[word]
+        if isinstance(value, Mapping):
+            return ", ".join(f"{name} {one:{digits}}" for name, one in value.items())
+        if isinstance(value, list | tuple | np.ndarray):
+            return ", ".join(format(one, digits) for one in value)
+        return format(value, digits)
+
+
+def sentence(text: str, facts: Mapping[str, object]) -> str:
+    """Return a text of ``printed.yaml`` with its facts.
+
+    Args:
+        text: facts stand in braces as for `str.format`. Before the digits may stand statistics and a unit, separated by
+            spaces: ``{error:abs max arcsec .3f}`` is the largest size of an SI array's values in arcseconds. Several
+            values are listed, those of a mapping with their names.
+        facts: by name.
+    """
+    return _Sentences().vformat(text, (), facts)
 
 
 Verdict = Literal[
@@ -267,17 +316,13 @@ class CheckResult:
         """Plain data for JSON."""
         return asdict(self) | {"also": list(self.also), "inputs": [asdict(i) for i in self.inputs]}
 
-    def timed(self, seconds: float) -> CheckResult:
-        """Result of the same check with its computing time."""
-        return replace(self, seconds=seconds)
-
 
 class Explanation(Spec):
     """A known reason for a value other than the claimed one.
 
     Attributes:
         verdict: CORRECTED if the reason is a fault, a gap or an ambiguity of the print, else REFUTED.
-        text: the reason in sentences; ``{name}`` stands for a fact that `Check.evaluate` is given.
+        text: the reason, with the facts that `Check.evaluate` is given, see `sentence`.
     """
 
     verdict: Literal["confirmed with correction", "refuted"]
@@ -311,6 +356,7 @@ class Check(Spec):
         not_checkable: why nothing can be compared; empty where something can.
         explanations: known reasons for other values, the likeliest first; `evaluate` is given the values.
         otherwise: what can be said where neither claim nor explanation agrees.
+        how: how the number is measured and what else is found, with facts like the explanations.
     """
 
     id: Text
@@ -330,6 +376,7 @@ class Check(Spec):
     not_checkable: Text = ""
     explanations: tuple[Explanation, ...] = ()
     otherwise: Text = ""
+    how: Text = ""
 
     @model_validator(mode="before")
     @classmethod
@@ -385,8 +432,8 @@ class Check(Spec):
     def evaluate(
         self,
         measured: float,
-        sigma: float | None,
-        how: str,
+        sigma: float | None = None,
+        how: str = "",
         implied: float | None = None,
         explained: Sequence[float | None] = (),
         inputs: Sequence[Chosen | Supposed] = (),
@@ -401,11 +448,11 @@ class Check(Spec):
         Args:
             measured: the simulation's number.
             sigma: its standard deviation, None without noise.
-            how: how it was measured and what else was found, in sentences.
+            how: what stands after the row's own ``how``.
             implied: what the paper's statement implies, where it prints no number.
             explained: values that the row's explanations would give, in their order; None where one is no reason here.
             inputs: chosen here; needed where the row's basis is ``chosen``.
-            facts: what the texts of the explanations and of ``otherwise`` name in braces, beside ``measured``.
+            facts: what the row's texts name in braces, beside ``measured``.
 
         Raises:
             ValueError: a number is not finite, there is nothing to compare with, or inputs are missing.
@@ -419,7 +466,8 @@ class Check(Spec):
         if self.tells is None or (self.basis == "chosen") != bool(inputs):
             raise ValueError(f"{self.id}: it must say what it tells, and its inputs just where they are chosen")
         goal, allowed = float(goal), self.tolerance + noise
-        verdict, reason = self._verdict(measured, goal, allowed, explained, {**facts, "measured": measured})
+        facts = {**facts, "measured": measured, "sigma": sigma, "implied": implied}
+        verdict, reason = self._verdict(measured, goal, allowed, explained, facts)
         agrees = verdict == self.agreed
         ranges = tuple(i.range(lambda value: self.outside(value, goal) <= allowed, agrees) for i in inputs)
         chosen = f"Chosen here: {'; '.join(r.text for r in ranges)}." if ranges else ""
@@ -430,7 +478,7 @@ class Check(Spec):
         if self.comparison != "two-sided":
             limit += f" One-sided: whatever is {'less' if self.comparison == 'at most' else 'more'} agrees."
         limit += f" To be told from {self.against}, {self.tells:.3g} away."
-        text = "\n".join(part for part in (how, chosen, reason, limit) if part)
+        text = "\n".join(part for part in (sentence(self.how, facts) + how, chosen, reason, limit) if part)
         found = self._result(measured, sigma, verdict, text)
         return replace(found, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
 
@@ -473,13 +521,13 @@ class Check(Spec):
         ]
         for value, reason in known:
             if abs(measured - value) <= allowed:
-                text = f"{reason.text.format(**facts)} That gives {value:.6g}."
+                text = f"{sentence(reason.text, facts)} That gives {value:.6g}."
                 if reason.verdict == CORRECTED and allowed > self.tells:
                     return UNDECIDED, f"{text} But {weak}"
                 return reason.verdict, text
         tried = ", ".join(f"{value:.6g}" for value, _ in known)
         unknown = f"The cause is not known{f'; what was thought of gives {tried}' if tried else ''}."
-        return REFUTED, self.otherwise.format(**facts) or unknown
+        return REFUTED, sentence(self.otherwise, facts) or unknown
 
     def _result(self, measured: float | None, sigma: float | None, verdict: Verdict, how: str) -> CheckResult:
         printed = {name: getattr(self, name) for name in _OF_THE_ROW}

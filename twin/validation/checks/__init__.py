@@ -1,1 +1,0 @@
-"""What a check of a paper is, and how it is evaluated, and how printed numbers are read."""

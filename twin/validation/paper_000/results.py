@@ -1,0 +1,534 @@
+"""Paper 000's results: its Table 1, planes against resection, and what the text says of Figs. 3 to 5, sentence by
+sentence, with the number that decides each.
+
+The words on the figures have no numbers: "far more" is taken as at least twice, "very near" as within a quarter,
+"little" as at most a quarter of the largest, and a slope that grows as one that grows by 5 %, the least that shows in a
+figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from analysis.arrays import ARCSEC, Array
+from analysis.orbit.planes import Method, Sensitivity, Station, Strip, intersection_angles, sensitivity
+from optics.numerics.backend import one_blas_thread
+from scenes.specs.orbit.angle import LINES
+from twin.orbit.angle.angle_flight import AnglePass, Measurement
+from twin.orbit.angle.angle_run import effect_rows, values_of
+from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, VERMILION
+from twin.validation.check import SIGMAS, Check, CheckResult, Chosen, Supposed, mean_of
+from twin.validation.group import Context, drawing, group_of, load_printed
+from twin.validation.paper_000.method import PAIRS, TEST, Passes, planes_of, repeated, setup_of
+
+PRINTED_ARCSEC = load_printed("000").numbers("table1.difference_arcsec")
+ALPHA, BETA = PRINTED_ARCSEC["alpha"], PRINTED_ARCSEC["beta"]
+POINT_SIGMA = float(np.hypot(2.0, 5.0 / 3.0))
+"""Metres: control points of 2 m, matched to a third of a pixel of 5 m."""
+
+POINTS = float(setup_of(TEST).test.strips.points)
+"""On each line."""
+
+LIMIT = 3.44
+"""Distance in two dimensions that 99.7 % keep, as three standard deviations in one."""
+
+
+@drawing("table1-000", 4.2)
+def differences_svg(figure: Figure, same: Array, own: Array, printed: tuple[float, float]) -> None:
+    """Scatter of alpha and beta, both (passes, 2), arcsec, and the printed pair."""
+    axes = figure.subplots()
+    axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
+    axes.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)
+    axes.plot(*own.T, "o", color=ORANGE, ms=3.5, mew=0, alpha=0.7, label="points of their own, light left in planes")
+    axes.plot(*same.T, "s", color=BLUE, ms=3.0, mew=0, label="same points, light corrected in both")
+    label = f"printed: {printed[0]}″, {printed[1]}″"
+    axes.plot(*printed, "D", color=VERMILION, ms=8, mec=INK, mew=0.8, label=label)
+    axes.plot(*(-v for v in printed), "D", color="none", ms=8, mec=VERMILION, mew=1.4, label="printed, other sign")
+    axes.set_aspect("equal")
+    axes.set(xlabel="α: resection − planes, arcsec", ylabel="β: resection − planes, arcsec")
+    axes.set(xlim=(-2.0, 2.0), ylim=(-2.0, 2.3))
+    axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """Resection minus planes, (passes, 2) of alpha and beta, arcsec; and the sigma that both methods claim, (2,)."""
+
+    values: Array
+    planes_sigma: Array
+    resection_sigma: Array
+
+    @property
+    def spread(self) -> Array:
+        """Standard deviation, (2,)."""
+        return np.asarray(np.std(self.values, axis=0, ddof=1))
+
+
+def differences(planes: Passes, resection: Passes) -> Differences:
+    """Both methods on measurements that may be the same."""
+    by_planes = [intersection_angles(*planes_of(m, "tls")) for m in planes.measured]
+    found = np.array([section.angles(PAIRS) for section in resection.sections])
+    claimed = [section.angle_covariance(PAIRS) for section in resection.sections]
+    return Differences(
+        (found - np.array([a.values for a in by_planes])) / ARCSEC,
+        np.sqrt(np.mean([np.diag(a.covariance) for a in by_planes], axis=0)) / ARCSEC,
+        np.sqrt(np.mean([np.diag(c) for c in claimed], axis=0)) / ARCSEC,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """Measurements for the table.
+
+    Attributes:
+        same: of points of 1.5 m, light taken out.
+        own: of `POINT_SIGMA`, light taken out, with which the resection works.
+        light: others with the same stations and the light left in, with which the planes work.
+    """
+
+    same: Passes
+    own: Passes
+    light: Passes
+
+
+def make_data(context: Context) -> Data:
+    """Draw all measurements."""
+    count = context.count(full=800, fast=120)
+    first, second, third = np.random.SeedSequence([context.seed, 5]).spawn(3)
+    setup = setup_of(TEST, points=POINT_SIGMA)
+    own = repeated(setup, second, count)
+    repeats = repeated(setup, third, count, corrected=False)
+    # one precise orbit for both methods
+    moved = tuple(_at(m, o.station.position) for m, o in zip(repeats.measured, own.measured, strict=True))
+    return Data(repeated(setup_of(TEST), first, count), own, Passes(repeats.flight, moved))
+
+
+def _at(measured: Measurement, position: Array) -> Measurement:
+    return replace(measured, station=replace(measured.station, position=position))
+
+
+@one_blas_thread()
+def run_table_1(context: Context) -> Iterator[CheckResult]:
+    """All checks of Table 1."""
+    context.progress(0.1, "measure ground points for both methods")
+    data = make_data(context)
+    same, own = differences(data.same, data.same), differences(data.light, data.own)
+    for k, (name, printed) in enumerate(PRINTED_ARCSEC.items()):
+        sigma = float(same.spread[k])
+        variance = same.planes_sigma[k] ** 2 - same.resection_sigma[k] ** 2
+        noise = sigma / np.sqrt(2.0 * (len(same.values) - 1))
+        facts = {"same": same, "both": [same.planes_sigma[k], same.resection_sigma[k]], "printed": printed}
+        facts["times"] = printed / sigma
+        yield context.row(f"000.table1.{name}", sigma, noise, float(np.sqrt(max(variance, 0.0))), **facts)
+    for k, name in enumerate(PRINTED_ARCSEC):
+        bias, spread, count = float(np.mean(own.values[:, k])), float(own.spread[k]), len(own.values)
+        noise = spread * np.sqrt(1.0 / count + SIGMAS**2 / (2.0 * (count - 1)))
+        reach = partial(_reach, abs(bias), SIGMAS * spread)
+        facts = {"own": own, "point": POINT_SIGMA, "bias": bias, "spread": spread}
+        yield context.row(f"000.table1.{name}_own", reach(1.0), noise, inputs=_points(reach), **facts)
+    yield _pair(context, data, own)
+    yield from _accuracy(context, data)
+    context.progress(0.9, "draw")
+    context.figure("table1", differences_svg(same.values, own.values, (ALPHA, BETA)), point=POINT_SIGMA)
+
+
+def _reach(bias: float, spread: float, factor: float) -> float:
+    return bias + factor * spread
+
+
+def _rms(bias: float, spread: float, factor: float) -> float:
+    return float(np.hypot(bias, factor * spread))
+
+
+def _points(response: Callable[[float], float]) -> list[Chosen]:
+    """The ground points, on which the scatter of an angle hangs; response: of what is measured to a factor on that."""
+    return [
+        Chosen("error of a point", POINT_SIGMA, "m", response),
+        Chosen("points on a line", POINTS, "1", lambda factor: response(factor**-0.5)),
+    ]
+
+
+def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
+    """Both angles have the nadir plane: what makes one larger makes the other smaller."""
+    measured, flight = data.light.measured[0], data.light.flight
+    # the station is common and drops out, the points of the two methods are not
+    exact = replace(measured, station=Station.of(measured.station.position))
+    covariance = 2.0 * intersection_angles(*planes_of(exact, "tls")).covariance / ARCSEC**2
+    bias = -next(row.bias for row in effect_rows(flight) if row.what == "all") / ARCSEC
+    forward, nadir, backward = (_pitch_variance(data.light, line) for line in LINES)
+    simple = np.array([[forward + nadir, -nadir], [-nadir, nadir + backward]])
+    pair = np.array([ALPHA, BETA])
+    facts = {
+        "correlation": covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]),
+        "own": own,
+        "distance": _distance(pair - np.mean(own.values, axis=0), np.cov(own.values.T)),
+        "pair": (ALPHA, BETA),
+        "apart": _distance(pair * [-1.0, 1.0] - bias, covariance),
+        "limit": LIMIT,
+    }
+    expected = _distance(pair - bias, 2.0 * simple)
+    return context.row("000.table1.pair", _distance(pair - bias, covariance), None, LIMIT, [expected], **facts)
+
+
+def _pitch_variance(passes: Passes, line: str) -> float:
+    """Variance of the pitch of a plane through n points at their range, arcsec^2."""
+    points = passes.points[line]
+    reach = float(np.mean(np.linalg.norm(points - passes.flight.station, axis=1)))
+    return (passes.flight.spec.errors.points / reach / ARCSEC) ** 2 / len(points)
+
+
+def _distance(off: Array, covariance: Array) -> float:
+    """Mahalanobis distance of a pair."""
+    return float(np.sqrt(off @ np.linalg.solve(covariance, off)))
+
+
+def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
+    for identifier, passes, light in (
+        ("000.accuracy", data.own, "taken out of the points"),
+        ("000.accuracy.light", data.light, "left in"),
+    ):
+        found = np.array([intersection_angles(*planes_of(m, "tls")).values for m in passes.measured])
+        off = (found - values_of(passes.flight.dihedral)) / ARCSEC
+        mean, spread, rms = np.mean(off, axis=0), np.std(off, axis=0), np.sqrt(np.mean(off**2, axis=0))
+        worst = int(np.argmax(rms))
+        inputs = _points(partial(_rms, float(mean[worst]), float(spread[worst])))
+        noise = float(spread[worst] / np.sqrt(len(off)))
+        facts = {"off": off, "point": POINT_SIGMA, "light": light, "mean": mean, "spread": spread}
+        yield context.row(identifier, rms[worst], noise, inputs=inputs, **facts)
+
+
+Kind = Literal["signs", "largest", "far", "alike", "little", "grows", "opposite"]
+Angle = Literal["alpha", "beta"]
+Place = tuple[float, float]
+"""Latitude and longitude, degrees."""
+Rises = Mapping[tuple[str, Angle, str], float]
+"""(what is moved, angle, axis) -> change of the angle for 10 m, arcsec."""
+AXES = ("x", "y", "z")
+FAR, ALIKE, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
+GREEK: Mapping[str, str] = {"alpha": "α", "beta": "β"}
+_STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
+REACH = 10.0
+"""Metres."""
+ELSEWHERE = (45.0, 120.0)
+"""Latitude and longitude, degrees, of a pass on which what the paper says of place-dependent sizes holds."""
+PANELS = {
+    "fig3": (("station", "alpha"), ("station", "beta")),
+    "fig4": (("forward", "alpha"), ("nadir", "alpha")),
+    "fig5": (("nadir", "beta"), ("backward", "beta")),
+}
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """One statement of the text: how `angle` answers when `what` is moved.
+
+    Attributes:
+        name: of the row, without the paper.
+        kind: what is said.
+        what: "station", or the line whose points move.
+        angle: of which it is said.
+        axes: of which it is said; for signs those along which the angle rises.
+        others: with which they are compared; for signs those along which it falls.
+    """
+
+    name: str
+    kind: Kind
+    what: str
+    angle: Angle
+    axes: tuple[str, ...]
+    others: tuple[str, ...] = ()
+
+    @property
+    def row(self) -> Check:
+        """What is compared."""
+        return load_printed("000").groups["000.figures"].rows[f"000.{self.name}"]
+
+    @property
+    def implied(self) -> float:
+        """What the sentence asks of `measure`."""
+        return {
+            "signs": 0.0, "largest": 1.0, "far": FAR, "alike": ALIKE, "little": LITTLE, "grows": GROWS, "opposite": 1.0,
+        }[self.kind]  # fmt: skip
+
+    def measure(self, rises: Rises, growth: Rises) -> float:
+        """The number that decides; growth: relative growth of the slopes, by the same keys."""
+
+        def rise(axis: str, angle: Angle = self.angle) -> float:
+            return rises[self.what, angle, axis]
+
+        size = {axis: abs(rise(axis)) for axis in AXES}
+        if self.kind == "signs":
+            return min([rise(axis) for axis in self.axes] + [-rise(axis) for axis in self.others])
+        if self.kind in ("largest", "far"):
+            return min(size[axis] for axis in self.axes) / max(size[axis] for axis in self.others)
+        if self.kind == "alike":
+            return max(size[axis] for axis in self.axes) / min(size[axis] for axis in self.axes)
+        if self.kind == "little":
+            return max(size[axis] for axis in self.axes) / max(size[axis] for axis in self.others)
+        if self.kind == "grows":
+            return min(growth[self.what, self.angle, axis] for axis in AXES)
+        return max((-rise(axis, "beta") / rise(axis, "alpha") for axis in AXES), key=lambda ratio: abs(ratio - 1.0))
+
+    def holds(self, rises: Rises, growth: Rises) -> bool:
+        """Whether the number says so, as the row compares it."""
+        return self.row.outside(self.measure(rises, growth), self.implied) <= self.row.tolerance
+
+
+YZ, XZ, XY = ("y", "z"), ("x", "z"), ("x", "y")
+SENTENCES: tuple[Sentence, ...] = (
+    Sentence("fig3.alpha_signs", "signs", "station", "alpha", ("x",), YZ),
+    Sentence("fig3.beta_signs", "signs", "station", "beta", ("x",), YZ),
+    Sentence("fig3.alpha_largest", "largest", "station", "alpha", ("z",), XY),
+    Sentence("fig3.beta_largest", "largest", "station", "beta", ("y",), XZ),
+    Sentence("fig3.alpha_growth", "grows", "station", "alpha", AXES),
+    Sentence("fig3.beta_growth", "grows", "station", "beta", AXES),
+    Sentence("fig4.forward_alike", "alike", "forward", "alpha", XZ),
+    Sentence("fig4.forward_signs", "signs", "forward", "alpha", ("y",), XZ),
+    Sentence("fig4.forward_y", "far", "forward", "alpha", ("y",), XZ),
+    Sentence("fig4.nadir_signs", "signs", "nadir", "alpha", XZ, ("y",)),
+    Sentence("fig4.nadir_yz", "largest", "nadir", "alpha", YZ, ("x",)),
+    Sentence("fig5.nadir_signs", "signs", "nadir", "beta", ("y",), XZ),
+    Sentence("fig5.nadir_yz", "far", "nadir", "beta", YZ, ("x",)),
+    Sentence("fig5.aft_signs", "signs", "backward", "beta", ("z",), ("y",)),
+    Sentence("fig5.aft_x", "little", "backward", "beta", ("x",), YZ),
+    Sentence("fig5.aft_largest", "largest", "backward", "beta", ("z",), XY),
+    Sentence("fig5.opposite", "opposite", "nadir", "alpha", AXES),
+)
+
+
+@drawing(lambda amount, change, panels: f"sensitivity-000-{panels[0][0]}-{panels[1][0]}", 3.3)
+def sensitivity_svg(
+    figure: Figure, amount: Array, change: Mapping[tuple[str, str, str], Array], panels: Sequence[tuple[str, str]]
+) -> None:
+    """A panel for each (what is moved, angle): a curve for each axis, arcsec over metres."""
+    for axes, (what, angle) in zip(figure.subplots(1, 2, sharey=True), panels, strict=True):
+        axes.axhline(0.0, color=GREY, lw=0.8)
+        ends = {}
+        for axis, (colour, mark) in _STYLES.items():
+            curve = change[what, angle, axis]
+            ends[axis] = float(curve[-1])
+            axes.plot(amount, curve, color=colour, marker=mark, ms=3.5, lw=1.4)
+        least = 0.07 * (max(0.0, *ends.values()) - min(0.0, *ends.values()))
+        last = -np.inf
+        for axis, value in sorted(ends.items(), key=lambda item: item[1]):
+            last = max(value, last + least)  # labels must not overlap
+            colour = _STYLES[axis][0]
+            axes.annotate(axis, (amount[-1], last), (6, 0), textcoords="offset points", va="center", color=colour)
+        moved = "station" if what == "station" else f"{what} points"
+        axes.set(title=f"{GREEK[angle]} over the error of the {moved}", xlabel="error, m")
+        axes.margins(x=0.06)
+        axes.grid(color=LIGHT, lw=0.5)
+    figure.axes[0].set_ylabel("change of the angle, arcsec")
+
+
+@drawing("places-000", 3.6)
+def places_svg(figure: Figure, held: Mapping[Place, int], total: int, marked: Sequence[Place]) -> None:
+    """How many sentences hold by place."""
+    axes = figure.subplots()
+    lat, lon = (np.unique([place[k] for place in held]) for k in (0, 1))
+    grid = np.array([[held[a, b] for b in lon] for a in lat])
+    span = {"vmin": grid.min() - 0.5, "vmax": total + 0.5}
+    mesh = axes.pcolormesh(lon, lat, grid, cmap="cividis", shading="nearest", **span)
+    for (a, b), count in held.items():
+        colour = "white" if (count - grid.min()) / (total - grid.min()) < 0.55 else INK
+        axes.text(b, a, str(count), ha="center", va="center", fontsize=8, color=colour)
+    for place in marked:
+        axes.plot(place[1], place[0], "o", ms=19, mfc="none", mec=VERMILION, mew=1.8)
+    axes.set(xlabel="longitude, ° E", ylabel="latitude, ° N")
+    figure.colorbar(mesh, ax=axes, label=f"sentences that hold, of {total}")
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """Curves of one measurement, by planes fitted anew.
+
+    Attributes:
+        amount: (k,) metres.
+        change: (what is moved, angle, axis) -> (k,), arcsec.
+    """
+
+    amount: Array
+    change: Mapping[tuple[str, str, str], Array]
+
+    @classmethod
+    def of(cls, table: Sequence[Sensitivity]) -> Answers:
+        """From the rows for every thing that is moved along every axis."""
+        change = {
+            (row.what, angle, row.axis): row.change[k] / ARCSEC for row in table for k, angle in enumerate(row.angles)
+        }
+        return cls(table[0].amount, change)
+
+    @property
+    def rises(self) -> Rises:
+        """At the end."""
+        return {key: float(change[-1]) for key, change in self.change.items()}  # type: ignore[misc]
+
+    @property
+    def growth(self) -> Rises:
+        """Growth of the steepness from the first to the last step, relative."""
+        out = {}
+        for key, change in self.change.items():
+            slope = np.abs(np.diff(change))
+            out[key] = float(slope[-1] / slope[0] - 1.0) if slope[0] > 0 else 0.0
+        return out  # type: ignore[return-value]
+
+
+def make_passes(
+    context: Context, place: Place | None = None, count: int | None = None, direction: str = "descending"
+) -> Passes:
+    """Measurements at the place of the library's test, or at another (latitude, longitude), degrees."""
+    at: dict[str, object] = {"direction": direction}
+    if place is not None:
+        at |= {"latitude": np.radians(place[0]), "longitude": np.radians(place[1])}
+    many = context.count(full=60, fast=10) if count is None else count
+    return repeated(setup_of(TEST, **at), np.random.SeedSequence([context.seed, 8]), many)
+
+
+def answers(measured: Measurement, flight: AnglePass, steps: int = 10, method: Method = "corrected") -> Answers:
+    """All planes fitted anew for every move."""
+    amount = np.linspace(0.0, REACH, steps + 1)
+    return Answers.of(sensitivity(measured.station, measured.strips, flight.pairs, method=method, amounts=amount))
+
+
+@one_blas_thread()
+def run_figures(context: Context) -> Iterator[CheckResult]:
+    """All checks of Figs. 3 to 5."""
+    context.progress(0.0, "move station and points")
+    passes = make_passes(context)
+    found = [answers(m, passes.flight) for m in passes.measured]
+    context.progress(0.4, "the same elsewhere")
+    there = make_passes(context, ELSEWHERE, 1)
+    other = answers(there.measured[0], there.flight)
+    places = _places(context)
+    for sentence in SENTENCES:
+        if sentence.row.id in context.selected:
+            yield _row(sentence, passes, found, other, places)
+    yield _ordinate(context, found, places)
+    if "000.fig4.single" in context.selected:
+        yield _single(context, passes)
+    context.progress(0.9, "draw")
+    _show(context, found[0], places)
+
+
+def _row(
+    sentence: Sentence, passes: Passes, found: list[Answers], other: Answers, places: Mapping[Place, Answers]
+) -> CheckResult:
+    values = np.array([sentence.measure(a.rises, a.growth) for a in found])
+    mean = {axis: np.mean([a.rises[sentence.what, sentence.angle, axis] for a in found]) for axis in AXES}
+    place = _place([sentence], places)
+    facts = {
+        "found": found,
+        "mean": {axis: f"{value:+.3f}″" for axis, value in mean.items()},
+        "place": place,
+        "other": sentence.measure(other.rises, other.growth),
+        "north": ELSEWHERE[0],
+        "east": ELSEWHERE[1],
+        "alike": ALIKE,
+    }
+    value, sigma = (float(values[0]), None) if sentence.kind == "grows" else mean_of(values)
+    inputs = [place] if sentence.row.basis == "chosen" else []
+    explained = _explained(sentence, passes, other)
+    return sentence.row.evaluate(value, sigma, "", sentence.implied, explained, inputs, facts)
+
+
+def _place(sentences: Sequence[Sentence], places: Mapping[Place, Answers]) -> Supposed:
+    """Where all of some sentences hold."""
+    held = sum(all(s.holds(a.rises, a.growth) for s in sentences) for a in places.values())
+    text = f"holds at {held} of {len(places)} places from 25° to 50° N and 80° to 130° E"
+    return Supposed("a descending pass over 40° N 116° E", text)
+
+
+def _explained(sentence: Sentence, passes: Passes, other: Answers) -> list[float]:
+    """Value that the reason of the row gives, where there is one."""
+    if sentence.kind == "grows":
+        return [REACH / float(np.linalg.norm(passes.flight.station - passes.flight.middle_point))]
+    if sentence.kind == "alike" and sentence.holds(other.rises, other.growth):
+        normal = np.abs(passes.normal("forward"))
+        return [float(normal[2] / normal[0])]
+    return []
+
+
+def _ordinate(context: Context, found: list[Answers], places: Mapping[Place, Answers]) -> CheckResult:
+    signs = [s for s in SENTENCES if s.kind == "signs"]
+    share, other = (
+        float(np.mean([s.holds({k: sign * v for k, v in a.rises.items()}, a.growth) for s in signs for a in found]))
+        for sign in (1.0, -1.0)
+    )
+    count = sum(len(s.axes + s.others) for s in signs)
+    facts = {"sentences": signs, "signs": count, "found": found, "other": other}
+    return context.row("000.fig3.ordinate", share, None, 1.0, inputs=[_place(signs, places)], **facts)
+
+
+def _single(context: Context, passes: Passes) -> CheckResult:
+    m = passes.measured[0]
+    base = intersection_angles(*planes_of(m, "corrected")).values[0]
+    shift = np.array([0.0, REACH, 0.0])
+
+    def moved(strip: Strip) -> float:
+        planes = planes_of(replace(m, strips={**m.strips, "forward": strip}), "corrected")
+        return float(intersection_angles(*planes).values[0] - base)
+
+    forward = m.strips["forward"]
+    whole = moved(forward.shifted(shift))
+    each = []
+    for k in range(len(forward.points)):
+        points = forward.points.copy()
+        points[k] += shift
+        each.append(moved(Strip(points, forward.covariance)))
+    value = float(np.max(np.abs(each)) / abs(whole))
+    inputs = [Chosen.power("points on a line", float(len(each)), "1", value, -1.0)]
+    return context.row("000.fig4.single", value, implied=0.0, inputs=inputs, each=each, whole=whole)
+
+
+def _places(context: Context) -> dict[Place, Answers]:
+    """Place -> answers of one measurement there."""
+    step = 5.0 if context.fast else 2.5
+    out = {}
+    grid = [(lat, lon) for lat in np.arange(25.0, 50.1, step) for lon in np.arange(80.0, 130.1, 2.0 * step)]
+    for k, place in enumerate(grid):
+        if k % 10 == 0:
+            context.progress(0.4 + 0.45 * k / len(grid), "the same elsewhere")
+        passes = make_passes(context, place, 1)
+        out[place] = answers(passes.measured[0], passes.flight, 2)
+    return out
+
+
+def _readings(context: Context) -> list[tuple[str, str, int, int]]:
+    """Frame and direction of the pass -> how many sentences hold of the angle, and of the figures' ordinate."""
+    rows = []
+    for direction in ("descending", "ascending"):
+        passes = make_passes(context, count=1, direction=direction)
+        flight, (m,) = passes.flight, passes.measured
+        frames = {
+            "Earth-fixed": m,
+            "east, north, up": m.in_frame(flight.local, flight.middle_point),
+            "forward, right, down": m.in_frame(flight.orbital, flight.station),
+        }
+        for frame, seen in frames.items():
+            # two of the frames have a nearly vertical plane
+            a = answers(seen, flight, 2, "tls")
+            minus = {key: -value for key, value in a.rises.items()}
+            counts = [sum(s.holds(r, a.growth) for s in SENTENCES) for r in (a.rises, minus)]
+            rows.append((frame, direction, counts[0], counts[1]))
+    return rows
+
+
+def _show(context: Context, shown: Answers, places: Mapping[Place, Answers]) -> None:
+    for name, panels in PANELS.items():
+        context.figure(name, sensitivity_svg(shown.amount, shown.change, panels))
+    held = {place: sum(s.holds(a.rises, a.growth) for s in SENTENCES) for place, a in places.items()}
+    context.figure("places", places_svg(held, len(SENTENCES), ((40.0, 116.0), ELSEWHERE)), total=len(SENTENCES))
+    context.table("readings", _readings(context), total=len(SENTENCES))
+    moved = ((what, axis) for what in ("station", "forward", "nadir", "backward") for axis in AXES)
+    rows = [(what, axis, *(shown.rises[what, angle, axis] for angle in ("alpha", "beta"))) for what, axis in moved]
+    context.table("changes", rows)
+
+
+TABLE_1 = group_of("000.table1", run_table_1)
+FIGURES = group_of("000.figures", run_figures)

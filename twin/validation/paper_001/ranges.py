@@ -1,0 +1,776 @@
+"""How far paper 001's formulas hold: readings of noise-free images along single and joint changes, under defocus, for
+other pupil offsets, fields and kinds of return, and where they leave a tolerance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from analysis.arrays import ARCSEC
+from analysis.monitor import monitoring
+from analysis.monitor.monitoring import PER_SI, MonitorGeometry
+from analysis.monitor.recovery import measure_spots
+from optics.geometry import zernike
+from optics.geometry.pose import Pose, about_axis
+from optics.geometry.surface import plane
+from optics.geometry.tree import Body, Motion, RigidTree, State
+from optics.numerics.backend import Backend, cores
+from optics.numerics.number_tree import FrozenMap
+from optics.raytrace.aim import AimError
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.trace import BeamMissedError, make_rays, trace
+from scenes.models.instrument_model import Instrument
+from scenes.specs.instrument import BASE
+from scenes.specs.resolved import ResolvedJob
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.motions import ElementaryMotion, line_family
+from twin.monitor.observation import Observing, observe, one_detector
+from twin.validation.group import load_printed
+from twin.validation.paper_001.formulas import PARAMETERS as NAMES
+from twin.validation.paper_001.formulas import focal_lengths
+
+PRINTED, JOINT, CORRECTED, CALIBRATED = "printed", "Table 1", "corrected", "calibrated"
+FORMS = (PRINTED, JOINT, CORRECTED, CALIBRATED)
+"""(2), (3), (5), (7) with the arctangent; Table 1's joint forms; the same with f_x for d_alpha, half of d_gamma times
+f/f_x, no cos^2, and (7); those with the two calibrated gradients over the field as well."""
+SHARE = 24
+"""Images of 96 x 96 pixels that are rendered at once: bounds the memory."""
+ROUNDS, NEAR = 3, 1e-3
+"""Refinement steps at most; and how near a point to a limit, relative to the size, makes another one needless."""
+
+Sample = Callable[[np.ndarray], Mapping[str, np.ndarray]]
+"""Sizes (N,) -> name -> values (N,), not negative; 1 is the limit."""
+
+
+class Bench:
+    """Spot positions, readings and truth of one instrument's monitor, without noise.
+
+    Args:
+        experiment: the instrument.
+        like: a bench on the same cameras: its geometry is taken over.
+        shapes: whether its spot shapes are taken over as well; needed for larger CCDs, of which only a window around
+            each spot is read out, as large as the CCDs of ``like``.
+    """
+
+    def __init__(self, experiment: MonitorExperiment, like: Bench | None = None, shapes: bool = False) -> None:
+        self.experiment = experiment
+        self._measure = like.experiment if like is not None and shapes else experiment
+        self.cameras = tuple(experiment.instrument.cameras)
+        self._geometry: dict[str, MonitorGeometry] = {}
+        if like is not None:
+            self._geometry = {name: like.geometry(name) for name in self.cameras}
+        self.frames = experiment.instrument.spec.autocollimator.frames
+
+    def geometry(self, camera: str) -> MonitorGeometry:
+        """What the formulas are given of a camera."""
+        if camera not in self._geometry:
+            self._geometry[camera] = self.experiment.geometry(camera)
+        return self._geometry[camera]
+
+    def positions(self, states: Sequence[State]) -> np.ndarray:
+        """Centres of the spots in rendered images, (S, C, 2) (row, column), px.
+
+        Raises:
+            SpotError, BeamMissedError: a spot is too near its CCD's edge or outside it, or its beam is lost.
+        """
+        path = self.experiment.path
+        rows, columns = path.shape
+        chunk = max(1, SHARE * 96 * 96 // (rows * columns))
+        out = np.empty((len(states), len(path.channels), 2))
+        calibration = self._measure.calibration
+        for piece, photons in path.iterate_photons(states, chunk=chunk):
+            mean = self.experiment.expected_frames(photons).reshape(-1, rows, columns)
+            windows, corner = _windows(mean, self._measure.path.shape)
+            found = measure_spots(windows, self.frames, calibration, "ml", cores())
+            place = np.stack([found.row, found.column], axis=-1) + corner
+            out[piece] = place.reshape(-1, len(path.channels), 2)
+        return out
+
+    def traced(self, states: Sequence[State]) -> np.ndarray:
+        """Means of the traced spots over the return face, (S, C, 2) (row, column) px from the CCD's middle, wherever
+        they fall.
+
+        Raises:
+            BeamMissedError, AimError: a beam is lost, or a part of it.
+        """
+        path = self.experiment.path
+        known, scout = path.coarse_trace(states), path.scout
+        basis = zernike.basis(known.turn.shape[-1], scout.nodes.x, scout.nodes.y)
+        start = np.repeat(scout.nominal.parameters, len(states), axis=0)
+        launch = known.fan.at(start + np.moveaxis(known.turn @ basis.T, 0, -1))
+        rays = trace(self.experiment.backend, known.back, make_rays(self.experiment.backend, *launch)).numpy()
+        if not rays[3].all():
+            raise BeamMissedError("a clear aperture cuts a monitor beam")
+        return np.moveaxis(known.place, 0, 1)
+
+    def readings(self, start: np.ndarray, end: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
+        """Camera -> form -> (S, 4) in the units of ``monitoring.PARAMETERS``, from positions (S, C, 2)."""
+        start = np.broadcast_to(start, end.shape)
+        nothing = np.zeros((4, 4))
+        out = {}
+        for k, name in enumerate(self.cameras):
+            pair = slice(2 * k, 2 * k + 2)
+            before, after, geometry = start[:, pair], end[:, pair], self.geometry(name)
+            # without the calibrated gradients over the field
+            bare = replace(geometry, d_f_per_alpha_m=0.0, d_gamma_per_beta=0.0)
+            found = {
+                PRINTED: monitoring.paper_single(before, after, nothing, geometry),
+                JOINT: monitoring.paper_joint(before, after, nothing, geometry),
+                CORRECTED: monitoring.derived(before, after, nothing, bare),
+                CALIBRATED: monitoring.derived(before, after, nothing, geometry),
+            }
+            out[name] = {form: parameters.vector * PER_SI for form, parameters in found.items()}
+        return out
+
+    def truth(self, states: Sequence[State]) -> dict[str, np.ndarray]:
+        """Camera -> (S, 4) traced changes in the units of ``monitoring.PARAMETERS``."""
+        found = self.experiment.sight.truth(states)
+        return {
+            name: np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) * PER_SI
+            for name, c in found.cameras.items()
+        }
+
+
+def _windows(images: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Windows of that shape around the brightest pixel of each image (B, H, W), and (B, 2) how far their first pixels
+    are from those of a window in the middle.
+    """
+    if images.shape[1:] == shape:
+        return images, np.zeros((len(images), 2))
+    brightest = np.stack(np.unravel_index(images.reshape(len(images), -1).argmax(axis=1), images.shape[1:]), axis=-1)
+    spare = np.array(images.shape[1:]) - shape
+    corner = np.clip(brightest - np.array(shape) // 2, 0, spare)
+    out = np.stack([image[r : r + shape[0], c : c + shape[1]] for image, (r, c) in zip(images, corner, strict=True)])
+    return out, corner - spare / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Quantities over the size of a change.
+
+    Attributes:
+        size: (N,), ascending, > 0.
+        value: name -> (N,), as shares of what is allowed.
+    """
+
+    size: np.ndarray
+    value: Mapping[str, np.ndarray]
+
+    def bracket(self, name: str) -> int | None:
+        """Index of the first size at which the limit is passed, None where it is not."""
+        beyond = np.flatnonzero(self.value[name] > 1.0)
+        return int(beyond[0]) if len(beyond) else None
+
+    def crossing(self, name: str) -> float | None:
+        """Size at which the limit is first passed, interpolated on logarithmic axes; None where it is not.
+
+        0 where it is passed at the smallest size already.
+        """
+        k = self.bracket(name)
+        if k is None:
+            return None
+        if k == 0:
+            return 0.0
+        (low, high), (a, b) = np.log(self.size[k - 1 : k + 1]), self.value[name][k - 1 : k + 1]
+        start, end = math.log(max(a, 1e-9)), math.log(b)
+        return math.exp(low - start * (high - low) / (end - start))
+
+    def merged(self, size: np.ndarray, value: Mapping[str, np.ndarray]) -> Curves:
+        """With more points."""
+        every = np.concatenate([self.size, size])
+        order = np.argsort(every)
+        return Curves(every[order], {n: np.concatenate([v, value[n]])[order] for n, v in self.value.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class Domain:
+    """How far something holds: followed in images as far as they go, traced on from there, until the beam is lost.
+
+    Attributes:
+        images, traced: curves over the size; both have the same names.
+        lost: size beyond which the beam is lost or not followed.
+        lost_why: which of the two.
+    """
+
+    images: Curves
+    traced: Curves
+    lost: float
+    lost_why: str
+
+    def limit(self, name: str) -> tuple[float, str]:
+        """Largest size within a limit, and whence it is known: "images", "trace" or why there is none."""
+        for curves, whence in ((self.images, "images"), (self.traced, "trace")):
+            found = curves.crossing(name)
+            if found is not None:
+                return found, whence
+        return self.lost, self.lost_why
+
+
+def sampled(sample: Sample, sizes: Sequence[float], names: Sequence[str] | None = None) -> Curves:
+    """Curves at given sizes, with points added where they pass the limit.
+
+    Args:
+        sample: what is sampled.
+        sizes: to begin with, ascending.
+        names: whose limits are refined; all by default.
+    """
+    first = np.array(sizes, dtype=float)
+    curves = Curves(first, sample(first))
+    wanted = tuple(curves.value) if names is None else names
+    for _ in range(ROUNDS):
+        new: list[float] = []
+        for x in sorted(x for x in (curves.crossing(name) for name in wanted) if x):
+            if np.min(np.abs(curves.size / x - 1.0)) > NEAR and (not new or x > (1.0 + NEAR) * new[-1]):
+                new.append(x)
+        if not new:
+            break
+        curves = curves.merged(np.array(new), sample(np.array(new)))
+    return curves
+
+
+EQUATIONS = {"d_alpha": "(3)", "d_beta": "(2)", "d_gamma": "(5)", "d_f": "(7)"}
+UNITS = {"d_alpha": "arcsec", "d_beta": "arcsec", "d_gamma": "arcsec", "d_f": "um"}
+_TABLE = load_printed("001")
+CLAIMED = {
+    "d_alpha": 0.1,
+    "d_beta": 0.1,
+    "d_gamma": _TABLE.number("table5.d_gamma_arcsec"),
+    "d_f": 1e3 * _TABLE.number("table5.d_f_mm"),
+}
+"""What section 3.3 and Table 5 claim of an error: arcsec and um."""
+FINE = {"d_alpha": 0.1, "d_beta": 0.1, "d_gamma": 0.1, "d_f": 40.0}
+"""0.1 arcsec for all angles, and Table 5's 0.04 mm."""
+RELATIVE = 0.01
+WINDOW, CUT = "leaves the area CCD", "an aperture cuts the beam"
+EDGE_PX = 11.0
+"""Spots may come this near to the outermost pixel centres: half a pixel nearer the fit's template ends on one side, one
+pixel nearer the centroid refuses them on all."""
+WIDE_PX = 384
+"""Rows and columns of the larger CCD that shows what comes after the window's edge."""
+_START = {"d_alpha": 0.02, "d_beta": 0.02, "d_gamma": 0.02, "d_f": 8.0}
+_FAR = {"d_alpha": 3600.0, "d_beta": 3600.0, "d_gamma": 36000.0, "d_f": 600e3}
+"""Table units: where the curves begin, and where the trace ends at the latest."""
+_WIDE_SHARE = 0.76
+_Raw = dict[str, list[np.ndarray]]
+KINDS = ("1 %", "fine", "claimed")
+BOX = np.array([4.0, 4.0, 24.0, 950.0])
+"""Half widths in d_alpha, d_beta, d_gamma (arcsec) and d_f (um): all at once, the spots just stay on the area CCD."""
+BOX_TEXT = f"±({BOX[0]:g}″, {BOX[1]:g}″, {BOX[2]:g}″, {1e-3 * BOX[3]:g} mm)"
+CORNERS = np.array(list(product((-1.0, 1.0), repeat=4)))
+_FAR_BOX = 200.0
+
+
+@dataclass(frozen=True, eq=False)
+class Range(Domain):
+    """One parameter changed in one direction; sizes are true changes in table units.
+
+    The names of the curves are those of ``criterion`` and WINDOW.
+
+    Attributes:
+        parameter: of NAMES.
+        sign: +1 or -1.
+        raw: of the images, form -> error over the true change as (N, 2), for the figure.
+        raw_traced: the same traced.
+        trace_gap: largest difference of a traced spot shift to the rendered one, px.
+    """
+
+    parameter: str
+    sign: int
+    raw: Mapping[str, np.ndarray]
+    raw_traced: Mapping[str, np.ndarray]
+    trace_gap: float
+
+    @property
+    def window(self) -> float:
+        """True change at which the first spot comes too near the area CCD's edge, table units."""
+        return self.limit(WINDOW)[0]
+
+
+def criterion(form: str, kind: str) -> str:
+    """Name of a form's error as a share of "1 %", "0.1" or "claimed"."""
+    return f"{form} {kind}"
+
+
+def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[ElementaryMotion, float]:
+    """The single motion behind a parameter, and its amount (SI) for one table unit of change."""
+    k = NAMES.index(parameter)
+    f, f_x = focal_lengths(geometry)
+    amount = (-f_x * ARCSEC, f * ARCSEC, ARCSEC * f_x / f, 1e-6 / f)[k]
+    return line_family(camera)[k], amount
+
+
+def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: int) -> Range:
+    """Follow one parameter in one direction.
+
+    Args:
+        bench: with the instrument's own area CCDs, for the window's edge.
+        wide: with larger ones, same camera.
+        parameter: of NAMES.
+        sign: of the change.
+        count: number of sizes to begin with.
+    """
+    camera = bench.cameras[0]
+    geometry = bench.geometry(camera)
+    motion, unit = motion_of(camera, parameter, geometry)
+    k = NAMES.index(parameter)
+    half = 0.5 * (min(bench.experiment.path.shape) - 1) - EDGE_PX
+    far = 0.5 * _WIDE_SHARE * WIDE_PX
+
+    def states(size: np.ndarray) -> list[State]:
+        return [motion.state(sign * unit * x) for x in size]
+
+    origin = bench.positions([{}])
+    traced_origin = bench.traced([{}])
+    middle = 0.5 * (np.array(bench.experiment.path.shape) - 1)
+    raw: _Raw = {form: [] for form in FORMS}
+    gap = [0.0]
+    truths: dict[float, float] = {}
+
+    def shares(size: np.ndarray, start: np.ndarray, end: np.ndarray, into: _Raw) -> Mapping[str, np.ndarray]:
+        truth = bench.truth(states(size))[camera][:, k]
+        truths.update(zip(size.tolist(), np.abs(truth).tolist(), strict=True))
+        readings = bench.readings(start, end)[camera]
+        out = {WINDOW: np.max(np.abs(end - start + origin - middle), axis=(1, 2)) / half}
+        for form in FORMS:
+            error = readings[form][:, k] - truth
+            into[form].append(np.stack([np.abs(truth), error], axis=-1))
+            allowed = (RELATIVE * np.abs(truth), FINE[parameter], CLAIMED[parameter])
+            for kind, limit in zip(KINDS, allowed, strict=True):
+                out[criterion(form, kind)] = np.abs(error) / limit
+        return out
+
+    def rendered(size: np.ndarray) -> Mapping[str, np.ndarray]:
+        every = states(size)
+        place = wide.positions(every)
+        moved = bench.traced(every) - traced_origin
+        gap[0] = max(gap[0], float(np.max(np.abs(place - origin - moved))))
+        return shares(size, origin, place, raw)
+
+    begin = _START[parameter]
+    end, why = beam_end(bench, states, begin, _FAR[parameter])
+    # the shift is proportional but for a few parts in a thousand
+    shift = float(np.max(np.abs(bench.traced(states(np.array([begin]))) - traced_origin)))
+    largest = min(begin * far / shift, 0.9 * end)
+    images = sampled(rendered, np.geomspace(begin, largest, count).tolist())
+    raw_traced: _Raw = {form: [] for form in FORMS}
+    traced = sampled(
+        lambda size: shares(size, traced_origin, bench.traced(states(size)), raw_traced),
+        np.geomspace(largest, end, 12).tolist(),
+    )
+
+    def over_truth(curves: Curves) -> Curves:
+        return Curves(np.array([truths[x] for x in curves.size.tolist()]), curves.value)
+
+    lost = truths[float(traced.size[-1])]
+    return Range(
+        over_truth(images), over_truth(traced), lost, why, parameter, sign, _joined(raw), _joined(raw_traced), gap[0]
+    )
+
+
+def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
+    """Form -> (N, 2), ascending in the change."""
+    out = {}
+    for form, pieces in parts.items():
+        every = np.concatenate(pieces)
+        out[form] = every[np.argsort(every[:, 0])]
+    return out
+
+
+def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: float, far: float) -> tuple[float, str]:
+    """The largest size, from ``start`` up to ``far``, whose beams pass whole, to 1 %, and why no larger one does."""
+
+    def fault(size: float) -> str:
+        try:
+            some = states(np.array([size]))
+            bench.traced(some)
+        except BeamMissedError:
+            return CUT
+        except (AimError, np.linalg.LinAlgError):
+            return "no ray is found"
+        return ""
+
+    good, bad, why = start, far, fault(far)
+    if not why:
+        return far, "not followed farther"
+    while bad / good > 1.01:
+        middle = math.sqrt(good * bad)
+        found = fault(middle)
+        good, bad, why = (good, middle, found) if found else (middle, bad, why)
+    return good, why
+
+
+def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]:
+    """States in which every camera makes changes (S, 4), table units, as far as the motions do them exactly."""
+    states: list[dict[str, Motion]] = [{} for _ in next(iter(changes.values()))]
+    for camera, wanted in changes.items():
+        units = [motion_of(camera, name, bench.geometry(camera))[1] for name in NAMES]
+        for state, (x, y, turn, scale) in zip(states, wanted * np.array(units), strict=True):
+            state[f"{BASE}/{camera}/focal_plane"] = Motion(rotate=(0.0, 0.0, turn), shift=(x, y, 0.0))
+            state[f"{BASE}/{camera}"] = Motion(scale=scale)
+    return list(states)
+
+
+@dataclass(frozen=True, eq=False)
+class Corners(Domain):
+    """The worst of the 16 corners over the share of the box.
+
+    The names of the curves are form and parameter; the values the worst error of all corners and cameras as a share of
+    what is claimed.
+    """
+
+    def text(self, name: str) -> str:
+        """The limit in words."""
+        share, whence = self.limit(name)
+        return f"{share:.3g}" + (" (beam cut)" if whence == self.lost_why else "")
+
+
+def key(form: str, parameter: str, fine: bool = False) -> str:
+    """Name of an error as a share of what Table 5 claims, or of 0.1 arcsec and 0.04 mm."""
+    return f"{form} {parameter}{' fine' if fine else ''}"
+
+
+def corners(bench: Bench, count: int) -> Corners:
+    """Follow the corners of the box from a thousandth of it until beams are cut."""
+    origin, traced_origin = bench.positions([{}]), bench.traced([{}])
+
+    def states(share: np.ndarray) -> list[State]:
+        wanted = (share[:, None, None] * CORNERS * BOX).reshape(-1, 4)
+        return joint_states(bench, dict.fromkeys(bench.cameras, wanted))
+
+    def worst(share: np.ndarray, start: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
+        truth, readings = bench.truth(states(share)), bench.readings(start, end)
+        out = {}
+        for form in FORMS:
+            error = np.max([np.abs(readings[c][form] - truth[c]) for c in bench.cameras], axis=0)
+            error = error.reshape(len(share), len(CORNERS), 4).max(axis=1)
+            for k, name in enumerate(NAMES):
+                out[key(form, name)] = error[:, k] / CLAIMED[name]
+                out[key(form, name, fine=True)] = error[:, k] / FINE[name]
+        return out
+
+    images = sampled(
+        lambda share: worst(share, origin, bench.positions(states(share))), np.geomspace(0.002, 1.0, count).tolist()
+    )
+    end, why = beam_end(bench, states, 1.05, _FAR_BOX)
+    traced = sampled(
+        lambda share: worst(share, traced_origin, bench.traced(states(share))), np.geomspace(1.0, end, 6).tolist()
+    )
+    return Corners(images, traced, end, why)
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Readings of many random changes regressed on the true ones.
+
+    Attributes:
+        gain: form -> camera -> (4, 4): reading p per unit of true change q.
+        sigma: likewise, standard deviations.
+        scatter: form -> (4,) rms of what the regression leaves, table units, all cameras.
+        trials: number of states.
+    """
+
+    gain: Mapping[str, Mapping[str, np.ndarray]]
+    sigma: Mapping[str, Mapping[str, np.ndarray]]
+    scatter: Mapping[str, np.ndarray]
+    trials: int
+
+    def mean(self, form: str, read: str, changed: str) -> tuple[float, float]:
+        """Mean of the cameras and its standard deviation."""
+        p, q = NAMES.index(read), NAMES.index(changed)
+        values = [self.gain[form][c][p, q] for c in self.gain[form]]
+        sigmas = [self.sigma[form][c][p, q] for c in self.sigma[form]]
+        return float(np.mean(values)), float(np.sqrt(np.sum(np.square(sigmas))) / len(sigmas))
+
+
+def separation(experiment: MonitorExperiment, bench: Bench, trials: int, seed: int) -> Separation:
+    """Random changes of all four parameters of both cameras, uniform in the box, read from noisy frames."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1001,)))
+    wanted = {c: rng.uniform(-1.0, 1.0, (trials, 4)) * BOX for c in bench.cameras}
+    states = joint_states(bench, wanted)
+    truth = bench.truth(states)
+    how = Observing(one_detector(experiment, bench.frames, seed), stated=False)
+    seen = [found.recovery for found in observe(experiment, states, how)]
+    parts = [bench.readings(found.before, found.after) for found in seen]
+    readings = {c: {form: np.concatenate([part[c][form] for part in parts]) for form in FORMS} for c in bench.cameras}
+    gain: dict[str, dict[str, np.ndarray]] = {form: {} for form in FORMS}
+    sigma: dict[str, dict[str, np.ndarray]] = {form: {} for form in FORMS}
+    scatter = {}
+    for form in FORMS:
+        rests = []
+        for camera in bench.cameras:
+            # the constant takes up the noise of the one nominal measurement
+            design = np.column_stack([truth[camera], np.ones(trials)])
+            solved, *_ = np.linalg.lstsq(design, readings[camera][form], rcond=None)
+            rest = readings[camera][form] - design @ solved
+            rests.append(rest)
+            variance = np.sum(rest**2, axis=0) / (trials - design.shape[1])
+            spread = np.diag(np.linalg.inv(design.T @ design))
+            gain[form][camera] = solved[:4].T
+            sigma[form][camera] = np.sqrt(variance[:, None] * spread[None, :4])
+        scatter[form] = np.sqrt(np.mean(np.concatenate(rests) ** 2, axis=0))
+    return Separation(gain, sigma, scatter, trials)
+
+
+RETURNS: Mapping[str, tuple[tuple[float, float] | None, str]] = {
+    "plane": (None, "as built"),
+    "roof": (None, "as built; the ridge lies across the line"),
+    "roof along": ((0.0, 3e-3), "the ridge lies along the line; the area CCD stands beside its pinhole along the line"),
+    "corner": ((0.0, 0.0), "the spot falls on its own pinhole: the area CCD must see it through a beam splitter"),
+}
+"""Kinds of return: a mirror facet; a roof whose ridge lies across the line, or along it; a corner cube. For each the
+place of the area CCD from its pinhole, where another one is needed, metres, and how both stand.
+"""
+SHIFT = 60e-6
+"""Shift of the line CCD, metres."""
+CONFOCAL = load_printed("004").number("alignment.confocal_mm") / 1e3
+"""How well paper 004 sets the line CCD to the focus, metres."""
+SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
+"""Single changes whose readings are compared in a defocused camera and at other fields: a third of the area CCD."""
+
+
+def variant(
+    resolved: ResolvedJob,
+    backend: Backend,
+    camera: str,
+    pixels: int | None = None,
+    pupil_offset: tuple[float, float] | None = None,
+    field: float | None = None,
+    ccd_offset: tuple[float, float] | None = None,
+) -> MonitorExperiment:
+    """The experiment with one camera of an instrument, changed and built anew.
+
+    Args:
+        resolved: the instrument as its file gives it.
+        backend: where to trace.
+        camera: the camera that is kept.
+        pixels: rows and columns of the area CCDs.
+        pupil_offset: centre (X, Y) of the monitor's sub-aperture in the entrance pupil, metres.
+        field: of the area CCDs, radians.
+        ccd_offset: (X, Y) from the pinhole to the area CCD's centre, metres.
+
+    Raises:
+        InputError: the prisms cannot stand so.
+    """
+    spec = resolved.instrument
+    site = spec.cameras[camera]
+    if pupil_offset is not None:
+        site = site.model_copy(update={"pupil_offset": pupil_offset})
+    of_ccd: dict[str, Any] = {} if pixels is None else {"rows": pixels, "columns": pixels}
+    if ccd_offset is not None:
+        of_ccd["offset"] = ccd_offset
+    of_monitor: dict[str, Any] = {"area_ccd": spec.autocollimator.area_ccd.model_copy(update=of_ccd)}
+    if field is not None:
+        of_monitor["field"] = field
+    changed = {
+        "cameras": FrozenMap({camera: site}),
+        "monitor": spec.autocollimator.model_copy(update=of_monitor),
+        "baffles": FrozenMap({}),
+    }
+    return MonitorExperiment(resolved.model_copy(update={"instrument": spec.model_copy(update=changed)}), backend)
+
+
+def with_return(experiment: MonitorExperiment, kind: str) -> MonitorExperiment:
+    """Return the experiment with another kind of return.
+
+    The facet becomes an opening of the same size, behind which two or three mirrors stand square to each other and
+    meet in its middle. Rays meet them in one order; the other orders give the same ray, as turns by half a turn do not
+    depend on theirs.
+
+    Args:
+        experiment: with the plane return that was built.
+        kind: of RETURNS.
+
+    Raises:
+        ValueError: it is no such kind.
+    """
+    if kind not in RETURNS:
+        raise ValueError(f"no return {kind!r}; there are {', '.join(RETURNS)}")
+    if kind == "plane":
+        return experiment
+    instrument = experiment.instrument
+    return experiment.with_instrument(replace(instrument, assembly=_returning(instrument, kind)))
+
+
+def _returning(instrument: Instrument, kind: str) -> Assembly:
+    """The assembly with mirrors square to each other behind every facet's opening."""
+    old = instrument.assembly
+    bodies, elements, sequences = list(old.tree.bodies), dict(old.elements), dict(old.sequences)
+    for channel in instrument.channels:
+        name = f"{channel.key}/return_face"
+        elements[name] = replace(old.elements[name], interaction=Interaction.PASS)
+        added = []
+        for k, pose in enumerate(_mirrors(kind)):
+            body, mirror = Body(f"{channel.face_body}/mirror_{k}", pose), f"{name}/mirror_{k}"
+            bodies.append(body)
+            elements[mirror] = Element(mirror, body.path, plane(), Interaction.REFLECT)
+            added.append(mirror)
+        way = old.sequences[f"{channel.key}/monitor"]
+        at = way.index(name)
+        sequences[f"{channel.key}/monitor"] = (*way[: at + 1], *added, *way[at + 1 :])
+    return Assembly(RigidTree(tuple(bodies)), elements, sequences, old.media)
+
+
+def _mirrors(kind: str) -> list[Pose]:
+    """Poses of the mirrors in the facet's frame (x along the line, y across it, z to the light)."""
+    if kind.startswith("roof"):
+        ridge = 1 if kind == "roof" else 0
+        return [Pose(about_axis(ridge, side * math.pi / 4)) for side in (1.0, -1.0)]
+    lean = math.acos(1.0 / math.sqrt(3.0))  # of a cube's faces to its diagonal
+    return [Pose(about_axis(2, 2.0 * math.pi * k / 3.0) @ about_axis(0, lean)) for k in range(3)]
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What a kind of return does.
+
+    Attributes:
+        kind: of RETURNS.
+        across, along: (2,) motion of the spots (left, right) over the motion of the line CCD across and along the line.
+        gain: (4,) corrected reading over truth, single changes.
+    """
+
+    kind: str
+    across: np.ndarray
+    along: np.ndarray
+    gain: np.ndarray
+
+
+def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Response]:
+    """All kinds of return, by rendered images."""
+    camera, pitch = like.cameras[0], resolved.instrument.autocollimator.area_ccd.pitch
+    out = []
+    for kind, (offset, _) in RETURNS.items():
+        built = with_return(variant(resolved, backend, camera, ccd_offset=offset), kind)
+        bench = Bench(built, like)
+        states = [{}, piston(camera, 0.0, along=(SHIFT, 0.0)), piston(camera, 0.0, along=(0.0, SHIFT))]
+        place = bench.positions(states)
+        moved = (place[1:] - place[0]) * pitch / SHIFT
+        # columns run along -X, rows along +Y
+        out.append(Response(kind, -moved[0, :, 1], moved[1, :, 0], gains(bench)[CORRECTED]))
+    return out
+
+
+def depth_of_focus(resolved: ResolvedJob, camera: str) -> float:
+    """2 λ N², where a quarter of a wave of defocus is reached at the monitor's wavelength, metres."""
+    spec = resolved.cameras[resolved.instrument.cameras[camera].camera]
+    return 2.0 * resolved.instrument.autocollimator.wavelength * (spec.focal_length / spec.entrance_pupil) ** 2
+
+
+def piston(camera: str, amount: float, *, along: tuple[float, float] = (0.0, 0.0), turn: float = 0.0) -> State:
+    """The line CCD moved along Z (and along X and Y, and turned about Z), metres and radians."""
+    return {f"{BASE}/{camera}/focal_plane": Motion(rotate=(0.0, 0.0, turn), shift=(*along, amount))}
+
+
+def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarray:
+    """Reading minus truth per metre of piston between before and after, (4,), table units, by images."""
+    camera = bench.cameras[0]
+    states = [piston(camera, z) for z in pistons]
+    readings = bench.readings(bench.positions([{}]), bench.positions(states))[camera][form]
+    false = readings - bench.truth(states)[camera]
+    z = np.array(pistons)
+    return np.asarray(z @ false / (z @ z))
+
+
+@dataclass(frozen=True, eq=False)
+class PupilStudy:
+    """False readings per piston over the place of the monitor's sub-aperture in the pupil.
+
+    Attributes:
+        offset: (N, 2) X, Y of the sub-aperture, metres.
+        slope: (N, 4) table units per metre of piston, corrected form.
+        gradient: (4, 2) change of the slope by X and Y, table units per m^2.
+        rest: (4,) rms of the slopes about that plane, table units per metre.
+    """
+
+    offset: np.ndarray
+    slope: np.ndarray
+    gradient: np.ndarray
+    rest: np.ndarray
+
+
+def pupil_study(
+    resolved: ResolvedJob, backend: Backend, like: Bench, offsets: Sequence[tuple[float, float]], depth: float
+) -> PupilStudy:
+    """Build the instrument anew with each sub-aperture and defocus it."""
+    slopes = []
+    for offset in offsets:
+        bench = Bench(variant(resolved, backend, like.cameras[0], pupil_offset=offset), like)
+        slopes.append(false_slopes(bench, CORRECTED, (-depth, depth)))
+    place, slope = np.array(offsets), np.array(slopes)
+    design = np.column_stack([np.ones(len(place)), place])
+    solved, *_ = np.linalg.lstsq(design, slope, rcond=None)
+    rest = np.sqrt(np.mean((slope - design @ solved) ** 2, axis=0))
+    return PupilStudy(place, slope, solved[1:].T, rest)
+
+
+def piston_curves(bench: Bench, count: int) -> Curves:
+    """The false readings of the corrected form over the piston (metres), as shares of FINE and CLAIMED, the worse of
+    the two directions.
+    """
+    camera, origin = bench.cameras[0], bench.positions([{}])
+
+    def shares(size: np.ndarray) -> dict[str, np.ndarray]:
+        states = [piston(camera, sign * z) for sign in (1.0, -1.0) for z in size]
+        readings = bench.readings(origin, bench.positions(states))[camera][CORRECTED]
+        false = np.abs(readings - bench.truth(states)[camera]).reshape(2, len(size), 4).max(axis=0)
+        out = {}
+        for k, name in enumerate(NAMES):
+            out[f"{name} fine"] = false[:, k] / FINE[name]
+            out[f"{name} claimed"] = false[:, k] / CLAIMED[name]
+        return out
+
+    return sampled(shares, np.geomspace(10e-6, 4e-3, count).tolist())
+
+
+def gains(bench: Bench, constant: float = 0.0) -> dict[str, np.ndarray]:
+    """Form -> (4,) reading over truth of SMALL single changes, with the same piston (metres) before and after."""
+    camera = bench.cameras[0]
+    states: list[State] = [piston(camera, constant)]
+    for name in NAMES:
+        motion, unit = motion_of(camera, name, bench.geometry(camera))
+        amount = unit * SMALL[name]
+        if name == "d_f":
+            states.append({**piston(camera, constant), motion.body: motion.motion(amount)})
+        elif name == "d_gamma":
+            states.append(piston(camera, constant, turn=amount))
+        else:
+            along = (amount, 0.0) if name == "d_alpha" else (0.0, amount)
+            states.append(piston(camera, constant, along=along))
+    place, truth = bench.positions(states), bench.truth(states)[camera]
+    change = np.diag(truth[1:] - truth[:1])
+    readings = bench.readings(place[:1], place[1:])[camera]
+    return {form: np.diag(readings[form]) / change for form in FORMS}
+
+
+@dataclass(frozen=True, eq=False)
+class FieldPoint:
+    """The formulas with the area CCDs at another field.
+
+    Attributes:
+        field: radians. separation: of the area CCDs, metres.
+        gains: form -> (4,) reading over truth.
+        slope: (4,) false reading per metre of piston, corrected form, table units.
+    """
+
+    field: float
+    separation: float
+    gains: dict[str, np.ndarray]
+    slope: np.ndarray
+
+
+def field_study(
+    resolved: ResolvedJob, backend: Backend, camera: str, fields: Sequence[float], depth: float
+) -> list[FieldPoint]:
+    """Build the instrument anew with the area CCDs at each field (radians)."""
+    out = []
+    for field in fields:
+        bench = Bench(variant(resolved, backend, camera, field=field))
+        slope = false_slopes(bench, CORRECTED, (-depth, depth))
+        out.append(FieldPoint(field, bench.geometry(camera).separation_m, gains(bench), slope))
+    return out
