@@ -17,6 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
+from analysis.monitor import autocollimator, recovery
 from analysis.monitor.monitoring import MonitorGeometry
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree, State

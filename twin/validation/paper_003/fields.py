@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from analysis.arrays import ARCSEC
 from analysis.orbit.forward_intersection import third_difference
+from analysis.orbit.planes import height_error
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES

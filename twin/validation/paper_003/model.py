@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from analysis.arrays import ARCSEC
-from analysis.calibration.adjustment import Adjustment
+from analysis.calibration.adjustment import Adjustment, adjust
 from analysis.calibration.strip_adjustment import Stepwise, stepwise
-from analysis.orbit.calibration_parameters import Gauge
+from analysis.orbit.calibration_parameters import Combination, Gauge
 from analysis.orbit.forward_intersection import CheckErrors
-from analysis.orbit.three_line_model import BIAS, INTERIOR, misclosure, partials
+from analysis.orbit.three_line_model import BIAS, INTERIOR, Rays, misclosure, partials
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
