@@ -176,7 +176,7 @@ class _Sentences(Formatter):
         return format(value, digits)
 
 
-def sentence(text: str, facts: Mapping[str, object]) -> str:
+def sentence(text: str, facts: Mapping[str, Any]) -> str:
     """Return a text of ``printed.yaml`` with its facts.
 
     Args:
@@ -437,7 +437,7 @@ class Check(Spec):
         implied: float | None = None,
         explained: Sequence[float | None] = (),
         inputs: Sequence[Chosen | Supposed] = (),
-        facts: Mapping[str, object] = FrozenMap(),
+        facts: Mapping[str, Any] = FrozenMap(),
     ) -> CheckResult:
         """The result, with the verdict that the numbers give.
 
@@ -500,12 +500,7 @@ class Check(Spec):
         return {"two-sided": abs(distance), "at most": distance, "at least": -distance}[self.comparison]
 
     def _verdict(
-        self,
-        measured: float,
-        goal: float,
-        allowed: float,
-        explained: Sequence[float | None],
-        facts: Mapping[str, object],
+        self, measured: float, goal: float, allowed: float, explained: Sequence[float | None], facts: Mapping[str, Any]
     ) -> tuple[Verdict, str]:
         assert self.tells is not None
         weak = (
@@ -530,7 +525,7 @@ class Check(Spec):
         return REFUTED, sentence(self.otherwise, facts) or unknown
 
     def _result(self, measured: float | None, sigma: float | None, verdict: Verdict, how: str) -> CheckResult:
-        printed = {name: getattr(self, name) for name in _OF_THE_ROW}
+        printed: dict[str, Any] = {name: getattr(self, name) for name in _OF_THE_ROW}
         return CheckResult(
             **printed, implied=None, measured=measured, sigma=sigma, power=None, inputs=(), verdict=verdict, how=how,
             seconds=0.0,

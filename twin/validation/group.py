@@ -117,7 +117,7 @@ class Context:
         """Add data with the title and caption that stand beside the group's rows."""
         self.add(Data(name, *self._said(name, {}), content))
 
-    def _said(self, name: str, facts: Mapping[str, object]) -> tuple[str, str]:
+    def _said(self, name: str, facts: Mapping[str, Any]) -> tuple[str, str]:
         text = self.texts[name]
         return sentence(text.title, facts), sentence(text.caption, facts)
 

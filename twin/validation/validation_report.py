@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 from markupsafe import Markup
 
@@ -314,6 +315,11 @@ def write_validation(validation: Validation, folder: RunFolder) -> None:
     folder.write_text("validation.html", render_report(validation))
     for name, content in summary_files(validation).items():
         folder.write_bytes(f"{SUMMARY}/{name}", content)
-    entries = {"backend": validation.backend, "seed": validation.seed, "only": validation.only, "fast": validation.fast}
+    entries: dict[str, Any] = {
+        "backend": validation.backend,
+        "seed": validation.seed,
+        "only": validation.only,
+        "fast": validation.fast,
+    }
     again = _words(validation)
     write_manifest(folder, PROGRAM, validation.started, validation.seconds, **entries, again=again)

@@ -421,7 +421,7 @@ def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
     """
     file = Path(test.source.file)
     if test.data is None:
-        said = {"conventions": test.conventions, "passes": test.passes}
+        said: dict[str, Any] = {"conventions": test.conventions, "passes": test.passes}
         data = measurements.OrbitDataSpec.model_construct(**said).with_source(test.source)
     else:
         place = file.parent / test.data

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -105,9 +106,7 @@ def setup_of(name: str, **changes: object) -> AngleSetup:
     """A test of the library; changes: fields of its `errors`, or latitude, longitude and direction of its pass."""
     setup = AngleSetup.read(name)
     test = setup.test
-    place: dict[str, object] = {
-        key: changes.pop(key) for key in ("latitude", "longitude", "direction") if key in changes
-    }
+    place: dict[str, Any] = {key: changes.pop(key) for key in ("latitude", "longitude", "direction") if key in changes}
     if place:
         assert test.orbit.passing is not None
         passing = test.orbit.passing.model_copy(update=place)
@@ -361,7 +360,7 @@ def _angle(planes: Planes, which: int, identifier: str) -> CheckResult:
     flight = planes.passes.flight
     truth = values_of(flight.dihedral)[which]
     off = planes.angles[:, which] - truth
-    facts = {"truth": truth, "off": off, "look": values_of(flight.look)[which] - truth}
+    facts: dict[str, Any] = {"truth": truth, "off": off, "look": values_of(flight.look)[which] - truth}
     return planes.row(identifier, *mean_of(off / ARCSEC), 0.0, **facts)
 
 
@@ -386,7 +385,7 @@ def _parallel(planes: Planes) -> CheckResult:
     flight = planes.passes.flight
     look = flight.look["alpha"]
     law = float(TWIST**2 / (2.0 * np.tan(look)) / ARCSEC)
-    facts = {"both": np.concatenate(off), "aligned": flight.dihedral["alpha"] - look}
+    facts: dict[str, Any] = {"both": np.concatenate(off), "aligned": flight.dihedral["alpha"] - look}
     # turned both ways, so that the arrays' own 35 arcsec of laboratory and launch count in square only
     return planes.row("000.eq6.parallel", *mean_of(0.5 * (off[0] + off[1])), 0.0, [law], **facts)
 
@@ -426,7 +425,7 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
     for name, (what, which, value) in cases.items():
         effect = rows[what]
         measured = float(effect.bias[which] / ARCSEC)
-        facts = {"effect": effect, "tilt": speed / ARCSEC}
+        facts: dict[str, Any] = {"effect": effect, "tilt": speed / ARCSEC}
         yield context.row(f"000.light.{name}", measured, None, 0.0, [value], **facts)
 
 
@@ -460,7 +459,7 @@ def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
 
     common = [centred(m, section) for m, section in zip(passes.measured, passes.sections, strict=True)]
     value, sigma = off(common)
-    facts = {"passes": passes, "trace": trace, "by_planes": trace / ARCSEC + value}
+    facts: dict[str, Any] = {"passes": passes, "trace": trace, "by_planes": trace / ARCSEC + value}
     yield context.row("000.traced", value, sigma, 0.0, **facts)
     apart = (_seen(passes, first) - _seen(passes, second)) / ARCSEC
     yield context.row("000.centres", *off(passes.measured), 0.0, [apart], **facts)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -123,7 +123,11 @@ def run_table_1(context: Context) -> Iterator[CheckResult]:
         sigma = float(same.spread[k])
         variance = same.planes_sigma[k] ** 2 - same.resection_sigma[k] ** 2
         noise = sigma / np.sqrt(2.0 * (len(same.values) - 1))
-        facts = {"same": same, "both": [same.planes_sigma[k], same.resection_sigma[k]], "printed": printed}
+        facts: dict[str, Any] = {
+            "same": same,
+            "both": [same.planes_sigma[k], same.resection_sigma[k]],
+            "printed": printed,
+        }
         facts["times"] = printed / sigma
         yield context.row(f"000.table1.{name}", sigma, noise, float(np.sqrt(max(variance, 0.0))), **facts)
     for k, name in enumerate(PRINTED_ARCSEC):
@@ -164,7 +168,7 @@ def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
     forward, nadir, backward = (_pitch_variance(data.light, line) for line in LINES)
     simple = np.array([[forward + nadir, -nadir], [-nadir, nadir + backward]])
     pair = np.array([ALPHA, BETA])
-    facts = {
+    facts: dict[str, Any] = {
         "correlation": covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]),
         "own": own,
         "distance": _distance(pair - np.mean(own.values, axis=0), np.cov(own.values.T)),
@@ -199,7 +203,7 @@ def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
         worst = int(np.argmax(rms))
         inputs = _points(partial(_rms, float(mean[worst]), float(spread[worst])))
         noise = float(spread[worst] / np.sqrt(len(off)))
-        facts = {"off": off, "point": POINT_SIGMA, "light": light, "mean": mean, "spread": spread}
+        facts: dict[str, Any] = {"off": off, "point": POINT_SIGMA, "light": light, "mean": mean, "spread": spread}
         yield context.row(identifier, rms[worst], noise, inputs=inputs, **facts)
 
 
@@ -333,7 +337,7 @@ def places_svg(figure: Figure, held: Mapping[Place, int], total: int, marked: Se
     axes = figure.subplots()
     lat, lon = (np.unique([place[k] for place in held]) for k in (0, 1))
     grid = np.array([[held[a, b] for b in lon] for a in lat])
-    span = {"vmin": grid.min() - 0.5, "vmax": total + 0.5}
+    span: dict[str, Any] = {"vmin": grid.min() - 0.5, "vmax": total + 0.5}
     mesh = axes.pcolormesh(lon, lat, grid, cmap="cividis", shading="nearest", **span)
     for (a, b), count in held.items():
         colour = "white" if (count - grid.min()) / (total - grid.min()) < 0.55 else INK
@@ -383,7 +387,7 @@ def make_passes(
     context: Context, place: Place | None = None, count: int | None = None, direction: str = "descending"
 ) -> Passes:
     """Measurements at the place of the library's test, or at another (latitude, longitude), degrees."""
-    at: dict[str, object] = {"direction": direction}
+    at: dict[str, Any] = {"direction": direction}
     if place is not None:
         at |= {"latitude": np.radians(place[0]), "longitude": np.radians(place[1])}
     many = context.count(full=60, fast=10) if count is None else count
@@ -422,7 +426,7 @@ def _row(
     values = np.array([sentence.measure(a.rises, a.growth) for a in found])
     mean = {axis: np.mean([a.rises[sentence.what, sentence.angle, axis] for a in found]) for axis in AXES}
     place = _place([sentence], places)
-    facts = {
+    facts: dict[str, Any] = {
         "found": found,
         "mean": {axis: f"{value:+.3f}″" for axis, value in mean.items()},
         "place": place,
@@ -461,7 +465,7 @@ def _ordinate(context: Context, found: list[Answers], places: Mapping[Place, Ans
         for sign in (1.0, -1.0)
     )
     count = sum(len(s.axes + s.others) for s in signs)
-    facts = {"sentences": signs, "signs": count, "found": found, "other": other}
+    facts: dict[str, Any] = {"sentences": signs, "signs": count, "found": found, "other": other}
     return context.row("000.fig3.ordinate", share, None, 1.0, inputs=[_place(signs, places)], **facts)
 
 
@@ -526,7 +530,8 @@ def _show(context: Context, shown: Answers, places: Mapping[Place, Answers]) -> 
     context.figure("places", places_svg(held, len(SENTENCES), ((40.0, 116.0), ELSEWHERE)), total=len(SENTENCES))
     context.table("readings", _readings(context), total=len(SENTENCES))
     moved = ((what, axis) for what in ("station", "forward", "nadir", "backward") for axis in AXES)
-    rows = [(what, axis, *(shown.rises[what, angle, axis] for angle in ("alpha", "beta"))) for what, axis in moved]
+    angles = ("alpha", "beta")
+    rows = [(what, axis, *(float(shown.rises[what, angle, axis]) for angle in angles)) for what, axis in moved]
     context.table("changes", rows)
 
 

@@ -245,7 +245,7 @@ def run(context: Context) -> Iterator[CheckResult]:
         # proportional to the input, but for the centroid's light, whose power the budget's own search tells
         power = log(0.1 * ARCSEC / value) / log(line.allowed / line.value)
         chosen = Chosen.power(_INPUT_OF[name], line.value, line.unit, value / ARCSEC, power)
-        facts = {"line": line, "trials": trials, "images": images}
+        facts: dict[str, Any] = {"line": line, "trials": trials, "images": images}
         row = f"001.table3.{name}"
         yield context.row(row, value / ARCSEC, line.sigma / ARCSEC, inputs=[chosen], **facts)
     if images.halved is not None:
@@ -278,7 +278,7 @@ def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
 
 def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
     """(12) and Table 4."""
-    facts: dict[str, object] = {"images": images, "frames": FRAMES}
+    facts: dict[str, Any] = {"images": images, "frames": FRAMES}
     if {"001.eq12", "001.table4.root_sum"} & context.selected:
         total, sigma = root_sum_of_squares(images.lines)
         inputs = [_in_sum(images, name, total / ARCSEC) for name in _LARGEST]
@@ -292,8 +292,8 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         largest = 1.0 + context.check("001.eq12").tolerance + SIGMAS * noise
         most = ((largest / measured) ** 2 - 1.0) / ((plain / total) ** 2 - 1.0)
         limit = f"holds up to a correlation of {max(most, 0.0):.2g} of all pairs"
-        inputs = [Supposed("causes that are independent", limit)]
-        yield context.row("001.eq12", measured, noise, inputs=inputs, value=value, total=total, plain=plain, **facts)
+        supposed = [Supposed("causes that are independent", limit)]
+        yield context.row("001.eq12", measured, noise, inputs=supposed, value=value, total=total, plain=plain, **facts)
     if images.scatter is not None:
         (single, s_sigma), (mean, m_sigma) = images.scatter
         rest = root_sum({n: v for n, v in TABLE_3.items() if n != "centroid"})
@@ -325,7 +325,7 @@ def _all_causes(value: float) -> list[Chosen]:
 
 def _monitored(context: Context, images: BudgetImages, together: Together) -> Iterator[CheckResult]:
     """Rows of all causes at once, Table 5 among them, with its errors by formula and by Monte Carlo."""
-    facts: dict[str, object] = {"images": images, "frames": FRAMES}
+    facts: dict[str, Any] = {"images": images, "frames": FRAMES}
 
     def row(identifier: str, error: tuple[float, float], unit: float, implied: float | None = None) -> CheckResult:
         value, sigma = error[0] / unit, error[1] / unit

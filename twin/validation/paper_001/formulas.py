@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from statistics import fmean
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -50,7 +50,13 @@ SMALLEST = 0.5
 """Smallest size of a random motion, as a share of its AMOUNTS."""
 UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
 """Units of the response matrix: arcsec and micrometres."""
-_FACTS = {"frames": FRAMES, "instrument": INSTRUMENT, "amounts": AMOUNTS, "piston": PISTON, "face": FACE}
+_FACTS: dict[str, Any] = {
+    "frames": FRAMES,
+    "instrument": INSTRUMENT,
+    "amounts": AMOUNTS,
+    "piston": PISTON,
+    "face": FACE,
+}
 
 
 def roll_displacement(x_left: Value, x_right: Value) -> Value:
@@ -338,7 +344,8 @@ def run(context: Context) -> Iterator[CheckResult]:
     shown = {i: ratio for i, ratio in ratios.items() if i in context.selected}
     if shown:
         _show_ratios(context, "ratios", {i: ratio.value for i, ratio in shown.items()})
-        rows = [[i, *(number for pair in ratio.cameras.values() for number in pair)] for i, ratio in shown.items()]
+        numbers = {i: [float(one) for pair in ratio.cameras.values() for one in pair] for i, ratio in shown.items()}
+        rows: list[list[Cell]] = [[i, *own] for i, own in numbers.items()]
         context.table("cameras", rows)
 
 
@@ -357,7 +364,16 @@ def _singles(context: Context, images: SingleMotions, shown: dict[str, Ratio]) -
 
     def row(identifier: str, ratio: Ratio, *explained: float | None, **facts: object) -> CheckResult:
         shown.setdefault(identifier, ratio)
-        more = {"ratio": ratio, "images": images, "f": f, "f_x": f_x, "local": local, "cos2": cos2, **_FACTS, **facts}
+        more: dict[str, Any] = {
+            "ratio": ratio,
+            "images": images,
+            "f": f,
+            "f_x": f_x,
+            "local": local,
+            "cos2": cos2,
+            **_FACTS,
+            **facts,
+        }
         implied = {"001.eq2.cos2": cos2, "001.eq3.cos2": 1.0}.get(identifier)
         return context.row(identifier, ratio.value, ratio.sigma, implied, explained, **more)
 
@@ -511,7 +527,7 @@ def joint_images(context: Context) -> JointMotions:
 def run_joint(context: Context) -> Iterator[CheckResult]:
     """All checks of the joint form; the images of all states are one batch."""
     images = joint_images(context)
-    ratios = {
+    ratios: dict[str, Any] = {
         "001.eq8.y": images.superposition("d_f", "d_beta", "Y"),
         "001.eq8.x": images.superposition("d_alpha", "d_gamma", "X"),
         "001.eq8.d_gamma_alone": images.stray("d_gamma", "Y", "X"),
@@ -544,7 +560,7 @@ def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
         "d_gamma_by_d_beta": (2, 1, -2.0 * f_x / f * g.d_gamma_per_beta),
         "d_f_by_d_alpha": (3, 0, -0.5 * g.d_f_per_alpha_m * ARCSEC / 1e-6),
     }
-    facts = {"images": images, "f": f, "f_x": f_x, "local": images.local_share, **_FACTS}
+    facts: dict[str, Any] = {"images": images, "f": f, "f_x": f_x, "local": images.local_share, **_FACTS}
     for name, (k, n, predicted) in rows.items():
         identifier = f"001.table1.{name}"
         yield context.row(identifier, matrix[k, n], sigma[k, n], None, [predicted], right=right[k, n], **facts)
@@ -564,7 +580,7 @@ def _angle(context: Context, images: JointMotions) -> CheckResult:
     better = images.angle("derived")
     f, f_x = focal_lengths(images.first)
     change = np.std(images.truth.angle_change[images.mixtures])
-    facts = {"images": images, "change": change, "rest": rest, "better": better}
+    facts: dict[str, Any] = {"images": images, "change": change, "rest": rest, "better": better}
     return context.row("001.fig4.angle", slope, sigma, None, [f_x / f], **facts)
 
 

@@ -19,7 +19,8 @@ from twin.validation.check import CheckResult
 from twin.validation.group import Context, drawing, group_of
 from twin.validation.paper_001 import ranges
 from twin.validation.paper_001.formulas import INSTRUMENT, focal_lengths
-from twin.validation.paper_001.ranges import CALIBRATED, CLAIMED, CORRECTED, FINE, FORMS, JOINT, NAMES, PRINTED
+from twin.validation.paper_001.formulas import PARAMETERS as NAMES
+from twin.validation.paper_001.ranges import CALIBRATED, CLAIMED, CORRECTED, FINE, FORMS, JOINT, PRINTED
 
 OTHER = "gf7_pair"
 """A camera of another focal length than that which Table 5 implies, in full runs."""
@@ -34,7 +35,7 @@ _SINGLE = (*(f"001.{equation}.range" for equation in _BY_EQUATION), "001.small_a
 _COLOURS = {PRINTED: VERMILION, JOINT: ORANGE, CORRECTED: BLUE, CALIBRATED: GREEN}
 _MARKS = {PRINTED: "o", JOINT: "D", CORRECTED: "s", CALIBRATED: "^"}
 _OF_PARAMETER = {"d_alpha": VERMILION, "d_beta": BLUE, "d_gamma": GREEN, "d_f": PURPLE}
-Data = dict[str, object]
+Data = dict[str, Any]
 """All ranges as data, to which each part of the checks adds its own."""
 
 
@@ -123,7 +124,7 @@ def _range(context: Context, identifier: str, both: list[ranges.Range], geometry
     f, f_x = focal_lengths(geometry)
     share = {"d_alpha": f_x / f - 1.0, "d_gamma": 2.0 * f_x / f - 1.0}.get(name)
     lost, why = min((r.lost, r.lost_why) for r in both)
-    facts = {
+    facts: dict[str, Any] = {
         "images": sum(len(r.images.size) for r in both),
         "wide": ranges.WIDE_PX,
         "last": both[0].images.size[-1] * per,
@@ -155,7 +156,7 @@ def _small(context: Context, own: Mapping[str, list[ranges.Range]]) -> CheckResu
             share = float(np.max(np.abs(linear / arctan - 1.0)[inside]))
             if share >= worst:
                 worst, where = share, f"{ranges.EQUATIONS[name]} at {r.window:.4g}″"
-    facts = {"where": where, "percent": math.sqrt(0.03), "tenth": (0.3 * ARCSEC) ** (1 / 3)}
+    facts: dict[str, Any] = {"where": where, "percent": math.sqrt(0.03), "tenth": (0.3 * ARCSEC) ** (1 / 3)}
     return context.row("001.small_angles.range", worst, implied=0.0, **facts)
 
 
@@ -170,7 +171,7 @@ def _field(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data: D
     ratio, bare = (last.gains[form][k] / first.gains[form][k] for form in (PRINTED, CORRECTED))
     cos2 = (math.cos(last.field) / math.cos(first.field)) ** 2
     ends = {n: f"{first.gains[PRINTED][j]:.4f} and {last.gains[PRINTED][j]:.4f}" for j, n in enumerate(NAMES)}
-    facts = {"points": points, "first": first, "last": last, "bare": bare, "ends": ends}
+    facts: dict[str, Any] = {"points": points, "first": first, "last": last, "bare": bare, "ends": ends}
     return context.row("001.eq2.range.field", ratio, None, 1.0, [cos2], **facts)
 
 
@@ -183,11 +184,11 @@ def _joint(context: Context, data: Data) -> Iterator[CheckResult]:
     context.progress(0.65, f"{trials} random changes with noise")
     found = ranges.separation(experiment, bench, trials, context.seed)
     _show_joint(context, corners, found, data)
-    facts: dict[str, object] = {"trials": trials, "box": ranges.BOX_TEXT, "bench": bench}
+    facts: dict[str, Any] = {"trials": trials, "box": ranges.BOX_TEXT, "bench": bench}
     explained = _box_limits(bench.geometry(bench.cameras[0]))
     for k, name in enumerate(NAMES):
         share, whence = corners.limit(ranges.key(JOINT, name))
-        more = {
+        more: dict[str, Any] = {
             "images": 16 * len(corners.images.size),
             "whence": whence,
             "corrected": corners.text(ranges.key(CORRECTED, name)),
@@ -235,7 +236,7 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
     f, f_x = focal_lengths(bench.geometry(camera))
     _show_defocus(context, slope, curves, change, pupil, (f_x, f), data)
     offset = next(iter(resolved.instrument.channels_of(camera).values())).pupil_offset[0]
-    facts = {
+    facts: dict[str, Any] = {
         "instrument": INSTRUMENT,
         "camera": camera,
         "offset": offset,
@@ -248,7 +249,7 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
     for equation, name in _BY_EQUATION.items():
         k = NAMES.index(name)
         edge = curves.crossing(f"{name} claimed")
-        more = {
+        more: dict[str, Any] = {
             "slope": slope[k] * 1e-6,
             "false": abs(slope[k]) * ranges.CONFOCAL,
             "unit": " µm" if name == "d_f" else "″",
@@ -279,7 +280,7 @@ def _returns(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
             "roof along": across,
             "corner": max((across, along), key=abs),
         }[r.kind]
-        facts = {
+        facts: dict[str, Any] = {
             "note": note,
             "shift": ranges.SHIFT,
             "across": _four(across),
@@ -453,12 +454,12 @@ def _show_causes(
 def _show_singles(context: Context, found: Mapping[str, Mapping[str, list[ranges.Range]]], data: Data) -> None:
     """Domains of every formula by itself."""
     rows: list[list[Cell]] = []
-    listed: dict[str, dict[str, object]] = {instrument: {} for instrument in found}
+    listed: dict[str, dict[str, Any]] = {instrument: {} for instrument in found}
     for instrument, name in ((instrument, name) for instrument in found for name in NAMES):
         both = found[instrument][name]
         per, unit, _ = _shown(name)
         ends = min(r.window for r in both), min(r.lost for r in both)
-        entry: dict[str, object] = {f"area_ccd_ends_at_{unit}": ends[0] * per, f"beam_cut_at_{unit}": ends[1] * per}
+        entry: dict[str, Any] = {f"area_ccd_ends_at_{unit}": ends[0] * per, f"beam_cut_at_{unit}": ends[1] * per}
         for form in FORMS:
             if form in (PRINTED, CORRECTED) or (form == JOINT and name == "d_f"):
                 limits = (limit_text(both, form, kind) for kind in ranges.KINDS)
@@ -508,7 +509,7 @@ def _show_defocus(
     """False readings by defocus; ``change`` of the gain; ``focal``: across and along the line, metres."""
     theory = {name: 1.0 / f**2 / ARCSEC for name, f in zip(("d_alpha", "d_beta"), focal, strict=True)}
     rows: list[list[Cell]] = []
-    listed: dict[str, object] = {}
+    listed: dict[str, Any] = {}
     for k, name in enumerate(NAMES):
         unit, expected = ranges.UNITS[name], theory.get(name)
         fine, claimed = (curves.crossing(f"{name} {kind}") for kind in ("fine", "claimed"))
@@ -541,7 +542,7 @@ def _show_field(context: Context, points: Sequence[ranges.FieldPoint], data: Dat
         false = {name: float(1e-6 * p.slope[NAMES.index(name)]) for name in ("d_alpha", "d_f")}
         corrected = (gains[CORRECTED][name] for name in _ORDER)
         rows.append([math.degrees(p.field), p.separation, gains[PRINTED]["d_beta"], *corrected, *false.values()])
-        place = {"field_deg": math.degrees(p.field), "separation_m": p.separation}
+        place: dict[str, Any] = {"field_deg": math.degrees(p.field), "separation_m": p.separation}
         by_defocus = {"false_d_alpha_arcsec_per_um": false["d_alpha"], "false_d_f_um_per_um": false["d_f"]}
         listed.append({**place, "reading_over_truth": gains, **by_defocus})
     context.table("field", rows)

@@ -85,10 +85,14 @@ def run(context: Context) -> Iterator[CheckResult]:
     yield from _relations(context, found)
     worst, spread = max(differences.values())
     text = ", ".join(f"about {axis} {value:.3f}" for axis, (value, _) in differences.items())
-    facts = {"found": found, "text": text, "printed": {axis: printed_mean_difference(axis) for axis in differences}}
-    for row in ("mean_error", "below_1"):
+    facts: dict[str, Any] = {
+        "found": found,
+        "text": text,
+        "printed": {axis: printed_mean_difference(axis) for axis in differences},
+    }
+    for name in ("mean_error", "below_1"):
         sigma = spread / math.sqrt(len(found.real))
-        yield context.row(f"001.table2.{row}", worst, sigma, inputs=[_errors(worst)], **facts)
+        yield context.row(f"001.table2.{name}", worst, sigma, inputs=[_errors(worst)], **facts)
     _show(context, found)
 
 
@@ -105,7 +109,7 @@ def _mean_difference(context: Context, found: Measured, series: laboratory.Serie
     perfect, result = found.ideal[axis], found.real[0][axis]
     means = np.array([table[axis].mean_difference for table in found.real])
     spread = laboratory.declared_spread(spec, series, float(np.max(result.sigma)) / math.sqrt(2.0))
-    facts = {
+    facts: dict[str, Any] = {
         "found": found,
         "result": result,
         "rows": series.steps + 1,
@@ -131,7 +135,7 @@ def _z_columns(context: Context, found: Measured) -> CheckResult:
     unrest = 2.0 * spec.errors.reading / ARCSEC
     chance = math.erf(0.005 / (unrest * math.sqrt(2.0))) ** len(one) if unrest > 0.0 else 0.0
     apart = np.max(np.abs(scale * first - second), axis=1)
-    facts = {
+    facts: dict[str, Any] = {
         "scale": scale,
         "one": one,
         "twice": one[1] * 2.0 / math.sqrt(3.0),
@@ -158,7 +162,7 @@ def _relations(context: Context, found: Measured) -> Iterator[CheckResult]:
         result, component = found.ideal[axis], column_component(axis)
         between = 2.0 * result.series.half_angle
         read = float(result.readings[1, -1, component] / result.series.angles[-1])
-        facts = {"series": result.series, "between": between, "read": read, "own": "XY"[component]}
+        facts: dict[str, Any] = {"series": result.series, "between": between, "read": read, "own": "XY"[component]}
         row = f"001.table2.relation.{axis.lower()}"
         yield context.row(row, read / autocollimator.relation_factor(axis, 2, between), **facts)
     result = found.ideal["Z"]

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -231,7 +232,7 @@ def _readings(first: float, last: float, interval: float) -> np.ndarray:
 def _quality(context: Context, campaigns: Sequence[Campaign], setup: CalibrationSetup) -> Iterator[CheckResult]:
     found = quality_of(setup, campaigns)
     errors, passes = setup.test.errors, found.orbit.shape[0] * found.orbit.shape[1]
-    facts: dict[str, object] = {"found": found, "passes": passes, "campaigns": campaigns}
+    facts: dict[str, Any] = {"found": found, "passes": passes, "campaigns": campaigns}
     worst, sigma = median_of(
         np.max([v.max(axis=1) / v.min(axis=1) for v in (found.orbit, found.attitude)], axis=(0, 2))
     )
@@ -256,7 +257,7 @@ def _quality(context: Context, campaigns: Sequence[Campaign], setup: Calibration
         truth = rms(again.attitude_error) / rms(found.attitude_error)
         shown = again.attitude_sigma / rms(found.attitude_sigma)
         sigma = np.std(shown) / np.sqrt(shown.size)
-        yield context.row("003.table2.equal", np.mean(shown), sigma, truth, [1.0], slow=SLOW, truth=truth)
+        yield context.row("003.table2.equal", float(np.mean(shown)), sigma, truth, [1.0], slow=SLOW, truth=truth)
 
 
 def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
@@ -265,7 +266,7 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
     error = flights.bias - flights.true_bias
     for k, axis in enumerate(BIAS):
         value, sigma = median_of(scatter[:, k])
-        facts = {"true": true[:, k], "claimed": flights.bias_sigma[:, :, k], "error": error[:, :, k]}
+        facts: dict[str, Any] = {"true": true[:, k], "claimed": flights.bias_sigma[:, :, k], "error": error[:, :, k]}
         row = f"003.table3.{axis}"
         yield context.row(row, value, sigma, inputs=[all_errors(value)], flights=flights, **facts)
     value, sigma = median_of(np.sqrt(np.mean(error[:, :, :2] ** 2, axis=(1, 2))) / ARCSEC)
@@ -284,7 +285,7 @@ def _slope(context: Context, flights: Flights, number: int, k: int) -> CheckResu
     amplitude = np.array([row[k].amplitude for row in flights.fits]) / ARCSEC
     true = flights.true_amplitude[:, k] / ARCSEC
     own = [row[k].amplitude_sigma for row in flights.fits]
-    facts = {"flights": flights, "own": own, "away": amplitude - true}
+    facts: dict[str, Any] = {"flights": flights, "own": own, "away": amplitude - true}
     return context.row(f"003.fig{number}", amplitude.mean(), mean_of(amplitude - true)[1], true.mean(), **facts)
 
 
@@ -297,7 +298,13 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
         by = (rms(flights.interior_sigma[:, :, lines_of(p)[0]]) * 1e6 for p in parts)
         each = " and ".join(f"{v:.1f} µm in {p}" for v, p in zip(by, parts, strict=True))
     value, sigma = median_of(np.sqrt(np.mean(scatter**2, axis=1)))
-    facts = {"flights": flights, "places": places, "each": each, "ratio": rms(scatter) / claimed, "what": what}
+    facts: dict[str, Any] = {
+        "flights": flights,
+        "places": places,
+        "each": each,
+        "ratio": rms(scatter) / claimed,
+        "what": what,
+    }
     return context.row(f"003.table{number}", value, sigma, inputs=[all_errors(value)], **facts)
 
 
@@ -313,7 +320,7 @@ def schemes_svg(figure: Figure, found: Flights, plan: float, height: float) -> N
         for k, name in enumerate(found.fields):
             place = np.arange(values.shape[1]) + 0.11 * (k - 3)
             bars = np.stack([middle[:, k] - low[:, k], high[:, k] - middle[:, k]])
-            style = {"color": _COLOURS[k % 7], "fmt": _MARKERS[k % 7], "ms": 4.5, "lw": 1.1}
+            style: dict[str, Any] = {"color": _COLOURS[k % 7], "fmt": _MARKERS[k % 7], "ms": 4.5, "lw": 1.1}
             axes.errorbar(place, middle[:, k], bars, label=name, **style)
         axes.axhline(limit, color=GREY, lw=1.0, ls="--")
         axes.text(5.45, limit * 1.04, f"1:50 000, {limit:g} m", color=GREY, ha="right", va="bottom", fontsize=8.5)
@@ -387,7 +394,7 @@ def _schemes(context: Context, flights: Flights, setup: CalibrationSetup) -> Ite
         # the same draws are in both: only their difference counts
         sigma = median_of((fields - expected).mean(axis=1))[1]
         medians = dict(zip(flights.fields, np.median(fields, axis=0), strict=True))
-        facts = {"flights": flights, "medians": medians, "means": fields.mean(axis=1)}
+        facts: dict[str, Any] = {"flights": flights, "medians": medians, "means": fields.mean(axis=1)}
         facts["spread"] = np.std(facts["means"])
         yield context.row(f"003.scheme{k}.plan", value, sigma, float(np.median(expected.mean(axis=1))), **facts)
     height = flights.height.mean(axis=2)
@@ -410,8 +417,8 @@ def _schemes(context: Context, flights: Flights, setup: CalibrationSetup) -> Ite
         row = f"003.scale50000.{what}"
         yield context.row(row, value, sigma, limit, inputs=[all_errors(value)], **facts)
         value, sigma = median_of(getattr(flights, f"{what}_before").mean(axis=1))
-        inputs = [Chosen.power("what the launch changes, times", 1.0, "1", value)]
-        yield context.row(f"003.before.{what}", value, sigma, inputs=inputs, flights=flights)
+        launch = [Chosen.power("what the launch changes, times", 1.0, "1", value)]
+        yield context.row(f"003.before.{what}", value, sigma, inputs=launch, flights=flights)
 
 
 def _per_shift(setup: CalibrationSetup) -> float:
@@ -452,7 +459,7 @@ def _findings(context: Context, flights: Flights) -> Iterator[CheckResult]:
         "scheme4.improves": (lambda plan: plan[:, 3].mean(axis=1) / plan[:, 0].mean(axis=1), 0.9),
         "scheme4.unseen": (lambda plan: plan[:, 3, -1] / plan[:, 0, -1], 1.0),
     }
-    facts = {
+    facts: dict[str, Any] = {
         "flights": flights,
         "spread": np.median(plan.std(axis=2), axis=0),
         "ratio": np.median(plan.max(axis=2) / plan.min(axis=2), axis=0),

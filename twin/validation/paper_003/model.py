@@ -69,7 +69,7 @@ _SIGMA = 2.5
 """Metres: of a mark, half a pixel. The terrain's curvature under it moves its centroid by 0.004 px at most."""
 _APART = 300.0
 _REACH = MARGIN + 4
-_TERRAIN: dict[str, object] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4}
+_TERRAIN: dict[str, Any] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4}
 
 
 def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> CalibrationSetup:
@@ -562,7 +562,7 @@ def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
         context.progress(0.02, "render marks")
         misses = missed(setup, campaign, rendered_marks(setup, campaign, stream(seed, 1)))
         largest = {line: np.abs(miss).max() for line, miss in misses.items()}
-        facts = {
+        facts: dict[str, Any] = {
             "marks": sum(map(len, misses.values())),
             "largest": {line: f"{miss:.4f} px" for line, miss in largest.items()},
             "mean": max(float(np.abs(miss.mean(axis=0)).max()) for miss in misses.values()),
@@ -581,7 +581,7 @@ def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[Check
     campaign = source_of(setup, seed).independent
     if "003.model.rank" in context.selected:
         found = rank_of(setup, campaign)
-        facts = {
+        facts: dict[str, Any] = {
             "found": found,
             "combinations": "; ".join(str(o) for o in found.open),
             "pixels": found.weak_sigma / setup.camera.pitch,
@@ -617,7 +617,7 @@ def _yaw(context: Context, seed: np.random.SeedSequence) -> CheckResult:
             found = calibrated_alone(campaign, one)
             sigmas.append(found.sigma[f"{one.name} yaw"])
             ratios.append((found.bias(one.name) - one.bias)[BIAS.index("yaw")] / sigmas[-1])
-    facts = {"ratios": ratios, "sigmas": sigmas}
+    facts: dict[str, Any] = {"ratios": ratios, "sigmas": sigmas}
     return context.row("003.model.bias.yaw", rms(ratios), float(np.sqrt(0.5 / len(ratios))), 1.0, **facts)
 
 
@@ -632,7 +632,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
     spec = setup.test.images
     assert spec is not None
     count = f"{len(found)} field{'s' * (len(found) > 1)} of {len(spec.patches)}"
-    facts: dict[str, object] = {"fields": count, "spec": spec, "images": 3 * len(found) * len(spec.patches)}
+    facts: dict[str, Any] = {"fields": count, "spec": spec, "images": 3 * len(found) * len(spec.patches)}
     if "003.model.points" in context.selected:
         error, matched, wrong = matching(campaign)
         limit = setup_of(FIELDS).test.errors.image
@@ -651,9 +651,9 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
     rows = []
     for f in found:
         deviations = np.sqrt(np.diag(f.covariance))
-        for k, (name, error) in enumerate(f.error.items()):
-            unit, scale = ("arcsec", ARCSEC) if name in BIAS else ("µm", 1e-6)
-            rows.append((f.name, name, unit, error / scale, float(deviations[k]) / scale))
+        for k, (name, off) in enumerate(f.error.items()):
+            called, scale = ("arcsec", ARCSEC) if name in BIAS else ("µm", 1e-6)
+            rows.append((f.name, name, called, off / scale, float(deviations[k]) / scale))
     context.table("images", rows)
 
 

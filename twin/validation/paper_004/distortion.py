@@ -169,7 +169,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     tests = [SpotTest(run) for run in measured_tests(context)]
     places, sets = tests[0].run.record.reading.shape
     count = len(tests) * places * sets
-    facts = {
+    facts: dict[str, Any] = {
         "tests": tests,
         "rendered": f"{len(tests)} tests of {places} points and {sets} sets, {count} spots rendered",
         "points": POINTS,
@@ -214,7 +214,7 @@ def _table2(context: Context) -> Iterator[CheckResult]:
         ("mean", np.mean(raw), np.mean(own), share[0] / np.mean(raw), share[1] / np.mean(own)),
         ("largest", np.max(raw), np.max(own), top[0] / np.max(raw), top[1] / np.max(own)),
     )
-    facts = {"points": raw, "changed": np.sum(changed), "share": 100.0 * np.mean(changed)}
+    facts: dict[str, Any] = {"points": raw, "changed": np.sum(changed), "share": 100.0 * np.mean(changed)}
     facts |= {"worse": int(np.argmin(raw - own)) + 1, "worst": int(np.argmax(own)) + 1}
     for name, first, second, before, after in kinds:
         value = lower(first, second)
@@ -236,7 +236,7 @@ def _eq1(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
     zero = rms([t.zero for t in tests])
     need = ACCURACY_UM / (UM * left) * zero
     noise = UM * rms(freed) / np.sqrt(len(tests))
-    more = {"zero": zero, "alone": alone, "need": need, "freed": freed}
+    more: dict[str, Any] = {"zero": zero, "alone": alone, "need": need, "freed": freed}
     yield context.row("004.eq1.constant", UM * rms(printed), noise, None, [UM * left], **facts, **more)
     value = UM * float(np.max(freed))
     yield context.row("004.eq1.zero", value, inputs=[dividing(value)], **facts, **more)
@@ -269,7 +269,12 @@ def _eq2(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
     def zero(found: Array, predicted: Array, equation: str) -> CheckResult:
         """The principal point by a printed equation: the error of the zero comes out as p."""
         error, turn = found - p_true, rms([t.zero for t in tests])
-        more = {"equation": equation, "true": np.mean(p_true), "zero": turn, "rest": rms(error - predicted)}
+        more: dict[str, Any] = {
+            "equation": equation,
+            "true": np.mean(p_true),
+            "zero": turn,
+            "rest": rms(error - predicted),
+        }
         more["per_arcsec"] = MM * rms(predicted) / (turn / ARCSEC)
         sigma = MM * rms(p_sigma) / np.sqrt(len(tests))
         return context.row("004.eq2.p", MM * rms(error), sigma, None, [MM * rms(predicted)], **facts, **more)
@@ -306,7 +311,7 @@ def _uneven(
     true, turn = np.array([t.part.p for t in tests]), tests[0].true_turn[UNEVEN]
     scatter = MM * float(np.std(found - true, ddof=1))
     value, truth = MM * float(np.mean(true) + np.mean(found - true)), MM * float(np.mean(true))
-    more = {"uneven": turn, "scatter": scatter}
+    more: dict[str, Any] = {"uneven": turn, "scatter": scatter}
     return context.row(identifier, value, scatter / np.sqrt(len(tests)), truth, **facts, **more)
 
 
@@ -384,7 +389,8 @@ def _errors_of_tests(context: Context, tests: Sequence[SpotTest], facts: Facts) 
     moved = np.abs(UM * np.array([_moved(test) for test in tests]))
     expected = 100.0 * float(np.mean(np.minimum(moved / 0.1, 1.0)))
     more = {"share": share, "worse": 100.0 * float(np.mean([second > first for first, second in columns]))}
-    yield context.row("004.table2.points", *mean_of(share), None, [expected], **facts, **more)
+    value, sigma = mean_of(share)
+    yield context.row("004.table2.points", value, sigma, None, [expected], **facts, **more)
 
 
 def _moved(test: SpotTest) -> Array:
@@ -527,7 +533,7 @@ def _ignored(context: Context, places: Callable[[Array], Array], turn: Array, pi
     moved = where - shift, turn - beside
     second = distortion(*moved, principal_distance(*moved))
     change = float(np.max(np.abs(second - first)))
-    facts = {
+    facts: dict[str, Any] = {
         "turn": turn,
         "shift": shift,
         "change": change,

@@ -89,7 +89,12 @@ def _coupling(context: Context, bench: FocusBench) -> CheckResult:
         f"{name} changes {', '.join(p for p, s in zip(PARAMETERS, row, strict=True) if s)}"
         for name, row in zip(ADJUSTMENTS, np.abs(change) > LIMITS, strict=True)
     )
-    facts = {"sites": bench.sites, "changed": changed, "lost": abs(change[0, 2] / change[0, 0]), "tilt": tilt}
+    facts: dict[str, Any] = {
+        "sites": bench.sites,
+        "changed": changed,
+        "lost": abs(change[0, 2] / change[0, 0]),
+        "tilt": tilt,
+    }
     chosen = Chosen("inclination of the mounting surface", tilt, "deg", lambda factor: coupled(effects(bench, factor)))
     row = "004.alignment.coupling"
     return context.row(row, coupled(change), explained=[3.0], inputs=[chosen], **facts)
@@ -171,7 +176,7 @@ def run(context: Context) -> Iterator[CheckResult]:
                 return
         alignments = measured_alignments(context, bench)
         count = "One alignment" if len(alignments) == 1 else f"{len(alignments)} alignments"
-        facts = {"alignments": count, "sites": bench.sites}
+        facts: dict[str, Any] = {"alignments": count, "sites": bench.sites}
         if context.wants(*(f"004.table1.{name}" for name in (*MTF_NYQUIST, "frequency"))):
             yield from _mtf(context, alignments, {**facts, "alignments": count.lower()})
         if context.wants(*(f"004.alignment.{name}" for name in ("defocus", "plane", "constraint", "shims"))):
@@ -232,7 +237,12 @@ def _mtf(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[
         # of the traced pupils, along the track, where the chips stand after the alignment
         true = float(np.mean([a.states[-1].true_mtf[band] for a in alignments]))
         rows.append([band, f"{printed:.2f}", *(f"{v:.4f}" for v in (value, sigma, true, perfect, *rest.values()))])
-        more = {"edges": edges, "fields": alignment.bench.setup.test.fields, "true": true, "perfect": perfect}
+        more: dict[str, Any] = {
+            "edges": edges,
+            "fields": alignment.bench.setup.test.fields,
+            "true": true,
+            "perfect": perfect,
+        }
         inputs = _losses(rest, value)
         yield context.row(f"004.table1.{band}", value, sigma, inputs=inputs, lost=rest, **facts, **more)
         logs.append((_slope(edges), float(np.prod(list(rest.values())))))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     )
     often = {name: sum(table.chosen == name for table in tables) for name in CLOSED_FORMS}
     names = {FIT_NAMES[name]: count for name, count in often.items() if count}
-    facts = {"tables": tables, "lines": lines, "chosen": chosen, "network": network, "names": names}
+    facts: dict[str, Any] = {"tables": tables, "lines": lines, "chosen": chosen, "network": network, "names": names}
     for name, found in (("interpolation", lines), ("fit", chosen)):
         value = float(np.max(found))
         yield context.row(f"004.turntable.{name}", value, inputs=[dividing(value)], **facts)
@@ -95,7 +96,7 @@ def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckRe
     kept, gone = float(np.max(size[keep])), float(np.min(size[~keep]))
     # half a reading is expected beyond it, two-sided
     wanted = brentq(lambda x: REPEATS * erfc(x / np.sqrt(2.0)) - 0.5, 0.1, 5.0)
-    facts = {"series": series, "size": size, "kept": kept, "gone": gone}
+    facts: dict[str, Any] = {"series": series, "size": size, "kept": kept, "gone": gone}
     return context.row("004.turntable.criterion", 0.5 * (kept + gone), None, wanted, **facts)
 
 
@@ -122,7 +123,7 @@ def _repeats(
         "chauvenet": np.array([np.max(s.rms_after) for s in series]) / ARCSEC,
         "chauvenet_mean": np.array([s.averaging_alone for s in series]) / ARCSEC,
     }
-    facts = {
+    facts: dict[str, Any] = {
         "rejected": np.mean([s.rejected for s in series]),
         "comparisons": series[0].comparisons,
         "good": rejection_rate(REPEATS) * series[0].comparisons.size,
@@ -135,7 +136,7 @@ def _repeats(
             chosen = context.check(identifier).basis == "chosen"
             inputs = _readings(spec, seeds[:FAST_TABLES], identifier, value) if chosen else []
             explained = [REPEAT_RMS_ARCSEC / REPEATS**0.5] if name.endswith("mean") else []
-            more = {"found": found, "quartiles": np.percentile(found, [25.0, 75.0])}
+            more: dict[str, Any] = {"found": found, "quartiles": np.percentile(found, [25.0, 75.0])}
             yield context.row(identifier, value, sigma, None, explained, inputs, **facts, **more)
 
 
@@ -188,7 +189,7 @@ def _network(context: Context, tables: Sequence[FittedTable]) -> CheckResult:
     best = np.array([t.held_out[NETWORK] / rival for t, rival in zip(tables, rivals, strict=True)])
     ratio = np.array([t.held_out[NETWORK] / t.held_out[t.chosen] for t in tables])
     rank = _ranks(tables)[NETWORK]
-    facts = {"tables": tables, "ratio": ratio, "best": best, "rank": rank, "wins": np.sum(rank == 1.0)}
+    facts: dict[str, Any] = {"tables": tables, "ratio": ratio, "best": best, "rank": rank, "wins": np.sum(rank == 1.0)}
     # of a median, by the median distance from it: a training that ends in a bad minimum now and then is far off
     middle = float(np.median(ratio))
     sigma = float(np.sqrt(0.5 * np.pi / len(ratio)) * np.median(np.abs(ratio - middle)) / norm.ppf(0.75))

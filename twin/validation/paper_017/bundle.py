@@ -8,6 +8,7 @@ cameras are known in both, so that attitudes and image points alone differ.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -116,7 +117,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     drawn = draw_block(strip(IMAGE, 0.01), stream(root, count))
     # between the two the limit goes with a power of the image points' error
     power = np.log(measured / fine) / np.log(IMAGE / FINE)
-    facts = {
+    facts: dict[str, Any] = {
         "floor": height_error(drawn, True),
         "factor": factor,
         "finer": fine,
