@@ -530,8 +530,7 @@ def _show(context: Context, shown: Answers, places: Mapping[Place, Answers]) -> 
     context.figure("places", places_svg(held, len(SENTENCES), ((40.0, 116.0), ELSEWHERE)), total=len(SENTENCES))
     context.table("readings", _readings(context), total=len(SENTENCES))
     moved = ((what, axis) for what in ("station", "forward", "nadir", "backward") for axis in AXES)
-    angles = ("alpha", "beta")
-    rows = [(what, axis, *(float(shown.rises[what, angle, axis]) for angle in angles)) for what, axis in moved]
+    rows = [(w, a, float(shown.rises[w, "alpha", a]), float(shown.rises[w, "beta", a])) for w, a in moved]
     context.table("changes", rows)
 
 
