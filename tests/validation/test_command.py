@@ -29,7 +29,8 @@ from twin.validation.check import (
     Explanation,
 )
 from twin.validation.group import CheckGroup, Context
-from twin.validation.registry import UnknownCheck, names_in_files, select
+from twin.validation.registry import UnknownCheck, select
+from twin.validation.row_names import names_in_files
 from twin.validation.runner import run_checks
 
 run = partial(invoke, command.app)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from twin.validation import registry
 from twin.validation.check import PAPERS, REFUTED
-from twin.validation.registry import matches
+from twin.validation.row_names import matches
 from twin.validation.runner import run_checks
 
 SUMMARY = Path(__file__).resolve().parents[2] / "docs" / "validation" / "README.md"

@@ -27,7 +27,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table
 from twin.run.svg import look, new_figure, plain_axes, to_svg
 from twin.validation.check import Check, CheckResult, Chosen, Supposed, sentence
-from twin.validation.registry import FILE, FOLDER, matches
+from twin.validation.row_names import FILE, FOLDER, matches
 
 
 class ArtefactText(Spec):

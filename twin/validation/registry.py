@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scenes.yaml.errors import nearest
 from scenes.yaml.named import Named
+from twin.validation.row_names import matches, names_in_files
 
 if TYPE_CHECKING:  # all that the checks compute with
     from twin.validation.group import CheckGroup
@@ -37,13 +36,6 @@ _GROUPS = (
 )
 """Where each group is. A new one is added here."""
 
-FILE = "printed.yaml"
-"""Name of the file in each paper's folder."""
-FOLDER = Path(__file__).parent
-"""The folder of the papers' folders."""
-_ROW = re.compile(r"^      (\d{3}(?:\.\w+)+):$|^        also: \[(.*)\]$", re.M)
-"""A row's key below ``groups``, or its further ids."""
-
 GROUPS: tuple[CheckGroup, ...]
 """Every group, in the order in which they run; imported when it is asked for."""
 
@@ -53,24 +45,6 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     found = globals()[name] = tuple(named.get() for named in _GROUPS)
     return found
-
-
-def names_in_files() -> list[str]:
-    """Ids of all rows of all papers and further ids of the same rows, paper by paper.
-
-    They are read from the files as text: who asks for an unknown one is told so before anything that computes is
-    imported, and before YAML is read, which takes a second.
-    """
-    found: list[str] = []
-    for file in sorted(FOLDER.glob(f"paper_*/{FILE}")):
-        for own, further in _ROW.findall(file.read_text("utf-8")):
-            found += [own] if own else [name.strip() for name in further.split(",")]
-    return found
-
-
-def matches(identifier: str, prefix: str) -> bool:
-    """Whether an id lies under a prefix: ``001.table3`` takes ``001.table3.x`` and itself, but not ``001.table33``."""
-    return identifier == prefix or identifier.startswith(f"{prefix}.")
 
 
 class UnknownCheck(Exception):
