@@ -175,7 +175,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.measured.adjust_setup:AdjustSetup",
         resolve="scenes.specs.measured.adjust_setup:resolve_any_adjust",
         run="twin.operate.operated_block:run_operated_block",
-        numbers="twin.orbit.block.block_numbers:BLOCK",
+        numbers="twin.orbit.block.block_report:BLOCK",
         report="twin.orbit.block.block_report:block_report",
         files=(
             FileKind(
@@ -249,7 +249,7 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.orbit.calibration.calibration_run:run_calibration",
         numbers="twin.orbit.calibration.calibration_numbers:CALIBRATION",
         report="twin.orbit.calibration.calibration_report:calibration_report",
-        export="twin.orbit.calibration.calibration_export:exported",
+        export="twin.orbit.calibration.calibration_run:exported",
         files=(
             FileKind(
                 "orbit_calibration",
@@ -283,7 +283,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.measured.orbit_data_setup:CheckSetup",
         resolve="scenes.specs.measured.orbit_data_setup:resolve_check",
         run="twin.orbit.conventions.check_run:run_check",
-        numbers="twin.orbit.conventions.check_numbers:CHECK",
+        numbers="twin.orbit.conventions.check_report:CHECK",
         report="twin.orbit.conventions.check_report:check_report",
         export="twin.orbit.conventions.check_run:exported",
         files=(
@@ -408,9 +408,9 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:SimulateSetup",
         resolve="scenes.specs.orbit.setup:resolve_simulate",
         run="twin.orbit.images.simulate_run:run_simulation",
-        numbers="twin.orbit.images.simulate_numbers:SIMULATE",
+        numbers="twin.orbit.images.simulate_run:SIMULATE",
         report="twin.orbit.images.simulate_report:simulation_report",
-        export="twin.orbit.calibration.calibration_export:simulation_exported",
+        export="twin.orbit.images.simulate_run:simulation_exported",
         files=(
             FileKind(
                 "orbit_simulate",

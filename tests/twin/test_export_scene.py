@@ -19,7 +19,7 @@ from twin.orbit.export import ground_accuracy, line_scanner
 from twin.orbit.export.export_report import _warnings as export_warnings
 from twin.orbit.export.quality_sections import quality_warnings
 from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
-from twin.orbit.measured.dimap_sensor import read_scene
+from twin.orbit.measured.platform_files import read_scene
 from twin.run.data_files import FrameFacts, tiff
 
 run = partial(invoke, command.app)

@@ -10,8 +10,7 @@ import tests.twin.orbit_file_bench as bench
 from scenes.yaml.errors import InputError
 from tests.twin.test_platform_files import CSV_ATTITUDE, EARTH, read
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.measured.orbit_files import read_oem, read_sp3
-from twin.orbit.measured.platform_readings import known_frame
+from twin.orbit.measured.orbit_files import known_frame, read_oem, read_sp3
 
 RADIUS, RATE = 6.878e6, 1.1068e-3
 

@@ -13,7 +13,7 @@ from tests.twin.dimap_bench import Scene, rpc, write
 from twin.orbit.export.polynomial_control import controlled, image_slope, polynomial_correction
 from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.measured.dimap_sensor import read_scene
+from twin.orbit.measured.platform_files import read_scene
 from twin.run.data_files import FrameFacts, tiff
 
 SCENE = Scene()

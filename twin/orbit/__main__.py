@@ -103,8 +103,7 @@ def adjust(
         return
 
     def run(setup: AnyAdjust, backend: Backend, seed: int, advance: Advance) -> BlockRun:
-        from twin.orbit.block.block_run import run_adjustment
-        from twin.orbit.block.point_workers import point_workers
+        from twin.orbit.block.block_run import point_workers, run_adjustment
 
         with point_workers(workers, scheduler, lambda text: print_warnings(errors, (text,))) as pool:
             return run_adjustment(setup, backend, seed, advance, pool)

@@ -23,9 +23,8 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.measured.adjust_setup import AdjustSetup
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
-from twin.orbit.block.pass_knowledge import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
-from twin.orbit.calibration.campaign import line_model
-from twin.orbit.calibration.observations import PassData
+from twin.orbit.block.measured_block import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
+from twin.orbit.calibration.campaign import PassData, line_model
 from twin.orbit.flight.earth import Earth, east_north_up, tai_of
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineTimes, drifted_payload, line_cameras

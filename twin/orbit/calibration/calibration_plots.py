@@ -8,16 +8,9 @@ from matplotlib.figure import Figure
 from analysis.orbit.three_line_model import BIAS, misclosure
 from analysis.units import ARCSEC
 from twin.orbit.calibration.calibration_run import CalibrationRun
-from twin.orbit.calibration.camera_drift import Monitoring
 from twin.orbit.calibration.flown_campaign import true_bias
-from twin.orbit.calibration.schemes import RMS, FieldErrors, values_of
+from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_of
 from twin.run import svg
-
-
-def drift_svg(run: CalibrationRun, found: Monitoring) -> str:
-    """The figure as SVG."""
-    with svg.look("calibration-monitor-heights"):
-        return svg.to_svg(_figure(run, found))
 
 
 def _expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) -> np.ndarray:
@@ -31,7 +24,9 @@ def _expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray)
     return np.asarray(np.hypot(found.at(0.0).without.together.height_rms, factor * metres))
 
 
-def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
+def _drift_figure(run: CalibrationRun) -> Figure:
+    found = run.monitoring
+    assert found is not None
     figure = svg.new_figure(4.3)
     left, right = figure.subplots(1, 2)
     angle = found.angle / ARCSEC or 1.0
@@ -239,6 +234,7 @@ def _check_figure(run: CalibrationRun) -> Figure:
 
 
 FIGURES = {
+    "monitor-heights": _drift_figure,
     "schemes-of-fields": _schemes_figure,
     "bias-latitude": _latitude_figure,
     "correlation-matrix": _correlation_figure,

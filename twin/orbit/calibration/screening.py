@@ -22,7 +22,7 @@ from analysis.statistics import robust_variance
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, Rejected
 from twin.orbit.calibration.campaign_adjustment import simultaneous
-from twin.orbit.calibration.field_images import FieldImages, Screening
+from twin.orbit.calibration.flown_campaign import FieldImages, Screening
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints, listed
 

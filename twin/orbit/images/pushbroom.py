@@ -24,8 +24,7 @@ from optics.numerics.threads import cores, one_blas_thread
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.texture import Extent
-from twin.orbit.images.jitter_exposure import exposures, steady
-from twin.orbit.images.line_optics import ImageMotion, LineOptics
+from twin.orbit.images.line_optics import ImageMotion, LineOptics, exposures, steady
 
 TOLERANCE = 2e-4
 """Metres: largest interpolation error of the look's place at given heights."""

@@ -16,8 +16,13 @@ import numpy as np
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
-from twin.orbit.conventions.pass_readings import LineClock, PassConventions, read_line_clocks
-from twin.orbit.conventions.reading_fit import ImpossibleError, line_times
+from twin.orbit.conventions.pass_readings import (
+    ImpossibleError,
+    LineClock,
+    PassConventions,
+    line_times,
+    read_line_clocks,
+)
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, line_cameras
@@ -36,9 +41,8 @@ from twin.orbit.images.image_points import (
     measure_points,
 )
 from twin.orbit.images.pushbroom import Window
-from twin.orbit.images.simulate_numbers import POINTS
-from twin.orbit.measured.geotiff import LARGEST_PART
-from twin.orbit.measured.map_part import MapPart, UserMap
+from twin.orbit.images.simulate_run import POINTS
+from twin.orbit.measured.maps import LARGEST_PART, MapPart, UserMap
 from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table, read_platform
@@ -185,7 +189,7 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
 
 def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
     """Grey values (rows, columns) of the image, or of its window; so many alike have to fit into the memory."""
-    from twin.orbit.measured.geotiff import opened
+    from twin.orbit.measured.maps import opened
 
     file, part = str(path), spec.window
     with opened(file) as source:

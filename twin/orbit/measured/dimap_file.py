@@ -33,9 +33,15 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, shown
 from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.platform_table import joined_quaternions
-from twin.orbit.measured import platform_readings
 from twin.orbit.measured.clock import Readings
-from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
+from twin.orbit.measured.orbit_files import (
+    SPEED_TOLERANCE,
+    AttitudeReadings,
+    OrbitReadings,
+    require_orbit,
+    require_unit,
+    velocity_misfit,
+)
 from twin.orbit.measured.xml_file import Element, read_xml, readings, require_rising
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
@@ -338,12 +344,10 @@ def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
     position = np.stack([one.one("LOCATION_XYZ").floats(3) for one in points])
     velocity = np.stack([one.one("VELOCITY_XYZ").floats(3) for one in points])
     require_orbit(file, position, lines)
-    share, inertial = platform_readings.velocity_misfit(
-        (clock.day - clock.day[0]) * _DAY + clock.second, position, velocity
-    )
+    share, inertial = velocity_misfit((clock.day - clock.day[0]) * _DAY + clock.second, position, velocity)
     if inertial:
         velocity = velocity - carried_with_earth(position)
-    elif np.median(share) > platform_readings.SPEED_TOLERANCE:
+    elif np.median(share) > SPEED_TOLERANCE:
         found = f"they differ by {100.0 * np.median(share):.3g} % in the median"
         points[0].one("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")
     return OrbitReadings(file, clock, position, velocity, "ITRS", "UTC"), inertial

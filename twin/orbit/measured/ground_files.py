@@ -15,7 +15,7 @@ from scenes.yaml.errors import InputError, Issue, Problem, names_text, shown
 from scenes.yaml.json_file import parse_json
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.measured.datum import Datum, Geoid
+from twin.orbit.measured.maps import Datum, Geoid
 from twin.orbit.measured.pass_measurements import ROLES, GroundPoints
 from twin.orbit.measured.xml_file import numbers, text_lines
 

@@ -19,7 +19,7 @@ from analysis.orbit.calibration_parameters import level_covariance
 from optics.numerics.array_math import in_span
 from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec
 from scenes.specs.measured.orbit_data_setup import DATA_FILE
-from scenes.specs.measured.pass_files import PlatformFilesSpec
+from scenes.specs.measured.pass_files import PlatformFilesSpec, body_axes_matrix
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
@@ -27,9 +27,9 @@ from scenes.yaml.units import LENGTH, SPEED, TIME
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.measured.map_part import MOST_HEIGHT
+from twin.orbit.measured.maps import MOST_HEIGHT
+from twin.orbit.measured.orbit_files import AGAINST_EARTH, INERTIAL, SPEED_TOLERANCE, velocity_misfit
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
-from twin.orbit.measured.platform_readings import platform_of
 from twin.run.procedure import Advance, silent
 
 _FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
@@ -368,6 +368,7 @@ CONVENTIONS: Mapping[str, Any] = {
 }
 """Conventions of the files that are written: the project's own."""
 CAMERA_FILE = "camera.yaml"
+TEST_FILE = "calibrate.yaml"
 
 
 def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]) -> dict[str, str]:
@@ -459,3 +460,123 @@ def _csv(columns: Mapping[str, Any]) -> str:
     cells = [[str(v) for v in np.asarray(c, dtype=object).tolist()] for c in columns.values()]
     rows = [", ".join(columns), *map(",".join, zip(*cells, strict=True))]
     return "\n".join(rows) + "\n"
+
+
+_LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
+"""Metres from the Earth's centre: of satellites that map the Earth."""
+_UNIT_TOLERANCE = 1e-3
+_FALL, _JUMP = 12.0, 0.05
+"""Largest acceleration, m/s^2, and share of the speed by which readings one interval apart may change it by noise."""
+_LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
+"""Between two readings, radians, and radians for each second: more than agile satellites turn."""
+
+
+def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: ConventionsSpec) -> PlatformTable:
+    """Orbit and attitude.
+
+    Args:
+        epoch: UTC.
+        orbit: its table.
+        attitude: its table, which may be the same.
+        conventions: of both.
+
+    Raises:
+        InputError: a time twice, a place where no satellite is, a velocity that is not that of the places, a
+            quaternion that is not of unit length.
+    """
+    order, looks = _rising(orbit), _rising(attitude)
+    time, place = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
+    radius = np.linalg.norm(place, axis=1)
+    wrong = np.flatnonzero((radius < _LEAST_RADIUS) | (radius > _MOST_RADIUS))
+    if len(wrong):
+        found = f"{radius[wrong[0]] / 1e3:.6g} km from the Earth's centre"
+        allowed = f"{_LEAST_RADIUS / 1e3:g} to {_MOST_RADIUS / 1e3:g} km; is the unit in the head right?"
+        raise orbit.error(int(order[wrong[0]]), "x", "no place of a satellite", found, allowed)
+    _check_jumps(orbit, order, time, place)
+    speed = None
+    given = [name for name in ("vx", "vy", "vz") if name in orbit]
+    if given:
+        missing = [name for name in ("vx", "vy", "vz") if name not in orbit]
+        if missing:
+            raise InputError(
+                Issue(f"no column {missing[0]!r}", orbit.file, found=names_text(given), allowed="all three or none")
+            )
+        speed = orbit.stacked("vx", "vy", "vz")[order]
+        _check_velocity(orbit, order, time, place, speed)
+    numbers = attitude.stacked("q1", "q2", "q3", "q4")[looks]
+    norm = np.linalg.norm(numbers, axis=1)
+    far = np.flatnonzero(np.abs(norm - 1.0) > _UNIT_TOLERANCE)
+    if len(far):
+        found = f"a norm of {norm[far[0]]:.6g}"
+        raise attitude.error(int(looks[far[0]]), "q1", "no unit quaternion", found, "four numbers of norm 1")
+    quaternion = _quaternions_of(numbers, conventions)
+    _check_turns(attitude, looks, quaternion)
+    return PlatformTable.of(epoch, time, place, speed, attitude["time"][looks], quaternion)
+
+
+def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
+    """Quaternions x, y, z, w that turn the project's body axes into those of the frame.
+
+    Args:
+        numbers: (n, 4) q1 to q4 as the file has them.
+        conventions: what they mean.
+    """
+    said = conventions.quaternion
+    assert said is not None
+    assert conventions.body_axes is not None
+    xyzw = numbers if said.scalar == "last" else np.roll(numbers, -1, axis=1)
+    if said.turns == "frame_to_body":
+        xyzw = xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
+    axes = np.array(body_axes_matrix(conventions.body_axes), np.float64)
+    if np.array_equal(axes, np.eye(3)):
+        return np.asarray(xyzw, np.float64)
+    from scipy.spatial.transform import Rotation
+
+    # v_frame = R(q) v_file, v_file = axes @ v_project
+    return np.asarray((Rotation.from_quat(xyzw) * Rotation.from_matrix(axes)).as_quat(canonical=False))
+
+
+def _rising(table: Table) -> NDArray[np.intp]:
+    """Rows in the order of time. InputError for a time twice."""
+    order = np.argsort(table["time"], kind="stable")
+    twice = np.flatnonzero(np.diff(table["time"][order]) == 0.0)
+    if len(twice):
+        row = int(order[twice[0] + 1])
+        raise table.error(row, "time", "this time stands twice", f"{table['time'][row]:.9g} s", "each time once")
+    return np.asarray(order, np.intp)
+
+
+def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Array) -> None:
+    """InputError for a place that no orbit passes between its neighbours."""
+    step = np.diff(time)
+    with np.errstate(over="ignore", invalid="ignore"):  # of times that all but coincide
+        rate = np.diff(place, axis=0) / step[:, None]
+        change = np.linalg.norm(np.diff(rate, axis=0), axis=1)
+        speed = np.median(np.linalg.norm(rate, axis=1))
+        jump = np.flatnonzero(~(change <= _FALL * (step[1:] + step[:-1]) + _JUMP * speed))
+    if len(jump):
+        row = int(order[jump[0] + 1])
+        found = f"the velocity changes by {change[jump[0]]:.4g} m/s"
+        raise table.error(
+            row, "x", "a jump of the orbit", found, "one pass without manoeuvre; leave out wrong readings"
+        )
+
+
+def _check_turns(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
+    """InputError for a turn from one reading to the next that no satellite makes."""
+    step = np.diff(table["time"][order])
+    turn = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
+    jump = np.flatnonzero(turn > _LEAST_TURN + _FASTEST_TURN * step)
+    if len(jump):
+        row, found = int(order[jump[0] + 1]), f"{np.degrees(turn[jump[0]]):.4g} deg in {step[jump[0]]:.4g} s"
+        raise table.error(row, "q1", "a jump of the attitude", found, "leave out wrong readings")
+
+
+def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, place: Array, speed: Array) -> None:
+    """InputError unless the velocity is the rate of change of the places."""
+    far, inertial = velocity_misfit(time, place, speed)
+    if np.median(far) > SPEED_TOLERANCE:
+        row = int(order[int(np.argsort(far)[len(far) // 2])])
+        found = f"they differ by {100.0 * np.median(far):.3g} % in the median"
+        problem = INERTIAL if inertial else "not the velocity of these positions"
+        raise table.error(row, "vx", problem, found, AGAINST_EARTH)
