@@ -19,13 +19,19 @@ from analysis.block.processes import STEPPED, Law
 from analysis.covariance_root import covariance_root
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
-from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.measured.adjust_setup import AdjustSetup
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
-from twin.orbit.block.measured_block import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
-from twin.orbit.calibration.campaign import PassData, line_model
-from twin.orbit.flight.earth import Earth, east_north_up, tai_of
+from twin.orbit.block.measured_block import (
+    MonitorSource,
+    camera_sigmas,
+    change_covariance,
+    law_of,
+    monitored_camera,
+    seconds_after_the_first,
+)
+from twin.orbit.calibration.campaign import PassData, line_model, pass_data
+from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineTimes, drifted_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
@@ -236,14 +242,11 @@ def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence, monitor: Monito
     spec, payload = setup.test, setup.camera
     earth = Earth.from_spec(spec.earth)
     readings = {name: _trajectory(spec, name, one, earth) for name, one in spec.passes.items()}
-    moments = {name: tai_of(one.epoch) for name, one in spec.passes.items()}
-    zero = min(moments.values())
-    begin = {
-        name: float(round((day - zero[0]) * _DAY + (part - zero[1]) * _DAY, 6)) for name, (day, part) in moments.items()
-    }
+    epochs = {name: one.epoch for name, one in spec.passes.items()}
+    begin = seconds_after_the_first(epochs)
     turns, shifts, constants = _courses(spec, spec.truth or spec.errors, begin, stream(seed, _COURSES))
     days = np.array(list(begin.values())) / _DAY
-    recorded = monitor({name: one.epoch for name, one in spec.passes.items()}, spec.lines) if monitor else None
+    recorded = monitor(epochs, spec.lines) if monitor else None
     true, expected, monitored = _cameras(spec, days, np.random.default_rng(stream(seed, _CAMERAS)), recorded)
     platforms = {
         name: TruePlatform(
@@ -253,19 +256,14 @@ def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence, monitor: Monito
     }
     lines = int((2.0 * spec.span - spec.line_time) / spec.line_time) - 1
     times = LineTimes.even(-spec.span + 0.5 * spec.line_time, spec.line_time, lines)
-    laboratory = line_cameras(payload)
     sensors, data, change = {}, {}, {}
     for k, name in enumerate(spec.passes):
         changed = line_cameras(drifted_payload(payload, {line: true[line][k] for line in spec.lines}))
         for line in spec.lines:
             sensors[f"{name}/{line}"] = Sensor.of_lines(changed[line], platforms[name], earth, times, NO_EFFECTS)
             change[f"{name}/{line}"] = true[line][k]
-        known_sensors = {
-            line: Sensor.of_lines(laboratory[line], readings[name], earth, times, NO_EFFECTS) for line in spec.lines
-        }
-        models = FrozenMap({line: line_model(payload, line) for line in spec.lines})
-        pitch = FrozenMap({line: payload.pitch_of(line) for line in spec.lines})
-        data[name] = PassData(name, known_sensors, models, pitch, spec.area.height, 1.0, payload.lines)
+        at = dict.fromkeys(spec.lines, times)
+        data[name] = pass_data(name, payload, readings[name], at, spec.area.height, 1.0)
     ground, role, seen = _points(setup, sensors, earth, np.random.default_rng(stream(seed, _PLACES)))
     shots = _shots(spec, platforms, earth, stream(seed, _LASER))
     first = len(ground)

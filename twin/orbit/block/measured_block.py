@@ -20,12 +20,10 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.measured.adjust_setup import MeasuredAdjustSetup
 from scenes.specs.orbit.adjust import CameraChangeSpec, LawSpec
 from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
-from twin.orbit.calibration.campaign import PassData, light_effects, line_model
+from twin.orbit.calibration.campaign import light_effects, line_model, pass_data
 from twin.orbit.flight.earth import Earth, tai_of
 from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import PassMeasurements
 from twin.run.procedure import Advance, BenchError, silent
@@ -70,6 +68,15 @@ def monitored_camera(law: np.ndarray, reading: np.ndarray, sigma: np.ndarray) ->
 _DAY = 86400.0
 
 
+def seconds_after_the_first(epochs: Mapping[str, str]) -> dict[str, float]:
+    """Return the time of each epoch since the earliest, seconds of TAI, to a microsecond."""
+    moments = {name: tai_of(epoch) for name, epoch in epochs.items()}
+    zero = min(moments.values())
+    return {
+        name: float(round((day - zero[0]) * _DAY + (part - zero[1]) * _DAY, 6)) for name, (day, part) in moments.items()
+    }
+
+
 def measured_block(
     setup: MeasuredAdjustSetup, advance: Advance = silent, monitor: MonitorSource | None = None
 ) -> tuple[known.Block, np.ndarray]:
@@ -86,12 +93,15 @@ def measured_block(
         if line not in spec.changes:
             raise BenchError(f"it is not said how {line} may have changed", ("changes",), f"`{line}:`")
     epochs = {one.name: one.platform.epoch for one in passes}
-    moments = {one.name: tai_of(one.platform.epoch) for one in passes}
-    zero = min(moments.values())
-    begin = {name: round((day - zero[0]) * _DAY + (part - zero[1]) * _DAY, 6) for name, (day, part) in moments.items()}
+    begin = seconds_after_the_first(epochs)
     points, number = _points(passes, spec.names == "shared")
     models = {line: line_model(payload, line) for line in lines}
-    data = {one.name: _pass_data(one, setup) for one in passes}
+    data = {}
+    for one in passes:
+        known_places = one.ground.itrs[one.ground.role != "tie"]
+        mean = float(np.mean(Earth().geodetic(known_places)[2])) if len(known_places) else 0.0
+        times = {line: one.line_times[line] for line in one.images}
+        data[one.name] = pass_data(one.name, payload, TabulatedTrajectory(one.platform), times, mean, 1.0)
     raw = {}
     for one in passes:
         for line, rays in data[one.name].rays(one.images).items():
@@ -131,20 +141,6 @@ def measured_block(
 def _middle(scenes: Sequence[known.Scene], name: str) -> float | None:
     times = [s.rays.time for s in scenes if s.of == name and s.rays.time is not None and len(s.rays.time)]
     return 0.5 * float(np.concatenate(times).min() + np.concatenate(times).max()) if times else None
-
-
-def _pass_data(one: PassMeasurements, setup: MeasuredAdjustSetup) -> PassData:
-    cameras, path, earth = line_cameras(setup.camera), TabulatedTrajectory(one.platform), Earth()
-    sensors = {
-        name: Sensor.of_lines(cameras[name], path, earth, one.line_times[name], NO_EFFECTS) for name in one.images
-    }
-    known_places = one.ground.role != "tie"
-    height = 0.0
-    if np.any(known_places):
-        height = float(np.mean(earth.geodetic(one.ground.itrs[known_places])[2]))
-    models = FrozenMap({name: line_model(setup.camera, name) for name in one.images})
-    pitch = FrozenMap({name: setup.camera.pitch_of(name) for name in one.images})
-    return PassData(one.name, FrozenMap(sensors), models, pitch, height, 1.0, setup.camera.lines)
 
 
 def _points(passes: Sequence[PassMeasurements], shared: bool) -> tuple[known.Points, dict[str, np.ndarray]]:

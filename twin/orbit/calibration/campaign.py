@@ -34,9 +34,9 @@ from optics.numerics.invariants import UnphysicalError
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import line_cameras, pixel_places
+from twin.orbit.flight.line_camera import LineTimes, line_cameras, pixel_places
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import Platform, Sensor
 from twin.orbit.flight.trajectory import MeasurementErrors, Trajectory
 from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 
@@ -616,6 +616,31 @@ def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
     )
 
 
+def pass_data(
+    name: str,
+    payload: ThreeLineCameraSpec,
+    platform: Platform,
+    times: Mapping[str, LineTimes],
+    height: float,
+    unit: float | None = None,
+) -> PassData:
+    """Return what is known of a pass: its lines by the laboratory's camera and the readings of the platform.
+
+    Args:
+        name: of the pass.
+        payload: camera as the laboratory measured it.
+        platform: orbit and attitude as they were read.
+        times: line camera -> when its lines were exposed.
+        height: of the ground above the ellipsoid, metres.
+        unit: sigma of an image point of weight 1, metres; None for points that weigh alike.
+    """
+    cameras, earth = line_cameras(payload), Earth()
+    sensors = {line: Sensor.of_lines(cameras[line], platform, earth, at, NO_EFFECTS) for line, at in times.items()}
+    models = {line: line_model(payload, line) for line in times}
+    pitch = {line: payload.pitch_of(line) for line in times}
+    return PassData(name, FrozenMap(sensors), FrozenMap(models), FrozenMap(pitch), height, unit, payload.lines)
+
+
 def campaign_of(
     spec: OrbitCalibrationSpec | MeasuredCalibrationSpec,
     payload: ThreeLineCameraSpec,
@@ -635,7 +660,7 @@ def campaign_of(
     """
     seen = {name for one in measured for name in one.images}
     laboratory = FrozenMap({name: line_model(payload, name) for name in payload.lines if name in seen})
-    passes = [_field_pass(one, payload, laboratory, ties_apart) for one in measured]
+    passes = [_field_pass(one, payload, ties_apart) for one in measured]
     unit = image_sigma(passes[0].control_images, passes[0].data)
     noise = _noise_of(spec.errors, unit, [one.measured for one in passes])
     weighed = tuple(replace(p, data=replace(p.data, unit=unit)) for p in passes)
@@ -665,23 +690,15 @@ def _noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Seque
     return Noise(image, attitude, station, *between, slow, tracker.slow.interval, walk, between[0])
 
 
-def _field_pass(
-    one: PassMeasurements, payload: ThreeLineCameraSpec, models: Mapping[str, LineModel], ties_apart: bool
-) -> FieldPass:
-    """Sort the points of a pass; rays are made later, when the effects on the light are taken out."""
-    earth, cameras, path = Earth(), line_cameras(payload), TabulatedTrajectory(one.platform)
-    sensors = {
-        name: Sensor.of_lines(cameras[name], path, earth, one.line_times[name], NO_EFFECTS) for name in one.images
-    }
+def _field_pass(one: PassMeasurements, payload: ThreeLineCameraSpec, ties_apart: bool) -> FieldPass:
     role = one.ground.role
     rays = np.zeros(len(role), int)
     for row in one.images.values():
         np.add.at(rays, row.point, 1)
     known = (role == "control") & (rays > 0)
-    _, latitude, height = earth.geodetic(one.ground.itrs[known])
-    pitch = {name: payload.pitch_of(name) for name in one.images}
-    own = FrozenMap({name: models[name] for name in one.images})
-    data = PassData(one.name, FrozenMap(sensors), own, FrozenMap(pitch), float(np.mean(height)), lines=payload.lines)
+    _, latitude, height = Earth().geodetic(one.ground.itrs[known])
+    times = {name: one.line_times[name] for name in one.images}
+    data = pass_data(one.name, payload, TabulatedTrajectory(one.platform), times, float(np.mean(height)))
     check = (role == "check") & (rays > 1)
     tie = (role == "tie") & (rays > 1)
     # control points first, ties after them

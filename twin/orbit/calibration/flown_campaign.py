@@ -35,9 +35,10 @@ from twin.orbit.calibration.campaign import (
     campaign_of,
     light_effects,
     line_model,
+    pass_data,
 )
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineTimes, changed_payload, drifted_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
@@ -464,17 +465,14 @@ def _pass(
     lines = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
     times = LineTimes.even(trajectory.first + 0.5 * spec.line_time, spec.line_time, lines)
     sensors = {k: Sensor.of_lines(cameras[k], trajectory, earth, times, effects) for k in LINES}
-    known, path = line_cameras(payload), TabulatedTrajectory(platform)
-    laboratory = {k: Sensor.of_lines(known[k], path, earth, times, NO_EFFECTS) for k in LINES}
-    models = FrozenMap({k: line_model(payload, k) for k in LINES})
-    pitch = FrozenMap({k: payload.pitch_of(k) for k in LINES})
-    pass_data = PassData(name, FrozenMap(laboratory), models, pitch, field.height)
+    path, at = TabulatedTrajectory(platform), dict.fromkeys(LINES, times)
+    known = pass_data(name, payload, path, at, field.height)
     images = None
     if imager is None:
         assert spec.points is not None
-        points = _simulated_points(field, spec, spec.points, sensors, pass_data, (place, image, ground))
+        points = _simulated_points(field, spec, spec.points, sensors, known, (place, image, ground))
     else:
-        points, images = imager.measured(field, sensors, pass_data, effects, pictures)
+        points, images = imager.measured(field, sensors, known, effects, pictures)
     ties: Mapping[str, ImagePoints] = {}
     if spec.strip is not None and spec.points is not None:
         tie_points = spec.points.model_copy(
@@ -483,7 +481,7 @@ def _pass(
         own = stream(seed, _TIES)
         a, b, c = (np.random.default_rng(s) for s in own.spawn(3))
         try:
-            ties = _simulated_points(field, spec, tie_points, sensors, pass_data, (a, b, c)).check_images
+            ties = _simulated_points(field, spec, tie_points, sensors, known, (a, b, c)).check_images
         except BenchError as error:
             remedy = "a shorter strip, or a longer pass (`span`)"
             raise BenchError(f"tie points: {error}", ("strip", "length"), remedy) from error

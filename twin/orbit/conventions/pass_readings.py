@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,6 @@ from twin.orbit.measured.dimap_file import is_dimap, read_dimap
 from twin.orbit.measured.earth_orientation import constant_orientation
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
 from twin.orbit.measured.measurement_tables import COLUMNS, image_covariance, require_known
-from twin.orbit.measured.orbit_files import AttitudeReadings, OrbitReadings
 from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.orbit.measured.platform_files import Conventions, PlatformReadings, clock_of, platform_table, read_platform
 from twin.orbit.measured.xml_file import first_lines
@@ -254,18 +254,7 @@ def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> Platf
     a, b = cut(orbit.clock), cut(attitude.clock)
     if len(orbit.clock.taken(a)) < 2 or len(attitude.clock.taken(b)) < 2:
         return platform  # told by what needs it
-    return replace(platform, orbit=_orbit_part(orbit, a), attitude=_attitude_part(attitude, b))
-
-
-def _orbit_part(orbit: OrbitReadings, part: slice) -> OrbitReadings:
-    speed = None if orbit.velocity is None else orbit.velocity[part]
-    return replace(orbit, clock=orbit.clock.taken(part), position=orbit.position[part], velocity=speed)
-
-
-def _attitude_part(attitude: AttitudeReadings, part: slice) -> AttitudeReadings:
-    q = None if attitude.quaternion is None else attitude.quaternion[part]
-    angles = None if attitude.angles is None else attitude.angles[part]
-    return replace(attitude, clock=attitude.clock.taken(part), quaternion=q, angles=angles)
+    return replace(platform, orbit=orbit.taken(a), attitude=attitude.taken(b))
 
 
 _SCALES = ("UTC", "GPS", "TAI", "TT")
@@ -292,18 +281,16 @@ class Question:
     text: Callable[[Any], str] = str
 
 
-def _of_platform(title: str, key: str, values: tuple[Any, ...], text: Callable[[Any], str] = str) -> Question:
-    return Question(
-        title,
-        lambda c: getattr(c.platform, key),
-        lambda c, v: replace(c, platform=replace(c.platform, **{key: v})),
-        lambda c: values,
-        text,
-    )
+def _question(title: str, key: str, values: tuple[Any, ...], text: Callable[[Any], str] = str) -> Question:
+    """Return the question for a convention of the pass, or of the platform where its key begins with ``platform.``."""
+    name = key.removeprefix("platform.")
+    if name == key:
+        return Question(title, attrgetter(key), lambda c, v: replace(c, **{key: v}), lambda c: values, text)
 
+    def put(conventions: PassConventions, value: Any) -> PassConventions:
+        return replace(conventions, platform=replace(conventions.platform, **{name: value}))
 
-def _of_pass(title: str, key: str, values: tuple[Any, ...], text: Callable[[Any], str] = str) -> Question:
-    return Question(title, lambda c: getattr(c, key), lambda c, v: replace(c, **{key: v}), lambda c: values, text)
+    return Question(title, attrgetter(key), put, lambda c: values, text)
 
 
 def _turned(c: PassConventions) -> tuple[tuple[str, str, str], ...]:
@@ -319,8 +306,8 @@ def _seconds(value: float) -> str:
 
 QUESTIONS: Mapping[str, Question] = FrozenMap(
     {
-        "quaternion_scalar": _of_platform("scalar of the quaternion", "scalar", ("last", "first")),
-        "quaternion_turns": _of_platform("quaternion turns", "turns", ("body_to_frame", "frame_to_body")),
+        "quaternion_scalar": _question("scalar of the quaternion", "platform.scalar", ("last", "first")),
+        "quaternion_turns": _question("quaternion turns", "platform.turns", ("body_to_frame", "frame_to_body")),
         "body_axes": Question(
             "body x, y, z point",
             lambda c: c.platform.body_axes,
@@ -328,24 +315,24 @@ QUESTIONS: Mapping[str, Question] = FrozenMap(
             _turned,
             ", ".join,
         ),
-        "angle_sequence": _of_platform(
-            "sequence of the angles", "sequence", ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")
+        "angle_sequence": _question(
+            "sequence of the angles", "platform.sequence", ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")
         ),
-        "attitude_frame": _of_platform("frame of the attitude", "attitude_frame", _FRAMES),
-        "orbit_frame": _of_platform("frame of the orbit", "orbit_frame", _FRAMES),
-        "orbit_time_scale": _of_platform("time scale of the orbit", "orbit_scale", _SCALES),
-        "attitude_time_scale": _of_platform("time scale of the attitude", "attitude_scale", _SCALES),
-        "line_time_scale": _of_pass("time scale of the lines", "line_scale", _SCALES),
-        "line_time_offset": _of_pass("offset of the line times", "line_offset", (0.0, -1.0, 1.0), _seconds),
-        "line_moment": _of_pass("moment of a line's time", "moment", ("start", "middle", "end")),
-        "line_origin": _of_pass(
+        "attitude_frame": _question("frame of the attitude", "platform.attitude_frame", _FRAMES),
+        "orbit_frame": _question("frame of the orbit", "platform.orbit_frame", _FRAMES),
+        "orbit_time_scale": _question("time scale of the orbit", "platform.orbit_scale", _SCALES),
+        "attitude_time_scale": _question("time scale of the attitude", "platform.attitude_scale", _SCALES),
+        "line_time_scale": _question("time scale of the lines", "line_scale", _SCALES),
+        "line_time_offset": _question("offset of the line times", "line_offset", (0.0, -1.0, 1.0), _seconds),
+        "line_moment": _question("moment of a line's time", "moment", ("start", "middle", "end")),
+        "line_origin": _question(
             "coordinate of the middle of line 0", "line_origin", (0.0, 0.5, 1.0), lambda v: f"{v:g}"
         ),
-        "pixel_origin": _of_pass(
+        "pixel_origin": _question(
             "coordinate of the middle of the first pixel", "pixel_origin", (0.0, 0.5, 1.0, 1.5), lambda v: f"{v:g}"
         ),
-        "first_pixel_sees": _of_pass("first pixel sees", "sees", ("right", "left")),
-        "line_axis": _of_pass(
+        "first_pixel_sees": _question("first pixel sees", "sees", ("right", "left")),
+        "line_axis": _question(
             "lines are counted", "backward", (False, True), lambda v: "from the last" if v else "from the first"
         ),
     }

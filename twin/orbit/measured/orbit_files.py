@@ -12,7 +12,7 @@ is a missing one. A file without its last line EOF is whole where it has as many
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -66,6 +66,14 @@ class OrbitReadings:
     scale: str | None = None
     segments: tuple[Segment, ...] = ()
 
+    def taken(self, part: slice) -> OrbitReadings:
+        """Return some of the readings, with what is among them of the segments."""
+        begin, end, _ = part.indices(len(self.clock))
+        here = (one for one in self.segments if one.first < end and one.last >= begin)
+        segments = (replace(one, first=max(one.first - begin, 0), last=min(one.last, end - 1) - begin) for one in here)
+        velocity, clock = None if self.velocity is None else self.velocity[part], self.clock.taken(part)
+        return replace(self, clock=clock, position=self.position[part], velocity=velocity, segments=tuple(segments))
+
 
 @dataclass(frozen=True, eq=False)
 class AttitudeReadings:
@@ -90,6 +98,12 @@ class AttitudeReadings:
     scale: str | None = None
     scalar: Scalar | None = None
     turns: Turns | None = None
+
+    def taken(self, part: slice) -> AttitudeReadings:
+        """Return some of the readings."""
+        values = {name: getattr(self, name) for name in ("quaternion", "angles")}
+        kept = {name: None if value is None else value[part] for name, value in values.items()}
+        return replace(self, clock=self.clock.taken(part), **kept)
 
 
 def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_FRAME") -> str:

@@ -213,10 +213,7 @@ def _one_segment(readings: PlatformReadings, meant: Conventions) -> tuple[OrbitR
         count = int(np.sum(in_span(turn_time, first, last)))
         if count > best_count:
             best, best_count, best_usable = one, count, usable
-    own = slice(best.first, best.last + 1)
-    clock = Readings(orbit.clock.day[own], orbit.clock.second[own])
-    velocity = None if orbit.velocity is None else orbit.velocity[own]
-    return replace(orbit, clock=clock, position=orbit.position[own], velocity=velocity, segments=()), best_usable
+    return replace(orbit.taken(slice(best.first, best.last + 1)), segments=()), best_usable
 
 
 def _in_itrs(
