@@ -21,7 +21,7 @@ from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
 from scenes.specs.measured.adjust_setup import AdjustSetup
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
-from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
+from scenes.specs.orbit.flight import AttitudeSpec
 from twin.orbit.block.measured_block import (
     MonitorSource,
     camera_sigmas,
@@ -30,14 +30,14 @@ from twin.orbit.block.measured_block import (
     monitored_camera,
     seconds_after_the_first,
 )
-from twin.orbit.calibration.campaign import PassData, line_model, pass_data
+from twin.orbit.calibration.campaign import PassData, line_model, pass_data, passing_orbit
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineTimes, drifted_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
-from twin.orbit.measured.pass_measurements import ImagePoints
+from twin.orbit.measured.pass_measurements import ImagePoints, point_names
 from twin.run.procedure import BenchError
 from twin.run.random_streams import stream
 
@@ -209,16 +209,9 @@ def _cameras(
 
 
 def _trajectory(spec: OrbitAdjustSpec, name: str, one: BlockPassSpec, earth: Earth) -> Trajectory:
-    passing = PassingSpec.model_construct(
-        longitude=spec.area.longitude if one.longitude is None else one.longitude,
-        latitude=spec.area.latitude if one.latitude is None else one.latitude,
-        altitude=spec.altitude,
-        direction=one.direction,
-        inclination=None,
-    )
-    orbit = OrbitSpec.model_construct(
-        epoch=one.epoch, before=spec.span, after=spec.span, passing=passing, elements=None, state=None
-    )
+    longitude = spec.area.longitude if one.longitude is None else one.longitude
+    latitude = spec.area.latitude if one.latitude is None else one.latitude
+    orbit = passing_orbit(one.epoch, spec.span, spec.altitude, longitude, latitude, one.direction)
     roll, pitch, yaw = spec.attitude.offset
     held = AttitudeSpec(nadir=spec.attitude.nadir, steering=spec.attitude.steering)
     attitude = Attitude.from_spec(held.model_copy(update={"offset": (roll + one.roll, pitch, yaw)}))
@@ -425,8 +418,7 @@ def _known_points(
     # where the mean height is: what a first intersection gives as well
     rough = earth.ecef(lon, lat, np.full(len(lon), spec.area.height))
     start = np.where((role == "control")[:, None], ground + noise + shift, rough)
-    letter = {"control": "c", "tie": "t", "check": "k"}
-    ids = np.array([f"{letter[r]}{k}" for k, r in enumerate(role.tolist())], object)
+    ids = np.array(point_names(role), object)
     return known.Points(ids, start, role, covariance)
 
 

@@ -31,6 +31,7 @@ from analysis.orbit.three_line_model import INTERIOR, LineModel, Rays
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.invariants import UnphysicalError
+from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
@@ -614,6 +615,16 @@ def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
     return LineModel.of(
         to_body, (line.principal_distance, *line.principal_point), line.position, line.k1, line.k2, half
     )
+
+
+def passing_orbit(
+    epoch: str, span: float, altitude: float, longitude: float, latitude: float, direction: str = "descending"
+) -> OrbitSpec:
+    """Return the orbit that passes a place at its epoch, followed for a span before and after; SI units."""
+    passing = PassingSpec.model_construct(
+        longitude=longitude, latitude=latitude, altitude=altitude, direction=direction, inclination=None
+    )
+    return OrbitSpec.model_construct(epoch=epoch, before=span, after=span, passing=passing, elements=None, state=None)
 
 
 def pass_data(

@@ -24,7 +24,6 @@ from analysis.orbit.calibration_parameters import level_covariance
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.angle import LINES
-from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
 from twin.orbit.calibration.campaign import (
@@ -36,6 +35,7 @@ from twin.orbit.calibration.campaign import (
     light_effects,
     line_model,
     pass_data,
+    passing_orbit,
 )
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import LightEffects
@@ -44,17 +44,10 @@ from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import TERMS, Trajectory
-from twin.orbit.images.image_points import (
-    BEYOND,
-    POINTS_REMEDY,
-    MatchedPoints,
-    PatchPoints,
-    PointsError,
-    measure_points,
-)
+from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PatchPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import LineJudgement, Patch, PatchError, fly_patch, imaged_lines, judged, true_ground
-from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
+from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.random_streams import stream
 
@@ -286,18 +279,15 @@ class _Chosen:
         images, wrong = {}, {}
         number = np.arange(int(chosen.sum()))
         for name, line in points.lines.items():
-            place = line.image[chosen]
-            spread = line.covariance[chosen] + BEYOND**2 * np.eye(2)
-            images[name] = ImagePoints.of(number, place[:, 0], place[:, 1], spread)
+            images[name] = line.measured(chosen, number)
             wrong[name] = judgements[name].wrong[chosen] if name in judgements else np.zeros(len(number), bool)
         return cls(images, points.ground[chosen], wrong)
 
     def followed_by(self, other: _Chosen) -> _Chosen:
-        images = {}
-        for name, row in self.images.items():
-            after = other.images[name]
-            columns = (np.concatenate([getattr(row, k), getattr(after, k)]) for k in ("line", "pixel", "covariance"))
-            images[name] = ImagePoints(np.concatenate([row.point, after.point + self.count]), *columns)
+        images = {
+            name: ImagePoints.joined([row, other.images[name].numbered(-self.count)])
+            for name, row in self.images.items()
+        }
         wrong = {name: np.concatenate([w, other.wrong[name]]) for name, w in self.wrong.items()}
         return _Chosen(images, np.concatenate([self.ground, other.ground]), wrong)
 
@@ -534,15 +524,12 @@ def _measurements_of(
     role = np.array(["control" if c else "tie" for c in is_control] + ["check"] * checks + ["tie"] * more, object)
     covariance = np.zeros((len(role), 3, 3))
     covariance[:count][is_control] = level_covariance(given[is_control], plan, tall)
-    letter = {"control": "c", "check": "k", "tie": "t"}
-    ids = [f"{letter[r]}{k}" for k, r in enumerate(role.tolist())]
     images = {}
     for line, row in points.control_images.items():
-        rows = [(row, 0), (points.check_images[line], count)]
-        rows += [(ties[line], count + checks)] if line in ties else []
-        columns = (np.concatenate([getattr(r, k) for r, _ in rows]) for k in ("line", "pixel", "covariance"))
-        images[line] = ImagePoints(np.concatenate([r.point + first for r, first in rows]), *columns)
-    ground = GroundPoints.of(ids, itrs, covariance, role)
+        parts = [row, points.check_images[line].numbered(-count)]
+        parts += [ties[line].numbered(-count - checks)] if line in ties else []
+        images[line] = ImagePoints.joined(parts)
+    ground = GroundPoints.of(point_names(role), itrs, covariance, role)
     return PassMeasurements(name, platform, FrozenMap(dict(times)), ground, FrozenMap(images))
 
 
@@ -577,16 +564,7 @@ def _trajectory(
     name: str, field: FieldSpec, spec: OrbitCalibrationSpec, earth: Earth, seed: np.random.SeedSequence
 ) -> Trajectory:
     """The true orbit, which passes the field's middle at its epoch, and the true attitude."""
-    passing = PassingSpec.model_construct(
-        longitude=field.longitude,
-        latitude=field.latitude,
-        altitude=spec.altitude,
-        direction="descending",
-        inclination=None,
-    )
-    orbit = OrbitSpec.model_construct(
-        epoch=field.epoch, before=spec.span, after=spec.span, passing=passing, elements=None, state=None
-    )
+    orbit = passing_orbit(field.epoch, spec.span, spec.altitude, field.longitude, field.latitude)
     try:
         return Trajectory.flown(propagate(orbit, earth), spec.attitude, seed)
     except ValueError as error:

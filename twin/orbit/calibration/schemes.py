@@ -18,9 +18,10 @@ independent: both take most of the time and change the errors at check points ha
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from scipy.stats import chi2
@@ -133,20 +134,34 @@ def values_of(errors: Mapping[str, CheckErrors], what: str) -> np.ndarray:
     return np.array([getattr(e, what) for e in errors.values()])
 
 
-def schemes_tested(campaign: Campaign, alone: Mapping[str, Adjustment]) -> FrozenMap[str, FrozenMap[str, CheckErrors]]:
-    """Scheme -> field -> errors at its check points.
+T = TypeVar("T")
+
+
+def by_scheme(
+    campaign: Campaign,
+    alone: Mapping[str, Adjustment],
+    test: Callable[[FieldPass, Mapping[str, LineModel], np.ndarray], T],
+) -> FrozenMap[str, FrozenMap[str, T]]:
+    """Return what a test of the schemes gives, scheme -> field.
 
     Args:
-        campaign: schemes and check points.
+        campaign: schemes and fields.
         alone: field -> it calibrated by itself.
+        test: of a field by cameras and bias, which are means of the scheme's fields; by its own in the last scheme.
     """
     found = {}
-    for k, names in enumerate(campaign.spec.schemes):
-        cameras, bias = averaged(campaign, [alone[name] for name in names], names)
-        found[str(k + 1)] = FrozenMap({p.name: tested(campaign, p, cameras, bias) for p in campaign.passes})
-    own = {p.name: tested(campaign, p, *averaged(campaign, [alone[p.name]], [p.name])) for p in campaign.passes}
-    found[str(len(campaign.spec.schemes) + 1)] = FrozenMap(own)
+    for k, scheme in enumerate((*campaign.spec.schemes, None)):
+        errors = {}
+        for one in campaign.passes:
+            names = scheme or (one.name,)
+            errors[one.name] = test(one, *averaged(campaign, [alone[name] for name in names], names))
+        found[str(k + 1)] = FrozenMap(errors)
     return FrozenMap(found)
+
+
+def schemes_tested(campaign: Campaign, alone: Mapping[str, Adjustment]) -> FrozenMap[str, FrozenMap[str, CheckErrors]]:
+    """Scheme -> field -> errors at its check points; arguments as of `by_scheme`."""
+    return by_scheme(campaign, alone, lambda one, cameras, bias: tested(campaign, one, cameras, bias))
 
 
 def tested_before(campaign: Campaign) -> FrozenMap[str, CheckErrors]:
@@ -266,29 +281,27 @@ def strips_adjusted(campaign: Campaign, advance: Advance) -> Strips | None:
     spec = campaign.spec
     if not spec.strip:
         return None
-    fields = len(campaign.passes)
-    parts = (len(spec.schemes) + 2) * fields
-    calibrated = {}
+    parts, done = (len(spec.schemes) + 2) * len(campaign.passes), itertools.count(1)
+    calibrated, strips = {}, {}
+
+    def in_strip(one: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
+        # those of the last scheme, with each field's own parameters, stay
+        strips[one.name] = strip = adjusted_strip(campaign, one, cameras, bias)
+        advance("strips", next(done), parts)
+        return tested_in_strip(campaign, one, strip, cameras, bias)
+
     with one_blas_thread():
-        for k, one in enumerate(campaign.passes):
-            calibrated[one.name] = calibrated_with_ties(campaign, one)
-            advance("strips", k + 1, parts)
-        schemes, own = _strips_by_scheme(campaign, calibrated, lambda done: advance("strips", fields + done, parts))
+        for one in campaign.passes:
+            field, gauge = field_with_ties(campaign, one), gauge_of(campaign)
+            calibrated[one.name] = adjust([field], campaign.laboratory, campaign.noise, gauge=gauge)
+            advance("strips", next(done), parts)
+        schemes = by_scheme(campaign, calibrated, in_strip)
     return Strips(
-        FrozenMap({name: int(np.isfinite(s.ground[:, 0]).sum()) for name, s in own.items()}),
+        FrozenMap({name: int(np.isfinite(s.ground[:, 0]).sum()) for name, s in strips.items()}),
         schemes,
-        FrozenMap({name: s.p_value for name, s in own.items()}),
-        own[campaign.passes[0].name].datum,
+        FrozenMap({name: s.p_value for name, s in strips.items()}),
+        strips[campaign.passes[0].name].datum,
     )
-
-
-def calibrated_with_ties(campaign: Campaign, one: FieldPass) -> Adjustment:
-    """A field by itself, with the tie points of its pass.
-
-    Raises:
-        CalibrationError: it cannot be solved.
-    """
-    return adjust([field_with_ties(campaign, one)], campaign.laboratory, campaign.noise, gauge=gauge_of(campaign))
 
 
 def field_with_ties(campaign: Campaign, one: FieldPass) -> CalibrationField:
@@ -310,20 +323,15 @@ def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.nd
     )
 
 
-def _tie_rays(one: FieldPass) -> Mapping[str, Rays]:
-    """The strip's tie points; where points are measured in images, all those that the calibration uses."""
-    return one.ties or one.control.rays
-
-
 def adjusted_strip(
     campaign: Campaign, one: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
 ) -> StripAdjustment:
-    """One pass on its tie points.
+    """One pass on its tie points; where points are measured in images, on all those that the calibration uses.
 
     Raises:
         CalibrationError: it cannot be adjusted.
     """
-    return adjust_strip(_tie_rays(one), cameras, campaign.noise, bias=bias)
+    return adjust_strip(one.ties or one.control.rays, cameras, campaign.noise, bias=bias)
 
 
 def tested_in_strip(
@@ -338,28 +346,6 @@ def _joined_rays(control: Rays, ties: Rays, count: int) -> Rays:
     """Rays of both, with times; points of the second are numbered after the first's."""
     pairs = ((getattr(control, name), getattr(ties, name)) for name in ("image", "station", "attitude", "time"))
     return Rays.of(np.concatenate([control.point, ties.point + count]), *(np.concatenate(pair) for pair in pairs))
-
-
-def _strips_by_scheme(
-    campaign: Campaign, calibrated: Mapping[str, Adjustment], advance: Callable[[int], None]
-) -> tuple[FrozenMap[str, FrozenMap[str, CheckErrors]], dict[str, StripAdjustment]]:
-    """Errors by scheme and field, and the strips with each field's own parameters."""
-    found: dict[str, FrozenMap[str, CheckErrors]] = {}
-    own: dict[str, StripAdjustment] = {}
-    done = 0
-    for k, scheme in enumerate((*campaign.spec.schemes, None)):
-        errors = {}
-        for one in campaign.passes:
-            names = scheme or (one.name,)
-            cameras, bias = averaged(campaign, [calibrated[name] for name in names], names)
-            strip = adjusted_strip(campaign, one, cameras, bias)
-            errors[one.name] = tested_in_strip(campaign, one, strip, cameras, bias)
-            if scheme is None:
-                own[one.name] = strip
-            done += 1
-            advance(done)
-        found[str(k + 1)] = FrozenMap(errors)
-    return FrozenMap(found), own
 
 
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
@@ -463,28 +449,29 @@ def flown(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) 
     return fly_fields(setup.model_copy(update={"test": test.model_copy(update=update)}), stream(seed)).independent
 
 
+def _treatment(campaign: Campaign, found: Adjustment, schemes: Mapping[str, Mapping[str, CheckErrors]]) -> Treatment:
+    errors = (tested(campaign, p, found.cameras_of(p.name), found.bias(p.name)) for p in campaign.passes)
+    pooled = {name: FieldErrors.pooled(fields.values()) for name, fields in schemes.items()}
+    return Treatment(FieldErrors.pooled(errors), found.p_value, FrozenMap(pooled))
+
+
 def without_monitor(campaign: Campaign) -> Treatment:
     """Adjust a campaign as if no camera drifted."""
-    found = simultaneous(campaign)
-    errors = [tested(campaign, p, found.cameras, found.bias(p.name)) for p in campaign.passes]
-    schemes = schemes_tested(campaign, {p.name: calibrated_alone(campaign, p) for p in campaign.passes})
-    pooled = FrozenMap({name: FieldErrors.pooled(fields.values()) for name, fields in schemes.items()})
-    return Treatment(FieldErrors.pooled(errors), found.p_value, pooled)
+    alone = {p.name: calibrated_alone(campaign, p) for p in campaign.passes}
+    return _treatment(campaign, simultaneous(campaign), schemes_tested(campaign, alone))
 
 
 def with_monitor(campaign: Campaign) -> Treatment:
     """Adjust a campaign with the monitor's readings, which are observations where a field is calibrated and correct the
     cameras where it is tested.
     """
-    found = adjust_with_readings(campaign)
-    errors = [tested(campaign, p, found.cameras_of(p.name), found.bias(p.name)) for p in campaign.passes]
+
+    def drifted(one: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
+        own = {line: camera.drifted(one.readings[line]) for line, camera in cameras.items()}
+        return tested(campaign, one, own, bias)
+
     alone = {p.name: adjust_field_with_readings(campaign, p) for p in campaign.passes}
-    schemes = {}
-    for k, names in enumerate(campaign.spec.schemes):
-        schemes[str(k + 1)] = FieldErrors.pooled(_drifted_scheme(campaign, alone, names, p) for p in campaign.passes)
-    own = (_drifted_scheme(campaign, alone, (p.name,), p) for p in campaign.passes)
-    schemes[str(len(campaign.spec.schemes) + 1)] = FieldErrors.pooled(own)
-    return Treatment(FieldErrors.pooled(errors), found.p_value, FrozenMap(schemes))
+    return _treatment(campaign, adjust_with_readings(campaign), by_scheme(campaign, alone, drifted))
 
 
 def adjust_with_readings(campaign: Campaign) -> Adjustment:
@@ -521,12 +508,3 @@ def height_per_arcsec(campaign: Campaign) -> float:
 def _reading_priors(campaign: Campaign, one: FieldPass) -> list[Prior]:
     sigma = reading_sigma(campaign.simulated)
     return [p for line, told in one.readings.items() for p in monitor_priors(one.name, line, told, sigma)]
-
-
-def _drifted_scheme(
-    campaign: Campaign, alone: Mapping[str, Adjustment], names: tuple[str, ...], one: FieldPass
-) -> CheckErrors:
-    """Errors of a field by the mean parameters of these fields, drifted by the field's own readings."""
-    cameras, bias = averaged(campaign, [alone[name] for name in names], names)
-    own = {line: camera.drifted(one.readings[line]) for line, camera in cameras.items()}
-    return tested(campaign, one, own, bias)

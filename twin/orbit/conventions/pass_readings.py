@@ -198,10 +198,9 @@ def _image_points(
     names, cameras = table["point"].astype(str), table["camera"].astype(str)
     require_known(table, "camera", tuple(lines))
     number = np.array([known.get(name, -1) for name in names.tolist()])
-    if np.any(number < 0):
-        row = int(np.argmax(number < 0))
+    for row in np.flatnonzero(number < 0)[:1]:
         name = str(names[row])
-        raise table.error(row, "point", "no such ground point", shown(name), None, nearest(name, known))
+        raise table.error(int(row), "point", "no such ground point", shown(name), None, nearest(name, known))
     found = {}
     for camera in dict.fromkeys(cameras.tolist()):
         rows = np.flatnonzero(cameras == camera)
@@ -578,17 +577,13 @@ class PassBench:
         """Places (n, 3) at the heights of the ground points, ITRS, metres, and the line time at each, seconds."""
         clock = self.readings.lines[name]
         number = line_of(meant, raw, clock)
-        beyond = ~in_span(number, clock.line[0] - 1.0, clock.line[-1] + 1.0)
-        if np.any(beyond):
-            worst = float(number[int(np.argmax(beyond))])
+        for worst in number[~in_span(number, clock.line[0] - 1.0, clock.line[-1] + 1.0)][:1]:
             told = f"{clock.line[0]:.10g} to {clock.line[-1]:.10g}"
             raise ImpossibleError(f"line {worst:.10g} of {name} has no time in the table, which tells those of {told}")
         times, line_time = line_times(clock, meant, self.epoch, number)
         path, camera = platform.path, self.cameras[name]
         pixel = pixel_of(meant, raw, camera.pixels) + step
-        outside = ~in_span(pixel, -0.5, camera.pixels - 0.5)
-        if np.any(outside):
-            worst = float(pixel[int(np.argmax(outside))])
+        for worst in pixel[~in_span(pixel, -0.5, camera.pixels - 0.5)][:1]:
             raise ImpossibleError(f"pixel {worst:.6g} of {name} does not exist, which has {camera.pixels}")
         first, last = path.first, path.last
         if not np.all(in_span(times, first, last)):

@@ -36,7 +36,6 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.image_points import (
-    BEYOND,
     CONSENSUS,
     POINTS_REMEDY,
     MatchedLine,
@@ -58,7 +57,7 @@ from twin.orbit.images.patch import (
     true_ground,
 )
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files
-from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
+from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.quantity import Quantity, Record
 from twin.run.random_streams import stream
@@ -446,8 +445,6 @@ def simulation_exported(run: Simulation) -> dict[str, str]:
     known = run.points.control
     sorts = [known] if run.points.ties is None else [known, run.points.ties]
     role = np.concatenate([np.where(known.check, "check", "control"), *(["tie"] * len(s.ground) for s in sorts[1:])])
-    letter = {"control": "c", "check": "k", "tie": "t"}
-    ids = [f"{letter[r]}{k}" for k, r in enumerate(role.tolist())]
     ground = np.concatenate([known.ground, *(np.full((len(s.ground), 3), np.nan) for s in sorts[1:])])
     covariance = np.zeros((len(role), 3, 3))
     # one error in plan moves all points of a patch: each of n weighs as if it had n times the variance
@@ -456,15 +453,10 @@ def simulation_exported(run: Simulation) -> dict[str, str]:
     covariance[: len(known.ground)] = level_covariance(known.ground, plan, tall)
     images = {}
     for name in known.lines:
-        parts, first = [], 0
-        for sort in sorts:
-            line = sort.lines[name]
-            good = np.flatnonzero(line.accepted)
-            place, spread = line.image[good], line.covariance[good] + BEYOND**2 * np.eye(2)
-            parts.append((good + first, place[:, 0], place[:, 1], spread))
-            first += len(sort.ground)
-        images[name] = ImagePoints.of(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    points = GroundPoints.of(ids, ground, covariance, role.astype(object))
+        good = [np.flatnonzero(sort.lines[name].accepted) for sort in sorts]
+        parts = [sort.lines[name].measured(rows, rows) for sort, rows in zip(sorts, good, strict=True)]
+        images[name] = ImagePoints.joined([parts[0], *(part.numbered(-len(known.ground)) for part in parts[1:])])
+    points = GroundPoints.of(point_names(role), ground, covariance, role.astype(object))
     one = PassMeasurements(spec.name, platform, dict.fromkeys(known.lines, times), points, images)
     gps, tracker = plain["errors"]["gps"], plain["errors"]["star_tracker"]
     test = {

@@ -31,7 +31,6 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Maps
 from twin.orbit.images.image_points import (
-    BEYOND,
     POINTS_REMEDY,
     ImagedGround,
     LineFrame,
@@ -260,9 +259,7 @@ def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, 
         roles += ["tie" if sort == "tie" else "check" if one.check[k] else "control" for k in number]
         for name, line in one.lines.items():
             good = np.flatnonzero(line.accepted & keep)
-            image, spread = line.image[good], line.covariance[good] + BEYOND**2 * np.eye(2)
-            which = [number[int(k)] for k in good]
-            rows[name].append(ImagePoints.of(which, image[:, 0], image[:, 1], spread))
+            rows[name].append(line.measured(good, np.array([number[int(k)] for k in good], np.intp)))
     itrs, role = np.concatenate(places), np.array(roles, object)
     covariance = np.zeros((len(ids), 3, 3))
     given = role != "tie"

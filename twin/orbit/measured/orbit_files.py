@@ -131,9 +131,7 @@ def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
     fails has the wrong unit.
     """
     radius = np.linalg.norm(position, axis=1)
-    far = (radius < 6.3e6) | (radius > 1e8)
-    if np.any(far):
-        row = int(np.argmax(far))
+    for row in np.flatnonzero((radius < 6.3e6) | (radius > 1e8))[:1]:
         found = f"{radius[row] / 1e3:.6g} km from the Earth's centre"
         raise InputError(Issue("no place of a satellite", file, lines[row], (), found, "6300 km to 100 000 km; units?"))
 
@@ -141,9 +139,7 @@ def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
 def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
     """InputError unless quaternions (M, 4) on these lines have length 1 to a thousandth."""
     length = np.linalg.norm(quaternion, axis=1)
-    far = np.abs(length - 1.0) > 1e-3
-    if np.any(far):
-        row = int(np.argmax(far))
+    for row in np.flatnonzero(np.abs(length - 1.0) > 1e-3)[:1]:
         found = f"length {length[row]:.6g}"
         raise InputError(Issue("not a quaternion of a rotation", file, lines[row], (), found, "length 1"))
 
@@ -223,7 +219,7 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
         if centre.upper() != "EARTH":
             raise InputError(Issue("an orbit about another body", file, line, ("CENTER_NAME",), shown(centre), "EARTH"))
     frame, line = _same(file, segments, "REF_FRAME")
-    rows, lines = _all_rows(segments)
+    rows, lines = [row for s in segments for row in s.rows], [line for s in segments for line in s.lines]
     widths = {len(row) for row in rows}
     cells = [row[1:7] for row in rows] if widths <= {7, 10} else [row[1:] for row in rows]
     found = 1e3 * numbers(file, cells, lines, ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT"))
@@ -386,11 +382,6 @@ def _scale(file: str, segments: list[_Segment]) -> str:
         raise InputError(Issue(problem.problem, file, line, key, problem.found, problem.allowed)) from None
 
 
-def _all_rows(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:
-    """Rows of all segments one after the other, with their lines."""
-    return [row for s in segments for row in s.rows], [line for s in segments for line in s.lines]
-
-
 def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
     """Segments of an orbit: nothing may be interpolated from one to the next, for they meet where an orbit breaks, as
     at a manoeuvre, nor used outside of USEABLE_START_TIME and USEABLE_STOP_TIME (502.0-B, 5.2.4).
@@ -441,49 +432,42 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     file, lines = str(path), text_lines(path, WHAT)
     head = lines[0]
     old = head[:2] in ("#a", "#b")
-    which = _name(satellite, lines, old) if satellite else _only_satellite(file, lines)
+    which = _satellite(file, lines, satellite, old)
     scale = _sp3_scale(file, lines, old)
     system = head[46:51].strip()
     frame = known_frame(system, file, 1, "coordinate system") if system not in ("", "UNDEF") else None
-    texts, where, places, rows, speeds, speed_rows = [], [], [], [], [], []
+    texts, places, rows, speeds, speed_rows = [], [], [], [], []
     epoch: str | None = None
-    ended = last_used = False
+    ended = used = False
     epochs = 0
     for k, line in enumerate(lines):
-        mark = line[:1]
+        mark, cells = line[:1], [line[4:18], line[18:32], line[32:46]]
         if mark == "*":
-            epoch, last_used, epochs = _epoch(file, k + 1, line), False, epochs + 1
+            epoch, used, epochs = _epoch(file, k + 1, line), False, epochs + 1
         elif mark in "PV" and line[1:4].strip() == which:
             if epoch is None:
                 raise InputError(Issue("a record before the first epoch", file, k + 1, (), shown(line[:20]), WHAT))
-            cells = [line[4:18], line[18:32], line[32:46]]
             if mark == "P":
-                if not any(c.strip(" 0.-") for c in cells) and all(c.strip() for c in cells):
-                    epoch_used = False
-                else:
-                    epoch_used = True
-                    texts.append(epoch)
-                    where.append(k + 1)
-                    places.append(cells)
-                    rows.append(k + 1)
-                last_used = epoch_used
-            elif rows and last_used:
+                used = any(c.strip(" 0.-") for c in cells) or not all(c.strip() for c in cells)
+            if mark == "P" and used:
+                texts.append(epoch)
+                places.append(cells)
+                rows.append(k + 1)
+            elif mark == "V" and used:
                 speeds.append(cells)
                 speed_rows.append(k + 1)
         elif line.startswith("EOF"):
             ended = True
             break
     stated = head[32:39].strip()
-    if not ended and not (stated.isdigit() and int(stated) == epochs and last_used):
+    if not ended and not (stated.isdigit() and int(stated) == epochs and used):
         found = f"{epochs} of {stated} epochs" if stated.isdigit() else None
         allowed = "EOF as the last line, or all epochs of the header"
         raise InputError(Issue("the file ends early", file, len(lines), (), found, allowed))
-    if not rows and satellite is not None:
-        raise _unknown(file, lines, satellite)
     if len(rows) < 2:
         raise InputError(Issue(f"fewer than two places of {which}", file, None, (), str(len(rows)), "two or more"))
-    clock = readings(file, texts, where)
-    require_rising(file, clock, where)
+    clock = readings(file, texts, rows)
+    require_rising(file, clock, rows)
     position = 1e3 * numbers(file, places, rows, ("x", "y", "z"))
     require_orbit(file, position, rows)
     velocity = None
@@ -495,30 +479,19 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     return OrbitReadings(file, clock, position, velocity, frame, scale)
 
 
-def _only_satellite(file: str, lines: list[str]) -> str:
+def _satellite(file: str, lines: list[str], wanted: str | None, old: bool) -> str:
+    """Return the name of a satellite in the file; in files of versions a and b a number may stand for it."""
     names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
-    if len(names) != 1:
-        found = names_text(names[:20]) or "none"
-        raise InputError(Issue("which satellite is not said", file, None, ("satellite",), found, "the name of one"))
-    return names[0]
-
-
-def _name(wanted: str, lines: list[str], old: bool) -> str:
-    """A satellite's name as the file spells it: in the old versions 5, 05 and G05 are one."""
-    names = {line[1:4].strip() for line in lines if line[:1] == "P"}
-    if wanted in names or not old:
-        return wanted
-    number = wanted.lstrip("Gg").lstrip("0")
-    return next((n for n in sorted(names) if n.lstrip("Gg").strip().lstrip("0") == number), wanted)
-
-
-def _unknown(file: str, lines: list[str], wanted: str) -> InputError:
-    """What to say of a satellite that a file does not have."""
-    names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
-    issue = Issue(
-        "no such satellite", file, None, ("satellite",), wanted, names_text(names[:20]), nearest(wanted, names)
-    )
-    return InputError(issue)
+    key, found = ("satellite",), names_text(names[:20]) or "none"
+    if wanted is None:
+        if len(names) != 1:
+            raise InputError(Issue("which satellite is not said", file, None, key, found, "the name of one"))
+        return names[0]
+    alike = [n for n in sorted(names) if n.lstrip("Gg").strip().lstrip("0") == wanted.lstrip("Gg").lstrip("0")]
+    name = wanted if wanted in names or not (old and alike) else alike[0]
+    if name not in names:
+        raise InputError(Issue("no such satellite", file, None, key, wanted, found, nearest(wanted, names)))
+    return name
 
 
 def _sp3_scale(file: str, lines: list[str], old: bool) -> str:
