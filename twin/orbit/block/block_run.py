@@ -171,7 +171,7 @@ def run_adjustment(
         datum, block, rejected = _datum(block, spec.robust, pool)
         robust = spec.robust and rejected is None
         found = adjust_block(
-            block, robust="reject" if robust else None, variance_components=_components(spec.components), pool=pool
+            block, robust="reject" if robust else None, variance_components=spec.components or False, pool=pool
         )
         advance("block", 2, 2)
         worth = _worth(kept_block(found), found, known, advance, pool)
@@ -223,10 +223,6 @@ def _datum(block: Block, robust: bool, pool: Pool | None) -> tuple[DatumTest | N
     return test, block, None
 
 
-def _components(names: tuple[str, ...]) -> bool | tuple[str, ...]:
-    return names or False
-
-
 def _check(found: BlockAdjustment, known: _Known) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Check points (k,) that were adjusted, their errors (k, 3), ITRS, metres, and covariances (k, 3, 3) of these."""
     block = found.assembly.block
@@ -240,8 +236,10 @@ def _worth(
 ) -> FrozenMap[str, Worth]:
     """Check points by all sensors, without each, and by none but ties."""
     sensors = [name for name in kept.sensors if name != "ties"]
+    # without ties the check points are all that is left to judge by
+    enough = int(np.sum(kept.points.role == "check")) >= _LEAST_CHECK
     cases: dict[str, tuple[str, ...]] = {ALL: ()}
-    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors if _leaves_points(kept, name)}
+    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors if name != "ties" or enough}
     if len(sensors) > 1:
         cases[NOTHING] = tuple(sensors)
     rows = {}
@@ -256,11 +254,6 @@ def _worth(
         rows[case] = _accuracy(left_out, one, known)
     advance("sensors", len(cases), len(cases))
     return FrozenMap(rows)
-
-
-def _leaves_points(block: Block, sensor: str) -> bool:
-    """Whether points are left to be judged by."""
-    return sensor != "ties" or int(np.sum(block.points.role == "check")) >= _LEAST_CHECK
 
 
 def _accuracy(left_out: tuple[str, ...], one: BlockAdjustment, known: _Known) -> Worth:

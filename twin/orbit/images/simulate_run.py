@@ -59,7 +59,7 @@ from twin.orbit.images.patch import (
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
 from twin.run.procedure import Advance, BenchError, silent
-from twin.run.quantity import Quantity, Record
+from twin.run.quantity import Quantity, Record, plain_data
 from twin.run.random_streams import stream
 from twin.run.reference_frames import described
 
@@ -301,21 +301,20 @@ SIMULATE: Record[Simulation] = Record(
 
 def camera_data(camera: ThreeLineCameraSpec) -> dict[str, Any]:
     """Interior orientation and mounting of every line, and how they make a look."""
-    line: Record[str] = Record(
-        "Interior orientation of a line and its mounting in the body.",
-        Quantity("pixels", camera.pixels_of),
-        Quantity("pitch_m", camera.pitch_of),
-        Quantity("principal_distance_m", lambda name: camera.lines[name].principal_distance),
-        Quantity("principal_point_m", lambda name: camera.lines[name].principal_point),
-        Quantity("k1_per_m2", lambda name: camera.lines[name].k1),
-        Quantity("k2_per_m4", lambda name: camera.lines[name].k2),
-        Quantity(
-            "camera_to_body",
-            lambda name: about_axis(1, camera.lines[name].look) @ rotation_matrix(np.array(camera.lines[name].rotate)),
-        ),
-        Quantity("position_m", lambda name: camera.lines[name].position),
-    )
-    return {"name": camera.name, "look": _LOOK, "lines": {name: line(name) for name in camera.lines}}
+    lines = {
+        name: {
+            "pixels": camera.pixels_of(name),
+            "pitch_m": camera.pitch_of(name),
+            "principal_distance_m": line.principal_distance,
+            "principal_point_m": line.principal_point,
+            "k1_per_m2": line.k1,
+            "k2_per_m4": line.k2,
+            "camera_to_body": about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate)),
+            "position_m": line.position,
+        }
+        for name, line in camera.lines.items()
+    }
+    return {"name": camera.name, "look": _LOOK, "lines": plain_data(lines)}
 
 
 def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
@@ -329,20 +328,17 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
         times[in_span(times, path.first, path.last)]
         for times in (readings(path.first, path.last, one.interval) for one in (errors.gps, errors.star_tracker))
     )
-    found: Record[Trajectory] = Record(
-        "Orbit and attitude at readings.",
-        Quantity("epoch_utc", lambda path: str(path.orbit.epoch)),
-        Quantity("orbit_s", lambda path: fixes),
-        Quantity("position_m", lambda path: path.position(fixes)),
-        Quantity("velocity_m_per_s", lambda path: path.velocity(fixes)),
-        Quantity("inertial_velocity_m_per_s", lambda path: path.inertial_velocity(fixes)),
-        Quantity("attitude_s", lambda path: looks),
-        Quantity(
-            "quaternion",
-            lambda path: joined_quaternions(Rotation.from_matrix(path.body_to_itrs(looks)).as_quat(canonical=False)),
-        ),
-    )
-    return found(path)
+    quaternion = Rotation.from_matrix(path.body_to_itrs(looks)).as_quat(canonical=False)
+    found = {
+        "epoch_utc": str(path.orbit.epoch),
+        "orbit_s": fixes,
+        "position_m": path.position(fixes),
+        "velocity_m_per_s": path.velocity(fixes),
+        "inertial_velocity_m_per_s": path.inertial_velocity(fixes),
+        "attitude_s": looks,
+        "quaternion": joined_quaternions(quaternion),
+    }
+    return {key: plain_data(value) for key, value in found.items()}
 
 
 def georeference_data(run: Simulation) -> dict[str, Any]:
