@@ -14,9 +14,9 @@ from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.specs.orbit.setup import resolve_calibration, resolve_simulate
 from twin.orbit.calibration.calibration_run import true_values
-from twin.orbit.calibration.campaign import Campaign
+from twin.orbit.calibration.campaign import Campaign, FieldImages
 from twin.orbit.calibration.campaign_adjustment import simultaneous
-from twin.orbit.calibration.flown_campaign import FieldImages, fly_fields
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.screening import screened
 from twin.orbit.images import image_points
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points

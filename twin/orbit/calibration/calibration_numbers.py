@@ -16,9 +16,8 @@ from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.null_space import Combination
 from analysis.orbit.three_line_model import BIAS
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
-from twin.orbit.calibration.campaign import Campaign, FieldPass, interior_names
+from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Screening, interior_names
 from twin.orbit.calibration.campaign_adjustment import LatitudeFit
-from twin.orbit.calibration.flown_campaign import FieldImages, Screening
 from twin.orbit.calibration.influences import AttitudeDrift, ChipStep, DatumRow, LightRow, Surprise
 from twin.orbit.calibration.schemes import (
     DriftSize,

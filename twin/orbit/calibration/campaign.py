@@ -47,7 +47,8 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import OrbitCalibrationSpec
     from scenes.specs.orbit.flight import ErrorsSpec
     from scenes.specs.orbit.three_line_camera import LineCameraSpec
-    from twin.orbit.calibration.flown_campaign import FieldImages
+    from twin.orbit.images.image_points import PatchPoints
+    from twin.orbit.images.patch import LineJudgement, Patch
 
 EFFECTS = ("light_time", "aberration", "refraction")
 _DISTORTION_STEPS = 8
@@ -329,6 +330,62 @@ class PassTruth:
             self.errors.bias + np.sin(latitude - self.errors.reference) * self.errors.thermal + time * self.errors.rate
         )
         return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
+
+
+@dataclass(frozen=True, eq=False)
+class PatchRecord:
+    """One patch and how its points were matched.
+
+    Attributes:
+        points: measured.
+        judgements: ``control`` (with the check points) or ``tie`` -> line -> against the truth.
+    """
+
+    points: PatchPoints
+    judgements: Mapping[str, Mapping[str, LineJudgement]]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldImages:
+    """What became of a field's points.
+
+    Attributes:
+        name: of the field.
+        patches: one by one.
+        shown: the first patch itself, for a figure.
+        wrong: line -> (n,) whether the place of a control or tie point is wrong, by number of the point.
+        wrong_check: line -> (m,) likewise for check points.
+        screening: what the adjustment has left out; None before it.
+    """
+
+    name: str
+    patches: tuple[PatchRecord, ...]
+    shown: Patch
+    wrong: Mapping[str, np.ndarray]
+    wrong_check: Mapping[str, np.ndarray]
+    screening: Screening | None = None
+
+
+@dataclass(frozen=True)
+class Screening:
+    """What the adjustment has left out of a field; counts are of image points, by truth where wrong or right.
+
+    Attributes:
+        entered, left: image points of control and tie points before and after.
+        wrong_entered, wrong_left: wrong ones among them.
+        right_lost: right ones that were left out.
+        check_entered, check_left: check points before and after the test of their intersection.
+        wrong_check_left: of these, with a wrong place in a line.
+    """
+
+    entered: int
+    left: int
+    wrong_entered: int
+    wrong_left: int
+    right_lost: int
+    check_entered: int
+    check_left: int
+    wrong_check_left: int
 
 
 @dataclass(frozen=True, eq=False)

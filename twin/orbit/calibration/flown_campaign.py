@@ -28,9 +28,11 @@ from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
 from twin.orbit.calibration.campaign import (
     Campaign,
+    FieldImages,
     FieldPoints,
     PassData,
     PassTruth,
+    PatchRecord,
     campaign_of,
     light_effects,
     line_model,
@@ -44,7 +46,7 @@ from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import TERMS, Trajectory
-from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PatchPoints, PointsError, measure_points
+from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import LineJudgement, Patch, PatchError, fly_patch, imaged_lines, judged, true_ground
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
@@ -74,66 +76,6 @@ _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
         "terrain": (("images", "ground", "terrain"), "less relief, a larger exponent or larger posts"),
     }
 )
-
-
-@dataclass(frozen=True, eq=False)
-class PatchRecord:
-    """One patch and how its points were matched.
-
-    Attributes:
-        pixel: of the nadir line that sees its middle.
-        track: from the field's middle along the flight, metres.
-        points: measured.
-        judgements: ``control`` (with the check points) or ``tie`` -> line -> against the truth.
-    """
-
-    pixel: float
-    track: float
-    points: PatchPoints
-    judgements: Mapping[str, Mapping[str, LineJudgement]]
-
-
-@dataclass(frozen=True, eq=False)
-class FieldImages:
-    """What became of a field's points.
-
-    Attributes:
-        name: of the field.
-        patches: one by one.
-        shown: the first patch itself, for a figure.
-        wrong: line -> (n,) whether the place of a control or tie point is wrong, by number of the point.
-        wrong_check: line -> (m,) likewise for check points.
-        screening: what the adjustment has left out; None before it.
-    """
-
-    name: str
-    patches: tuple[PatchRecord, ...]
-    shown: Patch
-    wrong: Mapping[str, np.ndarray]
-    wrong_check: Mapping[str, np.ndarray]
-    screening: Screening | None = None
-
-
-@dataclass(frozen=True)
-class Screening:
-    """What the adjustment has left out of a field; counts are of image points, by truth where wrong or right.
-
-    Attributes:
-        entered, left: image points of control and tie points before and after.
-        wrong_entered, wrong_left: wrong ones among them.
-        right_lost: right ones that were left out.
-        check_entered, check_left: check points before and after the test of their intersection.
-        wrong_check_left: of these, with a wrong place in a line.
-    """
-
-    entered: int
-    left: int
-    wrong_entered: int
-    wrong_left: int
-    right_lost: int
-    check_entered: int
-    check_left: int
-    wrong_check_left: int
 
 
 @dataclass(eq=False)
@@ -210,7 +152,7 @@ class Imager:
                 raise BenchError(problem, ("images", "points"), POINTS_REMEDY) from error
             patches.append(patch)
             judgements = {sort: judged(patch, some) for sort, some in points.sorts.items()}
-            records.append(PatchRecord(one.pixel, one.track, points, FrozenMap(judgements)))
+            records.append(PatchRecord(points, FrozenMap(judgements)))
             self.done += 1
             self.advance("patches", self.done, total)
         return self._collected(data, patches, records)
