@@ -275,20 +275,18 @@ class FieldPoints:
     """What was measured of a field's points.
 
     Attributes:
-        data: what is known of the pass beside them.
         control_images: line -> image points of the control points, and of the tie points after them.
         control_ground: (n, 3) given coordinates of control points, first guesses of ties, ITRS, metres.
         control: (n,) bool: which are control.
-        sigma: of each given coordinate, or of each axis in plan and of the height, metres.
+        sigma: of given coordinates, of each axis in plan and of the height, metres.
         check_images: line -> image points of the check points.
         check_ground: (m, 3) true coordinates of the check points, ITRS, metres.
     """
 
-    data: PassData
     control_images: Mapping[str, ImagePoints]
     control_ground: np.ndarray
     control: np.ndarray
-    sigma: float | tuple[float, float]
+    sigma: tuple[float, float]
     check_images: Mapping[str, ImagePoints]
     check_ground: np.ndarray
 

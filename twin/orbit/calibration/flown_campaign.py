@@ -13,7 +13,7 @@ The truth enters the record of wrong matches and the true places of check points
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -189,7 +189,6 @@ class Imager:
         sigma = self.spec.control.sigma * share, self.spec.points.height_sigma
         both = known.followed_by(tie)
         points = FieldPoints(
-            data,
             both.images,
             both.ground,
             np.arange(both.count) < known.count,
@@ -272,41 +271,37 @@ _DRIFT, _READING = 6, 7
 """Streams of a field's seed. What else is drawn of a field does not change with them."""
 
 
-def _sample_drift(
-    spec: OrbitCalibrationSpec, lines: Sequence[str], seed: np.random.SeedSequence
-) -> FrozenMap[str, np.ndarray]:
+def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) true d_alpha, d_beta, d_gamma (radians) and d_f (metres) during one field; empty for no drift.
 
     The draws of a line are the same whatever their sigmas are.
 
     Args:
         spec: the test.
-        lines: names of the three lines.
         seed: of the field.
     """
     if not spec.drift:
         return FrozenMap({})
-    unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(lines), 4))
+    unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(LINES), 4))
     sigma = {name: np.array([*one.angles, one.principal_distance]) for name, one in spec.drift.items()}
-    return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(lines, unit, strict=True)})
+    return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(LINES, unit, strict=True)})
 
 
 def _sample_readings(
-    spec: OrbitCalibrationSpec, lines: Sequence[str], drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
+    spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
 ) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) what the monitor reads, in the same units; empty for no monitor.
 
     Args:
         spec: the test.
-        lines: names of the three lines.
         drift: the true one.
         seed: of the field.
     """
     if spec.monitor is None:
         return FrozenMap({})
-    noise = np.random.default_rng(stream(seed, _READING)).standard_normal((len(lines), 4))
+    noise = np.random.default_rng(stream(seed, _READING)).standard_normal((len(LINES), 4))
     sigma = reading_sigma(spec) * spec.errors.switched_on
-    return FrozenMap({name: drift[name] + sigma * row for name, row in zip(lines, noise, strict=True)})
+    return FrozenMap({name: drift[name] + sigma * row for name, row in zip(LINES, noise, strict=True)})
 
 
 def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
@@ -342,23 +337,15 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
         _pass(name, field, spec, payload, changed, earth, own, imager)
         for (name, field), own in zip(spec.fields.items(), seed.spawn(len(spec.fields)), strict=True)
     ]
-    campaign = campaign_of(spec, payload, [one.measurements for one in flown], spec.images is None)
+    measured, readings, pictures, truths = zip(*flown, strict=True)
+    campaign = campaign_of(spec, payload, measured, spec.images is None)
     passes = tuple(
-        replace(p, known_truth=one.truth, readings=one.readings) for p, one in zip(campaign.passes, flown, strict=True)
+        replace(one, known_truth=truth, readings=told)
+        for one, truth, told in zip(campaign.passes, truths, readings, strict=True)
     )
-    images = tuple(one.images for one in flown if one.images is not None)
+    images = tuple(one for one in pictures if one is not None)
     truth = FrozenMap({k: line_model(changed, k) for k in LINES})
     return replace(campaign, passes=passes, images=images or None, known_truth=truth)
-
-
-@dataclass(frozen=True, eq=False)
-class _Flown:
-    """A pass: what was measured of it, what a monitor reads, what became of points in images, and the truth."""
-
-    measurements: PassMeasurements
-    readings: Mapping[str, np.ndarray]
-    images: FieldImages | None
-    truth: PassTruth
 
 
 def true_bias(spec: OrbitCalibrationSpec, latitude: np.ndarray) -> np.ndarray:
@@ -378,10 +365,10 @@ def _pass(
     earth: Earth,
     seed: np.random.SeedSequence,
     imager: Imager | None,
-) -> _Flown:
-    """Fly and measure."""
-    pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, LINES, seed)
-    readings = _sample_readings(spec, LINES, drift, seed)
+) -> tuple[PassMeasurements, Mapping[str, np.ndarray], FieldImages | None, PassTruth]:
+    """Return what was measured of a pass, what a monitor reads, what became of points in images, and the truth."""
+    pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, seed)
+    readings = _sample_readings(spec, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
     place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
     trajectory = _trajectory(name, field, spec, earth, seed)
@@ -430,24 +417,24 @@ def _pass(
         drift,
     )
     datum = errors.datum if errors.switched_on else (0.0, 0.0, 0.0)
-    told = _measurements_of(name, platform, FrozenMap(dict.fromkeys(LINES, times)), points, ties, datum)
-    return _Flown(told, readings, images, truth)
+    told = _measurements_of(name, platform, times, points, ties, datum)
+    return told, readings, images, truth
 
 
 def _measurements_of(
     name: str,
     platform: PlatformTable,
-    times: Mapping[str, LineTimes],
+    times: LineTimes,
     points: FieldPoints,
     ties: Mapping[str, ImagePoints],
-    datum: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    datum: tuple[float, float, float],
 ) -> PassMeasurements:
     """What was measured of a simulated pass, as files would have it.
 
     Args:
         name: of the pass.
         platform: readings.
-        times: line -> line times.
+        times: of every line.
         points: control, tie and check points.
         ties: line -> image points of further tie points, counted from 0.
         datum: by which control points are given too far east, north and up, metres.
@@ -458,21 +445,18 @@ def _measurements_of(
         given = given + np.array(datum) @ east_north_up(lon, lat)
     count, checks = len(given), len(points.check_ground)
     more = 1 + max((int(r.point.max()) for r in ties.values() if len(r.point)), default=-1)
-    plan, tall = points.sigma if isinstance(points.sigma, tuple) else (points.sigma, points.sigma)
-    empty = np.full((count, 3), np.nan)
-    itrs = np.concatenate(
-        [np.where(is_control[:, None], given, empty), points.check_ground, np.full((more, 3), np.nan)]
-    )
+    known = np.where(is_control[:, None], given, np.nan)
+    itrs = np.concatenate([known, points.check_ground, np.full((more, 3), np.nan)])
     role = np.array(["control" if c else "tie" for c in is_control] + ["check"] * checks + ["tie"] * more, object)
     covariance = np.zeros((len(role), 3, 3))
-    covariance[:count][is_control] = level_covariance(given[is_control], plan, tall)
+    covariance[:count][is_control] = level_covariance(given[is_control], *points.sigma)
     images = {}
     for line, row in points.control_images.items():
         parts = [row, points.check_images[line].numbered(-count)]
         parts += [ties[line].numbered(-count - checks)] if line in ties else []
         images[line] = ImagePoints.joined(parts)
     ground = GroundPoints.of(point_names(role), itrs, covariance, role)
-    return PassMeasurements(name, platform, FrozenMap(dict(times)), ground, FrozenMap(images))
+    return PassMeasurements(name, platform, FrozenMap(dict.fromkeys(LINES, times)), ground, FrozenMap(images))
 
 
 def _simulated_points(
@@ -499,7 +483,8 @@ def _simulated_points(
     given = points[:count] + control * ground.standard_normal((count, 3))
     control_images = {k: row.taken(np.arange(count)) for k, row in images.items()}
     check_images = {k: row.taken(np.arange(count, len(points))).numbered(count) for k, row in images.items()}
-    return FieldPoints(data, control_images, given, np.ones(count, bool), control, check_images, points[count:])
+    known = np.ones(count, bool)
+    return FieldPoints(control_images, given, known, (control, control), check_images, points[count:])
 
 
 def _trajectory(

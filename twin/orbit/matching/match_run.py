@@ -176,13 +176,11 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
         allowed = (
             f"{sensor.camera.pixels} pixels of {name}; `first_pixel` of the image's first column, and its `window`"
         )
-        raise InputError(spec.issue("an image wider than its line", ("first_pixel",), found=found, allowed=allowed))
+        raise spec.error("an image wider than its line", ("first_pixel",), found=found, allowed=allowed)
     if first_line + rows > sensor.lines + 1:
         found = f"lines to {first_line + rows - 1}"
         allowed = f"lines to {sensor.lines - 1}, of which the table has times; or a `window`"
-        raise InputError(
-            spec.issue("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
-        )
+        raise spec.error("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
     return LineFrame(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
 
 
@@ -195,19 +193,17 @@ def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
         from rasterio.windows import Window as Part
 
         if not 1 <= spec.band <= source.count:
-            raise InputError(spec.issue("no such band", ("band",), found=spec.band, allowed=f"1 to {source.count}"))
+            raise spec.error("no such band", ("band",), found=spec.band, allowed=f"1 to {source.count}")
         shape = (source.height, source.width)
         row, column, rows, columns = (
             (0, 0, *shape) if part is None else (part.row, part.column, part.rows, part.columns)
         )
         if row + rows > shape[0] or column + columns > shape[1]:
             allowed = f"within {shape[0]} rows and {shape[1]} columns"
-            raise InputError(spec.issue("a window outside of the image", ("window",), allowed=allowed))
+            raise spec.error("a window outside of the image", ("window",), allowed=allowed)
         if rows * columns > LARGEST_PART:
             found, allowed = f"{rows} x {columns} pixels", f"a `window:` of at most {LARGEST_PART:.0e} pixels"
-            raise InputError(
-                spec.issue("too large an image to be matched at once", ("window",), found=found, allowed=allowed)
-            )
+            raise spec.error("too large an image to be matched at once", ("window",), found=found, allowed=allowed)
         key = ("file",) if part is None else ("window", "rows")
         unit = "rows in a `window`" if part is None else "rows"
         require_memory(Lowered(spec, key, rows, unit, lambda n: n * columns * count * _PIXEL, 32))

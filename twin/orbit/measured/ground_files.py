@@ -88,7 +88,7 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
         geoid = None if spec.geoid is None else Geoid.read(folder / spec.geoid)
         datum = Datum.of(system, heights, geoid)
     except Problem as problem:
-        raise spec.error(problem.problem, ("crs",), found=problem.found, allowed=problem.allowed) from None
+        raise spec.error(problem, ("crs",)) from None
     try:
         itrs = datum.itrs(*rows.places.T)
     except Problem as problem:

@@ -500,9 +500,7 @@ class UserMap:
                 try:
                     values[k : k + 256] += self.geoid(*np.degrees(part.frame.geographic(east, north)))
                 except Problem as problem:
-                    raise InputError(
-                        Issue(problem.problem, self.raster.file, None, (), problem.found, problem.allowed)
-                    ) from None
+                    raise InputError(problem.at(self.raster.file)) from None
         known = values if part.valid is None else values[part.valid]
         if known.size and (known.min() < -1000.0 or known.max() > 10000.0):
             found = f"{known.min():g} to {known.max():g} m"

@@ -378,8 +378,7 @@ def _scale(file: str, segments: list[_Segment]) -> str:
     try:
         return known_scale(name)
     except Problem as problem:
-        key = ("TIME_SYSTEM",)
-        raise InputError(Issue(problem.problem, file, line, key, problem.found, problem.allowed)) from None
+        raise InputError(problem.at(file, line, ("TIME_SYSTEM",))) from None
 
 
 def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
@@ -502,8 +501,7 @@ def _sp3_scale(file: str, lines: list[str], old: bool) -> str:
             try:
                 return known_scale(line[9:12])
             except Problem as problem:
-                key = ("time system",)
-                raise InputError(Issue(problem.problem, file, k + 1, key, problem.found, problem.allowed)) from None
+                raise InputError(problem.at(file, k + 1, ("time system",))) from None
     if old:
         return known_scale("GPS")
     raise InputError(Issue("no line %c with the time system", file, None, (), None, WHAT))

@@ -257,7 +257,7 @@ def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants
     try:
         return clock.instants(scale).later(offset)
     except Problem as problem:
-        raise InputError(Issue(problem.problem, file, None, (), problem.found, problem.allowed)) from None
+        raise InputError(problem.at(file)) from None
 
 
 def _stated(spec: Any, key: str, said: str | None, found: str | None, what: str) -> str:
@@ -371,7 +371,7 @@ def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: Readings) -> Reading
         start = tai_minus_utc(calendar_reading(str(spec.epoch))[0])
         since = np.array([tai_minus_utc(int(day)) for day in days]) - start
     except Problem as problem:
-        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
+        raise spec.error(problem, ("epoch",)) from None
     between = float(np.max(np.abs(since)))
     if between and spec.leap_seconds is None:
         count = f"{between:g} leap seconds lie between the epoch and the times"
