@@ -142,12 +142,7 @@ _TOLD = 0.1
 def block_report(run: BlockRun) -> Report:
     """Report of a run."""
     return Report(
-        "Block adjustment",
-        *_verdict(run),
-        _facts(run),
-        _summary(run),
-        (_groups(run), _cameras(run), _open(run), _points(run)),
-        warnings=_warnings(run),
+        "Block adjustment", *_verdict(run), _facts(run), _summary(run), _sections(run), warnings=_warnings(run)
     )
 
 
@@ -212,69 +207,46 @@ def _summary(run: BlockRun) -> Table:
     )
 
 
-def _groups(run: BlockRun) -> Section:
-    rows = {name: GROUP(one) for name, one in run.adjustment.groups.items()}
-    table = GROUP.table(
+def _sections(run: BlockRun) -> tuple[Section, ...]:
+    """Return groups and laws, cameras, what stays open, and check points; docs/block.md explains them."""
+    groups = GROUP.table(
         "groups",
         "Observations and laws",
         "Variance of the residuals over that of the sigmas, with the share of the observations that others check. Laws"
         " of readings' errors are groups of their own.",
-        rows,
+        {name: GROUP(one) for name, one in run.adjustment.groups.items()},
         label="group",
     )
-    text = (
-        "The chance of a group is that of a chi-square with its redundancy for its freedom. A law with a course in time"
-        " is also tested for its neighbours, which should be independent: the warnings name one that is not.",
+    hidden = ("_sigma_before",) if run.drawn is not None else ("_sigma_before", "_true")
+    keys = [one.key for one in CHANGE if not one.key.endswith(hidden)]
+    changes = {name: CHANGE(one) for name, one in run.cameras.items()}
+    cameras = CHANGE.table(
+        "cameras", "Cameras", "Changes since the calibration, in each scene.", changes, keys, "scene"
     )
-    return Section("Whether what was stated holds", text, (table,))
-
-
-def _cameras(run: BlockRun) -> Section:
-    rows = {name: CHANGE(one) for name, one in run.cameras.items()}
-    keys = [
-        f"{name}{end}"
-        for name in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
-        for end in (("", "_sigma", "_true") if run.drawn is not None else ("", "_sigma"))
-    ]
-    table = CHANGE.table("cameras", "Cameras", "Changes since the calibration, in each scene.", rows, keys, "scene")
-    return Section("Cameras", (), (table,))
-
-
-def _open(run: BlockRun) -> Section:
-    rows: list[tuple[Cell, ...]] = [
-        (str(one).rsplit(" (", 1)[0], 100.0 * one.told) for one in run.open if one.told < _TOLD
-    ]
-    table = Table(
+    left = Table(
         "open",
         "Left to what is known beforehand",
         "Combinations for one sigma of what is known beforehand; told: by how much of a sigma of the observations alone"
         " they are known, in percent.",
         ("change of", "told [%]"),
-        rows,
+        [(str(one).rsplit(" (", 1)[0], 100.0 * one.told) for one in run.open if one.told < _TOLD],
         (None, 3),
     )
-    text = (
-        "No image point, control point or footprint tells these changes; they are as good as the sigmas that the file"
-        " states, and so is their part of the errors of the ground.",
-    )
-    return Section("What the observations do not tell", text, (table,))
-
-
-def _points(run: BlockRun) -> Section:
-    where, error, sigma = run.check
     ids = run.adjustment.assembly.block.points.ids
-    rows: list[tuple[Cell, ...]] = [
-        (str(ids[k]), *e.tolist(), *s.tolist()) for k, e, s in zip(where, error, sigma, strict=True)
-    ]
-    table = Table(
+    points = Table(
         "check_points",
         "Check points",
         "Errors and sigmas.",
         ("point", "east [m]", "north [m]", "up [m]", "σ east [m]", "σ north [m]", "σ up [m]"),
-        rows,
+        [(str(ids[k]), *e.tolist(), *s.tolist()) for k, e, s in zip(*run.check, strict=True)],
         (None, 3, 3, 3, 3, 3, 3),
     )
-    return Section("Check points", (), (table,), folded=1)
+    return (
+        Section("Whether what was stated holds", (), (groups,)),
+        Section("Cameras", (), (cameras,)),
+        Section("What the observations do not tell", (), (left,)),
+        Section("Check points", (), (points,), folded=1),
+    )
 
 
 def _warnings(run: BlockRun) -> tuple[str, ...]:
