@@ -121,9 +121,9 @@ class PassData:
         models: line -> the same camera as the adjustment has it.
         pitch: line -> of its pixels, metres.
         height: mean of the ground above the ellipsoid, metres.
+        lines: line -> what the payload's file says of it.
         unit: metres in the focal plane; every ray carries the covariance of its own image point in units of it
             squared. None: rays carry none.
-        lines: line -> what the payload's file says of it, for CCDs that do not lie in one line; None where they do.
     """
 
     name: str
@@ -131,15 +131,12 @@ class PassData:
     models: Mapping[str, LineModel]
     pitch: Mapping[str, float]
     height: float
+    lines: Mapping[str, LineCameraSpec]
     unit: float | None = None
-    lines: Mapping[str, LineCameraSpec] | None = None
 
     def places(self, name: str, pixel: np.ndarray) -> np.ndarray:
         """Where pixels (n,) of a line lie in its focal plane, (n, 2), metres."""
-        if self.lines is not None:
-            return pixel_places(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
-        y = self.pitch[name] * (pixel - 0.5 * (self.sensors[name].camera.pixels - 1))
-        return np.column_stack([np.zeros_like(y), y])
+        return pixel_places(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
 
     @property
     def phase(self) -> float:
@@ -194,10 +191,10 @@ class PassData:
             station, attitude = sensor.trajectory.position(seconds), sensor.trajectory.body_to_itrs(seconds)
             # the noise of readings is shared by its own clock, which ticks at the readings
             rays = Rays.of(row.point, image, station, attitude, seconds - self.phase)
-            found[name] = rays if self.unit is None else replace(rays, spread=self._spread(name, row) / self.unit**2)
+            found[name] = rays if self.unit is None else replace(rays, spread=self.spread(name, row) / self.unit**2)
         return found
 
-    def _spread(self, name: str, row: ImagePoints) -> np.ndarray:
+    def spread(self, name: str, row: ImagePoints) -> np.ndarray:
         """(n, 2, 2) of image points in the focal plane, metres^2. A later line acts as a smaller x."""
         scale = self.pitch[name] * np.array([-self.pixels_per_line(name), 1.0])
         return row.covariance * scale[:, None] * scale
@@ -293,14 +290,8 @@ class FieldPoints:
 
 def image_sigma(images: Mapping[str, ImagePoints], data: PassData) -> float:
     """One standard deviation of x and y in the focal plane for all image points, root mean square, metres."""
-    squares = []
-    for name, row in images.items():
-        square = data.pitch[name] ** 2
-        squares += [
-            square * data.pixels_per_line(name) ** 2 * row.covariance[:, 0, 0],
-            square * row.covariance[:, 1, 1],
-        ]
-    return float(np.sqrt(np.mean(np.concatenate(squares))))
+    variances = [np.diagonal(data.spread(name, row), axis1=1, axis2=2) for name, row in images.items()]
+    return float(np.sqrt(np.mean(np.concatenate(variances))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -704,7 +695,7 @@ def pass_data(
     sensors = {line: Sensor.of_lines(cameras[line], platform, earth, at, NO_EFFECTS) for line, at in times.items()}
     models = {line: line_model(payload, line) for line in times}
     pitch = {line: payload.pitch_of(line) for line in times}
-    return PassData(name, FrozenMap(sensors), FrozenMap(models), FrozenMap(pitch), height, unit, payload.lines)
+    return PassData(name, FrozenMap(sensors), FrozenMap(models), FrozenMap(pitch), height, payload.lines, unit)
 
 
 def campaign_of(

@@ -368,7 +368,7 @@ def _joints(campaign: Campaign) -> tuple[tuple[str, float], ...]:
     data = campaign.passes[0].data
     found = []
     for name in campaign.lines:
-        ccds = () if data.lines is None else data.lines[name].ccds or ()
+        ccds = data.lines[name].ccds or ()
         pixels = [0.5 * (a.last + b.first) for a, b in pairwise(ccds)]
         pixels = pixels or [0.5 * (data.sensors[name].camera.pixels - 1)]
         found += [(name, float(y)) for y in data.places(name, np.array(pixels))[:, 1]]
