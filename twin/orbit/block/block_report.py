@@ -32,12 +32,7 @@ WORTH: Record[Worth] = Record(
     "Check points by some of the block's sensors.",
     Quantity("left_out", lambda one: list(one.left_out), "sensors that were not used"),
     Quantity("predicted", lambda one: one.predicted, "by the covariances of the points", record=ACCURACY),
-    Quantity(
-        "found",
-        lambda one: one.found,
-        "by the points' true places, or given ones; none without check points",
-        record=ACCURACY,
-    ),
+    Quantity("found", lambda one: one.found, "by true or given places of check points", record=ACCURACY),
     Quantity("agreement", lambda one: one.agreement, "mean square of errors over sigmas; 1 where the sigmas are right"),
 )
 GROUP: Record[GroupTest] = Record(

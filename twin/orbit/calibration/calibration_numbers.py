@@ -234,9 +234,7 @@ UNKNOWN: Record[Unknown] = Record(
     Quantity("value", lambda one: one.value, "estimated"),
     Quantity("sigma", lambda one: one.sigma, "standard deviation with the gauge's held unknowns exact"),
     Quantity(
-        "sigma_with_gauge",
-        lambda one: one.sigma_with_gauge,
-        "standard deviation with what launch leaves to expect of the held unknowns",
+        "sigma_with_gauge", lambda one: one.sigma_with_gauge, "with what launch leaves to expect of the held unknowns"
     ),
     Quantity(
         "share_from_launch",
@@ -403,9 +401,7 @@ MEASURED: Record[tuple[Campaign, FieldPass, Adjustment]] = Record(
     Quantity("tie_points", lambda m: m[1].tie_count, "that calibrate or tie the strip"),
     Quantity("check_points", lambda m: len(m[1].check_ground), "that test"),
     Quantity(
-        "image_points",
-        lambda m: {name: len(row.point) for name, row in m[1].measurements.images.items()},
-        "by line camera",
+        "image_points", lambda m: {name: len(row.point) for name, row in m[1].measurements.images.items()}, "by line"
     ),
     Quantity(
         "gsd_m",
@@ -414,11 +410,7 @@ MEASURED: Record[tuple[Campaign, FieldPass, Adjustment]] = Record(
     ),
     Quantity("rejected", lambda m: _rejected(m, "points", []), "points with a rejected image point, and its line"),
     Quantity("rejected_check_points", lambda m: _rejected(m, "check_points", []), "whose rays do not meet"),
-    Quantity(
-        "sigma_factor",
-        lambda m: _rejected(m, "factors"),
-        "by line, on the sigmas of its image points, by the residuals",
-    ),
+    Quantity("sigma_factor", lambda m: _rejected(m, "factors"), "by line, on the sigmas of its image points"),
     Quantity("check_chi_square", lambda m: meeting_of(*m).chi_square, "of the rays of the check points"),
     Quantity("check_degrees_of_freedom", lambda m: meeting_of(*m).degrees_of_freedom, "of this chi-square"),
 )
