@@ -16,6 +16,7 @@ from twin.orbit.calibration.campaign import any_effect, light_effects
 from twin.orbit.calibration.influences import SURPRISE, drift_warnings, step_warnings
 from twin.orbit.calibration.schemes import values_of
 from twin.orbit.calibration.screening import meeting_of
+from twin.orbit.images.simulate_report import changes_text
 from twin.orbit.measured.pass_measurements import duplicates, listed
 from twin.run.report import Report, answer
 
@@ -66,16 +67,11 @@ def calibration_report(run: CalibrationRun) -> Report:
 
 def _facts(setup: CalibrationSetup) -> tuple[tuple[str, str], ...]:
     test, camera, errors = setup.test, setup.camera, setup.test.errors
-    changes = "; ".join(
-        f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
-        f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
-        for name, c in test.perturb.items()
-    )
     bias = ", ".join(format_quantity(v, ANGLE) for v in errors.star_tracker.bias)
     noise = f"image {errors.image:g} px, control {format_quantity(errors.control, LENGTH)}"
     return (
         ("Camera", f"{camera.name}, {camera.description}"),
-        ("Changed since the laboratory", changes or "nothing"),
+        ("Changed since the laboratory", changes_text(test.perturb)),
         ("Bias of the star trackers", f"[{bias}]"),
         ("Passes", f"descending, {test.altitude / 1e3:g} km, one over each of {len(test.fields)} fields"),
         ("Points", _points(setup)),

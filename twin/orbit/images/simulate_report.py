@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +30,7 @@ from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_png, to_svg
 
 if TYPE_CHECKING:
+    from scenes.specs.orbit.calibration import InteriorChangeSpec
     from scenes.specs.orbit.setup import SimulateSetup
 
 
@@ -242,6 +243,16 @@ def _summary(run: Simulation) -> Table:
     return _lines(run, "images", "Images", caption, (*keys, "mean_dn", "rms_contrast"))
 
 
+def changes_text(perturb: Mapping[str, InteriorChangeSpec]) -> str:
+    """Return in words what has changed in the lines of a camera since the laboratory."""
+    changes = (
+        f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
+        f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
+        for name, c in perturb.items()
+    )
+    return "; ".join(changes) or "nothing"
+
+
 def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
     test, camera = setup.test, setup.camera
     terrain, light = test.ground.terrain, test.ground.light
@@ -250,15 +261,10 @@ def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
         "Jacksboro fault, 3 arc seconds, moved" if terrain.kind == "real" else f"fractal, exponent {terrain.exponent:g}"
     )
     sun = f"{format_quantity(light.elevation, ANGLE)} high in {format_quantity(light.azimuth, ANGLE)}"
-    changes = "; ".join(
-        f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
-        f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
-        for name, c in test.perturb.items()
-    )
     bias = ", ".join(format_quantity(v, ANGLE) for v in test.errors.star_tracker.bias)
     return (
         ("Camera", f"{camera.name}, {camera.description}"),
-        ("Changed since the laboratory", changes or "nothing"),
+        ("Changed since the laboratory", changes_text(test.perturb)),
         ("Bias of the star trackers", f"[{bias}]"),
         ("Terrain", f"{kind}; {format_quantity(terrain.height, LENGTH)} high, {relief}"),
         ("Ground", f"cells of {test.ground.texture.spacing:g} m, reflectance {test.ground.texture.mean:g}"),

@@ -102,11 +102,9 @@ class DimapPass:
         attitude: its samples, or polynomials.
         forward, right: coefficients (K,) of the tangents of a pixel's look, ascending powers of the pixel from 0.
         pitch: of the detector's pixels, metres; None where the file does not say.
-        settings: what the file says was done to it, by key.
         refracted: whether its geometry knows refraction.
         inertial_velocity: whether its velocities were those against the stars.
         light_speed: whether it says that the speed of light was taken into account, of which nothing is known here.
-        accuracy: ACCURACY_STDV, metres; None where there is none.
         rpc: names of files with its rational polynomials.
     """
 
@@ -123,11 +121,9 @@ class DimapPass:
     forward: Array
     right: Array
     pitch: float | None
-    settings: Mapping[str, str]
     refracted: bool
     inertial_velocity: bool
     light_speed: bool
-    accuracy: float | None
     rpc: tuple[str, ...]
 
     @property
@@ -247,8 +243,6 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
     title = root.maybe("Dataset_Identification", "DATASET_NAME")
     pitch = model.maybe("Instrument_Configuration", "DETECTOR_SIZE_COL")
     said = root.maybe("Processing_Information", "Product_Settings", "Geometric_Settings")
-    settings = {} if said is None else {one.tag: one.text for one in said.children if one.text}
-    accuracy = root.maybe("Quality_Assessment", "Planimetric_Accuracy_Measurement", "Quality_Values", "ACCURACY_STDV")
     named = root.all("Geoposition", "Geoposition_Models", "Rational_Function_Model", "Component", "COMPONENT_PATH")
     return DimapPass(
         str(path),
@@ -264,11 +258,9 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
         forward,
         right,
         None if pitch is None else pitch.number(least=1e-7, most=1e-3, unit=_LENGTH),
-        FrozenMap(settings),
         _switch(said, "ATMOSPHERIC_REFRACTION_SETTING"),
         inertial,
         _switch(said, "LIGHT_SPEED_SETTING"),
-        None if accuracy is None else accuracy.number(least=0.0, most=1e5),
         tuple(one.attributes["href"] for one in named if one.attributes.get("href")),
     )
 
