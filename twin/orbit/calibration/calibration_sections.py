@@ -239,10 +239,10 @@ def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         f"Wrong: {WRONG}; before any test, after the thresholds of matching, after consensus. RMS and chi-square of "
         "right places."
     )
-    keys = ("wrong_found", "found", "wrong_matched", "matched", "wrong_accepted", "accepted")
-    keys += ("right_rejected_by_consensus", "rms_lines_px", "rms_pixels_px", "chi_square_ratio")
+    counts = ("wrong_found", "found", "wrong_matched", "matched", "wrong_accepted", "accepted")
+    keys = (*counts, "right_rejected_by_consensus", "rms_lines_px", "rms_pixels_px", "chi_square_ratio")
     matching = MATCHING.table("image-matching", "Matching", caption, found, keys, "field, points, line", digits=4)
-    counts = " and ".join(str(int(p.control.control.sum())) for p in campaign.passes)
+    left = " and ".join(str(int(p.control.control.sum())) for p in campaign.passes)
     text = (
         f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
         f"Of {total['found']} places that matching found, {total['wrong_found']} are wrong "
@@ -251,7 +251,7 @@ def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         f"neighbours' agreement {total['wrong_accepted']} of {total['accepted']}, the adjustment "
         f"{total['wrong_left']} of {total['left']} image points ({total['check_left']} check points: "
         f"{total['wrong_check_left']}). The neighbours' test costs {total['right_rejected_by_consensus']} right ones, "
-        f"the adjustment {total['right_rejected_by_adjustment']}. {counts} control points are left. Their image "
+        f"the adjustment {total['right_rejected_by_adjustment']}. {left} control points are left. Their image "
         f"points weigh by the covariances of the matching and {BEYOND:g} px beyond them, for what no fit shows.",
     )
     first = campaign.images[0]

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -664,7 +664,12 @@ def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
 
 
 def passing_orbit(
-    epoch: str, span: float, altitude: float, longitude: float, latitude: float, direction: str = "descending"
+    epoch: str,
+    span: float,
+    altitude: float,
+    longitude: float,
+    latitude: float,
+    direction: Literal["descending", "ascending"] = "descending",
 ) -> OrbitSpec:
     """Return the orbit that passes a place at its epoch, followed for a span before and after; SI units."""
     passing = PassingSpec.model_construct(

@@ -146,8 +146,8 @@ def found_table(points: PatchPoints) -> Table:
     caption = (
         "Displacement from predicted to found and sigma: medians of the accepted, px along the track and the line."
     )
-    keys = ("found", "matched", "accepted", "displacement_lines_px", "displacement_pixels_px")
-    keys += ("displacement_lines_px_sigma", "displacement_pixels_px_sigma")
+    moved = ("displacement_lines_px", "displacement_pixels_px")
+    keys = ("found", "matched", "accepted", *moved, *(f"{key}_sigma" for key in moved))
     return MATCHED.table("points-found", "Matching", caption, rows, keys, "points, line", digits=4)
 
 

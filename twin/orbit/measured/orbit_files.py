@@ -101,9 +101,8 @@ class AttitudeReadings:
 
     def taken(self, part: slice) -> AttitudeReadings:
         """Return some of the readings."""
-        values = {name: getattr(self, name) for name in ("quaternion", "angles")}
-        kept = {name: None if value is None else value[part] for name, value in values.items()}
-        return replace(self, clock=self.clock.taken(part), **kept)
+        turns, angles = (None if values is None else values[part] for values in (self.quaternion, self.angles))
+        return replace(self, clock=self.clock.taken(part), quaternion=turns, angles=angles)
 
 
 def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_FRAME") -> str:
