@@ -313,10 +313,14 @@ def field_with_ties(campaign: Campaign, one: FieldPass) -> CalibrationField:
 
 def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.ndarray) -> CalibrationField:
     """A field with more points (n, 3), ITRS, metres, without given coordinates; their rays are numbered from zero."""
-    count, more = len(field.ground), len(ground)
+    more, joined = len(ground), {}
+    for line, row in field.rays.items():
+        pairs = ((getattr(one, name) for one in (row, rays[line])) for name in ("image", "station", "attitude", "time"))
+        point = np.concatenate([row.point, rays[line].point + len(field.ground)])
+        joined[line] = Rays.of(point, *(np.concatenate(list(pair)) for pair in pairs))
     return replace(
         field,
-        rays={line: _joined_rays(row, rays[line], count) for line, row in field.rays.items()},
+        rays=joined,
         ground=np.concatenate([field.ground, ground]),
         covariance=np.concatenate([field.covariance, np.zeros((more, 3, 3))]),
         control=np.concatenate([field.control, np.zeros(more, bool)]),
@@ -340,12 +344,6 @@ def tested_in_strip(
     """Errors at a field's check points, intersected with the strip's attitude and orbit."""
     rays = {line: strip.corrected(row) for line, row in one.check.items()}
     return check_errors(intersect(rays, cameras, campaign.noise, bias=bias).ground, one.check_ground)
-
-
-def _joined_rays(control: Rays, ties: Rays, count: int) -> Rays:
-    """Rays of both, with times; points of the second are numbered after the first's."""
-    pairs = ((getattr(control, name), getattr(ties, name)) for name in ("image", "station", "attitude", "time"))
-    return Rays.of(np.concatenate([control.point, ties.point + count]), *(np.concatenate(pair) for pair in pairs))
 
 
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)

@@ -67,12 +67,6 @@ def _control_png(run: Simulation) -> bytes:
         return to_png(figure, _DPI)
 
 
-def _transfer_svg(run: Simulation) -> str:
-    """MTF along the line and along the track, all lines and the parts of the first that looks obliquely."""
-    with look("simulate-transfer"):
-        return to_svg(_transfer_figure(run))
-
-
 def _modulus(values: np.ndarray) -> np.ndarray:
     """Modulus of complex values; real ones keep their sign."""
     return np.abs(values) if np.iscomplexobj(values) else values
@@ -176,8 +170,10 @@ def _control(run: Simulation) -> Section:
 
 
 def _sharpness(run: Simulation) -> Section:
+    with look("simulate-transfer"):
+        drawing = to_svg(_transfer_figure(run))
     caption = "Up to half a cycle per sample; before any noise."
-    return Section("Sharpness", (), (SvgFigure("transfer", "Modulation transfer", caption, _transfer_svg(run)),))
+    return Section("Sharpness", (), (SvgFigure("transfer", "Modulation transfer", caption, drawing),))
 
 
 def _data(run: Simulation) -> Section:
