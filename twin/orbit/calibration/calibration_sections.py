@@ -420,7 +420,7 @@ def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         "unknowns. z: the error in sigmas.",
         ("unknown", "unit", "value", "σ", "σ per arcsec of drift", *(("truth", "z") if run.truth is not None else ())),
         rows,
-        (None, None, 3, 3, 2, 3, 2),
+        (None, None, 3, 3, 2, *((3, 2) if run.truth is not None else ())),
     )
     steps = CHIP_STEP.table(
         "chip-steps",
