@@ -13,8 +13,7 @@ from functools import cache, partial
 import pytest
 from hypothesis import HealthCheck, settings
 
-from optics.numerics.backend import Backend, load_backend
-from optics.numerics.threads import cores
+from optics.numerics.backend import Backend, cores, load_backend
 from scenes.models import instrument_builder
 from scenes.models.camera_model import CameraModel, derive_camera
 from scenes.models.instrument_builder import build_instrument

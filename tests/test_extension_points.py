@@ -26,17 +26,17 @@ import twin.export.__main__
 import twin.lab
 import twin.render
 import twin.validate
+from analysis.arrays import ARCSEC
 from analysis.monitor import recovery
 from analysis.monitor.estimators import Formula, OfEachCamera
 from analysis.monitor.parameters import CameraCalibration, Parameter
 from analysis.spots.centroid import gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
-from analysis.units import ARCSEC
 from optics.geometry.aperture import Circle
 from optics.geometry.sag_terms import SAG_TERMS, grown
 from optics.geometry.tree import Motion, State
 from optics.geometry.vector_shape import Polygon
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.targets.target_shapes import Target

@@ -20,7 +20,7 @@ from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.zernike import MAX_NOLL
 from optics.materials.glass import CatalogueGlass
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import OVER, LensSurface, Note, Prescription, even_asphere, turned_over
 from scenes.lens.statements import Source, read_lines

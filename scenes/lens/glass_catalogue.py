@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from optics.materials.glass import FORMULAS, GLASSES, CatalogueGlass, common_glasses
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.lens.statements import Glasses, Source, glass_key, is_number, read_lines, statement_of
 
 _CONSTANTS = 6

@@ -16,7 +16,7 @@ from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.tree import Body, RigidTree
 from optics.geometry.zernike import cartesian_terms, monomials, noll_to_nm, triangle_index, triangle_size
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, LENGTH, Kind, format_quantity

@@ -17,7 +17,7 @@ from optics.geometry.aperture import Aperture, Edge
 from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
 from optics.materials.glass import ABBE_LINES
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import LensSurface, Note, Prescription
 from scenes.yaml.errors import InputError, Issue, shown

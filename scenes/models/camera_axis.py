@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.geometry.pose import Pose
+from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.first_order import Paraxial, equal_area_radius, paraxial, ray_matrix
 from optics.raytrace.system import SystemBatch

@@ -23,7 +23,7 @@ from optics.geometry.tree import AT_REST, Body, RigidTree, State
 from optics.materials.glass import ABBE_LINES
 from optics.numerics.array_math import norm, turned
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.first_order import FirstOrder, Paraxial, RayMatrix, first_order, ray_matrix

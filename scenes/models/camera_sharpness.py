@@ -1,6 +1,6 @@
 """How sharp a camera is as designed, from a few hundred rays, and where its focal plane would be best.
 
-Errors are as ``optics.waves.wavefront`` has them: rms over the stop about the sphere that stands around the chief
+Errors are as ``optics.waves.imaging`` has them: rms over the stop about the sphere that stands around the chief
 ray's image, piston and tilt taken out, in waves of the camera's own wavelength. The best focal plane has the least
 mean square of them over the field.
 """
@@ -20,7 +20,7 @@ from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import AimError
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
-from optics.waves.wavefront import path_to_sphere
+from optics.waves.imaging import path_to_sphere
 from scenes.models.camera_model import CameraModel, collimated, coloured, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError, Issue

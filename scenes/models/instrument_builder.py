@@ -20,7 +20,7 @@ from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.materials.glass import glass
 from optics.materials.material import TemperatureRange, material
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import facet_block
 from optics.raytrace.system import assemble

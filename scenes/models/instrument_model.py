@@ -9,8 +9,8 @@ import numpy as np
 
 from optics.geometry.solid import Solid
 from optics.geometry.tree import PlacedBodies, State
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly
 from scenes.models.camera_model import CameraModel
 from scenes.specs.baffle import Plate

@@ -11,7 +11,7 @@ import numpy as np
 
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.surface import Surface
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from scenes.models.camera_model import CameraModel
 
 if TYPE_CHECKING:

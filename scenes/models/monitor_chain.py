@@ -22,7 +22,7 @@ from optics.geometry.tree import Body, RigidTree
 from optics.materials.glass import glass
 from optics.numerics.array_math import inner, norm, turned
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import Mount, Reflector, ReflectorParts

@@ -17,7 +17,7 @@ import numpy as np
 from optics.geometry.solid import solid_mesh
 from optics.materials.material import material
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.models.clearance import convex_hull
 from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import imaging_segments, rays_taken

@@ -16,11 +16,11 @@ import numpy as np
 
 from optics.geometry.pose import Pose
 from optics.geometry.tree import Motion, State
-from optics.numerics.frozen_map import FrozenMap
-from optics.thermal.deformation import Displacement, FaceChange
+from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import PRINTED, SEEN, TERMS, NodalDeformation, NodesError, nodal_deformation
 from optics.thermal.nodal_temperature import Coverage, NodalTemperature, linear_part
+from optics.thermal.thermo_elastic import Displacement, FaceChange
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import Held, ThermalModel
 from scenes.specs.job import JobSpec

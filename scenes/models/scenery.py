@@ -16,7 +16,7 @@ import numpy as np
 from optics.geometry.aperture import Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.tree import AT_REST, PlacedBodies, State
-from optics.materials.finish import CoatingTable, Finish
+from optics.materials.scatter import CoatingTable, Finish
 from optics.raytrace.assembly import Element, Interaction
 from scenes.models import scenery_parts
 from scenes.models.camera_model import line_body

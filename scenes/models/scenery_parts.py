@@ -14,7 +14,7 @@ from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating, Face, Solid, solid_mesh
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Motion, PlacedBodies, State
-from optics.materials.finish import ABSORBER, BARE, BLACK, COATED, GROUND, MIRROR, SILICON, Finish
+from optics.materials.scatter import ABSORBER, BARE, BLACK, COATED, GROUND, MIRROR, SILICON, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.meshes import polygon_mesh, sheet_mesh
 from scenes.specs.baffle import Plate

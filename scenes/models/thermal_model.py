@@ -26,12 +26,18 @@ from optics.geometry.surface import Surface
 from optics.geometry.tree import ORIGIN, Body, Motion, State, each_composed
 from optics.materials.glass import WarmGlass, glass
 from optics.materials.material import Material, TemperatureRange, material
-from optics.numerics.array_math import turned
-from optics.numerics.invariants import PhysicalError
-from optics.thermal.deformation import Displaced, FaceChange, Formula, face_change
+from optics.numerics.array_math import PhysicalError, turned
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
 from optics.thermal.heat import Temperature, Temperatures, carried_motion
-from optics.thermal.thermo_elastic import ElasticBody, Kinematic, free_linear_field
+from optics.thermal.thermo_elastic import (
+    Displaced,
+    ElasticBody,
+    FaceChange,
+    Formula,
+    Kinematic,
+    face_change,
+    free_linear_field,
+)
 from scenes.models.instrument_model import Instrument
 from scenes.models.lens_heat import Lens, lenses_of
 from scenes.models.meshes import THICKNESS, behind

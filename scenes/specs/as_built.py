@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from optics.geometry.tree import Motion, State
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.perturbation import AsBuilt, PlainPerturbationSpec
 from scenes.yaml.spec import Reference, TitledSpec

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from optics.geometry.zernike import MAX_NOLL
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs import load
 from scenes.specs.course import noll
 from scenes.specs.disturbances import DisturbancesSpec

@@ -13,8 +13,8 @@ from pydantic import Field, model_validator
 
 from optics.geometry.aperture import Circle, Edge, EdgeShape, Ellipse, Polygon, Ray, Rectangle
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
-from optics.materials.finish import BLACK, Finish
-from optics.numerics.frozen_map import FrozenMap
+from optics.materials.scatter import BLACK, Finish
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.spec import Spec, one_given

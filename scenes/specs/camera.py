@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from optics.geometry.sag_terms import SagTerm
 from optics.materials.glass import WarmGlass
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs import instrument as instruments
 from scenes.specs.baffle import SurfaceEdgeSpec

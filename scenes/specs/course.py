@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.array_math import number_of
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
 from scenes.yaml import units
 from scenes.yaml.csv_table import rows_of

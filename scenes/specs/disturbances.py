@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, model_validator
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import Term, moment
 from scenes.specs.instrument import Frames, InstrumentSpec, Tilt
 from scenes.specs.motion_text import motion_of

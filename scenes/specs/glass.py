@@ -18,7 +18,7 @@ from optics.materials.glass import (
     glass,
 )
 from optics.materials.material import MATERIALS, TemperatureRange
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from scenes.specs.spectrum import WavelengthRange
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.quantity import Quantity

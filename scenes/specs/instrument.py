@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from optics.materials.glass import GLASSES, glass
 from optics.materials.material import MATERIALS, material
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS, Reflector
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.detector import AreaSide, PixelPitch

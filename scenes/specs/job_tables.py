@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from optics.geometry import zernike
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import TERMS
 from scenes.specs.course import NO_MOTION, TemperatureChange, TemperatureGradient

@@ -7,7 +7,7 @@ scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's na
 from pathlib import Path
 from typing import Any, TypeVar
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.as_built import DESIGN, AsBuiltInstrumentSpec
 from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec

@@ -13,7 +13,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import DISTURBANCES, INSTRUMENTS, find_named, is_path

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Generic, Self, TypeVar, cast
 
 from pydantic import Field
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs import load
 from scenes.specs.camera import PANCHROMATIC, CameraSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec

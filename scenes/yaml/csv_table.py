@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import LONGEST_SHOWN, InputError, Issue, Problem, names_text, nearest, shown
 from scenes.yaml.input_file import read_bytes, read_text
 from scenes.yaml.units import TEMPERATURE, Kind, parse_quantity, unit_ratio

@@ -39,9 +39,8 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.materials.finish import CoatingTable
-from optics.materials.scatter import ScatterTable
-from optics.numerics.frozen_map import FrozenMap
+from optics.materials.scatter import CoatingTable, ScatterTable
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, nearest, shown
 from scenes.yaml.input_file import read_text

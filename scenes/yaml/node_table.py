@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.thermal.nodal_deformation import LEAST_NODES
 from scenes.yaml.csv_table import LARGEST_TABLE, Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown

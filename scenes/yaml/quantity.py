@@ -16,7 +16,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 from optics.geometry.sag_terms import SAG_TERMS, SagTerm
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml import units
 from scenes.yaml.errors import KeyPath, Problem, names_text, shown, unknown
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 
 
 @pytest.fixture(autouse=True, scope="package")

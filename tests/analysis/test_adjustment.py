@@ -9,8 +9,15 @@ from scipy import stats
 from analysis.block.reweighting import LARGEST_FACTOR, REJECT, robust_weights, standardised_packets
 from analysis.calibration.adjustment import adjust
 from analysis.calibration.strip_adjustment import stepwise
-from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Prior, Unknowns
-from analysis.orbit.null_space import Gauge, RankError
+from analysis.orbit.calibration_parameters import (
+    CalibrationError,
+    CalibrationField,
+    Gauge,
+    Noise,
+    Prior,
+    RankError,
+    Unknowns,
+)
 from tests.analysis.refusals import refuses
 from tests.analysis.test_three_line_model import ARCSEC, INTERIOR, PITCH, cameras, field_points, make_rays, observe
 from tests.tiers import quick

@@ -5,8 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.orbit.angles import AngleError, along_track_angle, along_track_angles, angles_between, line_frame
-from analysis.orbit.planes import Station, Strip, fit_plane
+from analysis.orbit.planes import (
+    AngleError,
+    Station,
+    Strip,
+    along_track_angle,
+    along_track_angles,
+    angles_between,
+    fit_plane,
+    line_frame,
+)
 from tests.analysis.refusals import refuses
 from tests.analysis.test_planes import ARCSEC, DEG, LINES, SCENE, descending_pass, noisy
 

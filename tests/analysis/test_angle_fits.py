@@ -12,9 +12,8 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import minimize
 
 from analysis.turntable import angle_network
-from analysis.turntable.angle_fits import FITS, angles_left, cross_validate, fewest, fit
 from analysis.turntable.angle_network import NotConvergedError
-from analysis.turntable.dividing_error import CalibrationSeries, choose
+from analysis.turntable.dividing_error import FITS, CalibrationSeries, angles_left, choose, cross_validate, fewest, fit
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import binom
 
-from analysis.monitor.detection_power import detection_power
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed
-from analysis.monitor.series_filter import SeriesFilter
+from analysis.monitor.series_filter import SeriesFilter, detection_power
 from analysis.statistics import limit_of
 from tests.analysis.followed_series import follow, of_shifts
 from tests.analysis.stated_motions import SpotNoise, disturbances

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from analysis.calibration.adjustment import adjust
-from analysis.orbit.calibration_parameters import CalibrationError, Noise, Prior, Unknowns, monitor_priors
-from analysis.orbit.null_space import RankError
+from analysis.orbit.calibration_parameters import CalibrationError, Noise, Prior, RankError, Unknowns, monitor_priors
 from tests.analysis.refusals import refuses
 from tests.analysis.test_adjustment import BIAS, HOLD_X, HOLD_XY, LABORATORY, SEVEN_NODES, TRUTH, measured
 from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, field_points, observe

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from analysis.covariance_root import covariance_root
+from optics.numerics.array_math import covariance_root
 
 PAIR = np.array([[1.0, 0.6], [0.6, 1.0]])
 AWAY = np.subtract.outer(np.arange(30.0), np.arange(30.0)) / 6.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.monitor.curvature import LinearReading, MotionModel, Retraced, read_again
+from analysis.monitor.recovery import LinearReading, MotionModel, Retraced, read_again
 
 RNG = np.random.default_rng(4)
 A = RNG.standard_normal((4, 4)) + 3.0 * np.eye(4)

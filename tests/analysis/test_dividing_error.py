@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.measurement_error import UndeterminedError
+from analysis.arrays import UndeterminedError
 from analysis.turntable.dividing_error import (
     CalibrationSeries,
     DividingCompensation,

@@ -5,7 +5,7 @@ ends in a second-best place. Spots and noise are those of ``test_spot_centroids`
 import numpy as np
 import pytest
 
-from analysis.monitor.spot_evidence import AFTER, BEFORE, NOISE, SpotEvidence
+from analysis.monitor.recovery import AFTER, BEFORE, NOISE, SpotEvidence
 from analysis.spots import likelihood
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.likelihood import fit_states, maximum_likelihood_fit, require_rest, widened

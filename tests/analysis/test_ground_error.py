@@ -7,9 +7,9 @@ import pytest
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
-from analysis.monitor.ground_error import EARTH_RADIUS_M, GroundGeometry
+from analysis.arrays import ARCSEC
+from analysis.monitor.monitoring import EARTH_RADIUS_M, GroundGeometry
 from analysis.orbit.forward_intersection import CalibratedLine, Sightings, intersect_pair
-from analysis.units import ARCSEC
 
 ALTITUDE, LOOKS, FIELD, FOCAL = 505e3, (math.radians(26.0), math.radians(-5.0)), (0.018, 0.019), (5.5, 5.4)
 SMALL = 2.0 * ARCSEC

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.orbit.ground_errors import (
+from analysis.orbit.forward_intersection import (
     circle_of_points,
     circular_error,
     interval_of_points,

@@ -7,8 +7,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from analysis.calibration.adjustment import adjust
-from analysis.calibration.hidden_terms import FALSE_ALARM, Steps
+from analysis.calibration.adjustment import FALSE_ALARM, Steps, adjust
 from analysis.orbit.calibration_parameters import CalibrationError, Prior, Unknowns
 from tests.analysis.test_adjustment import HOLD_XY, LABORATORY, NOISE, measured, seen, truth
 from tests.analysis.test_three_line_model import ARCSEC, PITCH

@@ -14,8 +14,7 @@ import tifffile
 from astropy.io import fits
 from PIL import Image
 
-from analysis.images.image_file import ImageFile, Region
-from analysis.images.image_header import ImageError
+from analysis.images.image_file import ImageError, ImageFile, Region
 from tests.analysis.refusals import refuses, spoilt
 
 FRAMES = np.random.default_rng(1).integers(0, 65536, (3, 20, 31)).astype(np.uint16)

@@ -11,15 +11,17 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from analysis.instrument_state.next_move import Actuators, best_move, measurement_worth
+from analysis.arrays import UndeterminedError
 from analysis.instrument_state.state_estimate import (
+    Actuators,
     MeasuredGroup,
     StateEstimate,
     StatePrior,
+    best_move,
     combinations,
     estimate_state,
+    measurement_worth,
 )
-from analysis.measurement_error import UndeterminedError
 from tests.analysis.refusals import refuses
 
 M = 7

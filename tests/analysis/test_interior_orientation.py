@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.orientation.distortion_model import (
+from analysis.orientation.interior import (
     OrientationError,
     distortion,
+    fit_interior_orientation,
     principal_distance,
     principal_distance_and_point,
     principal_point,
 )
-from analysis.orientation.interior import fit_interior_orientation
 from tests.analysis.refusals import refuses
 
 FALSE_ALARM = 1e-6

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from analysis.monitor.intersection_angle import exact
-from analysis.monitor.monitoring import CameraParameters
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
+from analysis.monitor.monitoring import CameraParameters, exact
 from tests.analysis.refusals import refuses
 
 FORWARD, BACKWARD = np.deg2rad(26.0), np.deg2rad(-5.0)

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from analysis.orbit.jitter import JitterError, Observations, periodogram, search, splined
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from analysis.orbit.jitter_lines import search, splined
-from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
 from tests.analysis.refusals import refuses
 
 GAPS = (0.1216, 0.1024)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.matching.consensus import consensus
+from analysis.matching.matches import consensus
 from tests.analysis.refusals import refuses
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.monitoring import (
     CameraParameters,
     MonitorGeometry,
@@ -15,7 +16,6 @@ from analysis.monitor.monitoring import (
     paper_joint,
     paper_single,
 )
-from analysis.units import ARCSEC
 from tests.analysis.refusals import refuses
 
 # Field angles far larger than real ones, so that a forgotten cos^2 cannot hide.

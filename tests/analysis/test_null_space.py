@@ -9,8 +9,17 @@ from scipy.linalg import subspace_angles
 
 from analysis.calibration.adjustment import FarPointsError, NoiseError, adjust
 from analysis.calibration.normal_equations import SharedNoise, State, Weights, assemble
-from analysis.orbit.calibration_parameters import CalibrationError, Noise, Parameters, Unknowns
-from analysis.orbit.null_space import WORST, Gauge, RankError, free_basis, null_vectors
+from analysis.orbit.calibration_parameters import (
+    WORST,
+    CalibrationError,
+    Gauge,
+    Noise,
+    Parameters,
+    RankError,
+    Unknowns,
+    free_basis,
+    null_vectors,
+)
 from analysis.orbit.three_line_model import LineModel
 from tests.analysis.refusals import refuses
 from tests.analysis.test_adjustment import BIAS, INNER, LABORATORY, NOISE, PITCH, measured

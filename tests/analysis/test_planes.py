@@ -9,16 +9,21 @@ import cv2
 import numpy as np
 import pytest
 
-from analysis.orbit.angles import (
+from analysis.orbit.planes import (
+    METHODS,
     AngleError,
+    NearVerticalWarning,
+    PlaneError,
+    Station,
+    Strip,
     angles_between,
+    fit_plane,
     height_error,
     intersection_angles,
     line_frame,
     look_angle,
     off_axis_angle,
 )
-from analysis.orbit.planes import METHODS, NearVerticalWarning, PlaneError, Station, Strip, fit_plane
 from tests.analysis.refusals import refuses
 
 FALSE_ALARM = 1e-6

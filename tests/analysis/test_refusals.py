@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from analysis.orbit.jitter import JitterError, Observations, periodogram, splined
 from astropy.io import fits
 from scipy import sparse
 
+from analysis.arrays import UndeterminedError
 from analysis.block import block_adjustment, reweighting
 from analysis.block.block import CamerasKnowledge, Term
 from analysis.block.block_adjustment import adjust_block, pruned
@@ -19,18 +21,14 @@ from analysis.block.processes import BlockError, Law
 from analysis.calibration import normal_equations, strip_adjustment
 from analysis.calibration.adjustment import adjust
 from analysis.calibration.strip_adjustment import adjust_strip
-from analysis.images.fits_image import fits_cards
-from analysis.images.image_file import ImageFile, Region
-from analysis.images.image_header import ImageError
+from analysis.images.image_file import ImageError, ImageFile, Region, fits_cards
 from analysis.matching.correlation import MatchOptions, distinct_points
 from analysis.matching.spline import resampled
-from analysis.measurement_error import UndeterminedError
 from analysis.monitor import limits
 from analysis.monitor.estimators import ESTIMATORS, Posterior, Shifts
 from analysis.monitor.filter_state import Observed
-from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.model_fit import gain, observability
-from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
+from analysis.monitor.monitoring import CameraParameters, GroundGeometry, MonitorGeometry
 from analysis.monitor.recovery import measure_spots, recover
 from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import StateSpace
@@ -47,10 +45,7 @@ from analysis.orbit.forward_intersection import (
     intersect_pair,
 )
 from analysis.orbit.image_correction import image_correction
-from analysis.orbit.jitter_lines import splined
-from analysis.orbit.jitter_spectrum import JitterError, Observations, periodogram
-from analysis.orientation.distortion_model import OrientationError
-from analysis.orientation.interior import fit_interior_orientation, line_orientation
+from analysis.orientation.interior import OrientationError, fit_interior_orientation, line_orientation
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.likelihood import maximum_likelihood_fit
@@ -58,8 +53,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import photon_transfer, pixel_correction
 from analysis.spots.spot_positions import difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
-from analysis.turntable.angle_fits import cross_validate, fit
-from analysis.turntable.dividing_error import CalibrationSeries
+from analysis.turntable.dividing_error import CalibrationSeries, cross_validate, fit
 from tests.analysis import test_adjustment
 from tests.analysis.drawn_blocks import Plan, draw
 from tests.analysis.refusals import refuses

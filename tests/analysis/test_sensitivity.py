@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.orbit.angles import sensitivity
-from analysis.orbit.planes import METHODS, Station
+from analysis.orbit.planes import METHODS, Station, sensitivity
 from tests.analysis.refusals import refuses
 from tests.analysis.test_planes import SCENE, noisy
 

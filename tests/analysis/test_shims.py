@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from analysis.focal_plane import shims
-from analysis.focal_plane.plane_fit import LineLevel, RigidMotion, fit_focal_plane
-from analysis.focal_plane.shims import Mount, ShimError
+from analysis.focal_plane.plane_fit import LineLevel, Mount, RigidMotion, ShimError, fit_focal_plane
 from tests.analysis.refusals import refuses
 from tests.analysis.test_planes import rotation
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from analysis.wavefront_maps.map_files import read_map
-from analysis.wavefront_maps.wavefront_map import MapError
+from analysis.wavefront_maps.map_files import MapError, read_map
 from analysis.wavefront_maps.zernike_table import read_zernikes
 from tests.analysis import wavefront_files as write
 from tests.analysis.refusals import refuses, spoilt

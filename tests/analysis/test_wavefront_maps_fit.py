@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from analysis.measurement_error import UndeterminedError
+from analysis.arrays import UndeterminedError
+from analysis.wavefront_maps.map_files import MapError, WavefrontMap
 from analysis.wavefront_maps.pupil_fit import Pupil, find_pupil, fit_map
-from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
 from analysis.wavefront_maps.zernike_table import circle_terms
 from tests.analysis.refusals import refuses
 from tests.tiers import quick

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from analysis.measurement_error import UndeterminedError
-from analysis.wavefront_maps.orientation import ORIENTATIONS, READINGS, Orientation, tellable
-from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
+from analysis.arrays import UndeterminedError
+from analysis.wavefront_maps.map_files import MapError, WavefrontMap
+from analysis.wavefront_maps.pupil_fit import ORIENTATIONS, READINGS, Orientation, tellable
 from analysis.wavefront_maps.zernike_table import circle_terms
 from tests.analysis.refusals import refuses
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.wavefront_maps.wavefront_map import MapError
+from analysis.wavefront_maps.map_files import MapError
 from analysis.wavefront_maps.zernike_table import (
     MOST_TERMS,
     ansi_to_nm,

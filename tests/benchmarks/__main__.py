@@ -14,7 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from optics.numerics.threads import cores
+from optics.numerics.backend import cores
 from tests.benchmarks.beside import compared, print_pairs, ratios, sources_of
 from tests.benchmarks.number import Speed, shown
 from tests.benchmarks.workbench import Workbench

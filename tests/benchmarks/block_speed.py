@@ -18,7 +18,7 @@ from analysis.block.block import Block, CameraKnowledge, Pass, Points, Scene, Te
 from analysis.block.block_adjustment import adjust_block
 from analysis.block.processes import Law
 from analysis.orbit.three_line_model import LineModel, Rays
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from tests.analysis.drawn_blocks import (
     ALTITUDE,
     ARCSEC,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
 from tests.benchmarks.number import Number, Speed

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from optics.geometry import polygon as polygons
-from optics.waves.pupil_edge import PupilEdge
 from optics.waves.pupil_shadow import FEW_SIDES, PupilShadow, quadrature_within, separate
+from optics.waves.pupil_terms import PupilEdge
 from scenes.models.shadow import Shadows
 from tests.tiers import quick
 

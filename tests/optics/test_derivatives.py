@@ -9,9 +9,8 @@ import pytest
 from optics.geometry.tree import Motion, State
 from optics.numerics.number_tree import leaves
 from optics.raytrace.assembly import Assembly
-from optics.raytrace.derivatives import jvp, vjp
 from optics.raytrace.system import SystemBatch, assemble
-from optics.raytrace.trace import Traced, make_rays, trace
+from optics.raytrace.trace import Traced, jvp, make_rays, trace, vjp
 from scenes.models.camera_model import IMAGE, collimated, field_direction
 
 MOTIONS = [

@@ -6,7 +6,7 @@ import pytest
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
 from optics.geometry.polygon import area, covered
 from optics.numerics import quadrature
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.waves import edge_shadow
 from optics.waves.edge_shadow import LitStop, holes
 from optics.waves.pupil_shadow import separate

@@ -9,9 +9,8 @@ from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from optics.raytrace.graded_ray import GradedRay
 from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
+from optics.raytrace.trace import GradedRay, make_rays, trace
 
 N0 = 1.5
 START, HEADING = np.array([0.03, -0.02, 0.01]), np.array([0.2, -0.1, 1.0]) / np.sqrt(1.05)

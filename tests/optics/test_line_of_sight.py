@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.pose import rotation_matrix
-from optics.raytrace.line_of_sight import LineChange, line_change
+from optics.raytrace.first_order import LineChange, line_change
 
 FOCAL_LENGTH, HALF = 5.5, 0.115
 POSITION = np.linspace(-HALF, HALF, 41)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optics.numerics import quadrature
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.waves.edge_shadow import StopOutlines
 from optics.waves.line_transfer import CutPupil, cut_pupils, line_transfers, lit_at
 from optics.waves.pupil_shadow import PupilShadow, separate

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from optics.waves.diffraction import airy
-from optics.waves.pixel_response import PixelResponse, UnsampledImageError
+from optics.waves.diffraction import PixelResponse, UnsampledImageError, airy
 
 PITCH, WAVELENGTH, F_NUMBER = 12e-6, 650e-9, 110.4
 

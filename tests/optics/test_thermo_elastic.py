@@ -11,8 +11,8 @@ from optics.geometry.surface import Surface, ZernikeFigure, plane
 from optics.geometry.zernike import zernike
 from optics.materials.material import material
 from optics.thermal import thermo_elastic
-from optics.thermal.deformation import Displacement, face_change, rigid_modes
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
+from optics.thermal.thermo_elastic import Displacement, face_change, rigid_modes
 from tests.tiers import quick
 
 SILICA = material("fused silica")

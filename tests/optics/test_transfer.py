@@ -17,8 +17,8 @@ from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves import transfer
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.imaging import aim_collimated, imaging_rays, pupil_field
-from optics.waves.pupil_edge import PupilEdge
 from optics.waves.pupil_stack import PupilFunction, circular_pupil, fit_pupils
+from optics.waves.pupil_terms import PupilEdge
 from optics.waves.transfer import TransferTable, polychromatic_transfer
 from scenes.models.camera_model import IMAGE, field_direction
 from tests.tiers import quick

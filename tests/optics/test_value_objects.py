@@ -15,8 +15,7 @@ from optics.geometry.tree import Body, Motion
 from optics.geometry.vector_shape import Disk, HalfPlane, Polygon
 from optics.materials.glass import N_BK7, Glass, ThermalDispersion
 from optics.materials.material import TemperatureRange
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.number_tree import leaves, map_leaves, with_leaf
+from optics.numerics.number_tree import FrozenMap, leaves, map_leaves, with_leaf
 from optics.raytrace.assembly import Element, Interaction
 
 FIGURE = ZernikeFigure(0.5, (0.1, 0.0), {4: 1e-7, 5: 2e-7})

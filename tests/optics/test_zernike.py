@@ -8,7 +8,7 @@ from optics.geometry.aperture import Circle
 from optics.geometry.surface import Surface
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
-from optics.waves.wavefront import eikonal, fit_wavefront, path_to_sphere
+from optics.waves.imaging import eikonal, fit_wavefront, path_to_sphere
 from tests.optics.bench import PASS, Stage, at, build, run
 
 # Noll, JOSA 66, 207 (1976), table I: index -> n, m (m < 0: sine)

@@ -7,7 +7,7 @@ from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import one_shape
 from optics.geometry.tree import Motion, State
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.instrument import BASE
 from tests.tiers import quick
 from tests.twin.dirty_frames import draw, measurement

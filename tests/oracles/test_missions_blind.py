@@ -55,7 +55,7 @@ from scipy.stats import betabinom, binom
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.series_filter import SeriesFilter
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from tests.analysis.followed_series import Followed, follow, of_shifts
 
 DAY, YEAR = 86_400.0, 365.25 * 86_400.0

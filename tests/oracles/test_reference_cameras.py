@@ -6,10 +6,10 @@ import pytest
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import LineChange, chief_rays, line_change
+from optics.raytrace.first_order import LineChange, chief_rays, line_change
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.wavefront import fit_wavefront, path_to_sphere
+from optics.waves.imaging import fit_wavefront, path_to_sphere
 from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction
 from tests.tiers import quick
 

@@ -28,7 +28,7 @@ import matplotlib.font_manager  # noqa: F401 - makes its folders at home when it
 import psutil
 from typer.testing import CliRunner
 
-from optics.numerics.threads import LIMIT
+from optics.numerics.backend import LIMIT
 from tests.robustness.case import Case, Reached, cut
 from tests.robustness.mutate import Mutant, mutate
 from twin.run.run_folder import is_run_folder

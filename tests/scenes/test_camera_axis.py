@@ -8,7 +8,7 @@ from rich.console import Console
 from typer import Exit
 
 from optics.geometry.tree import Motion
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.aim import AimError
 from scenes.models.camera_axis import AfocalError
 from scenes.models.camera_model import CameraModel, derive_camera

@@ -10,7 +10,7 @@ import pytest
 from optics.geometry.aperture import Circle, Edge
 from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.assembly import Interaction
 from scenes.lens.__main__ import read_prescription
 from scenes.lens.batoid_writer import batoid_text

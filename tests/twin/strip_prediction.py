@@ -7,7 +7,7 @@ from analysis.calibration.normal_equations import SharedNoise, State, Weights, a
 from analysis.orbit.calibration_parameters import CalibrationField, Parameters, Unknowns
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.schemes import with_points
 from twin.orbit.flight.earth import east_north_up

@@ -15,12 +15,12 @@ from astropy.io import fits
 from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag, null_space
 
+from analysis.arrays import ARCSEC
 from analysis.instrument_state.state_estimate import Agreement
-from analysis.units import ARCSEC
-from analysis.wavefront_maps.orientation import Orientation
+from analysis.wavefront_maps.pupil_fit import Orientation
 from optics.geometry import zernike
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import UnphysicalError
 from optics.raytrace.trace import BeamMissedError
 from scenes.specs.asbuilt import resolve_asbuilt
 from scenes.specs.load import EXAMPLES

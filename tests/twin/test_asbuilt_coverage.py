@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from analysis.arrays import ARCSEC
 from analysis.instrument_state.state_estimate import combinations
 from analysis.monitor.recovery import recover
-from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, compose
 from optics.numerics.backend import Backend
 from scenes.specs.asbuilt import resolve_asbuilt

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.models.camera_model import derive_camera
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, blur_warnings, cameras_of, sharpness
 from scenes.specs.camera import CameraSpec

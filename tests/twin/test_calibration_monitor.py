@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.units import ARCSEC
-from optics.numerics.frozen_map import FrozenMap
+from analysis.arrays import ARCSEC
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.flight import ThermalDriftSpec

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import eigh
 from scipy.stats import chi2
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec

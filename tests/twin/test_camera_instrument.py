@@ -11,7 +11,7 @@ import pytest
 
 import twin
 from optics.geometry.tree import Motion
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.instrument import InstrumentSpec

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.camera_model import field_direction
 from scenes.models.camera_sharpness import FieldBeams

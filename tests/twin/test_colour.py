@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.waves.transfer import polychromatic_transfer
 from scenes.specs.spectrum import SpectrumSpec
 from tests.scenes.lens.colour_cameras import colour_camera

@@ -10,7 +10,7 @@ from optics.geometry.tree import Motion
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.wavefront import path_to_sphere
+from optics.waves.imaging import path_to_sphere
 from scenes.models.camera_model import collimated, field_direction
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath

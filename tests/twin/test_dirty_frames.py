@@ -11,7 +11,7 @@ from analysis.spots.photon_transfer import pixel_correction
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import SpotError
 from analysis.spots.static_defects import examine, lone_pixels
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.models.disturbances import state_of
 from scenes.specs.job import AnalysisSpec, JobSpec
 from scenes.specs.resolved import resolve_job

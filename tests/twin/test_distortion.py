@@ -12,10 +12,9 @@ import pytest
 from scipy import stats
 from scipy.stats import chi2
 
-from analysis.orientation.interior import fit_interior_orientation
-from analysis.orientation.measurement import Spots, locate_spots
+from analysis.arrays import ARCSEC
+from analysis.orientation.interior import Spots, fit_interior_orientation, locate_spots
 from analysis.turntable.dividing_error import choose, compensate
-from analysis.units import ARCSEC
 from optics.numerics.backend import load_backend
 from optics.targets.target_image import target_image
 from optics.targets.target_shapes import pinhole

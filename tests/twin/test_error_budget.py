@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from optics.thermal.heat import Temperature
 from scenes.specs.disturbances import JobDisturbancesSpec
 from scenes.specs.load import load_disturbances, load_error_budget

@@ -16,7 +16,7 @@ from analysis.focal_plane.plane_fit import RigidMotion
 from analysis.focal_plane.through_focus import focus_vertex, outlying_points
 from analysis.mtf.edge_location import EdgeError
 from optics.geometry.pose import Pose, rotation_matrix
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.targets.collimator import TooNarrowError
 from scenes.specs.load import LAB, SCENES

@@ -9,7 +9,7 @@ import pytest
 
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.tree import Motion
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import ROOT

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from analysis.orbit.three_line_model import BIAS
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec

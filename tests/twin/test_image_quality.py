@@ -10,10 +10,9 @@ from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import chief_rays
+from optics.raytrace.first_order import chief_rays
 from optics.raytrace.system import assemble
-from optics.waves.imaging import aim_collimated
-from optics.waves.wavefront import fit_wavefront, path_to_sphere
+from optics.waves.imaging import aim_collimated, fit_wavefront, path_to_sphere
 from scenes.models.camera_axis import LAUNCH_DISTANCE
 from twin.monitor.image_quality import FIELDS, QUALITY
 from twin.monitor.image_quality import image_quality as quality_of

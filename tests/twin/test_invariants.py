@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optics.numerics.invariants import UnphysicalError, hold_below, hold_equal, hold_within
+from optics.numerics.array_math import UnphysicalError, hold_below, hold_equal, hold_within
 from optics.waves import pupil_stack
 from scenes.models import shadow
 from scenes.specs.load import load_camera

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from optics.geometry.tree import Motion
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import chief_rays
+from optics.raytrace.first_order import chief_rays
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.specs.orbit.setup import load_three_line_camera

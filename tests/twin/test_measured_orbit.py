@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import twin.orbit.__main__ as command
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data_setup import resolve_measured_angle, resolve_measured_calibration
 from scenes.specs.measured.pass_files import body_axes_matrix

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import model_fit, monitoring
 from analysis.monitor.monitoring import PER_SI
 from analysis.monitor.recovery import measure_spots, recover
-from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.instrument import BASE
 from scenes.yaml.errors import InputError

@@ -10,7 +10,7 @@ import pytest
 
 from analysis.block.block import CamerasKnowledge
 from analysis.block.block_adjustment import adjust_block
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.measured.adjust_setup import resolve_adjust
 from scenes.specs.operation import read_operation
 from scenes.yaml.errors import InputError

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from tests.tiers import quick

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from analysis.orbit.calibration_parameters import CalibrationError
 from analysis.orbit.three_line_model import misclosure
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES, EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec

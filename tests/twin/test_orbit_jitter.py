@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from analysis.orbit.jitter import Found, search
 
-from analysis.orbit.jitter_lines import Found, search
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data_setup import resolve_any_jitter
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec

@@ -20,7 +20,7 @@ import twin.orbit.__main__ as command
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
 from analysis.orbit.three_line_model import LineModel
 from analysis.spots.spot_positions import SpotError
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.adjust_setup import resolve_measured_adjust
 from scenes.specs.measured.orbit_data import OrbitCheckSpec, OrbitMatchSpec

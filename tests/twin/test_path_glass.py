@@ -13,7 +13,7 @@ from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
-from optics.materials.finish import ABSORBER, BARE, Finish, reflectance
+from optics.materials.scatter import ABSORBER, BARE, Finish, reflectance
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.scenery import Scenery
 from scenes.models.scenery_parts import Finishes, solid_surfaces

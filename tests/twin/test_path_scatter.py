@@ -12,8 +12,16 @@ from scipy.stats import chi2
 
 from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating
-from optics.materials.finish import CoatingTable, Finish, reflectance
-from optics.materials.scatter import ABg, HarveyShack, ScatterTable, lobe_area, total_scatter
+from optics.materials.scatter import (
+    ABg,
+    CoatingTable,
+    Finish,
+    HarveyShack,
+    ScatterTable,
+    lobe_area,
+    reflectance,
+    total_scatter,
+)
 from scenes.models.scenery import Scenery
 from tests.optics.bench import unit
 from tests.optics.test_scatter_table import lambert, of_lobe

@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
 from scenes.specs.procedures import Procedure

@@ -8,7 +8,7 @@ from scipy import constants
 from scipy.special import erf
 
 from analysis.mtf.slanted_edge import measure_edge
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from scenes.specs.load import load_detector
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, TerrainSpec
 from scenes.specs.orbit.setup import load_three_line_camera

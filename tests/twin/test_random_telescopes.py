@@ -7,7 +7,7 @@ in direction cosines at the image, and the transfer function is the autocorrelat
 import numpy as np
 import pytest
 
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
 from scenes.yaml.errors import InputError
 from tests.oracles.pupil_raster import raster_of
 from tests.own_trace import OwnCamera

@@ -24,7 +24,7 @@ import twin.main_job.render_command
 import twin.main_job.render_drawings
 import twin.main_job.render_folder
 import twin.render as command
-from optics.numerics.threads import LIMIT
+from optics.numerics.backend import LIMIT
 from scenes.specs.load import EXAMPLES
 from tests.tiers import quick
 from tests.twin.commands import files, invoke

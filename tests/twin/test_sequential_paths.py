@@ -15,7 +15,7 @@ from optics.geometry.aperture import Circle
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree
-from optics.materials.finish import CoatingTable, Finish
+from optics.materials.scatter import CoatingTable, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.models.scenery_parts import Finishes, mirror_surface

@@ -10,8 +10,7 @@ import pytest
 
 import twin
 from analysis.monitor.limits import posterior_sigma, quantities
-from analysis.monitor.recovery import joint, judged_spots, recover, recovery_of
-from analysis.monitor.spot_evidence import SpotEvidence
+from analysis.monitor.recovery import SpotEvidence, joint, judged_spots, recover, recovery_of
 from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import difference_covariance

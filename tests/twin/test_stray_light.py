@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2, norm, t
 
 from optics.geometry.tree import Motion
-from optics.materials.finish import MIRROR, Finish
+from optics.materials.scatter import MIRROR, Finish
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.scenery import build_scenery
 from scenes.models.scenery_parts import Finishes

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import twin.study.__main__ as command
-from analysis.measurement_error import MeasurementError
-from optics.numerics.invariants import PhysicalError
+from analysis.arrays import MeasurementError
+from optics.numerics.array_math import PhysicalError
 from scenes.specs.procedures import Procedure
 from tests.twin.commands import invoke
 from tests.twin.study_bench import write_study

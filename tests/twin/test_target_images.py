@@ -14,7 +14,7 @@ from scipy.signal import fftconvolve
 from analysis.mtf.slanted_edge import measure_edge
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.system import assemble
 from optics.targets.target_shapes import pinhole_target, star_target
 from optics.waves.diffraction import Grid, image

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import UnphysicalError
 from scenes.models.camera_model import CameraModel
 from scenes.specs.camera import CameraSpec
 from scenes.specs.tolerance import ToleranceSetup

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2, norm, t
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import limits as theory
-from analysis.monitor.ground_error import GroundGeometry
-from analysis.units import ARCSEC
+from analysis.monitor.monitoring import GroundGeometry
 from optics.geometry.tree import Motion
 from optics.numerics.backend import load_backend
 from scenes.specs.job import JobSpec

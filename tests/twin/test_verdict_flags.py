@@ -16,7 +16,7 @@ import typer
 
 import twin
 from docs.site.golden_fields import kept_fields
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.resolved import resolve
 from scenes.specs.study import UNITS, unit_of
 from tests.golden.digest import expanded

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from analysis.orbit.angles import sensitivity
-from analysis.orbit.planes import Station
+from analysis.orbit.planes import Station, sensitivity
 from optics.numerics.backend import load_backend
 from scenes.specs.orbit.angle import LINES, usual_angles
 from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from analysis.arrays import ARCSEC
 from analysis.orbit.forward_intersection import CheckErrors
-from analysis.units import ARCSEC
 from optics.numerics.backend import load_backend
 from tests.validation.mutated import undrawn
 from twin.validation import registry

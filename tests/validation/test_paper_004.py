@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from analysis.turntable.angle_fits import FITS, fit
 from analysis.turntable.angle_network import NotConvergedError
+from analysis.turntable.dividing_error import FITS, fit
 from optics.numerics.backend import load_backend
 from tests.tiers import quick
 from twin.validation import registry

@@ -7,13 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.instrument_state.next_move import Actuators
-from analysis.instrument_state.state_estimate import MeasuredGroup, StateEstimate, estimate_state
-from analysis.measurement_error import MeasurementError
+from analysis.arrays import MeasurementError
+from analysis.instrument_state.state_estimate import Actuators, MeasuredGroup, StateEstimate, estimate_state
 from optics.geometry.tree import State
+from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.number_tree import FrozenMap
 from scenes.models.disturbances import StatedMotions, motions_of_spec
 from scenes.specs.asbuilt import AsBuiltSetup, MeasurementsSpec
 from scenes.specs.tolerance import OF_MONITOR, MeritSpec, ToleranceBudgetSpec, ToleranceSetup

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
 from twin.run.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table, plain, significant

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from analysis.instrument_state.state_estimate import FALSE_ALARM, Agreement, Combination, StateEstimate, combinations
+from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError
 from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.tolerance import MeritSpec, amount_text
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit

@@ -16,12 +16,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.instrument_state.state_estimate import MeasuredGroup
-from analysis.units import ARCSEC
 from optics.geometry.tree import State
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import PhysicalError
-from optics.raytrace.line_of_sight import line_tangents
+from optics.numerics.array_math import PhysicalError
+from optics.numerics.number_tree import FrozenMap
+from optics.raytrace.first_order import line_tangents
 from scenes.specs import asbuilt as specs
 from scenes.specs.motion_text import node_named
 from scenes.specs.tolerance import MeritSpec

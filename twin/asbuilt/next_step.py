@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.instrument_state.next_move import NextMove, best_move, measurement_worth
-from analysis.instrument_state.state_estimate import StateEstimate
+from analysis.instrument_state.state_estimate import NextMove, StateEstimate, best_move, measurement_worth
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
 
 MOST_ROUNDS = 3

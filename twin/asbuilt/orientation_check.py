@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from analysis.measurement_error import UndeterminedError
-from analysis.wavefront_maps.orientation import Orientation, ReadingEvidence, tellable
+from analysis.arrays import UndeterminedError
+from analysis.wavefront_maps.pupil_fit import Orientation, ReadingEvidence, tellable
+from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError
 from scenes.specs.asbuilt import AsBuiltSetup
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.measured_kinds import UNKNOWN_FOCUS, MeasuredKind, WavefrontReadings

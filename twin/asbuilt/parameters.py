@@ -14,7 +14,7 @@ import numpy as np
 
 from analysis.instrument_state.state_estimate import StatePrior
 from optics.geometry.tree import State
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import HEAT, Component, StatedMotions
 from scenes.models.instrument_model import Instrument

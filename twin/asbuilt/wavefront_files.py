@@ -8,11 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from analysis.measurement_error import MeasurementError
-from analysis.wavefront_maps.map_files import read_map
-from analysis.wavefront_maps.orientation import Orientation
-from analysis.wavefront_maps.pupil_fit import fit_map
-from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
+from analysis.arrays import MeasurementError
+from analysis.wavefront_maps.map_files import MapError, WavefrontMap, read_map
+from analysis.wavefront_maps.pupil_fit import Orientation, fit_map
 from analysis.wavefront_maps.zernike_table import read_zernikes
 from scenes.yaml.errors import InputError
 from twin.camera.varied_beams import VariedBeams

@@ -22,17 +22,16 @@ from analysis.arrays import shows
 from optics.geometry import zernike
 from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State
-from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import UnphysicalError, hold_within
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.array_math import UnphysicalError, hold_within
+from optics.numerics.backend import Backend, one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import equal_area_radius
+from optics.waves.imaging import path_to_sphere
 from optics.waves.line_transfer import line_transfers
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
-from optics.waves.wavefront import path_to_sphere
 from scenes.models.camera_model import ROOT, CameraModel, camera_alone, derive_camera, field_direction, lenses
 from scenes.models.camera_sharpness import FIELDS, Cut, FieldBeams, FocalPlane, stop_nodes
 from scenes.models.instrument_model import Instrument

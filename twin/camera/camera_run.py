@@ -14,9 +14,9 @@ from analysis.arrays import shows
 from analysis.monitor import parameters
 from optics.geometry import zernike
 from optics.geometry.tree import State
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import UnphysicalError
-from optics.raytrace.line_of_sight import LineChange
+from optics.raytrace.first_order import LineChange
 from scenes.models.camera_design import with_plane
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument

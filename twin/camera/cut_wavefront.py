@@ -10,12 +10,12 @@ import numpy as np
 from optics.geometry.polygon import covered
 from optics.geometry.tree import State
 from optics.numerics import quadrature
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.waves.edge_shadow import LitStop, holes
+from optics.waves.imaging import PartFit, fit_part, fit_wavefront, orthonormal_parts
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, smooth_terms
-from optics.waves.wavefront import PartFit, fit_part, fit_wavefront, orthonormal_parts
 from twin.targets.target_path import LineRays, TargetPath
 
 WORST_LIGHT = 5e-3

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.arrays import shows
-from analysis.orientation.distortion_model import principal_distance, principal_distance_and_point
+from analysis.orientation.interior import principal_distance, principal_distance_and_point
 from optics.raytrace.first_order import enclosed_area
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_sharpness import FocalPlane

@@ -15,7 +15,7 @@ from analysis.arrays import shows
 from optics.geometry.aperture import Aperture, Circle, Rectangle
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.first_order import Paraxial, equal_area_radius, first_order, ray_matrix

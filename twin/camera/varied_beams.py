@@ -17,15 +17,15 @@ from optics.geometry import zernike
 from optics.geometry.polygon import area
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
-from optics.numerics.invariants import UnphysicalError
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.array_math import UnphysicalError
+from optics.numerics.backend import one_blas_thread
 from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.edge_shadow import LitStop
+from optics.waves.imaging import path_to_sphere
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, to_terms
-from optics.waves.wavefront import path_to_sphere
 from scenes.models.camera_axis import LAUNCH_DISTANCE
 from scenes.models.camera_model import glass_steps, in_glass
 from twin.camera.camera_optics import CameraOptics

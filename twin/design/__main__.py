@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from optics.numerics.threads import cores
+from optics.numerics.backend import cores
 from scenes.kinds.file_kinds import kind_of
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError

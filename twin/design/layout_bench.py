@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from analysis.monitor.disturbances import Disturbances
 from optics.numerics.backend import Backend, load_backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models import monitor_layout

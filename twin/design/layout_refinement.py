@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linprog
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.instrument_builder import build_instrument

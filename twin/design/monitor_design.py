@@ -8,7 +8,7 @@ from math import sqrt
 from pathlib import Path
 from typing import Any
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from optics.numerics.backend import Backend
 from scenes.models import monitor_layout
 from scenes.specs.detector import DetectorSpec

@@ -16,8 +16,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import LIMIT, one_blas_thread
+from optics.numerics.backend import LIMIT, one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.models.monitor_layout import Beam
 from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, Seen, bench_of
 from twin.design.layout_refinement import LayoutNumber, Slope, slope_of

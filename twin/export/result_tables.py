@@ -16,7 +16,7 @@ from typing import Any
 import h5py
 
 from analysis.monitor import parameters
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.study import unit_of
 from scenes.yaml.json_file import read_json
 from twin.run.data_files import DataColumn, DataTable

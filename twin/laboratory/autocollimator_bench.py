@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import autocollimator
 from analysis.spots.centroid import energy_centroid, mean_frames
 from analysis.spots.spot_positions import SpotPositions
-from analysis.units import ARCSEC
 from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import Backend

@@ -23,9 +23,8 @@ from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, Traced, make_rays, require_some, trace
-from optics.waves.diffraction import Grid, PupilField, image
-from optics.waves.pixel_response import PixelResponse, UnsampledImageError
-from optics.waves.wavefront import eikonal
+from optics.waves.diffraction import Grid, PixelResponse, PupilField, UnsampledImageError, image
+from optics.waves.imaging import eikonal
 from scenes.models.autocollimator_model import UNITS, Bench, autocollimator_body, outgoing, pinhole_body, round_trip
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 

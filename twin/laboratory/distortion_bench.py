@@ -21,8 +21,7 @@ from analysis.spots.noise import NoiseModel
 from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import State
 from optics.geometry.vector_shape import Disk, Polygon
-from optics.numerics.backend import Backend
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import Backend, one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.targets.target_shapes import Target, pinhole

@@ -6,10 +6,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from analysis.arrays import Array
+from analysis.arrays import ARCSEC, MM_PER_M, Array
 from analysis.orientation.interior import LINE_TERMS, InteriorOrientation, LineOrientation
 from analysis.turntable.dividing_error import DividingCompensation, expected_rejections
-from analysis.units import ARCSEC, MM_PER_M
 from twin.laboratory import turntable_numbers
 from twin.laboratory.distortion_run import DistortionRun, Estimate, SimulatedDistortion
 from twin.laboratory.measured_readings import DataFile, SpotReadings

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.orientation.distortion_model import design
-from analysis.orientation.interior import gain
+from analysis.arrays import ARCSEC
+from analysis.orientation.interior import design, gain
 from analysis.spots.centroid import mean_frames
-from analysis.units import ARCSEC
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera_tests import MeasuredDistortionSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory.distortion_numbers import DISTORTION, ESTIMATE, POINTS

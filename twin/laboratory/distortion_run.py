@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from analysis.arrays import Array
 from analysis.orientation import interior, measurement
-from analysis.orientation.distortion_model import OrientationError, distortion, principal_distance, principal_point
-from analysis.orientation.distortion_model import principal_distance_and_point as distance_and_point
+from analysis.orientation.interior import OrientationError, distortion, principal_distance, principal_point
+from analysis.orientation.interior import principal_distance_and_point as distance_and_point
 from analysis.spots.spot_positions import SpotError
-from analysis.turntable.angle_fits import FITS
-from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate, covered
+from analysis.turntable.dividing_error import FITS, CalibrationSeries, DividingCompensation, choose, compensate, covered
 from optics.numerics.backend import Backend
 from scenes.specs.camera_tests import DistortionFiles, DistortionTestSpec, MeasuredDistortionSpec
 from scenes.specs.resolved import DistortionSetup, ExperimentSetup, MeasuredDistortionSetup

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from analysis.turntable.dividing_error import CalibrationSeries
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs import camera_tests
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.spec import Spec

@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from analysis.arrays import UM_PER_M as UM
 from analysis.focal_plane.through_focus import FocusVertex
-from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import rotation_vector
 from twin.laboratory.focus_bench import BudgetLine
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState

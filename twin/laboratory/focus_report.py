@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.units import ARCMIN, UM_PER_M
+from analysis.arrays import ARCMIN, UM_PER_M
 from scenes.specs.camera_tests import MeasuredFocusSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.laboratory import focus_plots

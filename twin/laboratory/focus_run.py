@@ -14,11 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from analysis.focal_plane.plane_fit import FocalPlaneFit, LineLevel, ObservabilityError, RigidMotion, fit_focal_plane
-from analysis.focal_plane.shims import Mount, ShimError, ShimPlan, shim_plan
+from analysis.focal_plane.plane_fit import (
+    FocalPlaneFit,
+    LineLevel,
+    Mount,
+    ObservabilityError,
+    RigidMotion,
+    ShimError,
+    ShimPlan,
+    fit_focal_plane,
+    shim_plan,
+)
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
-from optics.numerics.backend import Backend
-from optics.numerics.threads import cores
+from optics.numerics.backend import Backend, cores
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.targets.collimator import TooNarrowError

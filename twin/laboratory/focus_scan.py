@@ -12,7 +12,7 @@ from analysis.focal_plane.through_focus import FocusError, FocusVertex, focus_ve
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
 from optics.geometry.pose import Pose
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.backend import cores, one_blas_thread
 from twin.laboratory.focus_bench import FocusBench, Site
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.random_streams import stream

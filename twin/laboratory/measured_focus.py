@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from analysis.arrays import Array
 from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex, outlying_points
-from analysis.images.image_file import ImageFile, Region
-from analysis.images.image_header import ImageError
+from analysis.images.image_file import ImageError, ImageFile, Region
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
 from analysis.spots.noise import NoiseModel
 from analysis.statistics import limit_of
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.backend import cores, one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera_tests import FocusFiles, NoiseSpec
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import names_text, nearest

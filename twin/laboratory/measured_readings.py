@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.arrays import Array
-from analysis.orientation.measurement import CALIBRATED, Spots
+from analysis.orientation.interior import CALIBRATED, Spots
 from analysis.turntable.dividing_error import CalibrationSeries, covered, gaps
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera_tests import DistortionFiles
 from scenes.specs.turntable import TurntableFiles
 from scenes.yaml.csv_table import Column, Table, read_table

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
 from analysis.turntable.dividing_error import CalibrationSeries
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
 from twin.run.random_streams import stream
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import chi2
 
+from analysis.arrays import ARCSEC
 from analysis.turntable.dividing_error import covered, gaps
-from analysis.units import ARCSEC
 from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
 from twin.laboratory.turntable_bench import TurntableModel

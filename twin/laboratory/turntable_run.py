@@ -15,10 +15,18 @@ from typing import Any
 import numpy as np
 
 from analysis.arrays import Array
-from analysis.turntable.angle_fits import FITS, AngleFit, angles_left, fewest
-from analysis.turntable.dividing_error import CalibrationSeries, Choice, DividingCompensation, choose, compensate
-from optics.numerics.backend import Backend
-from optics.numerics.threads import one_blas_thread
+from analysis.turntable.dividing_error import (
+    FITS,
+    AngleFit,
+    CalibrationSeries,
+    Choice,
+    DividingCompensation,
+    angles_left,
+    choose,
+    compensate,
+    fewest,
+)
+from optics.numerics.backend import Backend, one_blas_thread
 from scenes.specs.resolved import ExperimentSetup
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from twin.laboratory.measured_readings import Comparisons, read_turntable

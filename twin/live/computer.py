@@ -21,9 +21,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
 
-from optics.numerics.backend import BackendUnavailable
+from optics.numerics.backend import BackendUnavailable, cores, kernel_threads, one_blas_thread
 from optics.numerics.llvm import LibraryMissing
-from optics.numerics.threads import cores, kernel_threads, one_blas_thread
 from scenes.yaml.errors import InputError
 from twin.live.camera_pictures import CameraPictures
 from twin.live.live_bench import LOST, LiveBench

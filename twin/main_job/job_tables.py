@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 from pathlib import PurePath
 from typing import Any
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.thermal.nodal_deformation import PRINTED, SEEN, NodalDeformation
 from scenes.models.nodal_bodies import HeatedBody, HeatedFace
 from scenes.specs.job import JobSpec

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from analysis.arrays import shows
-from analysis.monitor.curvature import BEYOND
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares, consistency
 from analysis.monitor.estimators import Estimator, applicable, judged
-from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.limits import Quantity, posterior_sigma, quantities, unmoved
+from analysis.monitor.monitoring import GroundGeometry
 from analysis.monitor.parameters import CameraCalibration
-from analysis.monitor.recovery import Recovery
+from analysis.monitor.recovery import BEYOND, Recovery
 from analysis.spots.likelihood import FALSE_ALARM as SPOT_ALARM
 from analysis.spots.likelihood import FitStates
 from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.assumptions import assumed

@@ -12,8 +12,8 @@ import numpy as np
 from analysis.monitor.recovery import recover
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State, compose
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import UnphysicalError
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.instrument_builder import squared_facets
 from scenes.models.instrument_model import Instrument, MisplacedError

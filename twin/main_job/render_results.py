@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from analysis.arrays import shows
+from analysis.arrays import ARCSEC, shows
 from analysis.monitor import parameters
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import Estimator
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
 from analysis.monitor.recovery import Recovery
-from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction
 from scenes.models.scenery import MeasuredFinishes

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import parameters
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
-from analysis.units import ARCSEC
 from scenes.specs.instrument import BASE
 from twin.main_job.spot_plots import marks
 from twin.monitor.reading_table import Reading

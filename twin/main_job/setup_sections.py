@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from optics.thermal.nodal_deformation import NodalDeformation
 from twin.main_job.job_tables import BENT, WARMED, faces_of, heated_of
 from twin.main_job.render_results import JobRun

@@ -24,22 +24,20 @@ from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
 from optics.geometry.tree import State
 from optics.numerics import quadrature
-from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import UnphysicalError, hold_below, hold_equal, hold_within
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.array_math import UnphysicalError, hold_below, hold_equal, hold_within
+from optics.numerics.backend import Backend, one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import chief_rays
+from optics.raytrace.first_order import chief_rays
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError
 from optics.waves.edge_shadow import StopOutlines
-from optics.waves.imaging import ImagingRays, imaging_rays
+from optics.waves.imaging import ImagingRays, eikonal, imaging_rays, path_to_sphere
 from optics.waves.line_transfer import LINE_SIDES, cut_pupils, line_transfers
-from optics.waves.pupil_edge import WORST_BEND
 from optics.waves.pupil_shadow import FEW_SIDES, SMALLEST
 from optics.waves.pupil_stack import CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
-from optics.waves.wavefront import eikonal, path_to_sphere
+from optics.waves.pupil_terms import WORST_BEND
 from scenes.models import shadow
 from scenes.models.camera_axis import LAUNCH_DISTANCE
 from scenes.models.camera_model import coloured, lenses, line_body

@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.limits import Split, split
+from analysis.monitor.monitoring import GroundGeometry
 from analysis.monitor.recovery import joint
 from analysis.spots.likelihood import image_bound
 from optics.geometry.tree import State

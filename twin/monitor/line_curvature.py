@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 
 from analysis.monitor import model_fit
-from analysis.monitor.curvature import MotionModel, Retraced
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.parameters import CameraCalibration
+from analysis.monitor.recovery import MotionModel, Retraced
 from optics.geometry.tree import Motion, State
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
 from scenes.models.disturbances import StatedMotions, states_of
 from scenes.models.thermal_model import ThermalModel
 from twin.monitor.monitor_path import MonitorPath

@@ -22,7 +22,7 @@ from optics.raytrace.aim import RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.system import SystemBatch, UploadedSystems, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.diffraction import Grid, PupilField
-from optics.waves.wavefront import eikonal
+from optics.waves.imaging import eikonal
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import Channel
 from twin.monitor.image_sampling import UncertainImageError

@@ -24,9 +24,8 @@ from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.aim import RayFan, aim, transverse_axes
-from optics.raytrace.derivatives import RayTangents, jvp, vjp
 from optics.raytrace.system import SystemBatch, assemble
-from optics.raytrace.trace import make_rays, trace
+from optics.raytrace.trace import RayTangents, jvp, make_rays, trace, vjp
 from scenes.models.disturbances import Component, StatedMotions, states_of
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel

@@ -13,19 +13,17 @@ from functools import cached_property
 import numpy as np
 
 from analysis.arrays import shows
-from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.ground_error import GroundGeometry
-from analysis.monitor.monitoring import MonitorGeometry
+from analysis.monitor.monitoring import GroundGeometry, MonitorGeometry
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
+from analysis.monitor.recovery import MotionModel
 from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import State
-from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.array_math import PhysicalError
+from optics.numerics.backend import Backend, one_blas_thread
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import NodalDeformation
-from optics.waves.pixel_response import UnsampledImageError
+from optics.waves.diffraction import UnsampledImageError
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument

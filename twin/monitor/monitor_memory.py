@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from optics.numerics.threads import cores
+from optics.numerics.backend import cores
 from scenes.specs.course import FEWEST
 from scenes.specs.detector import LEAST_SIDE
 from scenes.specs.resolved import ResolvedJob

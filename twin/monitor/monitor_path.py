@@ -15,12 +15,10 @@ from functools import cached_property
 import numpy as np
 
 from optics.geometry.tree import PlacedBodies, State
-from optics.numerics.backend import Backend
+from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.quadrature import PupilNodes
-from optics.numerics.threads import one_blas_thread
 from optics.raytrace.system import touched_bodies
-from optics.waves.diffraction import PupilField, image
-from optics.waves.pixel_response import PixelResponse, UnsampledImageError
+from optics.waves.diffraction import PixelResponse, PupilField, UnsampledImageError, image
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE, Channel
 from twin.monitor.image_sampling import (

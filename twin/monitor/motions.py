@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from optics.geometry.pose import triple
 from optics.geometry.tree import ORIGIN, Motion, State
 from scenes.models.instrument_model import Instrument

@@ -18,7 +18,7 @@ from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots, rec
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
-from optics.numerics.threads import cores, one_blas_thread, one_kernel_thread
+from optics.numerics.backend import cores, one_blas_thread, one_kernel_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from twin.monitor.monitor_experiment import MonitorExperiment

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import parameters
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import ESTIMATORS
-from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.limits import unmoved
+from analysis.monitor.monitoring import GroundGeometry
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibration, Parameter
 from analysis.monitor.recovery import Estimates, Recovery
-from analysis.units import ARCSEC
 from twin.monitor.truth import Truth
 from twin.run.artefact import FAR, SAME, decimals_for, fixed
 

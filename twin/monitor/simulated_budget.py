@@ -13,12 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.monitoring import coefficients
 from analysis.monitor.recovery import Recovery, measure_spots
-from analysis.units import ARCSEC
 from optics.geometry.tree import State
-from optics.numerics.backend import Backend
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.backend import Backend, cores, one_blas_thread
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import states_of
 from scenes.specs.disturbances import ErrorBudgetSpec

@@ -8,18 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.curvature import Curvature
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares
-from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.jump_detection import Jump
+from analysis.monitor.monitoring import GroundGeometry
 from analysis.monitor.parameters import CameraCalibration
-from analysis.monitor.recovery import Recovery, estimates_of
+from analysis.monitor.recovery import Curvature, Recovery, SpotEvidence, estimates_of
 from analysis.monitor.series_smoother import smooth, window_of
-from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.spot_positions import NoiseParts, SeriesNoise, SpotError
 from analysis.statistics import limit_of
 from optics.geometry.tree import Motion, State
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError

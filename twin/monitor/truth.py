@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 
 from analysis.arrays import shows
-from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.monitoring import GroundGeometry
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import LineChange, aim_chief_rays, chief_rays, line_change
+from optics.raytrace.first_order import LineChange, aim_chief_rays, chief_rays, line_change
 from optics.raytrace.system import SystemBatch, assemble
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument

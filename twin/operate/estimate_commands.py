@@ -15,7 +15,7 @@ from twin.operate.terminal import Place, line, require_record, tell, told
 from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict, print_whole, result_table
 
 if TYPE_CHECKING:
-    from analysis.monitor.detection_power import Power
+    from analysis.monitor.series_filter import Power
     from twin.operate.estimate.following import Course, Following
     from twin.operate.estimate.operation import Operation
     from twin.operate.record.entries import Alarm

@@ -16,7 +16,7 @@ import numpy as np
 from analysis.arrays import Array
 from analysis.monitor.disturbances import Disturbances
 from optics.geometry.tree import Body, Motion
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import HEAT, Component, state_of, usual_pivot
 from scenes.models.instrument_model import Instrument

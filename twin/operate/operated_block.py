@@ -19,10 +19,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.arrays import Array
+from analysis.arrays import ARCSEC, Array
 from analysis.block.block import CamerasKnowledge
 from analysis.monitor.limits import Quantity
-from analysis.units import ARCSEC
 from scenes.specs.measured.adjust_setup import AnyAdjust
 from scenes.specs.orbit.adjust import MonitorRecordSpec
 from scenes.yaml.errors import InputError, Problem, unknown

@@ -20,7 +20,7 @@ from sqlalchemy import Select, func, select
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import share_interval
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.operate.estimate.alarms import name_of, percent
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of

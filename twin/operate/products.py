@@ -18,7 +18,7 @@ import numpy as np
 from sqlalchemy import select
 
 from analysis.arrays import Array
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
 from twin.operate.estimate.operation_model import plan_digest

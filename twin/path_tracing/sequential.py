@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from optics.geometry.surface import SurfaceNumbers
-from optics.materials.finish import Finish
+from optics.materials.scatter import Finish
 from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
 from twin.path_tracing import tables as layout

@@ -17,8 +17,8 @@ import numpy as np
 
 from optics.geometry.tree import State
 from optics.numerics import quadrature
+from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError
 from optics.waves.diffraction import Grid, image
 from scenes.models.instrument_model import Instrument
 from scenes.models.scenery import Scenery, build_scenery

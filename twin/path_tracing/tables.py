@@ -14,8 +14,7 @@ from optics.geometry.sag_terms import SagTerm, kinds_of, of_kinds
 from optics.geometry.surface import FigureNumbers, GridNumbers, SurfaceNumbers
 from optics.geometry.zernike import triangle_size
 from optics.materials import finish, scatter
-from optics.materials.finish import Finish
-from optics.materials.scatter import DrawnScatter
+from optics.materials.scatter import DrawnScatter, Finish
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
 from scenes.models.scenery import Scenery

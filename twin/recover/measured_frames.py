@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.images.image_file import ImageFile, recorded
-from analysis.images.image_header import ImageError
+from analysis.images.image_file import ImageError, ImageFile, recorded
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PhotonTransfer, PixelCorrection, photon_transfer, pixel_correction

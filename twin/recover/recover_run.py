@@ -11,16 +11,14 @@ from typing import Any
 import numpy as np
 
 from analysis.arrays import shows
-from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Consistency, Disturbances
 from analysis.monitor.monitoring import MonitorGeometry, coefficients
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
-from analysis.monitor.recovery import Recovery, judged_spots, recover, recovery_of
+from analysis.monitor.recovery import MotionModel, Recovery, judged_spots, recover, recovery_of
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions
-from optics.numerics.backend import Backend
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import Backend, one_blas_thread
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.course import moment
 from scenes.specs.instrument import SIDES

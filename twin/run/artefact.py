@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from markupsafe import Markup
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.run.data_files import csv_table
 
 MINUS = "\N{MINUS SIGN}"

@@ -118,8 +118,8 @@ def explained(errors: Console) -> Iterator[None]:
         raise typer.Exit(BAD_INPUT) from None
     except Exception as error:
         # the work that failed has imported these; help and a bad file do not wait for them
+        from optics.numerics.array_math import PhysicalError, UnphysicalError
         from optics.numerics.backend import BackendUnavailable
-        from optics.numerics.invariants import PhysicalError, UnphysicalError
         from optics.numerics.llvm import LibraryMissing
         from twin.run.run_folder import RunFolderError
 

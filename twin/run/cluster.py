@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from optics.numerics.threads import ONE_THREAD
+from optics.numerics.backend import ONE_THREAD
 from twin.run import cli, durable, owned_files, provenance
 
 if TYPE_CHECKING:  # it takes half a second, and a study's file is read before workers are started

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import tifffile
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.run.frame_store import FileRoom, in_file, mean_of, parts
 
 if TYPE_CHECKING:

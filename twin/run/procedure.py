@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from threadpoolctl import threadpool_info
 
-from optics.numerics.threads import LIMIT, cores
+from optics.numerics.backend import LIMIT, cores
 from twin.run.owned_files import digest
 
 PACKAGES = (

@@ -14,8 +14,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from analysis.units import ARCMIN, ARCSEC
-from optics.numerics.frozen_map import FrozenMap
+from analysis.arrays import ARCMIN, ARCSEC
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.study import unit_of
 from twin.run.artefact import Cell, Table, shown_unit
 from twin.run.data_files import DataColumn, DataTable

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.run.artefact import Artefact, Table
 from twin.run.data_files import FrameFacts
 

@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import IO, Any
 
-from optics.numerics.threads import cores
+from optics.numerics.backend import cores
 
 MOST_TASKS = 256
 _HEAD = struct.Struct("=QB")

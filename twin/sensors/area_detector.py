@@ -27,8 +27,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from analysis.spots.noise import COARSE, FEW, WHOLE, FurtherNoise, NoiseModel
-from optics.numerics.invariants import UnphysicalError
-from optics.numerics.threads import cores
+from optics.numerics.array_math import UnphysicalError
+from optics.numerics.backend import cores
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.yaml.errors import Problem, names_text, nearest

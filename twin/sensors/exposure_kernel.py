@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from optics.numerics.backend import one_kernel_thread
 from optics.numerics.llvm import ensure_llvm
-from optics.numerics.threads import one_kernel_thread
 from twin.run.frame_store import let_go
 from twin.sensors.poisson_numbers import (
     CELLS_PER_UNIT,

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from optics.numerics.backend import load_backend
-from optics.numerics.threads import cores
+from optics.numerics.backend import cores, load_backend
 from scenes.kinds.file_kinds import read_for
 from scenes.yaml.errors import InputError
 from twin.run import cli, cluster, durable, memory, provenance, run_folder

@@ -24,7 +24,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from optics.geometry.tree import State
 from optics.geometry.vector_shape import HalfPlane
-from optics.numerics.invariants import PhysicalError, UnphysicalError
+from optics.numerics.array_math import PhysicalError, UnphysicalError
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.targets.target_image import EdgeProfile, target_image

@@ -17,12 +17,12 @@ from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
-from optics.raytrace.line_of_sight import chief_rays
+from optics.raytrace.first_order import chief_rays
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
 from optics.targets.collimator import Collimator

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optics.numerics.threads import cores
+from optics.numerics.backend import cores
 from scenes.kinds.file_kinds import read_for
 from scenes.yaml.named import Named
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.tolerance import AllocationSpec, ToleranceSetup, amount_si
 from scenes.yaml.units import split_quantity
 from twin.run.procedure import Advance, silent

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
 from optics.waves.pupil_terms import products
 from optics.waves.transfer import VariedTransfer, polychromatic_transfer
 from scenes.models.camera_model import lenses

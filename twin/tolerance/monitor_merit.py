@@ -23,12 +23,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.limits import split
-from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from optics.numerics import quadrature
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
 from optics.raytrace.system import assemble
 from optics.waves.imaging import imaging_rays
 from scenes.models.shadow import TracedBeams

@@ -17,11 +17,10 @@ from functools import cached_property
 import numpy as np
 
 from optics.geometry.tree import State
-from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError, UnphysicalError
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.array_math import PhysicalError, UnphysicalError
+from optics.numerics.backend import Backend, one_blas_thread
 from optics.raytrace.assembly import Element
-from optics.raytrace.line_of_sight import line_change, line_tangents
+from optics.raytrace.first_order import line_change, line_tangents
 from scenes.models.camera_model import lenses
 from scenes.specs.tolerance import OF_MONITOR, SPECTRUM, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown

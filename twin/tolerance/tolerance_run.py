@@ -12,7 +12,7 @@ import numpy as np
 from analysis.statistics import share_interval
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.job import JobSpec
 from scenes.specs.load import is_path
 from scenes.specs.tolerance import AllocationSpec, ToleranceBudgetSpec, ToleranceSetup, amount_text

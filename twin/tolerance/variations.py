@@ -16,7 +16,7 @@ from optics.geometry.aperture import Circle
 from optics.geometry.pose import Pose, rotation_matrix, triple
 from optics.geometry.tree import Body, Motion, State
 from optics.geometry.zernike import noll_to_nm, zernike
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Element
 from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument

@@ -15,8 +15,7 @@ from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.limits import Quantity
 from analysis.monitor.recovery import Recovery
-from optics.numerics.backend import Backend
-from optics.numerics.threads import cores
+from optics.numerics.backend import Backend, cores
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.disturbances import states_of
 from scenes.specs.resolved import ResolvedJob

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import limits
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.limits import Elasticity, HeavyTail, LeastSeen, Quantity, Split, elasticities, heavy_tails, unseen
@@ -15,7 +16,6 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.monitor.recovery import MeasuredSpots, joint, judged_spots
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.spot_positions import SpotError, difference_covariance
-from analysis.units import ARCSEC
 from scenes.models.disturbances import states_of
 from scenes.models.instrument_model import MisplacedError
 from scenes.specs.instrument import BASE

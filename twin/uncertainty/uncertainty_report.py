@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
-from analysis.units import ARCSEC
 from twin.run import svg
 from twin.run.artefact import Cell, SvgFigure, Table, shown_unit, significant
 from twin.run.report import Report, Section, answer, sentence

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import Moment, ascending, moment
 from scenes.specs.detector import DetectorSpec, PixelPitch
 from scenes.specs.disturbances import JobDisturbances

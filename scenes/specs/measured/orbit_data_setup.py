@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, load_named
 from scenes.specs.measured import orbit_data
 from scenes.specs.measured.pass_files import PlatformFilesSpec, with_absolute_files

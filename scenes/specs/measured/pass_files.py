@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.flight import EarthSpec
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import Quantity

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.measured.pass_files import ClockReading, TimeScale
 from scenes.specs.operation import Event
 from scenes.yaml.errors import Problem, names_text, nearest

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.array_math import number_of
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment, no_such_time
 from scenes.specs.disturbances import JobDisturbances, component_named
 from scenes.specs.job import AnalysisSpec, JobSpec, PerturbationSpec, RenderSpec, checked_nodes

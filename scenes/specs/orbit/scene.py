@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from optics.geometry.polygon import area, hull, intersect, sides
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import Diffusion, TdiSpec
 from scenes.specs.orbit.angle import GroundSigma, TerrainHeight
 from scenes.specs.spectrum import WavelengthRange

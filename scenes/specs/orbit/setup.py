@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs import load
 from scenes.specs.camera import CameraSpec
 from scenes.specs.course import DEFAULT_PIVOT

@@ -18,15 +18,12 @@ from numpy.typing import NDArray
 from scipy.special import pdtrc
 
 from analysis.arrays import Array
-from analysis.monitor.detection_power import Power, detection_power
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.filter_state import Belief, Observed
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.limits import Quantity
-from analysis.monitor.series_filter import SeriesFilter
-from analysis.monitor.series_following import hinted, jointly, smoothed
-from optics.numerics.backend import load_backend
-from optics.numerics.threads import one_blas_thread
+from analysis.monitor.series_filter import Power, SeriesFilter, detection_power, hinted, jointly, smoothed
+from optics.numerics.backend import load_backend, one_blas_thread
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
 from twin.monitor.monitor_experiment import MonitorExperiment

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.covariance_root import covariance_root
 from analysis.orbit.planes import Station, Strip
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.geometry.tree import State
+from optics.numerics.array_math import covariance_root
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.instrument_builder import build_instrument

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.orbit.angles import AlongTrackAngles, PlaneAngles
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
+from analysis.orbit.planes import AlongTrackAngles, PlaneAngles
 from twin.orbit.angle.angle_run import AngleRun, EffectRow, FrameRow, PassAngles, Scatter, SimulatedAngleRun, values_of
 from twin.run.quantity import Quantity, Record
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.measured.orbit_data_setup import MeasuredAngleSetup
 from scenes.specs.perturbation import PlainPerturbationSpec

@@ -17,12 +17,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2
 
+from analysis.arrays import ARCSEC
 from analysis.orbit import angles as plane_angles
-from analysis.orbit.angles import AlongTrackAngles, AngleError, PlaneAngles, Sensitivity, angles_between
-from analysis.orbit.planes import METHODS, Method, NearVerticalWarning, PlaneError, PlaneFit, Strip, fit_plane
+from analysis.orbit.planes import (
+    METHODS,
+    AlongTrackAngles,
+    AngleError,
+    Method,
+    NearVerticalWarning,
+    PlaneAngles,
+    PlaneError,
+    PlaneFit,
+    Sensitivity,
+    Strip,
+    angles_between,
+    fit_plane,
+)
 from analysis.orbit.resection import ObservedLine, Resection, ResectionError, resect
-from analysis.units import ARCSEC
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineAngles

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.orbit.angles import AXES
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
+from analysis.orbit.planes import AXES
 from twin.orbit.angle.angle_run import Scatter, SimulatedAngleRun, values_of
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT
 from twin.run import svg

@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.angles import AngleError
-from analysis.orbit.planes import PlaneError, Station, Strip
+from analysis.orbit.planes import AngleError, PlaneError, Station, Strip
 from analysis.orbit.resection import ResectionError
 from optics.numerics.array_math import in_span
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.measured.orbit_data_setup import AnyAngle, MeasuredAngleSetup
 from scenes.specs.orbit.angle import LEAST_POINTS, usual_angles
 from scenes.yaml.errors import names_text, nearest

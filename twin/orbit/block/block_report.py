@@ -13,7 +13,7 @@ import numpy as np
 from analysis.block.block_adjustment import LawTest
 from analysis.block.network import DatumTest, Network, Open
 from analysis.block.reweighting import GroupTest
-from analysis.orbit.ground_errors import Accuracy
+from analysis.orbit.forward_intersection import Accuracy
 from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun, CameraChange, Worth
 from twin.orbit.measured.pass_measurements import duplicates, listed
 from twin.run.artefact import Cell, Table

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import chi2
 
+from analysis.arrays import MeasurementError
 from analysis.block.block import Block
 from analysis.block.block_adjustment import BlockAdjustment, LawTest, adjust_block, kept_block, law_tests
 from analysis.block.network import DatumTest, Network, Open, datum_test, network_of, open_combinations
 from analysis.block.point_reduction import Pool
 from analysis.block.processes import BlockError
-from analysis.measurement_error import MeasurementError
-from analysis.orbit.ground_errors import Accuracy, level_axes, predicted, realised
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import one_blas_thread
+from analysis.orbit.forward_intersection import Accuracy, level_axes, predicted, realised
+from optics.numerics.backend import one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.measured.adjust_setup import AnyAdjust, MeasuredAdjustSetup
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import MonitorSource, measured_block

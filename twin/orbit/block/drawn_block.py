@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from analysis.block import block as known
 from analysis.block.processes import STEPPED, Law
-from analysis.covariance_root import covariance_root
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
+from optics.numerics.array_math import covariance_root
 from scenes.specs.measured.adjust_setup import AdjustSetup
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.flight import AttitudeSpec

@@ -16,7 +16,7 @@ from analysis.block.processes import Law
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.measured.adjust_setup import MeasuredAdjustSetup
 from scenes.specs.orbit.adjust import CameraChangeSpec, LawSpec
 from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec

@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from analysis.arrays import Array
-from analysis.calibration.adjustment import Adjustment
-from analysis.calibration.hidden_terms import FALSE_ALARM
+from analysis.calibration.adjustment import FALSE_ALARM, Adjustment
 from analysis.calibration.strip_adjustment import Datum
-from analysis.orbit.calibration_parameters import OFFSET, RATE
+from analysis.orbit.calibration_parameters import OFFSET, RATE, Combination
 from analysis.orbit.forward_intersection import CheckErrors
-from analysis.orbit.null_space import Combination
 from analysis.orbit.three_line_model import BIAS
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
 from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Screening, interior_names

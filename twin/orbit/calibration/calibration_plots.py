@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
+from analysis.arrays import ARCSEC
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS, misclosure
-from analysis.units import ARCSEC
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.flown_campaign import true_bias
 from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_of

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration import calibration_sections

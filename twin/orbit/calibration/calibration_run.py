@@ -14,12 +14,11 @@ import numpy as np
 
 from analysis.calibration.adjustment import Adjustment, FarPointsError, NoiseError
 from analysis.calibration.strip_adjustment import Stepwise, stepwise
-from analysis.orbit.calibration_parameters import OFFSET, RATE
+from analysis.orbit.calibration_parameters import OFFSET, RATE, RankError
 from analysis.orbit.forward_intersection import CheckErrors, ThirdDifference, third_difference
-from analysis.orbit.null_space import RankError
 from analysis.orbit.three_line_model import BIAS, INTERIOR
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.measured.orbit_data_setup import AnyCalibration, MeasuredCalibrationSetup
 from scenes.specs.orbit.calibration import LEAST_TIES
 from scenes.yaml.yaml_file import dump_yaml

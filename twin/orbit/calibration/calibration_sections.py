@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.three_line_model import BIAS
-from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_numbers import CHIP_STEP, LATITUDE, MATCHING, SCREENED
 from twin.orbit.calibration.calibration_plots import figure_svg

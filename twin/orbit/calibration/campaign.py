@@ -29,8 +29,8 @@ from analysis.orbit.calibration_parameters import CalibrationField, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import INTERIOR, LineModel, Rays
 from optics.geometry.pose import about_axis, rotation_matrix
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.earth import Earth, east_north_up

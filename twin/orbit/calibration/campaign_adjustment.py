@@ -24,12 +24,10 @@ from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from analysis.block.reweighting import Robust
-from analysis.calibration.adjustment import Adjustment, adjust
-from analysis.calibration.hidden_terms import FALSE_ALARM
-from analysis.orbit.calibration_parameters import OFFSET, RATE, Prior, Unknowns, index
-from analysis.orbit.null_space import Gauge
+from analysis.calibration.adjustment import FALSE_ALARM, Adjustment, adjust
+from analysis.orbit.calibration_parameters import OFFSET, RATE, Gauge, Prior, Unknowns, index
 from analysis.orbit.three_line_model import BIAS
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, FoundDrift
 
 GAUGE = Gauge(held=("nadir x", "nadir y"))

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.geometry.pose import rotation_matrix
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath

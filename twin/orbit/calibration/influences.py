@@ -17,11 +17,10 @@ from typing import Self
 import numpy as np
 from scipy.stats import chi2, norm
 
-from analysis.calibration.adjustment import Adjustment
-from analysis.calibration.hidden_terms import FALSE_ALARM, Rates, Steps
+from analysis.arrays import ARCSEC
+from analysis.calibration.adjustment import FALSE_ALARM, Adjustment, Rates, Steps
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
-from analysis.units import ARCSEC
 from scenes.specs.measured.orbit_data import MeasuredCalibrationSpec
 from twin.orbit.calibration.campaign import EFFECTS, Campaign, FoundDrift
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous

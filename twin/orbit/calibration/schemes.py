@@ -26,14 +26,14 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from scipy.stats import chi2
 
+from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment, adjust
 from analysis.calibration.strip_adjustment import Datum, StripAdjustment, adjust_strip
 from analysis.orbit.calibration_parameters import CalibrationField, Prior, Unknowns, monitor_priors
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.orbit.three_line_model import BIAS, LineModel, Rays
-from analysis.units import ARCSEC
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.calibration.campaign import EFFECTS, Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma

@@ -19,7 +19,7 @@ from analysis.calibration.adjustment import Adjustment, FarPointsError
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import Rays, misclosure
 from analysis.statistics import robust_variance
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Rejected, Screening
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.flight.light_effects import NO_EFFECTS

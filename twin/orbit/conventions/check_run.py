@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.stats import chi2
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue
 from twin.orbit.conventions import pass_readings
 from twin.orbit.conventions.pass_readings import (

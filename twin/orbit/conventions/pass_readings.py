@@ -22,7 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.array_math import in_span
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError, Problem, names_text, nearest, shown
 from scenes.yaml.units import TIME

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from analysis.orbit.forward_intersection import CalibratedLine
 from analysis.orbit.image_correction import Kind
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.kinds.file_kinds import kind_of
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.measured.pass_files import GroundFileSpec

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
-from analysis.orbit.ground_errors import circular_error, linear_error
+from analysis.orbit.forward_intersection import circular_error, linear_error
 from optics.geometry.pose import rotation_matrix
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.export.rational_polynomial import axis_sigma
 from twin.orbit.flight.earth import east_north_up
 from twin.orbit.flight.sensor import Platform, Sensor

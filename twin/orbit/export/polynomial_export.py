@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.export.export_report import FOLDER

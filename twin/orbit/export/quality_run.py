@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from analysis.orbit.image_correction import LEAST_POINTS
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text
 from twin.orbit.export.export_run import (
     Controlled,

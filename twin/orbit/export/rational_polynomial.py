@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import Array
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import why_unreadable
 from twin.orbit.flight.sensor import Sensor

@@ -28,9 +28,9 @@ from optics.geometry.pose import about_axis, rotation_matrix
 from optics.geometry.tree import State
 from optics.numerics.array_math import in_span
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import chief_rays
+from optics.raytrace.first_order import chief_rays
 from optics.raytrace.system import assemble
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument

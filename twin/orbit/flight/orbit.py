@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from optics.numerics.array_math import in_span
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError, in_span
 from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, FLATTENING, Earth, EarthRotation, ut1_of
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from scipy.interpolate import CubicSpline, KroghInterpolator
 from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array
-from optics.numerics.array_math import in_span
-from optics.numerics.invariants import UnphysicalError
+from optics.numerics.array_math import UnphysicalError, in_span
 from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.trajectory import Attitude, Trajectory, readings
 

@@ -20,8 +20,8 @@ from scipy import fft
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.sparse import csr_array
 
-from optics.numerics.invariants import UnphysicalError
-from optics.numerics.threads import cores
+from optics.numerics.array_math import UnphysicalError
+from optics.numerics.backend import cores
 from twin.orbit.flight.earth import Earth, curvature_radii
 
 if TYPE_CHECKING:

@@ -25,12 +25,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter, zoom
 
-from analysis.matching.consensus import DisplacementField, consensus
 from analysis.matching.correlation import MatchOptions, Reason, distinct_points
-from analysis.matching.matches import match
+from analysis.matching.matches import DisplacementField, consensus, match
 from analysis.matching.spline import resampled
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Map, Maps

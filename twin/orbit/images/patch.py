@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2
 
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError
+from optics.numerics.number_tree import FrozenMap
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.orthophoto import Control, make_control

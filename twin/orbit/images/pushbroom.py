@@ -19,8 +19,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy import fft
 
-from optics.numerics.invariants import PhysicalError, UnphysicalError
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.array_math import PhysicalError, UnphysicalError
+from optics.numerics.backend import cores, one_blas_thread
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.texture import Extent

@@ -22,7 +22,7 @@ from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.numerics.array_math import in_span
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.simulate import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec
 from twin.orbit.jitter.jitter_run import JitterRun, PassJitter
 from twin.run.quantity import Quantity, Record

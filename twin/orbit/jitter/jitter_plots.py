@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from analysis.arrays import ARCSEC
 from analysis.statistics import robust_sigma
-from analysis.units import ARCSEC
 from twin.orbit.jitter.jitter_run import JitterRun, PassJitter
 from twin.run import svg
 

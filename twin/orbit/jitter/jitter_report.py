@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from twin.orbit.jitter.jitter_numbers import FoundLine, blind_multiples, found_lines, noise_factors, transfers
 from twin.orbit.jitter.jitter_plots import figure_svg
 from twin.orbit.jitter.jitter_run import JitterRun, PassJitter

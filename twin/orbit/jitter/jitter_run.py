@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from analysis.orbit.jitter import Course, Found, JitterError, search, splined
 
-from analysis.orbit.jitter_lines import Course, Found, search, splined
-from analysis.orbit.jitter_spectrum import JitterError
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.measured.orbit_data_setup import AnyJitter, MeasuredJitterSetup
 from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
 from scenes.specs.orbit.setup import JitterSetup

@@ -20,14 +20,13 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from analysis.orbit.jitter import Observations
 from numpy.polynomial import chebyshev
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.jitter_spectrum import Observations
 from analysis.statistics import robust_sigma
 from optics.geometry.pose import rotation_matrix
-from optics.numerics.array_math import in_span
-from optics.numerics.invariants import PhysicalError
+from optics.numerics.array_math import PhysicalError, in_span
 from scenes.specs.orbit.jitter_search import AXES, JitterSearchSpec
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import LightEffects, carried_with_earth

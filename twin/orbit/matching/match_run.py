@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.orbit.calibration_parameters import level_covariance
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from twin.orbit.conventions.pass_readings import (
     ImpossibleError,

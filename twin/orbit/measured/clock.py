@@ -17,7 +17,7 @@ from datetime import date, datetime, timedelta
 import erfa
 import numpy as np
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import Problem, names_text, shown
 from twin.orbit.flight.earth import DAY, years_without_announced_leap_seconds
 

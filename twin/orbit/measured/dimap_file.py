@@ -29,7 +29,7 @@ from scipy.interpolate import CubicSpline
 
 from analysis.arrays import Array
 from optics.numerics.array_math import in_span
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, shown
 from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.platform_table import joined_quaternions

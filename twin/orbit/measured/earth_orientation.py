@@ -14,7 +14,7 @@ from typing import Any
 import erfa
 import numpy as np
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from optics.numerics.array_math import in_span
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError, Issue

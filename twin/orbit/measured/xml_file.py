@@ -16,7 +16,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.csv_table import LARGEST_NUMBER, table_text
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
 from twin.orbit.measured.clock import Readings

@@ -18,19 +18,18 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import Jump
-from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots
+from analysis.monitor.recovery import MeasuredSpots, Recovery, SpotEvidence, judged_spots
 from analysis.monitor.series_filter import SeriesFilter
-from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from analysis.statistics import chance_beyond, limit_of
-from analysis.units import ARCSEC
 from optics.geometry.tree import State, compose
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.backend import cores, one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.models.disturbances import states_of as amounts_as_states
 from scenes.models.drawn_motions import drawn_motions
 from scenes.specs.course import moment

@@ -20,7 +20,7 @@ from analysis.monitor.control_loop import DECAYING, LimitCycle, Margins
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.model_fit import UnseenMode, floor, unseen_modes
 from optics.numerics.array_math import number_of
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment

@@ -13,13 +13,12 @@ from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import LeastSquares, Posterior, Shifts
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.monitoring import CameraParameters
-from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots
+from analysis.monitor.recovery import MeasuredSpots, Recovery, SpotEvidence, judged_spots
 from analysis.monitor.series_smoother import smooth, window_of
-from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SeriesNoise, SpotError
 from optics.geometry.tree import State, compose
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.backend import cores, one_blas_thread
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError

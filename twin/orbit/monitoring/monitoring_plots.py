@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.control_loop import open_loop, rejection
-from analysis.units import ARCSEC
 from twin.orbit.monitoring.loop_run import LoopPass, LoopRun
 from twin.orbit.monitoring.monitoring_numbers import positions
 from twin.orbit.monitoring.monitoring_run import MonitorRun

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import disturbances
 from analysis.monitor.model_fit import UnseenMode
 from analysis.monitor.monitoring import PER_SI
-from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.yaml.errors import names_text

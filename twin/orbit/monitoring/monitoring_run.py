@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2, norm
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.disturbances import Consistency
-from analysis.monitor.intersection_angle import exact
+from analysis.monitor.monitoring import exact
 from analysis.orbit.forward_intersection import IntersectionError, between
-from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State, compose
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.specs.instrument import BASE

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.orbit.forward_intersection import CalibratedLine, Sightings, check_errors, intersect_pair
-from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import moment
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth

@@ -18,10 +18,10 @@ from analysis.monitor.recovery import Recovery, estimates
 from optics.geometry.tree import COMPLEX_STEP, FIGURE, Motion, State
 from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
-from optics.raytrace.derivatives import jvp
-from optics.raytrace.line_of_sight import aim_chief_rays
+from optics.numerics.number_tree import FrozenMap
+from optics.raytrace.first_order import aim_chief_rays
 from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.trace import jvp
 from scenes.models.instrument_model import Instrument
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import hit_slopes

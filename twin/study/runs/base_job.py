@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from analysis.measurement_error import MeasurementError
+from analysis.arrays import MeasurementError
+from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
-from optics.numerics.invariants import PhysicalError
 from scenes.specs.procedures import Procedure
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, shown

@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from analysis.monitor.recovery import Recovery
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes
 from scenes.specs.job_tables import TableTemperatureSpec

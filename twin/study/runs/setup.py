@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.job_tables import HEAT_KEYS
 from scenes.specs.load import find_named
 from scenes.specs.procedures import BASES, PROCEDURES, studied

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from optics.numerics.backend import Backend, load_backend
-from optics.numerics.threads import ONE_THREAD, kernel_threads
+from optics.numerics.backend import ONE_THREAD, Backend, kernel_threads, load_backend
 from scenes.yaml.errors import InputError
 from twin.run.memory import largest_memory
 from twin.run.provenance import source_digest

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError, Issue, KeyPath, nearest

@@ -8,11 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.arrays import Array
-from analysis.orbit.angles import intersection_angles
-from analysis.orbit.planes import NearVerticalWarning, PlaneFit, fit_plane
-from analysis.units import ARCSEC
-from optics.numerics.threads import one_blas_thread
+from analysis.arrays import ARCSEC, Array
+from analysis.orbit.planes import NearVerticalWarning, PlaneFit, fit_plane, intersection_angles
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from twin.orbit.angle.angle_run import values_of
 from twin.validation.checks.check import CheckResult, mean_of

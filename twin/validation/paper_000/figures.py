@@ -13,11 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.arrays import Array
-from analysis.orbit.angles import Sensitivity, intersection_angles, sensitivity
-from analysis.orbit.planes import Method, Strip
-from analysis.units import ARCSEC
-from optics.numerics.threads import one_blas_thread
+from analysis.arrays import ARCSEC, Array
+from analysis.orbit.planes import Method, Sensitivity, Strip, intersection_angles, sensitivity
+from optics.numerics.backend import one_blas_thread
 from twin.orbit.angle.angle_flight import AnglePass, Measurement
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import Check, CheckResult, Chosen, Supposed, mean_of

@@ -8,12 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.orbit.planes import Method, PlaneFit, fit_plane
 from analysis.orbit.resection import Resection
-from analysis.units import ARCSEC
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, Measurement, angle_camera, fly

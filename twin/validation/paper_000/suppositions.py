@@ -11,10 +11,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analysis.orbit.angles import angles_between, height_error, off_axis_angle
-from analysis.orbit.planes import fit_plane
-from analysis.units import ARCSEC
-from optics.numerics.threads import one_blas_thread
+from analysis.arrays import ARCSEC
+from analysis.orbit.planes import angles_between, fit_plane, height_error, off_axis_angle
+from optics.numerics.backend import one_blas_thread
 from twin.orbit.angle.angle_flight import AnglePass, Measurement
 from twin.orbit.angle.angle_run import centred, effect_rows, sighted
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, standard_refractivity

@@ -9,11 +9,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.arrays import Array
-from analysis.orbit.angles import intersection_angles
-from analysis.orbit.planes import Station
-from analysis.units import ARCSEC
-from optics.numerics.threads import one_blas_thread
+from analysis.arrays import ARCSEC, Array
+from analysis.orbit.planes import Station, intersection_angles
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from twin.orbit.angle.angle_flight import Measurement
 from twin.orbit.angle.angle_run import effect_rows, values_of

@@ -9,12 +9,12 @@ from math import sqrt
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import monitoring
 from analysis.monitor.monitoring import MonitorGeometry
 from analysis.monitor.recovery import measure_spots
-from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.backend import cores, one_blas_thread
 from scenes.specs.instrument import BASE
 from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_budget

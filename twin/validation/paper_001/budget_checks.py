@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from math import hypot, log, sqrt
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from twin.monitor.simulated_budget import BudgetLine, Together
 from twin.run.artefact import Cell, Data
 from twin.run.svg import BLUE, INK, look, new_figure, plain_axes, to_svg

@@ -9,12 +9,12 @@ from statistics import fmean
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.monitoring import MonitorGeometry
-from analysis.units import ARCSEC
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace

@@ -12,10 +12,9 @@ from typing import TypeVar
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import autocollimator, recovery
-from analysis.monitor.intersection_angle import IntersectionAngleChange
-from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
-from analysis.units import ARCSEC
+from analysis.monitor.monitoring import CameraParameters, IntersectionAngleChange, MonitorGeometry
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment

@@ -9,7 +9,7 @@ from itertools import product
 
 import numpy as np
 
-from analysis.units import ARCSEC
+from analysis.arrays import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment

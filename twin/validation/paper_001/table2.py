@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor import autocollimator
 from analysis.monitor.autocollimator import column_component, mean_difference, relation_factor
-from analysis.units import ARCSEC
 from optics.numerics.quadrature import PupilNodes
 from scenes.models.autocollimator_model import UNITS, mirror_body
 from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from analysis.calibration.adjustment import Adjustment, adjust
 from analysis.calibration.strip_adjustment import Stepwise, stepwise
-from analysis.orbit.null_space import Combination, Gauge
+from analysis.orbit.calibration_parameters import Combination, Gauge
 from analysis.orbit.three_line_model import BIAS, INTERIOR, Rays, misclosure, partials
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES, EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from analysis.orbit.angles import height_error
+from analysis.orbit.planes import height_error
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import CalibrationSetup

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.orbit.three_line_model import BIAS, INTERIOR
-from analysis.units import ARCSEC
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.calibration import CalibrationImagesSpec
 from scenes.specs.orbit.setup import CalibrationSetup

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment
 from analysis.calibration.strip_adjustment import Stepwise, stepwise
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS, INTERIOR, misclosure
-from analysis.units import ARCSEC
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.scene import TerrainSpec
 from scenes.specs.orbit.setup import CalibrationSetup

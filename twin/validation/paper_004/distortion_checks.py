@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.arrays import Array
-from analysis.units import ARCSEC
-from analysis.units import MM_PER_M as MM
-from analysis.units import UM_PER_M as UM
-from optics.numerics.threads import one_blas_thread
+from analysis.arrays import ARCSEC, Array
+from analysis.arrays import MM_PER_M as MM
+from analysis.arrays import UM_PER_M as UM
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.resolved import resolve_distortion
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import SimulatedDistortion, measure

@@ -15,16 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 
-from analysis.arrays import Array
-from analysis.orientation.distortion_model import (
-    distortion,
-    principal_distance,
-    principal_distance_and_point,
-    principal_point,
-)
-from analysis.units import ARCSEC
-from analysis.units import MM_PER_M as MM
-from analysis.units import UM_PER_M as UM
+from analysis.arrays import ARCSEC, Array
+from analysis.arrays import MM_PER_M as MM
+from analysis.arrays import UM_PER_M as UM
+from analysis.orientation.interior import distortion, principal_distance, principal_distance_and_point, principal_point
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
 from scenes.models.camera_model import ROOT, build_camera_under_test

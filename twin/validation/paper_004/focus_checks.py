@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from analysis.arrays import Array
-from analysis.focal_plane.plane_fit import RigidMotion, fit_focal_plane
-from analysis.focal_plane.shims import ShimPlan, shim_plan
+from analysis.arrays import ARCMIN, ARCSEC, MM_PER_M, UM_PER_M, Array
+from analysis.focal_plane.plane_fit import RigidMotion, ShimPlan, fit_focal_plane, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
 from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
-from analysis.units import ARCMIN, ARCSEC, MM_PER_M, UM_PER_M
 from optics.geometry.pose import Pose, rotation_matrix
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.resolved import resolve_focus
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_run import FocusState, SimulatedFocus, align, line_turn, mount_of

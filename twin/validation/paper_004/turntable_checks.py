@@ -11,12 +11,10 @@ from scipy.optimize import brentq
 from scipy.special import erfc
 from scipy.stats import norm
 
-from analysis.arrays import Array
-from analysis.turntable.angle_fits import FITS, fit
+from analysis.arrays import ARCSEC, Array
 from analysis.turntable.angle_network import NotConvergedError
-from analysis.turntable.dividing_error import CalibrationSeries, rejection_rate
-from analysis.units import ARCSEC
-from optics.numerics.threads import one_blas_thread
+from analysis.turntable.dividing_error import FITS, CalibrationSeries, fit, rejection_rate
+from optics.numerics.backend import one_blas_thread
 from scenes.specs.resolved import resolve_turntable
 from scenes.specs.turntable import TurntableTestSpec
 from twin.laboratory.turntable_bench import TurntableModel

@@ -14,8 +14,8 @@ import numpy as np
 from analysis.block.block_adjustment import adjust_block
 from analysis.orbit.calibration_parameters import Noise, vertical
 from analysis.orbit.forward_intersection import intersect
-from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.backend import one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.adjust_setup import AdjustSetup, resolve_adjust
 from scenes.specs.orbit.adjust import BlockPointsSpec, CameraChangeSpec, ReadingLawsSpec

@@ -13,7 +13,7 @@ from analysis.monitor.monitoring import PER_SI, MonitorGeometry
 from analysis.monitor.recovery import measure_spots
 from optics.geometry import zernike
 from optics.geometry.tree import State
-from optics.numerics.threads import cores
+from optics.numerics.backend import cores
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from twin.monitor.monitor_experiment import MonitorExperiment
 

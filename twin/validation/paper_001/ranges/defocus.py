@@ -13,7 +13,7 @@ from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.monitoring import MonitorGeometry
-from analysis.units import ARCSEC
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from twin.run.artefact import Data

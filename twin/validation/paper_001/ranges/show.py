@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.monitoring import MonitorGeometry
-from analysis.units import ARCSEC
 from twin.run.artefact import SYMBOLS, Cell
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.group import Context

@@ -9,8 +9,8 @@ from itertools import product
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from analysis.monitor.monitoring import MonitorGeometry
-from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
