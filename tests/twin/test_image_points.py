@@ -14,14 +14,13 @@ from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.specs.orbit.setup import CalibrationSetup, SimulateSetup
 from twin.orbit.calibration.calibration_run import true_values
-from twin.orbit.calibration.campaign import Campaign
+from twin.orbit.calibration.campaign import Campaign, FieldImages
 from twin.orbit.calibration.campaign_adjustment import simultaneous
-from twin.orbit.calibration.field_images import FieldImages
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.screening import screened
 from twin.orbit.images import image_points
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
-from twin.orbit.images.point_judgement import judged, true_ground
+from twin.orbit.images.patch import judged, true_ground
 from twin.orbit.images.simulate_run import Simulation, run_simulation
 
 SIMULATE, CALIBRATE = (SCENES / ORBIT / f"{name}.yaml" for name in ("simulate", "calibrate_images"))

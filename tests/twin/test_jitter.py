@@ -11,7 +11,7 @@ from tests.tiers import quick
 from tests.twin.pushbroom_bench import LINE_TIME, PLACE, Ground, lines
 from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.ground.grid import GroundFrame, Terrain
-from twin.orbit.images.jitter_exposure import collected, exposures
+from twin.orbit.images.line_optics import collected, exposures
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import PushbroomScene, render_patch
 from twin.sensors.charge_transfer import Collection, Motion

@@ -16,12 +16,10 @@ from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
-from twin.orbit.calibration.campaign import interior_names
-from twin.orbit.calibration.campaign_adjustment import GAUGE, simultaneous
+from twin.orbit.calibration.campaign import PassData, image_sigma, interior_names
+from twin.orbit.calibration.campaign_adjustment import GAUGE, fitted, rate_priors, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import surprises
-from twin.orbit.calibration.latitude import fitted, rate_priors
-from twin.orbit.calibration.observations import PassData, image_sigma
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints
 

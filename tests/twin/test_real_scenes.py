@@ -15,7 +15,7 @@ import pytest
 
 from twin.orbit.export.quality_run import compared
 from twin.orbit.export.rational_polynomial import RationalPolynomial
-from twin.orbit.measured.dimap_sensor import read_scene
+from twin.orbit.measured.platform_files import read_scene
 
 REAL = Path(os.environ.get("TWIN_REAL", Path(__file__).parents[3] / "shared" / "real"))
 needed = pytest.mark.skipif(

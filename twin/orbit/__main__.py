@@ -98,7 +98,7 @@ def adjust(
     options = Options(out, seed, backend, force, as_json, quiet, strict=strict)
 
     def run(setup: AnyAdjust, backend: Backend, seed: int, advance: Advance) -> Any:
-        from twin.orbit.block.point_workers import point_workers
+        from twin.orbit.block.block_run import point_workers
 
         with point_workers(workers, scheduler, lambda text: print_warnings(errors, (text,))) as pool:
             return procedure.run(setup, backend, seed, advance, pool)

@@ -209,6 +209,7 @@ class Record(Generic[S]):
         rows: Sequence[Mapping[str, Any]] | Mapping[str, Mapping[str, Any]],
         keys: Sequence[str] = (),
         label: str = "",
+        digits: int = 6,
     ) -> Table:
         """A table of a report.
 
@@ -219,6 +220,7 @@ class Record(Generic[S]):
             rows: as this record gives them, or by name, which then is the first column.
             keys: of the columns, in their order; all if none are given.
             label: head of the column of names.
+            digits: significant ones of numbers without decimals of their own.
         """
 
         def told(row: Mapping[str, Any]) -> list[Cell]:
@@ -231,7 +233,7 @@ class Record(Generic[S]):
             cells: list[list[Cell]] = [[first, *told(row)] for first, row in rows.items()]
         else:
             cells = [told(row) for row in rows]
-        return Table(name, title, caption, heads, cells, decimals)
+        return Table(name, title, caption, heads, cells, decimals, digits)
 
     def data_table(
         self, name: str, title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = ()

@@ -36,7 +36,7 @@ from twin.orbit.export.rational_polynomial import (
     read_rpc,
 )
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.measured.dimap_sensor import DimapScene
+from twin.orbit.measured.platform_files import DimapScene
 from twin.run.artefact import Table
 from twin.run.quantity import Quantity, Record
 from twin.run.report import Report, answer

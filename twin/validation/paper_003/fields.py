@@ -21,8 +21,7 @@ from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.orbit.calibration.campaign_adjustment import calibrated_alone
-from twin.orbit.calibration.latitude import LatitudeFit, fitted
+from twin.orbit.calibration.campaign_adjustment import LatitudeFit, calibrated_alone, fitted
 from twin.orbit.calibration.schemes import schemes_tested, tested, tested_before, values_of
 from twin.run.artefact import Cell
 from twin.run.random_streams import stream
