@@ -14,11 +14,11 @@ from analysis.block.block_adjustment import LawTest
 from analysis.block.network import DatumTest, Network, Open
 from analysis.block.reweighting import GroupTest
 from analysis.orbit.forward_intersection import Accuracy
+from twin.framework.artefact import Cell, Table
+from twin.framework.quantity import Quantity, Record
+from twin.framework.report import Report, Section, answer
 from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun, CameraChange, Worth
 from twin.orbit.measured.pass_measurements import duplicates, listed
-from twin.run.artefact import Cell, Table
-from twin.run.quantity import Quantity, Record
-from twin.run.report import Report, Section, answer
 
 ACCURACY: Record[Accuracy] = Record(
     "Errors that hold nine points in ten.",

@@ -22,6 +22,8 @@ from optics.numerics.array_math import covariance_root
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.flight import AttitudeSpec
 from scenes.specs.orbit.setup import AdjustSetup
+from twin.framework.procedure import BenchError
+from twin.framework.random_streams import stream
 from twin.orbit.block.measured_block import (
     MonitorSource,
     camera_sigmas,
@@ -38,8 +40,6 @@ from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
 from twin.orbit.measured.pass_measurements import ImagePoints, point_names
-from twin.run.procedure import BenchError
-from twin.run.random_streams import stream
 
 Course = Callable[[np.ndarray], np.ndarray]
 Monitored = dict[str, known.CameraKnowledge] | known.CamerasKnowledge

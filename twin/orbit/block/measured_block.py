@@ -20,6 +20,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.adjust import CameraChangeSpec, LawSpec
 from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
 from scenes.specs.orbit.setup import MeasuredAdjustSetup
+from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.block.measured_block import MonitorSource, camera_sigmas, change_covariance, monitored_camera
 from twin.orbit.block.pass_knowledge import law_of
 from twin.orbit.calibration.campaign import light_effects, line_model, pass_data
@@ -28,7 +29,6 @@ from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import PassMeasurements
-from twin.run.procedure import Advance, BenchError, silent
 
 MonitorSource = Callable[[Mapping[str, str], Sequence[str]], CamerasKnowledge]
 """Epochs of passes, UTC, and lines -> what a record of the monitor says of the lines' cameras in these passes."""

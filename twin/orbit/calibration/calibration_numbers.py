@@ -13,6 +13,7 @@ from analysis.calibration.strip_adjustment import Datum
 from analysis.orbit.calibration_parameters import OFFSET, RATE, Combination
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS
+from twin.framework.quantity import Quantity, Record
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
 from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Screening, interior_names
 from twin.orbit.calibration.campaign_adjustment import LatitudeFit
@@ -31,7 +32,6 @@ from twin.orbit.calibration.schemes import (
 from twin.orbit.calibration.screening import ground_sample, meeting_of
 from twin.orbit.images.patch import LineJudgement
 from twin.orbit.images.simulate_run import MATCH_COUNTS
-from twin.run.quantity import Quantity, Record
 
 # --- errors at check points, by scheme -------------------------------------------------------------------
 

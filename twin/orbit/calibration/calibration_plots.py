@@ -7,10 +7,10 @@ from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from analysis.orbit.three_line_model import BIAS, misclosure
+from twin.framework import svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.flown_campaign import true_bias
 from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_of
-from twin.run import svg
 
 
 def _expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) -> np.ndarray:

@@ -22,6 +22,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.calibration import LEAST_TIES
 from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from scenes.yaml.yaml_file import dump_yaml
+from twin.framework.memory import Lowered, require_memory
+from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
 from twin.orbit.calibration.campaign_adjustment import (
     LatitudeFit,
@@ -59,8 +61,6 @@ from twin.orbit.calibration.schemes import (
 )
 from twin.orbit.calibration.screening import require_labelled, screened
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files, read_measurements
-from twin.run.memory import Lowered, require_memory
-from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

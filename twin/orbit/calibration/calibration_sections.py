@@ -15,6 +15,8 @@ from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.framework.artefact import Cell, OwnDecimals, PngFigure, SvgFigure, Table
+from twin.framework.report import Section
 from twin.orbit.calibration.calibration_numbers import CHIP_STEP, LATITUDE, MATCHING, SCREENED
 from twin.orbit.calibration.calibration_plots import figure_svg
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
@@ -24,8 +26,6 @@ from twin.orbit.calibration.screening import ground_sample, meeting_of
 from twin.orbit.images.image_points import BEYOND
 from twin.orbit.images.patch import WRONG
 from twin.orbit.images.point_report import SORTS, points_png
-from twin.run.artefact import Cell, OwnDecimals, PngFigure, SvgFigure, Table
-from twin.run.report import Section
 
 _SCALES = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}
 """Unit of an unknown in files -> its size in the unit of tables, and that unit."""

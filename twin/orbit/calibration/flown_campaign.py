@@ -26,6 +26,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.random_streams import stream
 from twin.orbit.calibration.campaign import (
     Campaign,
     FieldImages,
@@ -50,8 +52,6 @@ from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PointsE
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import LineJudgement, Patch, PatchError, fly_patch, imaged_lines, judged, true_ground
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import (

@@ -34,11 +34,11 @@ from analysis.orbit.forward_intersection import CheckErrors, check_errors, inter
 from analysis.orbit.three_line_model import BIAS, LineModel
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
+from twin.framework.procedure import Advance
+from twin.framework.random_streams import stream
 from twin.orbit.calibration.campaign import EFFECTS, Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma
-from twin.run.procedure import Advance
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import MapLimitsSpec

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from twin.framework.artefact import Cell, Table
+from twin.framework.quantity import Quantity, Record
+from twin.framework.report import Report, Section, answer
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
 from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, Fit, changed
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.run.artefact import Cell, Table
-from twin.run.quantity import Quantity, Record
-from twin.run.report import Report, Section, answer
 
 Ranked = tuple[Check, Tried]
 Placed = tuple[Check, Changes]

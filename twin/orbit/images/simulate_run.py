@@ -26,6 +26,10 @@ from scenes.specs.orbit.scene import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.yaml_file import dump_yaml
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.quantity import Quantity, Record, plain_data
+from twin.framework.random_streams import stream
+from twin.framework.reference_frames import described
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, changed_payload, line_cameras
@@ -57,10 +61,6 @@ from twin.orbit.images.patch import (
 )
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.quantity import Quantity, Record, plain_data
-from twin.run.random_streams import stream
-from twin.run.reference_frames import described
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

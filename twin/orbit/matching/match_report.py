@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from twin.framework.report import Report, Section, answer
 from twin.orbit.images.point_report import found_table, how_measured, point_artefacts
 from twin.orbit.matching.match_run import IMAGE, Match
-from twin.run.report import Report, Section, answer
 
 _FAR = 0.5
 """Share of the reach: matches that lie farther from where they were expected leave the search little room."""
