@@ -432,6 +432,9 @@ def test_the_posterior_is_that_of_the_joint_normal_distribution(whole) -> None:
     draws = found.draw(rng, 4000)
     # a standard deviation of 4000 draws is right to 1.1 %; 4.5 of them, of some 30 motions
     np.testing.assert_allclose(np.std(draws, axis=0), found.sigma, rtol=0.05)
+    # where everything together contradicts what is stated, draws are wider by the root of chi-square per degree
+    doubted = replace(found, whole=replace(found.whole, chi_square=9.0 * found.whole.degrees))
+    np.testing.assert_allclose(np.std(doubted.draw(rng, 4000), axis=0), 3.0 * found.sigma, rtol=0.05)
 
 
 @pytest.mark.parametrize(("changes", "words"), refusals("asbuilt"))

@@ -205,6 +205,9 @@ def test_well_and_converter_clip():
     assert report.pixels.tolist() == [1024, 0]
     assert report.any
     assert narrow.saturation_dn == 255
+    # a pixel may be full four standard deviations of the noise below the well
+    level = counter(full_well_e=1e4, dark_noise_e=100.0).saturated(np.zeros((2, 4, 4), np.uint16)).level_dn
+    assert level == pytest.approx(counter().offset_dn + counter().system_gain_dn_per_e * (1e4 - 400.0))
     # dark noise below zero grey values is clipped, not wrapped around
     dark = detector(offset_dn=0.0, dark_noise_e=100.0).expose(np.zeros((32, 32)), uniform(32, 32), 2, 0.0, seed=1)
     assert dark.min() == 0
